@@ -1,0 +1,42 @@
+# One environment for users and developers: .venv. `make demo` and `make test` create it.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test test-fast check format bench bench-gpu clean
+
+demo: .venv/installed
+	$(BIN)/qfolio train pendulum
+
+test: .venv/installed-dev
+	$(BIN)/pytest
+
+test-fast: .venv/installed-dev
+	$(BIN)/pytest -m "not slow"
+
+check: .venv/installed-dev
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	$(BIN)/mypy
+
+format: .venv/installed-dev
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+bench: .venv/installed-dev
+	$(BIN)/python bench/run.py
+
+bench-gpu: .venv/installed
+	$(BIN)/python bench/gpu.py
+
+clean:
+	rm -rf .venv .venv-bench
+
+.venv/installed: pyproject.toml
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
+	$(BIN)/python -m pip install --quiet --editable ".[watch]"
+	touch $@
+
+.venv/installed-dev: .venv/installed
+	$(BIN)/python -m pip install --quiet --group dev
+	touch $@

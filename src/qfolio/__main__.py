@@ -1,0 +1,5 @@
+"""``python -m qfolio`` is the ``qfolio`` command."""
+
+from qfolio.cli import main
+
+main()

@@ -1,0 +1,250 @@
+"""Deep Q-network (Mnih et al. 2015), with double Q-learning (van Hasselt et al. 2016).
+
+A Q-network estimates the discounted return of each action. Collecting: actions are ε-greedy on it,
+and transitions go into a replay buffer. Training: it regresses, on batches from the buffer, towards
+r + γ max_a Q'(s', a), where Q' is a target network that follows it slowly. docs/dqn.md holds every
+formula, the place where it stands here, and each deviation from the paper.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from qfolio.errors import QfolioError
+from qfolio.mdp import Agent, Metrics, Task, Transition
+from qfolio.networks import MLP
+from qfolio.replay import Replay
+
+
+class Experience(NamedTuple):
+    """What the buffer keeps of a transition; nothing is bootstrapped behind ``terminal``."""
+
+    observation: Float[Array, "batch observation"]
+    action: Int[Array, " batch"]
+    reward: Float[Array, " batch"]
+    next_observation: Float[Array, "batch observation"]
+    terminal: Bool[Array, " batch"]
+
+
+class DQNState(eqx.Module):
+    """All that a DQN agent learns and remembers."""
+
+    online: MLP
+    target: MLP
+    optimizer: optax.ScaleByAdamState
+    replay: Replay
+    episodes: Int[Array, ""]  # finished; ε follows it
+    steps: Int[Array, ""]  # calls of learn; the target network follows it
+
+
+class DQN(Agent):
+    """Hyperparameters of a deep Q-network; the defaults are tuned for the pendulum."""
+
+    hidden: tuple[int, ...] = eqx.field(static=True, default=(128, 128))
+    environments: int = eqx.field(static=True, default=32)  # stepped side by side
+    episode_steps: int = eqx.field(static=True, default=0)  # cut training episodes; 0: the task's
+    batch_size: int = eqx.field(static=True, default=256)
+    updates: int = eqx.field(static=True, default=1)  # gradient steps per step of all environments
+    replay_capacity: int = eqx.field(static=True, default=65536)  # transitions
+    learning_starts: int = eqx.field(
+        static=True, default=1024
+    )  # transitions stored before learning
+    double: bool = eqx.field(static=True, default=True)
+    time_limit_terminal: bool = eqx.field(static=True, default=False)  # wrong, but often done
+    target_period: int = eqx.field(static=True, default=1)  # steps between target updates
+    target_rate: float = 0.03  # how far each goes towards the online network; 1 copies it
+    discount: float = 0.99
+    learning_rate: float = 1e-3
+    learning_rate_end: float = 0.0
+    learning_rate_steps: float = 8000.0  # gradient steps of the cosine from the one to the other
+    epsilon: float = 1.0
+    epsilon_end: float = 0.05
+    epsilon_decay: float = 0.995  # factor per finished episode
+    huber: float = math.inf  # |TD error| beyond which the loss is linear; inf squares all of it
+    reward_scale: float = 0.1  # the network learns values of scaled rewards
+
+    def __check_init__(self) -> None:
+        positive = ("environments", "batch_size", "updates", "replay_capacity", "target_period")
+        _require(self, positive, lambda x: x >= 1, "at least 1")
+        _require(self, ("learning_rate", "learning_rate_steps", "huber", "reward_scale"),
+                 lambda x: x > 0, "greater than 0")  # fmt: skip
+        _require(
+            self,
+            ("learning_starts", "learning_rate_end", "episode_steps"),
+            lambda x: x >= 0,
+            "at least 0",
+        )
+        fractions = ("discount", "target_rate", "epsilon", "epsilon_end", "epsilon_decay")
+        _require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
+        _require(self, ("hidden",), lambda x: len(x) > 0 and min(x) >= 1, "one or more layer sizes")
+        if self.learning_starts > self.replay_capacity:
+            raise QfolioError(
+                f"learning_starts is {self.learning_starts}, more than replay_capacity "
+                f"({self.replay_capacity}) can hold; lower the one or raise the other."
+            )
+
+    def contrast(self) -> tuple[str, "DQN"]:
+        label = "without double DQN" if self.double else "with double DQN"
+        return label, dataclasses.replace(self, double=not self.double)
+
+    def init(self, task: Task, key: PRNGKeyArray) -> DQNState:
+        observation = jax.eval_shape(lambda k: task.observe(task.reset(k)), key)
+        online = MLP((observation.shape[-1], *self.hidden, task.actions.n), key)
+        scalar = jax.ShapeDtypeStruct((), jnp.float32)
+        row = Experience(
+            observation=observation,
+            action=jax.ShapeDtypeStruct((), jnp.int32),
+            reward=scalar,
+            next_observation=observation,
+            terminal=jax.ShapeDtypeStruct((), jnp.bool_),
+        )
+        zero = jnp.array(0, jnp.int32)
+        return DQNState(
+            online=online,
+            target=online,
+            optimizer=optax.scale_by_adam().init(online),
+            replay=Replay.empty(row, self.replay_capacity, self.environments),
+            episodes=zero,
+            steps=zero,
+        )
+
+    def warm_up(self) -> int:
+        return max(0, math.ceil(self.learning_starts / self.environments) - 1)
+
+    def epsilon_now(self, state: DQNState) -> Float[Array, ""]:
+        return jnp.maximum(self.epsilon_end, self.epsilon * self.epsilon_decay**state.episodes)
+
+    def weights(self, state: DQNState) -> MLP:
+        return state.online
+
+    def action_values(
+        self, weights: MLP, observation: Float[Array, "batch observation"]
+    ) -> Float[Array, "batch action"]:
+        """Q(s, ·) in units of the task's reward."""
+        return weights(observation) / self.reward_scale
+
+    def policy(
+        self, weights: MLP, observation: Float[Array, "batch observation"]
+    ) -> Int[Array, " batch"]:
+        return weights(observation).argmax(-1)
+
+    def act(
+        self, state: DQNState, observation: Float[Array, "batch observation"], key: PRNGKeyArray
+    ) -> Int[Array, " batch"]:
+        greedy = self.policy(state.online, observation)
+        n = state.online.biases[-1].shape[0]
+        # One uniform decides both: below ε explore, and where below ε it fell picks the action.
+        uniform = jax.random.uniform(key, greedy.shape)
+        epsilon = self.epsilon_now(state)
+        explored = jnp.minimum(uniform / jnp.maximum(epsilon, 1e-30) * n, n - 1).astype(jnp.int32)
+        return jnp.where(uniform < epsilon, explored, greedy)
+
+    def observe(self, state: DQNState, rollout: Transition) -> DQNState:
+        step = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout)  # time × environments
+        terminal = step.terminated
+        if self.time_limit_terminal:
+            terminal = terminal | step.truncated
+        experience = Experience(
+            step.observation, step.action, step.reward, step.next_observation, terminal
+        )
+        finished = (step.terminated | step.truncated).sum(dtype=jnp.int32)
+        return eqx.tree_at(
+            lambda s: (s.replay, s.episodes),
+            state,
+            (state.replay.add(experience), state.episodes + finished),
+        )
+
+    def learn(
+        self, state: DQNState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[DQNState, Metrics]:
+        epsilon = self.epsilon_now(state)
+        state = self.observe(state, rollout)
+
+        def update(carry, key):  # type: ignore[no-untyped-def]
+            online, optimizer = carry
+            batch = state.replay.sample(key, self.batch_size)
+            (loss, max_q), gradient = jax.value_and_grad(self._loss, has_aux=True)(
+                online, state.target, batch
+            )
+            direction, optimizer = optax.scale_by_adam().update(gradient, optimizer)
+            rate = self._learning_rate(optimizer.count)
+            online = jax.tree.map(lambda w, d: w - rate * d, online, direction)
+            return (online, optimizer), (loss, max_q)
+
+        carry = (state.online, state.optimizer)
+        if self.updates == 1:
+            (online, optimizer), (loss, max_q) = update(carry, key)
+        else:
+            keys = jax.random.split(key, self.updates)
+            (online, optimizer), (loss, max_q) = lax.scan(update, carry, keys)
+
+        steps = state.steps + 1
+        rate = self.target_rate
+        if self.target_period > 1:
+            rate = jnp.where(steps % self.target_period == 0, rate, 0.0)
+        target = jax.tree.map(lambda t, w: t + rate * (w - t), state.target, online)
+        metrics = {"loss": loss.mean(), "epsilon": epsilon, "max_q": max_q.mean()}
+        state = DQNState(online, target, optimizer, state.replay, state.episodes, steps)
+        return state, metrics
+
+    def _learning_rate(self, update: Int[Array, ""]) -> Float[Array, ""]:
+        """A cosine from ``learning_rate`` to ``learning_rate_end`` (Loshchilov & Hutter 2017)."""
+        done = jnp.minimum(update / self.learning_rate_steps, 1.0)
+        weight = (1 + jnp.cos(jnp.pi * done)) / 2
+        return self.learning_rate_end + weight * (self.learning_rate - self.learning_rate_end)
+
+    def _loss(
+        self, online: MLP, target: MLP, batch: Experience
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Mean loss, and the batch's mean max_a Q(s, a) in units of reward."""
+        q = online(batch.observation)
+        taken = jnp.take_along_axis(q, batch.action[:, None], axis=1)[:, 0]
+        q_next = target(batch.next_observation)
+        selector = online(batch.next_observation) if self.double else q_next
+        following = bootstrap(q_next, selector)
+        goal = td_target(self.reward_scale * batch.reward, batch.terminal, following, self.discount)
+        error = lax.stop_gradient(goal) - taken
+        return huber_loss(error, self.huber).mean(), q.max(1).mean() / self.reward_scale
+
+
+def bootstrap(
+    q_next: Float[Array, "batch action"], selector: Float[Array, "batch action"]
+) -> Float[Array, " batch"]:
+    """The next state's value: ``q_next`` at the action that ``selector`` finds best.
+
+    Double Q-learning (van Hasselt et al. 2016, eq. 4) lets the online network select and the target
+    network evaluate; with ``selector = q_next`` this is max_a Q'(s', a) (Mnih et al. 2015).
+    """
+    return jnp.take_along_axis(q_next, selector.argmax(1)[:, None], axis=1)[:, 0]
+
+
+def td_target(
+    reward: Float[Array, " batch"],
+    terminal: Bool[Array, " batch"],
+    following: Float[Array, " batch"],
+    discount: Float[Array, ""] | float,
+) -> Float[Array, " batch"]:
+    """Bellman target r + γ V(s'), where nothing follows a terminal transition."""
+    return reward + jnp.where(terminal, 0.0, discount * following)
+
+
+def huber_loss(
+    error: Float[Array, "*batch"], delta: Float[Array, ""] | float
+) -> Float[Array, "*batch"]:
+    """½e² up to |e| = δ and δ(|e| − ½δ) beyond (Huber 1964); δ = ∞ squares everything."""
+    clipped = jnp.clip(error, -delta, delta)
+    return clipped * (error - clipped / 2)
+
+
+def _require(agent: DQN, names: tuple[str, ...], holds, wanted: str) -> None:  # type: ignore[no-untyped-def]
+    for name in names:
+        value = getattr(agent, name)
+        if not holds(value):
+            raise QfolioError(f"{name} is {value}; it must be {wanted}.")

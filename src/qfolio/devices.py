@@ -1,0 +1,115 @@
+"""How jax is set up, and how the members of a population share the processor.
+
+A population is a pytree whose leaves have a leading member axis: one member for each seed (or
+configuration). Devices share the members. On a GPU a device steps its members in lockstep (vmap).
+On a CPU each core is a device of its own, and takes its members one after the other: one agent's
+weights then stay in its cache, its matrix products keep their shape, and a member's arithmetic does
+not depend on how many others there are, to the last bit.
+"""
+
+import os
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import NamedSharding, PartitionSpec
+from jaxtyping import Array
+
+from qfolio.files import cache_directory
+
+
+def configure() -> None:
+    """Makes each CPU core a device and keeps compiled programs on disk.
+
+    Takes effect if called before jax first computes; whatever the user has set himself stays.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    wanted = {
+        "--xla_force_host_platform_device_count": str(len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1),
+        "--xla_cpu_multi_thread_eigen": "false",
+    }  # fmt: skip
+    new = [f"{flag}={value}" for flag, value in wanted.items() if flag not in flags]
+    os.environ["XLA_FLAGS"] = " ".join([flags, *new]).strip()
+    if not jax.config.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "programs"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def describe() -> str:
+    device = jax.devices()[0]
+    return f"{len(jax.devices())} × {device.device_kind} ({device.platform})"
+
+
+class Members:
+    """``count`` members spread over the devices, each in a slot of its device.
+
+    Outside, leaves have a leading axis of ``count``; on the devices, one of slots. ``place`` and
+    ``fetch`` go from the one to the other.
+    """
+
+    def __init__(self, count: int) -> None:
+        devices = jax.devices()[: min(len(jax.devices()), count)]
+        self._one_by_one = devices[0].platform == "cpu"
+        # At least two slots: XLA simplifies an axis of one away and then fuses, and so rounds,
+        # differently. A slot without a member costs memory, but no time.
+        slots = max(2 if self._one_by_one else 1, -(-count // len(devices)))
+        shares = np.array_split(np.arange(count), len(devices))
+        self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
+        self._filling = np.concatenate([np.resize(share, slots) for share in shares])
+        self._sharding = NamedSharding(
+            jax.sharding.Mesh(np.array(devices), ("member",)), PartitionSpec("member")
+        )
+        taken = np.array([len(share) for share in shares], np.int32)
+        self._taken = jax.device_put(taken, self._sharding)
+
+    def place(self, tree: Any) -> Any:
+        """Moves each member to a device."""
+        slots = jax.tree.map(lambda x: np.asarray(x)[self._filling], tree)
+        return jax.device_put(slots, self._sharding)
+
+    def fetch(self, tree: Any) -> Any:
+        """The members as numpy arrays."""
+        return jax.tree.map(lambda x: np.asarray(x)[self._slots], tree)
+
+    def compile(self, function: Callable[..., Any], *example: Any, donate: bool = False) -> Any:
+        """``function(member, *shared)`` as a program over all members' slots.
+
+        example: arguments shaped like those to come. ``donate``: the first one's memory is reused.
+        """
+
+        def on_device(taken: Array, members: Any, *shared: Any) -> Any:
+            one = lambda member: function(member, *shared)  # noqa: E731
+            return _map(one, members, taken[0]) if self._one_by_one else jax.vmap(one)(members)
+
+        def on_all(taken: Array, members: Any, *shared: Any) -> Any:
+            split, same = self._sharding.spec, PartitionSpec()
+            return jax.shard_map(
+                on_device,
+                mesh=self._sharding.mesh,
+                in_specs=(split, split, *[same] * len(shared)),
+                out_specs=split,
+                check_vma=False,
+            )(taken, members, *shared)
+
+        program = jax.jit(on_all, donate_argnums=1 if donate else ())
+        return partial(program.lower(self._taken, *example).compile(), self._taken)
+
+
+def _map(function: Callable[[Any], Any], members: Any, count: Array) -> Any:
+    """``lax.map`` over the first ``count`` members only."""
+    at = lambda i: jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, i, 0, False), members)  # noqa: E731
+    shapes = jax.eval_shape(function, at(0))
+    length = jax.tree.leaves(members)[0].shape[0]
+    results = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
+
+    def body(i: Array, results: Any) -> Any:
+        put = lambda all, one: lax.dynamic_update_index_in_dim(all, one, i, 0)  # noqa: E731
+        return jax.tree.map(put, results, function(at(i)))
+
+    return lax.fori_loop(0, count, body, results)

@@ -1,0 +1,81 @@
+"""How good a policy is: greedy returns from fixed starts, and how far its values overestimate."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from qfolio.mdp import Agent, Task
+
+STARTS = 1024
+"""Start states that results are graded on; those along the learning curve are the first of them."""
+
+
+def start_keys(n: int = STARTS) -> PRNGKeyArray:
+    """Keys of the fixed start states; the first of many are the same as few."""
+    return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(20151), i))(jnp.arange(n))
+
+
+class Greedy(NamedTuple):
+    """Greedy episodes from some starts."""
+
+    returns: Float[Array, " start"]  # undiscounted, over the task's horizon
+    overestimation: Float[Array, ""]  # NaN where the agent estimates no action values
+
+
+def evaluate(task: Task, agent: Agent, weights: PyTree, keys: PRNGKeyArray) -> Greedy:
+    """Follows the greedy policy from each key's start state for twice the horizon.
+
+    The return counts the first half. The overestimation is the mean over the states visited in it
+    of max_a Q(s, a) less the discounted return that really followed (van Hasselt et al. 2016,
+    section 3); the second half is there so that what follows is not cut off.
+    """
+    starts = jax.vmap(task.reset)(keys)
+
+    def step(carry: tuple[PyTree, Array], time: Array) -> tuple[tuple[PyTree, Array], tuple]:
+        states, alive = carry
+        observation = jax.vmap(task.observe)(states)
+        values = agent.action_values(weights, observation)
+        best = jnp.full(alive.shape, jnp.nan) if values is None else values.max(-1)
+        actions = agent.policy(weights, observation)
+        step_keys = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
+        after = jax.vmap(task.step)(states, actions, step_keys)
+        reward = jnp.where(alive, after.reward, 0.0)
+        return (after.state, alive & ~after.terminated), (reward, best, alive)
+
+    alive = jnp.ones(keys.shape, bool)
+    times = jnp.arange(2 * task.horizon)
+    _, (rewards, best, visited) = lax.scan(step, (starts, alive), times)
+
+    def back(following: Array, reward: Array) -> tuple[Array, Array]:
+        now = reward + agent.discount * following
+        return now, now
+
+    _, discounted = lax.scan(back, jnp.zeros(keys.shape), rewards, reverse=True)
+    first = slice(0, task.horizon)
+    error = jnp.where(visited, best - discounted, 0.0)[first].sum() / visited[first].sum()
+    return Greedy(rewards[first].sum(0), error)
+
+
+class Episode(NamedTuple):
+    """One greedy episode, step by step."""
+
+    states: PyTree  # (time + 1, ...)
+    actions: Array  # (time, ...)
+    rewards: Float[Array, " time"]
+
+
+def play(task: Task, agent: Agent, weights: PyTree, key: PRNGKeyArray) -> Episode:
+    """One greedy episode of the task's horizon from the start state of ``key``."""
+
+    def step(state: PyTree, time: Array) -> tuple[PyTree, tuple]:
+        action = agent.policy(weights, task.observe(state)[None])[0]
+        after = task.step(state, action, jax.random.fold_in(key, time))
+        return after.state, (after.state, action, after.reward)
+
+    start = task.reset(key)
+    _, (states, actions, rewards) = lax.scan(step, start, jnp.arange(task.horizon))
+    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
+    return Episode(states, actions, rewards)

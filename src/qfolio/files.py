@@ -1,0 +1,77 @@
+"""Files that are never half-written and never executed: atomic writes, safetensors, the cache."""
+
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from qfolio.errors import QfolioError
+
+
+def cache_directory() -> Path:
+    """Where compiled programs and solved optima are kept; safe to delete at any time."""
+    if path := os.environ.get("QFOLIO_CACHE"):
+        return Path(path)
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData/Local"))
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library/Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return base / "qfolio"
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes to a temporary name beside ``path``, then renames: a reader sees all or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: Path, content: Any) -> None:
+    write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Raises QfolioError where the file is missing or holds no JSON object."""
+    try:
+        content = json.loads(path.read_text())
+    except OSError as error:
+        raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise QfolioError(f"{path} is damaged, it holds no valid JSON ({error}).") from None
+    if not isinstance(content, dict):
+        raise QfolioError(f"{path} is damaged, it holds no JSON object.")
+    return content
+
+
+def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Named arrays as safetensors, which hold numbers only and cannot carry code."""
+    write_bytes(path, save({name: np.asarray(a, order="C") for name, a in arrays.items()}))
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Raises QfolioError where the file is missing, truncated or not safetensors."""
+    try:
+        return load(path.read_bytes())
+    except OSError as error:
+        raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
+    except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise QfolioError(
+            f"{path} is no safetensors file or is damaged ({error}); restore it or train anew."
+        ) from None

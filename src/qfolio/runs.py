@@ -1,0 +1,441 @@
+"""A run: a population in training, what it has reported so far, and its folder on disk.
+
+The folder holds config.json (settings, written once), metrics.csv and evaluation.csv (appended),
+checkpoint.safetensors (the whole training state, replaced as one), policy.safetensors (weights)
+and, at the end, summary.json. The checkpoint is the truth: rows that are ahead of it are dropped when a
+run is resumed, and then come again, the same to the last digit.
+"""
+
+import csv
+import datetime
+import math
+import platform
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version as version_of
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+import numpy as np
+
+import qfolio
+from qfolio import devices, settings
+from qfolio.errors import QfolioError
+from qfolio.evaluation import STARTS, start_keys
+from qfolio.files import read_arrays, read_json, write_arrays, write_json
+from qfolio.mdp import Agent, Task
+from qfolio.registry import AGENTS, TASKS, find, name_of
+from qfolio.statistics import bootstrap_interval
+from qfolio.training import Episodes, Population, chunk_steps
+
+FORMAT = 1
+"""Of the run folder; raised whenever an older folder can no longer be read."""
+
+CURVE_STARTS = 64
+"""Start states of the evaluations along the learning curve."""
+
+EVALUATIONS = 20
+"""Points on the learning curve, about."""
+
+CHECKPOINT_SECONDS = 10.0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run is, after each chunk."""
+
+    episodes: int
+    total: int
+    mean_return: float  # of the training episodes finished in this chunk, all seeds; NaN if none
+    epsilon: float
+    steps_per_second: float  # environment steps of all seeds
+    seconds_left: float
+    greedy_return: float | None  # mean over seeds, where the curve has a point here
+
+
+class Run:
+    """Seeds of one agent on one task; make it with ``Run.create``, ``Run.open`` or ``train``."""
+
+    def __init__(
+        self, task: Task, agent: Agent, config: dict[str, Any], folder: Path | None
+    ) -> None:
+        self.task, self.agent, self.config, self.folder = task, agent, config, folder
+        first = config["seed"]
+        self.population = Population(task, agent, range(first, first + config["seeds"]))
+        self.metrics: list[dict[str, float]] = []
+        self.evaluations: list[dict[str, float]] = []
+        self.seconds_train = 0.0
+        self.interrupted = False
+
+    @classmethod
+    def create(
+        cls,
+        task: Task,
+        agent: Agent,
+        *,
+        episodes: int,
+        seeds: int = 1,
+        seed: int = 0,
+        preset: str | None = None,
+        out: Path | str | None = None,
+    ) -> "Run":
+        """A run before its first step; ``out`` must be a new or empty folder."""
+        for name, value in (("episodes", episodes), ("seeds", seeds)):
+            if value < 1:
+                raise QfolioError(f"{name} is {value}; it must be at least 1.")
+        if not 0 <= seed <= 2**32 - seeds:
+            raise QfolioError(f"seed is {seed}; it must be between 0 and 2³² − seeds.")
+        folder = None if out is None else Path(out)
+        if (
+            folder is not None
+            and folder.exists()
+            and (not folder.is_dir() or any(folder.iterdir()))
+        ):
+            raise QfolioError(
+                f"{folder} is not empty; name a new folder, or go on with --resume {folder}."
+            )
+        config = {
+            "format": FORMAT,
+            "version": qfolio.__version__,
+            "task": name_of(TASKS, task),
+            "task_settings": settings.describe(task),
+            "agent": name_of(AGENTS, agent),
+            "preset": preset,
+            "agent_settings": settings.describe(agent),
+            "episodes": episodes,
+            "seeds": seeds,
+            "seed": seed,
+            "device": devices.describe(),
+            "versions": {
+                "python": platform.python_version(),
+                **{name: version_of(name) for name in ("jax", "equinox", "optax", "numpy")},
+            },
+            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        }
+        run = cls(task, agent, config, folder)
+        if folder is not None:
+            write_json(folder / "config.json", config)
+            run._write_checkpoint()
+        return run
+
+    @classmethod
+    def open(
+        cls, folder: Path | str, task: Task | None = None, agent: Agent | None = None
+    ) -> "Run":
+        """A run as its last checkpoint left it.
+
+        task, agent: needed only where they are not among those that qfolio registers.
+        """
+        folder = Path(folder)
+        config = read_config(folder)
+        run = cls(
+            task or configured_task(config), agent or configured_agent(config), config, folder
+        )
+        run._read_checkpoint()
+        return run
+
+    @property
+    def episodes(self) -> int:
+        """Finished by the seed that has finished fewest."""
+        return self.population.episodes
+
+    def train(
+        self, episodes: int | None = None, listener: Callable[[Progress], None] | None = None
+    ) -> None:
+        """Trains until each seed has finished ``episodes`` (those of the configuration).
+
+        A first Ctrl-C stops after the current chunk, sets ``interrupted`` and leaves a checkpoint.
+        A loss that is not finite raises QfolioError; the last good checkpoint stays.
+        """
+        if episodes is not None and episodes != self.config["episodes"]:
+            self.config["episodes"] = episodes
+            if self.folder is not None:
+                write_json(self.folder / "config.json", self.config)
+        total = self.config["episodes"]
+        steps = self.population.steps_left(total)
+        if not steps:
+            return
+        chunks = math.ceil(steps / chunk_steps(self.task, self.agent))
+        every = max(1, round(chunks / EVALUATIONS))
+        begun, saved = self.population.steps, perf_counter()
+        start_seconds = self.seconds_train
+        done = 0
+        with _interruptible() as stop:
+            while steps := self.population.steps_left(total):
+                records = self._advance(steps)
+                done += 1
+                steps = self.population.steps_left(total)
+                greedy = None
+                if done % every == 0 or not steps:
+                    greedy = self._evaluate()
+                if stop.is_set() or not steps or perf_counter() - saved > CHECKPOINT_SECONDS:
+                    self._write_checkpoint()
+                    saved = perf_counter()
+                if listener is not None:
+                    rate = (self.population.steps - begun) / (self.seconds_train - start_seconds)
+                    listener(self._progress(records, total, rate, steps, greedy))
+                if stop.is_set() and steps:
+                    self.interrupted = True
+                    return
+
+    def first_weights(self) -> Any:
+        """The first seed's learned weights."""
+        return jax.tree.map(lambda x: x[0], self.agent.weights(self.population.fetch().agent))
+
+    def summary(self) -> dict[str, Any]:
+        """Greedy returns on the fixed start states, the optimum on the same, and what it cost."""
+        result = self.grade()
+        steps = self.population.steps * self.agent.environments
+        summary = {
+            "task": self.config["task"],
+            "agent": self.config["agent"],
+            "preset": self.config["preset"],
+            "seeds": self.config["seeds"],
+            "episodes": self.episodes,
+            "env_steps": steps,
+            "seconds_compile": round(self.population.seconds_compile, 3),
+            "seconds_train": round(self.seconds_train, 3),
+            "steps_per_second": round(
+                steps * self.config["seeds"] / max(self.seconds_train, 1e-9), 1
+            ),
+            **result,
+        }
+        if self.folder is not None:
+            write_json(self.folder / "summary.json", summary)
+        return summary
+
+    def grade(self, starts: int = STARTS) -> dict[str, Any]:
+        """Returns, optimum and regret of each seed's policy on the first fixed start states."""
+        keys = start_keys(starts)
+        greedy = self.population.evaluate(keys)
+        returns = greedy.returns.mean(1)
+        solution = self.task.optimum()
+        optimum, regret = None, None
+        if solution is not None:
+            optimum = float(solution.returns(keys).mean())
+            regret = ((optimum - returns) / abs(optimum)).tolist()
+        return {
+            "return_mean": float(returns.mean()),
+            "return_ci95": [float(end) for end in bootstrap_interval(returns, np.mean)]
+            if len(returns) > 1
+            else None,
+            "return_per_seed": returns.tolist(),
+            "optimum": optimum,
+            "regret_per_seed": regret,
+            "overestimation_per_seed": greedy.overestimation.tolist(),
+        }
+
+    def _advance(self, steps: int) -> list[dict[str, float]]:
+        before = self.population.member_episodes
+        compiled = self.population.seconds_compile
+        start = perf_counter()
+        episodes = self.population.advance(steps)
+        self.seconds_train += perf_counter() - start - (self.population.seconds_compile - compiled)
+        records = list(_records(self.population.seeds, before, episodes))
+        self.metrics += records
+        self._append("metrics.csv", records)
+        return records
+
+    def _evaluate(self) -> float:
+        greedy = self.population.evaluate(start_keys(CURVE_STARTS))
+        records = [
+            {
+                "seed": seed,
+                "episode": episode,
+                "env_steps": self.population.steps * self.agent.environments,
+                "return": float(returns.mean()),
+                "overestimation": float(overestimation),
+            }
+            for seed, episode, returns, overestimation in zip(
+                self.population.seeds, self.population.member_episodes, *greedy, strict=True
+            )
+        ]
+        self.evaluations += records
+        self._append("evaluation.csv", records)
+        return float(greedy.returns.mean())
+
+    def _progress(
+        self,
+        records: list[dict[str, float]],
+        total: int,
+        rate: float,
+        steps_left: int,
+        greedy: float | None,
+    ) -> Progress:
+        returns = [record["return"] for record in records]
+        return Progress(
+            episodes=self.episodes,
+            total=total,
+            mean_return=float(np.mean(returns)) if returns else math.nan,
+            epsilon=records[-1].get("epsilon", math.nan) if records else math.nan,
+            steps_per_second=rate * self.agent.environments * len(self.population.seeds),
+            seconds_left=steps_left / rate,
+            greedy_return=greedy,
+        )
+
+    def _append(self, name: str, records: Sequence[dict[str, float]]) -> None:
+        if self.folder is None or not records:
+            return
+        path = self.folder / name
+        new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(records[0]))
+            if new:
+                writer.writeheader()
+            writer.writerows(records)
+
+    def _write_checkpoint(self) -> None:
+        if self.folder is None:
+            return
+        state = self._snapshot()
+        weights = self.agent.weights(state["training"].agent)
+        write_arrays(self.folder / "policy.safetensors", _named(weights))
+        write_arrays(self.folder / "checkpoint.safetensors", _named(state))
+
+    def _snapshot(self) -> dict[str, Any]:
+        return {"training": self.population.fetch(), "seconds_train": np.array(self.seconds_train)}
+
+    def _read_checkpoint(self) -> None:
+        assert self.folder is not None
+        path = self.folder / "checkpoint.safetensors"
+        state = _fill(self._snapshot(), read_arrays(path), path)
+        self.seconds_train = float(state["seconds_train"])
+        self.population.restore(state["training"])
+        self.metrics = self._read_rows("metrics.csv")
+        self.evaluations = self._read_rows("evaluation.csv")
+
+    def _read_rows(self, name: str) -> list[dict[str, float]]:
+        """The rows up to the checkpoint; later ones, or one cut short by a crash, are dropped."""
+        assert self.folder is not None
+        path = self.folder / name
+        if not path.exists():
+            return []
+        done = dict(zip(self.population.seeds, self.population.member_episodes, strict=True))
+        rows = []
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                try:
+                    values = {key: float(text) for key, text in row.items()}
+                    if values["episode"] <= done[int(values["seed"])]:
+                        rows.append(values)
+                except (TypeError, ValueError, KeyError):
+                    continue  # cut short
+        path.unlink()
+        self._append(name, [r | {k: int(r[k]) for k in ("seed", "episode", "env_steps") if k in r}
+                            for r in rows])  # fmt: skip
+        return rows
+
+
+def train(
+    task: Task,
+    agent: Agent,
+    *,
+    episodes: int,
+    seeds: int = 1,
+    seed: int = 0,
+    out: Path | str | None = None,
+    listener: Callable[[Progress], None] | None = None,
+) -> Run:
+    """Trains ``seeds`` agents side by side, from seeds ``seed``, ``seed + 1``, …
+
+    out: a new folder for the run; without it nothing is written. ``run.summary()`` grades it.
+    """
+    devices.configure()
+    run = Run.create(task, agent, episodes=episodes, seeds=seeds, seed=seed, out=out)
+    run.train(listener=listener)
+    return run
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """config.json, or QfolioError where ``folder`` is no run of this version."""
+    if not (folder / "config.json").is_file():
+        raise QfolioError(f"{folder} is no run: it has no config.json.")
+    config = read_json(folder / "config.json")
+    if config.get("format") != FORMAT:
+        raise QfolioError(
+            f"{folder} was written by qfolio {config.get('version', 'of an unknown version')} in "
+            f"another format; this is {qfolio.__version__}: use that version, or train anew."
+        )
+    wanted = {"task": str, "agent": str, "task_settings": dict, "agent_settings": dict,
+              "episodes": int, "seeds": int, "seed": int}  # fmt: skip
+    for name, kind in wanted.items():
+        if not isinstance(config.get(name), kind):
+            raise QfolioError(
+                f"{folder / 'config.json'} is damaged: {name} is missing or no {kind.__name__}."
+            )
+    if not (
+        1 <= config["seeds"] <= 2**20 and config["episodes"] >= 1 and 0 <= config["seed"] < 2**32
+    ):
+        raise QfolioError(
+            f"{folder / 'config.json'} is damaged: seeds, seed or episodes are out of range."
+        )
+    return config
+
+
+def configured_task(config: dict[str, Any]) -> Task:
+    return settings.build(find("task", TASKS, config["task"]), config["task_settings"])
+
+
+def configured_agent(config: dict[str, Any]) -> Agent:
+    return settings.build(find("agent", AGENTS, config["agent"]), config["agent_settings"])
+
+
+def _records(
+    seeds: Sequence[int], before: Sequence[int], episodes: Episodes
+) -> Iterator[dict[str, float]]:
+    """A row for each finished episode, in the order in which they finished."""
+    for member, (seed, number) in enumerate(zip(seeds, before, strict=True)):
+        finished = episodes.finished[member]
+        columns = {"return": episodes.returns, **episodes.metrics}
+        values = {name: column[member][finished] for name, column in columns.items()}
+        for i in range(int(finished.sum())):
+            yield {
+                "seed": seed,
+                "episode": number + i + 1,
+                **{name: float(column[i]) for name, column in values.items()},
+            }
+
+
+def _named(tree: Any) -> dict[str, np.ndarray]:
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _fill(template: Any, arrays: dict[str, np.ndarray], path: Path) -> Any:
+    """``template`` with its leaves from ``arrays``, which must fit it name by name."""
+    wanted = _named(template)
+    fits = wanted.keys() == arrays.keys() and all(
+        arrays[name].shape == leaf.shape and arrays[name].dtype == leaf.dtype
+        for name, leaf in wanted.items()
+    )
+    if not fits:
+        raise QfolioError(
+            f"{path} does not belong to the settings in config.json beside it; "
+            "restore the two together, or train anew."
+        )
+    return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """Turns the first Ctrl-C into an event; a second one interrupts at once."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def note(number: int, frame: Any) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, previous)
+
+    previous = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,82 @@
+"""Tasks so small that every action value is known by hand."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from qfolio.mdp import Discrete, Step, Task
+
+TERMINATED, GOES_ON = jnp.array(True), jnp.array(False)
+
+
+class OneState(Task):
+    """One step; action 1 pays 1 and action 0 nothing."""
+
+    horizon: int = eqx.field(static=True, default=1)
+    actions: Discrete = eqx.field(default_factory=lambda: Discrete(2))
+
+    def reset(self, key):
+        return jnp.zeros(())
+
+    def observe(self, state):
+        return jnp.ones(1)
+
+    def step(self, state, action, key):
+        return Step(state, action.astype(jnp.float32), TERMINATED)
+
+
+class TwoStates(Task):
+    """One step from a state ±1; the action must match it: Q(s, a) = s · (2a − 1)."""
+
+    horizon: int = eqx.field(static=True, default=1)
+    actions: Discrete = eqx.field(default_factory=lambda: Discrete(2))
+
+    def reset(self, key):
+        return jax.random.rademacher(key, (), jnp.float32)
+
+    def observe(self, state):
+        return state[None]
+
+    def step(self, state, action, key):
+        return Step(state, state * (2.0 * action - 1.0), TERMINATED)
+
+
+class RewardDelay(Task):
+    """Two steps whatever the action; only the second pays 1: values γ, then 1."""
+
+    horizon: int = eqx.field(static=True, default=2)
+    actions: Discrete = eqx.field(default_factory=lambda: Discrete(2))
+
+    def reset(self, key):
+        return jnp.zeros(())
+
+    def observe(self, state):
+        return jnp.stack([1.0 - state, state])
+
+    def step(self, state, action, key):
+        return Step(state + 1.0, state, state > 0.5)
+
+
+class Endless(Task):
+    """Pays 1 for ever, cut after one step: worth 1/(1 − γ), but 1 if the cut counts as the end."""
+
+    horizon: int = eqx.field(static=True, default=1)
+    actions: Discrete = eqx.field(default_factory=lambda: Discrete(2))
+
+    def reset(self, key):
+        return jnp.zeros(())
+
+    def observe(self, state):
+        return jnp.ones(1)
+
+    def step(self, state, action, key):
+        return Step(state, jnp.array(1.0), GOES_ON)
+
+
+class Explosive(Endless):
+    """Rewards that overflow after some steps, so that the loss becomes infinite."""
+
+    horizon: int = eqx.field(static=True, default=1000)
+
+    def step(self, state, action, key):
+        return Step(state + 1.0, jnp.where(state > 40, jnp.inf, 1.0), GOES_ON)

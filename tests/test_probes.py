@@ -1,0 +1,66 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import Endless, OneState, RewardDelay, TwoStates
+
+from qfolio.agents.dqn import DQN
+from qfolio.training import Population
+
+DISCOUNT = 0.9
+
+
+def learned_values(task, observations, steps=1500, **changes):
+    settings = {
+        "hidden": (32,), "environments": 4, "batch_size": 32, "replay_capacity": 1000,
+        "learning_starts": 100, "episode_steps": 0, "discount": DISCOUNT, "target_rate": 0.05,
+        "learning_rate": 3e-3, "learning_rate_steps": 1500.0, "reward_scale": 1.0,
+        "epsilon_end": 0.2, "learning_rate_end": 0.0,
+    }  # fmt: skip
+    agent = DQN(**{**settings, **changes})
+    population = Population(task, agent, [0])
+    while population.steps < steps:
+        population.advance(steps - population.steps)
+    weights = jax.tree.map(lambda x: jnp.array(x[0]), agent.weights(population.fetch().agent))
+    return np.asarray(agent.action_values(weights, jnp.array(observations)))
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_one_state(double):
+    values = learned_values(OneState(), [[1.0]], double=double)
+    np.testing.assert_allclose(values, [[0.0, 1.0]], atol=0.02)
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_two_states(double):
+    values = learned_values(TwoStates(), [[1.0], [-1.0]], double=double)
+    np.testing.assert_allclose(values, [[-1, 1], [1, -1]], atol=0.02)
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_reward_delay(double):
+    values = learned_values(RewardDelay(), [[1.0, 0.0], [0.0, 1.0]], double=double)
+    np.testing.assert_allclose(values, [[DISCOUNT] * 2, [1, 1]], rtol=0.02)
+
+
+@pytest.mark.parametrize("changes", [{}, {"target_rate": 1.0, "target_period": 10}])
+def test_a_time_limit_is_not_the_end(changes):
+    values = learned_values(Endless(), [[1.0]], steps=3000, learning_rate_steps=3000.0,
+                            target_rate=changes.get("target_rate", 0.2),
+                            target_period=changes.get("target_period", 1))  # fmt: skip
+    np.testing.assert_allclose(values, 1 / (1 - DISCOUNT), rtol=0.02)
+
+
+def test_a_time_limit_taken_for_the_end():
+    values = learned_values(Endless(), [[1.0]], time_limit_terminal=True)
+    np.testing.assert_allclose(values, 1.0, rtol=0.02)
+
+
+def test_scaled_rewards_and_huber_loss_leave_the_values_alone():
+    values = learned_values(RewardDelay(), [[1.0, 0.0]], reward_scale=0.5, huber=0.1)
+    np.testing.assert_allclose(values, DISCOUNT, rtol=0.02)
+
+
+def test_several_updates_a_step():
+    values = learned_values(TwoStates(), [[1.0]], steps=500, updates=3)
+    np.testing.assert_allclose(values, [[-1, 1]], atol=0.02)
