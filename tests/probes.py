@@ -9,11 +9,18 @@ from qfolio.mdp import Discrete, Step, Task
 TERMINATED, GOES_ON = jnp.array(True), jnp.array(False)
 
 
-class OneState(Task):
+class Probe(Task):
+    """Two actions."""
+
+    @property
+    def actions(self):
+        return Discrete(2)
+
+
+class OneState(Probe):
     """One step; action 1 pays 1 and action 0 nothing."""
 
     horizon: int = eqx.field(static=True, default=1)
-    actions: Discrete = eqx.field(default_factory=lambda: Discrete(2))
 
     def reset(self, key):
         return jnp.zeros(())
@@ -25,11 +32,10 @@ class OneState(Task):
         return Step(state, action.astype(jnp.float32), TERMINATED)
 
 
-class TwoStates(Task):
+class TwoStates(Probe):
     """One step from a state ±1; the action must match it: Q(s, a) = s · (2a − 1)."""
 
     horizon: int = eqx.field(static=True, default=1)
-    actions: Discrete = eqx.field(default_factory=lambda: Discrete(2))
 
     def reset(self, key):
         return jax.random.rademacher(key, (), jnp.float32)
@@ -41,11 +47,10 @@ class TwoStates(Task):
         return Step(state, state * (2.0 * action - 1.0), TERMINATED)
 
 
-class RewardDelay(Task):
+class RewardDelay(Probe):
     """Two steps whatever the action; only the second pays 1: values γ, then 1."""
 
     horizon: int = eqx.field(static=True, default=2)
-    actions: Discrete = eqx.field(default_factory=lambda: Discrete(2))
 
     def reset(self, key):
         return jnp.zeros(())
@@ -57,11 +62,10 @@ class RewardDelay(Task):
         return Step(state + 1.0, state, state > 0.5)
 
 
-class Endless(Task):
+class Endless(Probe):
     """Pays 1 for ever, cut after one step: worth 1/(1 − γ), but 1 if the cut counts as the end."""
 
     horizon: int = eqx.field(static=True, default=1)
-    actions: Discrete = eqx.field(default_factory=lambda: Discrete(2))
 
     def reset(self, key):
         return jnp.zeros(())

@@ -2,10 +2,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Endless, OneState, RewardDelay, TwoStates
 
 from qfolio.agents.dqn import DQN
 from qfolio.training import Population
+
+from probes import Endless, OneState, RewardDelay, TwoStates
 
 DISCOUNT = 0.9
 

@@ -6,7 +6,7 @@ from qfolio.replay import Replay
 
 
 def filled(capacity, writes, width=2):
-    replay = Replay.empty(jax.ShapeDtypeStruct((), jnp.int32), capacity, width)
+    replay = Replay.empty(jnp.array(0), capacity, width)
     for i in range(writes):
         replay = replay.add(jnp.arange(i * width, (i + 1) * width))
     return replay

@@ -55,12 +55,16 @@ def train(
     from qfolio.runs import Run
 
     if resume is not None:
+        if assignments or seeds is not None or out is not None:
+            raise QfolioError(
+                "--resume keeps the run's settings and seeds; leave --set, --seeds and --out out."
+            )
         run = Run.open(resume)
         folder = resume
     else:
         folder = out or Path("runs") / f"{task}-{preset}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         run = _new_run(task, agent, preset, episodes, seeds, seed, folder, assignments)
-    total = episodes or run.config["episodes"]
+    total = run.config["episodes"] if episodes is None else episodes
     _say(f"{_describe(run)} · {run.config['device']}")
     with _window(live, run) as show:
         _train(run, total, show)
@@ -157,13 +161,16 @@ def _new_run(
 
 def _train(run: "Run", episodes: int, show: Callable[["Run"], None] | None = None) -> None:
     """Trains with live progress; leaves the process after Ctrl-C."""
-    from rich.progress import BarColumn, Progress, TextColumn
+    import rich.progress
 
     optimum = _optimum(run)
     columns = ("episodes", "return", "greedy", "optimum", "epsilon", "steps/s", "left")
     _say("".join(f"{name:>11}" for name in columns))
-    columns_live = (BarColumn(bar_width=24), TextColumn("{task.description}"))
-    with Progress(*columns_live, console=_console(), transient=True) as live:
+    bar_columns = (
+        rich.progress.BarColumn(bar_width=24),
+        rich.progress.TextColumn("{task.description}"),
+    )
+    with rich.progress.Progress(*bar_columns, console=_console(), transient=True) as live:
         bar = live.add_task("compiling", total=episodes, completed=run.episodes)
 
         def note(now: "Progress") -> None:
@@ -174,7 +181,7 @@ def _train(run: "Run", episodes: int, show: Callable[["Run"], None] | None = Non
                 _number(optimum),
                 f"{now.epsilon:.2f}",
                 f"{now.steps_per_second:,.0f}",
-                f"{datetime.timedelta(seconds=round(now.seconds_left))}",
+                str(datetime.timedelta(seconds=round(now.seconds_left))),
             ]
             left = cells[-1]
             live.update(
@@ -242,8 +249,7 @@ def _finish(run: "Run", folder: Path, comparison: "Run | None") -> None:
 
     with _console().status("Grading on 1,024 start states and writing the report"):
         summary = run.summary()
-        command = f"qfolio train --resume {folder}"
-        write_report(folder, report_data(run, summary, comparison, command))
+        write_report(folder, report_data(run, summary, comparison, _command(run)))
     _print_result(run, summary)
     _say(
         f"{summary['env_steps'] * summary['seeds']:,} steps in {summary['seconds_train']:.1f} s of "
@@ -251,6 +257,26 @@ def _finish(run: "Run", folder: Path, comparison: "Run | None") -> None:
         f"{summary['seconds_compile']:.1f} s of compiling."
     )
     _say(f"Report: {folder / 'report.html'}")
+
+
+def _command(run: "Run") -> str:
+    """The command line that repeats a run, and the one that goes on with it."""
+    from qfolio import registry, settings
+
+    config = run.config
+    preset = registry.preset(config["task"], config["agent"], config["preset"])
+    default = settings.describe(settings.build(type(run.agent), preset["settings"]))
+    default |= settings.describe(type(run.task)())
+    chosen = config["agent_settings"] | config["task_settings"]
+    changed = [
+        f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}"
+        for name, value in chosen.items()
+        if value != default[name]
+    ]
+    words = ["qfolio train", config["task"], "--agent", config["agent"], "--preset"]
+    words += [config["preset"], "--episodes", config["episodes"], "--seeds", config["seeds"]]
+    words += ["--seed", config["seed"], *(["--set", *changed] if changed else [])]
+    return f"{' '.join(map(str, words))}\nqfolio train --resume {run.folder}"
 
 
 def _print_result(run: "Run", result: dict[str, Any]) -> None:

@@ -19,6 +19,7 @@ from jax import lax
 from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array
 
+from qfolio.errors import QfolioError
 from qfolio.files import cache_directory
 
 
@@ -35,7 +36,7 @@ def configure() -> None:
     }  # fmt: skip
     new = [f"{flag}={value}" for flag, value in wanted.items() if flag not in flags]
     os.environ["XLA_FLAGS"] = " ".join([flags, *new]).strip()
-    if not jax.config.jax_compilation_cache_dir:
+    if not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "programs"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -44,6 +45,23 @@ def configure() -> None:
 def describe() -> str:
     device = jax.devices()[0]
     return f"{len(jax.devices())} × {device.device_kind} ({device.platform})"
+
+
+def require_memory(tree: Any, count: int) -> None:
+    """Raises QfolioError where ``count`` members shaped like ``tree`` cannot fit, before trying."""
+    needed = count * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+    stats = jax.devices()[0].memory_stats()
+    if stats:
+        there = stats["bytes_limit"] * len(jax.devices())
+    elif hasattr(os, "sysconf"):
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    else:
+        return
+    if needed > there:
+        raise QfolioError(
+            f"These settings need {needed / 2**30:,.1f} GiB of memory and there are "
+            f"{there / 2**30:,.1f}; lower hidden, replay_capacity or the number of seeds."
+        )
 
 
 class Members:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 
 from qfolio.mdp import Agent, Task
 
@@ -13,7 +13,7 @@ STARTS = 1024
 """Start states that results are graded on; those along the learning curve are the first of them."""
 
 
-def start_keys(n: int = STARTS) -> PRNGKeyArray:
+def start_keys(n: int = STARTS) -> Key[Array, " start"]:
     """Keys of the fixed start states; the first of many are the same as few."""
     return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(20151), i))(jnp.arange(n))
 
@@ -25,7 +25,7 @@ class Greedy(NamedTuple):
     overestimation: Float[Array, ""]  # NaN where the agent estimates no action values
 
 
-def evaluate(task: Task, agent: Agent, weights: PyTree, keys: PRNGKeyArray) -> Greedy:
+def evaluate(task: Task, agent: Agent, weights: PyTree, keys: Key[Array, " start"]) -> Greedy:
     """Follows the greedy policy from each key's start state for twice the horizon.
 
     The return counts the first half. The overestimation is the mean over the states visited in it

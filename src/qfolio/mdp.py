@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 
 class Discrete(eqx.Module):
@@ -47,7 +47,7 @@ class Transition(NamedTuple):
 class Optimum(Protocol):
     """The exact answer of a task, computed without learning."""
 
-    def returns(self, keys: PRNGKeyArray) -> np.ndarray:
+    def returns(self, keys: Key[Array, " start"]) -> np.ndarray:
         """Undiscounted returns of the optimal policy, one for each start that a key draws."""
         ...
 
@@ -65,6 +65,11 @@ class Task(eqx.Module):
     @abc.abstractmethod
     def observe(self, state: PyTree) -> Array:
         """What the agent may see of a state; nothing later than now."""
+
+    @property
+    def observation_scale(self) -> tuple[float, ...] | float:
+        """The range ± of each component of an observation."""
+        return 1.0
 
     @abc.abstractmethod
     def step(self, state: PyTree, action: Array, key: PRNGKeyArray) -> Step:

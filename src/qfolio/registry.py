@@ -12,7 +12,7 @@ AGENTS = {"dqn": "qfolio.agents.dqn:DQN"}
 PRESETS: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
     ("pendulum", "dqn"): {
         # The defaults of DQN are tuned for this preset.
-        "fast": {"episodes": 8192, "seeds": 8, "settings": {}},
+        "fast": {"episodes": 7456, "seeds": 8, "settings": {}},
         "best": {"episodes": 8192, "seeds": 8, "settings": {}},
         # Every hyperparameter of the report that qfolio grew out of.
         "report": {
@@ -20,6 +20,7 @@ PRESETS: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
             "seeds": 1,
             "settings": {
                 "hidden": (256, 256),
+                "input_gain": 0.0,
                 "environments": 1,
                 "episode_steps": 0,
                 "batch_size": 64,

@@ -2,8 +2,8 @@
 
 The folder holds config.json (settings, written once), metrics.csv and evaluation.csv (appended),
 checkpoint.safetensors (the whole training state, replaced as one), policy.safetensors (weights)
-and, at the end, summary.json. The checkpoint is the truth: rows that are ahead of it are dropped when a
-run is resumed, and then come again, the same to the last digit.
+and, at the end, summary.json. The checkpoint is the truth: rows that are ahead of it are dropped
+when a run is resumed, and then come again, the same to the last digit.
 """
 
 import csv
@@ -166,21 +166,22 @@ class Run:
         start_seconds = self.seconds_train
         done = 0
         with _interruptible() as stop:
-            while steps := self.population.steps_left(total):
+            while True:
                 records = self._advance(steps)
                 done += 1
                 steps = self.population.steps_left(total)
                 greedy = None
                 if done % every == 0 or not steps:
                     greedy = self._evaluate()
-                if stop.is_set() or not steps or perf_counter() - saved > CHECKPOINT_SECONDS:
-                    self._write_checkpoint()
-                    saved = perf_counter()
                 if listener is not None:
                     rate = (self.population.steps - begun) / (self.seconds_train - start_seconds)
                     listener(self._progress(records, total, rate, steps, greedy))
-                if stop.is_set() and steps:
-                    self.interrupted = True
+                self.interrupted = stop.is_set() and steps > 0
+                last = self.interrupted or not steps
+                if last or perf_counter() - saved > CHECKPOINT_SECONDS:
+                    self._write_checkpoint()
+                    saved = perf_counter()
+                if last:
                     return
 
     def first_weights(self) -> Any:
@@ -389,16 +390,14 @@ def _records(
     seeds: Sequence[int], before: Sequence[int], episodes: Episodes
 ) -> Iterator[dict[str, float]]:
     """A row for each finished episode, in the order in which they finished."""
-    for member, (seed, number) in enumerate(zip(seeds, before, strict=True)):
-        finished = episodes.finished[member]
-        columns = {"return": episodes.returns, **episodes.metrics}
-        values = {name: column[member][finished] for name, column in columns.items()}
-        for i in range(int(finished.sum())):
-            yield {
-                "seed": seed,
-                "episode": number + i + 1,
-                **{name: float(column[i]) for name, column in values.items()},
-            }
+    number = dict(zip(seeds, before, strict=True))
+    columns = {"return": episodes.returns, **episodes.metrics}
+    # By time first, so that the order does not depend on where chunks begin and end.
+    for time, member, environment in np.argwhere(episodes.finished.swapaxes(0, 1)):
+        seed = seeds[member]
+        number[seed] += 1
+        values = {name: float(x[member, time, environment]) for name, x in columns.items()}
+        yield {"seed": seed, "episode": number[seed], **values}
 
 
 def _named(tree: Any) -> dict[str, np.ndarray]:

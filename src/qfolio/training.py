@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
-from qfolio.devices import Members
+from qfolio.devices import Members, require_memory
 from qfolio.errors import QfolioError
 from qfolio.evaluation import Greedy, evaluate
 from qfolio.mdp import Agent, Metrics, Task, Transition
@@ -178,6 +178,8 @@ class Population:
         self._agent = lambda numbers: eqx.combine(static, numbers)
         self._programs: dict[str, Any] = {}
         self.seconds_compile = 0.0
+        first = jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))
+        require_memory(first, len(self.seeds))
         self.state: TrainingState = self._run(
             "begin",
             lambda member: begin(task, self._agent(member[1]), member[0]),
@@ -237,10 +239,10 @@ class Population:
             )
         return self._members.fetch(episodes)
 
-    def evaluate(self, keys: PRNGKeyArray) -> Greedy:
+    def evaluate(self, keys: Key[Array, " start"]) -> Greedy:
         """Greedy returns (member, start) and overestimation (member,) of the policies so far."""
 
-        def program(member: tuple[PyTree, Agent], keys: PRNGKeyArray) -> Any:
+        def program(member: tuple[PyTree, Agent], keys: Key[Array, " start"]) -> Any:
             weights, numbers = member
             return evaluate(self.task, self._agent(numbers), weights, keys)
 

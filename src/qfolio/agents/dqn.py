@@ -8,7 +8,8 @@ formula, the place where it stands here, and each deviation from the paper.
 
 import dataclasses
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -48,8 +49,9 @@ class DQN(Agent):
     """Hyperparameters of a deep Q-network; the defaults are tuned for the pendulum."""
 
     hidden: tuple[int, ...] = eqx.field(static=True, default=(128, 128))
+    input_gain: float = 6.0  # of the first layer, for observations scaled to ±1; 0: plain weights
     environments: int = eqx.field(static=True, default=32)  # stepped side by side
-    episode_steps: int = eqx.field(static=True, default=0)  # cut training episodes; 0: the task's
+    episode_steps: int = eqx.field(static=True, default=28)  # cut training episodes; 0: the task's
     batch_size: int = eqx.field(static=True, default=256)
     updates: int = eqx.field(static=True, default=1)  # gradient steps per step of all environments
     replay_capacity: int = eqx.field(static=True, default=65536)  # transitions
@@ -60,30 +62,27 @@ class DQN(Agent):
     time_limit_terminal: bool = eqx.field(static=True, default=False)  # wrong, but often done
     target_period: int = eqx.field(static=True, default=1)  # steps between target updates
     target_rate: float = 0.03  # how far each goes towards the online network; 1 copies it
-    discount: float = 0.99
-    learning_rate: float = 1e-3
+    discount: float = 0.995
+    learning_rate: float = 2.5e-3
     learning_rate_end: float = 0.0
-    learning_rate_steps: float = 8000.0  # gradient steps of the cosine from the one to the other
+    learning_rate_steps: float = 6500.0  # gradient steps of the cosine from the one to the other
     epsilon: float = 1.0
-    epsilon_end: float = 0.05
-    epsilon_decay: float = 0.995  # factor per finished episode
-    huber: float = math.inf  # |TD error| beyond which the loss is linear; inf squares all of it
-    reward_scale: float = 0.1  # the network learns values of scaled rewards
+    epsilon_end: float = 0.01
+    epsilon_decay: float = 0.99  # factor per finished episode
+    huber: float = 1.0  # |TD error| beyond which the loss is linear; inf squares all of it
+    reward_scale: float = 0.15  # the network learns values of scaled rewards
 
     def __check_init__(self) -> None:
-        positive = ("environments", "batch_size", "updates", "replay_capacity", "target_period")
-        _require(self, positive, lambda x: x >= 1, "at least 1")
-        _require(self, ("learning_rate", "learning_rate_steps", "huber", "reward_scale"),
-                 lambda x: x > 0, "greater than 0")  # fmt: skip
-        _require(
-            self,
-            ("learning_starts", "learning_rate_end", "episode_steps"),
-            lambda x: x >= 0,
-            "at least 0",
-        )
-        fractions = ("discount", "target_rate", "epsilon", "epsilon_end", "epsilon_decay")
+        counts = "environments batch_size updates replay_capacity target_period"
+        _require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        _require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
+        _require(self, "learning_rate_end input_gain", lambda x: x >= 0, "at least 0")
+        scales = "learning_rate learning_rate_steps huber reward_scale"
+        _require(self, scales, lambda x: x > 0, "greater than 0")
+        fractions = "discount target_rate epsilon epsilon_end epsilon_decay"
         _require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
-        _require(self, ("hidden",), lambda x: len(x) > 0 and min(x) >= 1, "one or more layer sizes")
+        sizes = lambda x: len(x) > 0 and min(x) >= 1 and max(x) < 2**31  # noqa: E731
+        _require(self, "hidden", sizes, "one or more layer sizes")
         if self.learning_starts > self.replay_capacity:
             raise QfolioError(
                 f"learning_starts is {self.learning_starts}, more than replay_capacity "
@@ -95,15 +94,21 @@ class DQN(Agent):
         return label, dataclasses.replace(self, double=not self.double)
 
     def init(self, task: Task, key: PRNGKeyArray) -> DQNState:
-        observation = jax.eval_shape(lambda k: task.observe(task.reset(k)), key)
-        online = MLP((observation.shape[-1], *self.hidden, task.actions.n), key)
-        scalar = jax.ShapeDtypeStruct((), jnp.float32)
+        observation = task.observe(task.reset(key))
+        online = MLP(
+            (observation.shape[-1], *self.hidden, task.actions.n),
+            key,
+            # Small weights on a bounded observation make a Q-function too smooth for the task.
+            input_gain=jnp.where(
+                self.input_gain > 0, self.input_gain / jnp.array(task.observation_scale), 1.0
+            ),
+        )
         row = Experience(
             observation=observation,
-            action=jax.ShapeDtypeStruct((), jnp.int32),
-            reward=scalar,
+            action=jnp.array(0, jnp.int32),
+            reward=jnp.array(0.0),
             next_observation=observation,
-            terminal=jax.ShapeDtypeStruct((), jnp.bool_),
+            terminal=jnp.array(False),
         )
         zero = jnp.array(0, jnp.int32)
         return DQNState(
@@ -186,9 +191,8 @@ class DQN(Agent):
             (online, optimizer), (loss, max_q) = lax.scan(update, carry, keys)
 
         steps = state.steps + 1
-        rate = self.target_rate
-        if self.target_period > 1:
-            rate = jnp.where(steps % self.target_period == 0, rate, 0.0)
+        due = steps % self.target_period == 0
+        rate = self.target_rate if self.target_period == 1 else jnp.where(due, self.target_rate, 0)
         target = jax.tree.map(lambda t, w: t + rate * (w - t), state.target, online)
         metrics = {"loss": loss.mean(), "epsilon": epsilon, "max_q": max_q.mean()}
         state = DQNState(online, target, optimizer, state.replay, state.episodes, steps)
@@ -243,8 +247,8 @@ def huber_loss(
     return clipped * (error - clipped / 2)
 
 
-def _require(agent: DQN, names: tuple[str, ...], holds, wanted: str) -> None:  # type: ignore[no-untyped-def]
-    for name in names:
+def _require(agent: DQN, names: str, holds: Callable[[Any], bool], wanted: str) -> None:
+    for name in names.split():
         value = getattr(agent, name)
         if not holds(value):
             raise QfolioError(f"{name} is {value}; it must be {wanted}.")

@@ -9,14 +9,13 @@ import contextlib
 import hashlib
 import inspect
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree
 
 from qfolio.errors import QfolioError
 from qfolio.files import cache_directory, read_arrays, write_arrays
@@ -39,7 +38,7 @@ class GridOptimum:
     ) -> None:
         self.task, self.state, self.axes, self.periodic = task, state, axes, periodic
 
-    def returns(self, keys: PRNGKeyArray) -> np.ndarray:
+    def returns(self, keys: Key[Array, " start"]) -> np.ndarray:
         """Undiscounted returns over the task's horizon of the optimal policy, one for each key."""
         starts = jax.vmap(self.task.reset)(keys)
         solve = jax.jit(lambda: self._follow(self._solve(1.0, self.task.horizon), starts))
@@ -69,21 +68,19 @@ class GridOptimum:
     def _shape(self) -> tuple[int, int]:
         return len(self.axes[0]), len(self.axes[1])
 
-    @property
-    def _points(self) -> PyTree:
-        return self.state(*jnp.meshgrid(*self.axes, indexing="ij"))
-
     def _look_ahead(self, values: Array, states: PyTree, action: Array, discount: float) -> Array:
-        after = self._step(states, action)
+        """r + γ V(s') for one action in each of the states (k, …)."""
+        after = self._step(states, jnp.broadcast_to(action, jax.tree.leaves(states)[0].shape))
         return after.reward + discount * self._interpolate(values, *after.state)
 
-    def _step(self, states: PyTree, action: Int[Array, "..."]) -> Step:
+    def _step(self, states: PyTree, actions: Int[Array, " k"]) -> Step:
         unused = jax.random.key(0)  # the task is deterministic
-        return self.task.step(states, action, unused)
+        return jax.vmap(self.task.step, (0, 0, None))(states, actions, unused)
 
     def _action_values(self, values: Array, discount: float) -> Float[Array, "action n m"]:
-        look = partial(self._look_ahead, values, self._points, discount=discount)
-        return lax.map(lambda action: look(action=action), jnp.arange(self.task.actions.n))
+        points = self.state(*(x.ravel() for x in jnp.meshgrid(*self.axes, indexing="ij")))
+        look = lambda action: self._look_ahead(values, points, action, discount)  # noqa: E731
+        return lax.map(look, jnp.arange(self.task.actions.n)).reshape(-1, *self._shape)
 
     def _solve(self, discount: float, steps: int) -> Float[Array, "steps n m"]:
         """Values with 0, 1, … steps − 1 steps to go."""

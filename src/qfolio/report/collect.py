@@ -80,6 +80,6 @@ def _maps(run: Run, task: Pendulum) -> Maps | None:
         value=np.asarray(values.max(-1)).reshape(shape),
         policy=np.asarray(task.torque(values.argmax(-1))).reshape(shape),
         exact_value=exact_value[::2, ::2],  # the solver's grid is twice as fine
-        exact_policy=np.asarray(task.torque(exact_action))[::2, ::2],
+        exact_policy=np.asarray(task.torque(jnp.array(exact_action)))[::2, ::2],
         discount=discount,
     )

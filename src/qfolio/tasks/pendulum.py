@@ -52,6 +52,10 @@ class Pendulum(Task):
     def actions(self) -> Discrete:
         return Discrete(self.torques)
 
+    @property
+    def observation_scale(self) -> tuple[float, ...]:
+        return (1.0, 1.0, self.max_speed)
+
     def torque(self, action: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
         """The torque in N m that an action stands for."""
         return self.max_torque * (2.0 * action / (self.torques - 1) - 1.0)

@@ -1,0 +1,239 @@
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+import qfolio.files
+from qfolio.agents.dqn import DQN
+from qfolio.errors import QfolioError
+from qfolio.runs import Run, train
+
+from probes import Explosive
+
+
+def create(task, agent, folder, episodes=12, **options):
+    return Run.create(task, agent, episodes=episodes, out=folder, **options)
+
+
+def contents(folder):
+    """Everything that a resumed run must have in common with one that was never interrupted."""
+    arrays = load_file(folder / "checkpoint.safetensors")
+    del arrays["seconds_train"]
+    return arrays, (folder / "metrics.csv").read_text()
+
+
+def assert_same(folder, other):
+    (arrays, metrics), (expected, expected_metrics) = contents(folder), contents(other)
+    assert arrays.keys() == expected.keys()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array, expected[name], err_msg=name)
+    assert metrics == expected_metrics
+
+
+def test_n_and_n_episodes_equal_2n(task, agent, tmp_path):
+    create(task, agent, tmp_path / "straight", episodes=24, seeds=2).train()
+    create(task, agent, tmp_path / "halves", episodes=12, seeds=2).train()
+    again = Run.open(tmp_path / "halves")
+    assert again.episodes == 12
+    again.train(24)
+    assert_same(tmp_path / "halves", tmp_path / "straight")
+
+
+SCRIPT = """
+import sys
+sys.path.insert(0, {tests!r})
+from qfolio import devices
+devices.configure()
+import qfolio.runs
+from qfolio.agents.dqn import DQN
+from qfolio.tasks.pendulum import Pendulum
+qfolio.runs.CHECKPOINT_SECONDS = 0.0
+agent = DQN(hidden=(16,), environments=2, batch_size=8, replay_capacity=200, learning_starts=20,
+            episode_steps=0, learning_rate_steps=200.0)
+run = qfolio.runs.Run.create(Pendulum(horizon=25), agent, episodes={episodes}, seeds=2, out={out!r})
+print("started", flush=True)
+run.train(listener=lambda progress: print(progress.episodes, flush=True))
+"""
+
+
+@pytest.mark.slow
+def test_killed_at_a_random_moment(task, agent, tmp_path):
+    """SIGKILL falls anywhere, also into the writing of a checkpoint, which happens all the time."""
+    moments = random.Random(time.time_ns())
+    episodes = 2400
+    straight = create(task, agent, tmp_path / "straight", episodes=episodes, seeds=2)
+    straight.train()
+    stopped_at = []
+    for i in range(3):
+        folder = tmp_path / f"killed{i}"
+        script = SCRIPT.format(tests=str(tmp_path), episodes=episodes, out=str(folder))
+        process = subprocess.Popen(
+            [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=os.environ
+        )
+        assert process.stdout is not None
+        for _ in range(2):
+            process.stdout.readline()
+        time.sleep(moments.uniform(0, 1.5))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        resumed = Run.open(folder)
+        stopped_at.append(resumed.episodes)
+        resumed.train()
+        assert_same(folder, tmp_path / "straight")
+    assert min(stopped_at) < episodes
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(task, agent, tmp_path, monkeypatch):
+    run = create(task, agent, tmp_path / "run")
+    before = (tmp_path / "run" / "checkpoint.safetensors").read_bytes()
+
+    def full_disk(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(qfolio.files.os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        run.train()
+    assert (tmp_path / "run" / "checkpoint.safetensors").read_bytes() == before
+    leftovers = [path.name for path in (tmp_path / "run").iterdir() if path.name.startswith(".")]
+    assert leftovers == []
+
+
+def test_ctrl_c_stops_with_a_checkpoint(task, agent, tmp_path):
+    run = create(task, agent, tmp_path / "run", episodes=24 * 50)
+
+    def press(progress):
+        if progress.episodes >= 24:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    run.train(listener=press)
+    assert run.interrupted
+    assert 0 < run.episodes < 24 * 50
+    assert Run.open(tmp_path / "run").episodes == run.episodes
+
+
+def test_an_infinite_loss_keeps_the_last_good_checkpoint(tmp_path):
+    agent = DQN(hidden=(4,), environments=2, batch_size=8, learning_starts=4, episode_steps=0)
+    run = create(Explosive(), agent, tmp_path / "run")
+    before = (tmp_path / "run" / "checkpoint.safetensors").read_bytes()
+    with pytest.raises(QfolioError, match="no longer finite"):
+        run.train()
+    assert (tmp_path / "run" / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_rows_ahead_of_the_checkpoint_are_dropped(task, agent, tmp_path):
+    create(task, agent, tmp_path / "run", episodes=4).train()
+    metrics = tmp_path / "run" / "metrics.csv"
+    good = metrics.read_text()
+    metrics.write_text(good + "0,5,-100.0,0.1,0.9,1.0\n0,6,-1")
+    assert len(Run.open(tmp_path / "run").metrics) == 4
+    assert metrics.read_text() == good
+
+
+def test_the_policy_file_holds_the_weights_only(task, agent, tmp_path):
+    run = create(task, agent, tmp_path / "run", seeds=2)
+    policy = load_file(tmp_path / "run" / "policy.safetensors")
+    assert {name: array.shape for name, array in policy.items()} == {
+        "weights/0": (2, 3, 16), "weights/1": (2, 16, 11), "biases/0": (2, 16), "biases/1": (2, 11),
+    }  # fmt: skip
+    np.testing.assert_array_equal(policy["weights/0"][0], run.first_weights().weights[0])
+
+
+def test_summary(task, agent, tmp_path):
+    run = train(task, agent, episodes=4, seeds=2, seed=5, out=tmp_path / "run")
+    summary = run.summary()
+    assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
+    assert {
+        "task", "agent", "preset", "seeds", "episodes", "env_steps", "seconds_compile",
+        "seconds_train", "steps_per_second", "return_mean", "return_ci95", "return_per_seed",
+        "optimum", "regret_per_seed", "overestimation_per_seed",
+    } <= summary.keys()  # fmt: skip
+    assert (summary["seeds"], summary["episodes"], summary["env_steps"]) == (2, 4, 100)
+    np.testing.assert_allclose(summary["return_mean"], np.mean(summary["return_per_seed"]))
+    shortfall = summary["optimum"] - np.array(summary["return_per_seed"])
+    np.testing.assert_allclose(summary["regret_per_seed"], shortfall / abs(summary["optimum"]))
+    assert run.config["seed"] == 5
+
+
+def spoil_checkpoint(folder, how):
+    path = folder / "checkpoint.safetensors"
+    if how == "missing":
+        path.unlink()
+    elif how == "truncated":
+        path.write_bytes(path.read_bytes()[:-100])
+    elif how == "pickle":
+        path.write_bytes(b"\x80\x04cos\nsystem\n(S'touch /tmp/owned'\ntR.")
+    elif how == "foreign":
+        save_file({"a": np.zeros(3)}, path)
+    elif how == "other shapes":
+        arrays = load_file(path)
+        arrays["training/steps"] = np.zeros((5,), np.int32)
+        save_file(arrays, path)
+
+
+@pytest.mark.parametrize("how", ["missing", "truncated", "pickle", "foreign", "other shapes"])
+def test_refuses_checkpoints_that_do_not_fit(task, agent, tmp_path, how):
+    create(task, agent, tmp_path / "run")
+    spoil_checkpoint(tmp_path / "run", how)
+    with pytest.raises(QfolioError, match=r"checkpoint\.safetensors"):
+        Run.open(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": 0, "version": "0.0.1"}, "written by qfolio 0.0.1"),
+        ({"task": "os:system"}, "no task 'os:system'"),
+        ({"agent": "dqm"}, "did you mean dqn"),
+        ({"seeds": "many"}, "damaged"),
+        ({"seeds": -1}, "damaged"),
+        ({"agent_settings": {"hidden": [0]}}, "hidden"),
+        ({"agent_settings": {"hidden": [10**9, 10**9]}}, "memory|checkpoint"),
+    ],
+)
+def test_refuses_configurations_that_make_no_sense(task, agent, tmp_path, change, message):
+    create(task, agent, tmp_path / "run")
+    path = tmp_path / "run" / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(QfolioError, match=message):
+        Run.open(tmp_path / "run")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "\x00", "[" * 100_000])
+def test_refuses_damaged_configurations(task, agent, tmp_path, text):
+    create(task, agent, tmp_path / "run")
+    (tmp_path / "run" / "config.json").write_text(text)
+    with pytest.raises(QfolioError, match="damaged"):
+        Run.open(tmp_path / "run")
+
+
+def test_refuses_a_folder_that_is_no_run(tmp_path):
+    with pytest.raises(QfolioError, match="no run"):
+        Run.open(tmp_path)
+
+
+def test_never_overwrites_a_folder(task, agent, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(QfolioError, match="not empty"):
+        create(task, agent, tmp_path)
+
+
+@pytest.mark.parametrize("options", [{"episodes": 0}, {"seeds": 0}, {"seed": -1}, {"seed": 2**32}])
+def test_refuses_counts_that_make_no_sense(task, agent, options):
+    with pytest.raises(QfolioError, match=next(iter(options))):
+        Run.create(task, agent, **{"episodes": 1, **options})
+
+
+def test_training_without_a_folder_writes_nothing(task, agent, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = train(task, agent, episodes=2)
+    assert run.episodes == 2
+    assert list(tmp_path.iterdir()) == []
+    assert jax.tree.leaves(run.first_weights())
