@@ -14,7 +14,7 @@ def test_text_becomes_the_fields_type():
             "hidden": "64,32",
             "discount": "0.5",
             "double": "False",
-            "batch_size": "32",
+            "batch_size": "9",
             "huber": "inf",
         },
     )

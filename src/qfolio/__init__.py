@@ -1,5 +1,6 @@
 """qfolio: reinforcement learning for portfolio optimization.
 
+>>> import qfolio
 >>> run = qfolio.train(qfolio.Pendulum(), qfolio.DQN(), episodes=200, seeds=8)
 >>> run.grade()["regret_per_seed"]
 """
@@ -12,6 +13,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from qfolio.agents.dqn import DQN as DQN
     from qfolio.errors import QfolioError as QfolioError
+    from qfolio.presets import preset as preset
     from qfolio.runs import Run as Run
     from qfolio.runs import train as train
     from qfolio.tasks.pendulum import Pendulum as Pendulum
@@ -21,10 +23,11 @@ _HOMES = {
     "Pendulum": "qfolio.tasks.pendulum",
     "QfolioError": "qfolio.errors",
     "Run": "qfolio.runs",
+    "preset": "qfolio.presets",
     "train": "qfolio.runs",
 }
 
-__all__ = ["DQN", "Pendulum", "QfolioError", "Run", "__version__", "train"]
+__all__ = ["DQN", "Pendulum", "QfolioError", "Run", "__version__", "preset", "train"]
 
 
 def __getattr__(name: str) -> Any:

@@ -140,19 +140,19 @@ def _new_run(
     folder: Path,
     assignments: tuple[str, ...],
 ) -> "Run":
-    from qfolio import registry, settings
+    from qfolio import presets, registry, settings
     from qfolio.runs import Run
 
     task_class = registry.find("task", registry.TASKS, task_name)
-    agent_class = registry.find("agent", registry.AGENTS, agent_name)
-    preset = registry.preset(task_name, agent_name, preset_name)
+    registry.find("agent", registry.AGENTS, agent_name)
+    preset = presets.preset(preset_name, task_name, agent_name)
     chosen = settings.parse(assignments)
     task_settings = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
     return Run.create(
         settings.build(task_class, task_settings),
-        settings.build(agent_class, {**preset["settings"], **chosen}),
-        episodes=preset["episodes"] if episodes is None else episodes,
-        seeds=preset["seeds"] if seeds is None else seeds,
+        preset.build(**chosen),
+        episodes=preset.episodes if episodes is None else episodes,
+        seeds=preset.seeds if seeds is None else seeds,
         seed=seed,
         preset=preset_name,
         out=folder,
@@ -261,11 +261,12 @@ def _finish(run: "Run", folder: Path, comparison: "Run | None") -> None:
 
 def _command(run: "Run") -> str:
     """The command line that repeats a run, and the one that goes on with it."""
-    from qfolio import registry, settings
+    from qfolio import settings
+    from qfolio.presets import preset
 
     config = run.config
-    preset = registry.preset(config["task"], config["agent"], config["preset"])
-    default = settings.describe(settings.build(type(run.agent), preset["settings"]))
+    name = config["preset"] or "report"  # whose settings are the agent's defaults
+    default = settings.describe(preset(name, config["task"], config["agent"]).build())
     default |= settings.describe(type(run.task)())
     chosen = config["agent_settings"] | config["task_settings"]
     changed = [
@@ -274,7 +275,7 @@ def _command(run: "Run") -> str:
         if value != default[name]
     ]
     words = ["qfolio train", config["task"], "--agent", config["agent"], "--preset"]
-    words += [config["preset"], "--episodes", config["episodes"], "--seeds", config["seeds"]]
+    words += [name, "--episodes", config["episodes"], "--seeds", config["seeds"]]
     words += ["--seed", config["seed"], *(["--set", *changed] if changed else [])]
     return f"{' '.join(map(str, words))}\nqfolio train --resume {run.folder}"
 

@@ -46,31 +46,29 @@ class DQNState(eqx.Module):
 
 
 class DQN(Agent):
-    """Hyperparameters of a deep Q-network; the defaults are tuned for the pendulum."""
+    """A deep Q-network; the defaults are those of the report that qfolio grew out of."""
 
-    hidden: tuple[int, ...] = eqx.field(static=True, default=(128, 128))
-    input_gain: float = 6.0  # of the first layer, for observations scaled to ±1; 0: plain weights
-    environments: int = eqx.field(static=True, default=32)  # stepped side by side
-    episode_steps: int = eqx.field(static=True, default=28)  # cut training episodes; 0: the task's
-    batch_size: int = eqx.field(static=True, default=256)
+    hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))
+    input_gain: float = 0.0  # of the first layer, for observations scaled to ±1; 0: plain weights
+    environments: int = eqx.field(static=True, default=1)  # stepped side by side
+    episode_steps: int = eqx.field(static=True, default=0)  # cut training episodes; 0: the task's
+    batch_size: int = eqx.field(static=True, default=64)
     updates: int = eqx.field(static=True, default=1)  # gradient steps per step of all environments
-    replay_capacity: int = eqx.field(static=True, default=65536)  # transitions
-    learning_starts: int = eqx.field(
-        static=True, default=1024
-    )  # transitions stored before learning
-    double: bool = eqx.field(static=True, default=True)
+    replay_capacity: int = eqx.field(static=True, default=50_000)  # transitions
+    learning_starts: int = eqx.field(static=True, default=64)  # transitions stored before learning
+    double: bool = eqx.field(static=True, default=False)
     time_limit_terminal: bool = eqx.field(static=True, default=False)  # wrong, but often done
-    target_period: int = eqx.field(static=True, default=1)  # steps between target updates
-    target_rate: float = 0.03  # how far each goes towards the online network; 1 copies it
-    discount: float = 0.995
-    learning_rate: float = 2.5e-3
-    learning_rate_end: float = 0.0
-    learning_rate_steps: float = 6500.0  # gradient steps of the cosine from the one to the other
+    target_period: int = eqx.field(static=True, default=200)  # steps between target updates
+    target_rate: float = 1.0  # how far each goes towards the online network; 1 copies it
+    discount: float = 0.99
+    learning_rate: float = 1e-3
+    learning_rate_end: float = 1e-3
+    learning_rate_steps: float = 1e5  # gradient steps of the cosine from the one to the other
     epsilon: float = 1.0
     epsilon_end: float = 0.01
-    epsilon_decay: float = 0.99  # factor per finished episode
-    huber: float = 1.0  # |TD error| beyond which the loss is linear; inf squares all of it
-    reward_scale: float = 0.15  # the network learns values of scaled rewards
+    epsilon_decay: float = 0.995  # factor per finished episode
+    huber: float = math.inf  # |TD error| beyond which the loss is linear; inf squares all of it
+    reward_scale: float = 1.0  # the network learns values of scaled rewards
 
     def __check_init__(self) -> None:
         counts = "environments batch_size updates replay_capacity target_period"
