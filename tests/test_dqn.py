@@ -56,7 +56,7 @@ def test_what_counts_as_the_end(task, terminated, truncated, wrong, expected):
     agent = DQN(environments=2, time_limit_terminal=wrong, episode_steps=0)
     state = agent.init(task, jax.random.key(0))
     state = agent.observe(state, rollout(agent, terminated=terminated, truncated=truncated))
-    assert state.replay.rows.terminal[:2].tolist() == [expected] * 2
+    assert state.replay.unpack(state.replay.rows).terminal[:2].tolist() == [expected] * 2
 
 
 def test_the_gradient_reaches_the_online_network_only(task, agent):

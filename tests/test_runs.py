@@ -133,8 +133,13 @@ def test_rows_ahead_of_the_checkpoint_are_dropped(task, agent, tmp_path):
     metrics = tmp_path / "run" / "metrics.csv"
     good = metrics.read_text()
     metrics.write_text(good + "0,5,-100.0,0.1,0.9,1.0\n0,6,-1")
-    assert len(Run.open(tmp_path / "run").metrics) == 4
-    assert metrics.read_text() == good
+    spoilt = metrics.read_text()
+    run = Run.open(tmp_path / "run")
+    assert len(run.metrics) == 4
+    assert metrics.read_text() == spoilt, "reading a run changes nothing"
+    run.train(8)
+    assert metrics.read_text().startswith(good)
+    assert [row["episode"] for row in run.metrics] == [1, 2, 3, 4, 5, 6, 7, 8]
 
 
 def test_the_policy_file_holds_the_weights_only(task, agent, tmp_path):

@@ -20,6 +20,12 @@ def trained(task, agent, seeds, steps):
     return population, records
 
 
+def stored(population):
+    """The first member's replay buffer."""
+    replay = population.fetch().agent.replay
+    return replay.unpack(jnp.array(replay.rows[0]))
+
+
 def same(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
@@ -60,7 +66,7 @@ def test_transitions_end_before_the_reset():
         episode_steps=0,
     )  # fmt: skip
     population, _ = trained(RewardDelay(), agent, [0], [4])
-    rows = jax.tree.map(lambda x: x[0], population.fetch().agent.replay.rows)
+    rows = stored(population)
     np.testing.assert_array_equal(rows.observation[:, 1], [0, 0, 1, 1, 0, 0, 1, 1])
     np.testing.assert_array_equal(rows.next_observation[:, 1], [1, 1, 2, 2, 1, 1, 2, 2])
     np.testing.assert_array_equal(rows.reward, [0, 0, 1, 1, 0, 0, 1, 1])
@@ -83,7 +89,7 @@ def test_records_are_the_finished_episodes(task, agent):
 def test_the_return_of_a_record_is_the_sum_of_rewards(task, agent):
     """Against the rewards in the buffer, which the first episode still fills in order."""
     population, records = trained(task, agent, [0], [25])
-    rewards = population.fetch().agent.replay.rows.reward[0][:50].reshape(25, 2)
+    rewards = stored(population).reward[:50].reshape(25, 2)
     last = records[-1]
     np.testing.assert_allclose(last.returns[0][last.finished[0]], rewards.sum(0), rtol=1e-5)
 
@@ -92,7 +98,7 @@ def test_training_episodes_can_be_cut_shorter(task):
     agent = DQN(hidden=(4,), environments=2, batch_size=4, learning_starts=4, episode_steps=5)
     population, _ = trained(task, agent, [0], [20])
     assert population.episodes == 8
-    assert not population.fetch().agent.replay.rows.terminal.any()
+    assert not stored(population).terminal.any()
 
 
 def test_warm_up_stores_and_does_not_learn(task, agent):
@@ -132,3 +138,12 @@ def test_hyperparameters_can_differ_between_members(task, agent):
 
     slow, fast = jax.vmap(weights_after)(jnp.array([1e-3, 1e-2]))
     assert not np.allclose(slow, fast)
+
+
+def test_lockstep_members_learn_the_same(task, agent, monkeypatch):
+    """On a GPU members are stepped in lockstep (vmap); only the rounding may differ."""
+    one_by_one, _ = trained(task, agent, [0, 1, 2], [30])
+    monkeypatch.setattr("qfolio.devices.LOCKSTEP", {"cpu"})
+    lockstep, _ = trained(task, agent, [0, 1, 2], [30])
+    expected, actual = (p.fetch().agent.online.weights for p in (one_by_one, lockstep))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), expected, actual)

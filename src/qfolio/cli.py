@@ -1,9 +1,8 @@
-"""The commands. Nothing below this file prints; jax is imported only by commands that compute."""
+"""The commands; jax is imported only by those that compute."""
 
 import contextlib
 import datetime
 import json
-import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ from tyro.conf import Positional, arg
 from qfolio.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.runs import Progress, Run
+    from qfolio.runs import Run
 
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
 
@@ -52,22 +51,22 @@ def train(
     from qfolio import devices
 
     devices.configure()
+    from qfolio import console
     from qfolio.runs import Run
 
-    if resume is not None:
-        if assignments or seeds is not None or out is not None:
+    with _window(live) as show:
+        if resume is None:
+            name = f"{task}-{preset}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+            folder = out or Path("runs") / name
+            run = _new_run(task, agent, preset, episodes, seeds, seed, folder, assignments)
+        elif assignments or seeds is not None or out is not None:
             raise QfolioError(
                 "--resume keeps the run's settings and seeds; leave --set, --seeds and --out out."
             )
-        run = Run.open(resume)
-        folder = resume
-    else:
-        folder = out or Path("runs") / f"{task}-{preset}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-        run = _new_run(task, agent, preset, episodes, seeds, seed, folder, assignments)
-    total = run.config["episodes"] if episodes is None else episodes
-    _say(f"{_describe(run)} · {run.config['device']}")
-    with _window(live, run) as show:
-        _train(run, total, show)
+        else:
+            run, folder = Run.open(resume), resume
+        console.say(console.describe(run))
+        _train(run, run.config["episodes"] if episodes is None else episodes, show)
     comparison = _comparison(run, folder) if compare else None
     _finish(run, folder, comparison)
 
@@ -97,7 +96,9 @@ def evaluate(
     if as_json:
         print(json.dumps({"folder": str(folder), "starts": episodes, **result}, indent=2))
     else:
-        _print_result(run, result)
+        from qfolio.console import print_result
+
+        print_result(run.population.seeds, result)
 
 
 def watch(folder: Positional[Path], *, episodes: int = 3) -> None:
@@ -127,7 +128,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3) -> None:
     episode = greedy_episode(run, run.task)
     path = folder / "episode.gif"
     pendulum_gif(path, episode.states, episode.torques, episode.rewards)
-    _say(f"There is no display here; the episode is in {path}")
+    print(f"There is no display here; the episode is in {path}")
 
 
 def _new_run(
@@ -161,62 +162,26 @@ def _new_run(
 
 def _train(run: "Run", episodes: int, show: Callable[["Run"], None] | None = None) -> None:
     """Trains with live progress; leaves the process after Ctrl-C."""
-    import rich.progress
+    from qfolio import console
+    from qfolio.evaluation import start_keys
+    from qfolio.runs import CURVE_STARTS
 
-    optimum = _optimum(run)
-    columns = ("episodes", "return", "greedy", "optimum", "epsilon", "steps/s", "left")
-    _say("".join(f"{name:>11}" for name in columns))
-    bar_columns = (
-        rich.progress.BarColumn(bar_width=24),
-        rich.progress.TextColumn("{task.description}"),
-    )
-    with rich.progress.Progress(*bar_columns, console=_console(), transient=True) as live:
-        bar = live.add_task("compiling", total=episodes, completed=run.episodes)
-
-        def note(now: "Progress") -> None:
-            cells = [
-                f"{now.episodes:,}",
-                _number(now.mean_return),
-                _number(now.greedy_return),
-                _number(optimum),
-                f"{now.epsilon:.2f}",
-                f"{now.steps_per_second:,.0f}",
-                str(datetime.timedelta(seconds=round(now.seconds_left))),
-            ]
-            left = cells[-1]
-            live.update(
-                bar,
-                completed=min(now.episodes, episodes),
-                description=f"{cells[0]} episodes  return {cells[1]}  ε {cells[4]}  "
-                f"{cells[5]} steps/s  {left} left",
-            )
-            if now.greedy_return is not None:
-                _say("".join(f"{cell:>11}" for cell in cells))
-                if show is not None:
-                    show(run)
-
-        run.train(episodes, note)
+    solution, optimum = run.task.optimum(), None
+    if solution is not None:
+        with console.console.status("Solving for the exact optimum (once; then it is on disk)"):
+            optimum = float(solution.returns(start_keys())[:CURVE_STARTS].mean())
+    console.train(run, episodes, optimum, show)
     if run.interrupted:
-        _say(
+        console.say(
             f"Stopped after {run.episodes:,} episodes. "
             f"Go on with: qfolio train --resume {run.folder}"
         )
         sys.exit(INTERRUPTED)
 
 
-def _optimum(run: "Run") -> float | None:
-    from qfolio.evaluation import start_keys
-    from qfolio.runs import CURVE_STARTS
-
-    solution = run.task.optimum()
-    if solution is None:
-        return None
-    with _console().status("Solving for the exact optimum (once; then it is on disk)"):
-        return float(solution.returns(start_keys())[:CURVE_STARTS].mean())
-
-
 def _comparison(run: "Run", folder: Path) -> "Run | None":
     """The same training with the one thing changed that the report contrasts; resumable too."""
+    from qfolio.console import say
     from qfolio.runs import Run
 
     variant = run.agent.contrast()
@@ -238,25 +203,26 @@ def _comparison(run: "Run", folder: Path) -> "Run | None":
             out=place,
         )
     if contrast.population.steps_left(run.config["episodes"]):
-        _say(f"\nFor contrast, {label} ({contrast.config['seeds']} of the seeds):")
+        say(f"\nFor contrast, {label} ({contrast.config['seeds']} of the seeds):")
         _train(contrast, run.config["episodes"])
     return contrast
 
 
 def _finish(run: "Run", folder: Path, comparison: "Run | None") -> None:
+    from qfolio.console import console, print_result, say
     from qfolio.report.collect import report_data
     from qfolio.report.page import write_report
 
-    with _console().status("Grading on 1,024 start states and writing the report"):
+    with console.status("Grading on 1,024 start states and writing the report"):
         summary = run.summary()
         write_report(folder, report_data(run, summary, comparison, _command(run)))
-    _print_result(run, summary)
-    _say(
+    print_result(run.population.seeds, summary)
+    say(
         f"{summary['env_steps'] * summary['seeds']:,} steps in {summary['seconds_train']:.1f} s of "
         f"training ({summary['steps_per_second']:,.0f} a second), "
         f"{summary['seconds_compile']:.1f} s of compiling."
     )
-    _say(f"Report: {folder / 'report.html'}")
+    say(f"Report: {folder / 'report.html'}")
 
 
 def _command(run: "Run") -> str:
@@ -280,37 +246,8 @@ def _command(run: "Run") -> str:
     return f"{' '.join(map(str, words))}\nqfolio train --resume {run.folder}"
 
 
-def _print_result(run: "Run", result: dict[str, Any]) -> None:
-    from rich.table import Table
-
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for name in ("seed", "return", "optimum", "regret", "overestimation"):
-        table.add_column(name, justify="right", min_width=9)
-    regrets = result["regret_per_seed"] or [math.nan] * len(result["return_per_seed"])
-    optimum = _number(result["optimum"])
-    per_seed = zip(
-        run.population.seeds,
-        result["return_per_seed"],
-        regrets,
-        result["overestimation_per_seed"],
-        strict=True,
-    )
-    for seed, value, regret, over in per_seed:
-        table.add_row(str(seed), _number(value), optimum, f"{regret:.2%}", _number(over))
-    mean = (sum(column) / len(column) for column in (regrets, result["overestimation_per_seed"]))
-    regret, over = mean
-    table.add_section()
-    table.add_row("mean", _number(result["return_mean"]), optimum, f"{regret:.2%}", _number(over))
-    _console().print(table)
-    if result["return_ci95"]:
-        low, high = result["return_ci95"]
-        _say(f"95 % interval of the mean return over seeds: {low:.1f} to {high:.1f}")
-    else:
-        _say("One seed has no interval; train several with --seeds.")
-
-
 @contextlib.contextmanager
-def _window(live: bool, run: "Run") -> Iterator[Callable[["Run"], None] | None]:
+def _window(live: bool) -> Iterator[Callable[["Run"], None] | None]:
     """What ``--live`` shows: the first agent's episode in a window, at each point of the curve."""
     from qfolio.watch import Window, has_display
 
@@ -318,7 +255,7 @@ def _window(live: bool, run: "Run") -> Iterator[Callable[["Run"], None] | None]:
         yield None
         return
     if not has_display():
-        raise QfolioError("--live needs a display; without one, watch DIR writes episode.gif.")
+        raise QfolioError("--live needs a display; without one, qfolio watch DIR writes a GIF.")
     from qfolio.report.collect import greedy_episode
 
     window = Window()
@@ -332,26 +269,6 @@ def _window(live: bool, run: "Run") -> Iterator[Callable[["Run"], None] | None]:
         yield show
     finally:
         window.close()
-
-
-def _describe(run: "Run") -> str:
-    config = run.config
-    seeds = f"{config['seeds']} seed" + "s" * (config["seeds"] > 1)
-    return f"{config['agent'].upper()} on {config['task']} · preset {config['preset']} · {seeds}"
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:,.1f}"
-
-
-def _console() -> Any:
-    from rich.console import Console
-
-    return Console(stderr=False, highlight=False)
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)
 
 
 def main() -> NoReturn:
@@ -368,6 +285,10 @@ def main() -> NoReturn:
         )
     except QfolioError as error:
         print(f"qfolio: {error}", file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"qfolio: {where}{error.strerror or error}.", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("qfolio: interrupted", file=sys.stderr)

@@ -37,16 +37,25 @@ _FAST = {
     "discount": 0.995,
     "learning_rate": 3e-3,
     "learning_rate_end": 0.0,
-    "learning_rate_steps": 6500.0,
-    "epsilon_decay": 0.99,
+    "learning_rate_steps": 6000.0,
+    "epsilon_decay": 0.995,
     "huber": 0.3,
     "reward_scale": 0.3,
 }
 
+_BEST = {
+    **_FAST,
+    "hidden": (192, 192),
+    "episode_steps": 40,
+    "replay_capacity": 262_144,
+    "learning_rate": 2e-3,
+    "learning_rate_steps": 30_000.0,
+}
+
 PRESETS = {
     ("pendulum", "dqn"): {
-        "fast": Preset("dqn", _FAST, episodes=7456, seeds=8),
-        "best": Preset("dqn", _FAST, episodes=7456, seeds=8),
+        "fast": Preset("dqn", _FAST, episodes=6912, seeds=8),
+        "best": Preset("dqn", _BEST, episodes=24_032, seeds=8),
         # Each hyperparameter of the report that qfolio grew out of; they are DQN's defaults.
         "report": Preset("dqn", {}, episodes=600, seeds=1),
     }

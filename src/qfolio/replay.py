@@ -4,40 +4,57 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 
 class Replay(eqx.Module):
-    """Rows of any pytree; the oldest are overwritten.
+    """Rows of any pytree of numbers; the oldest are overwritten.
 
+    A row is packed into float32, which holds integers exactly up to 2²⁴. One matrix takes one
+    in-place write and one gather; XLA would copy whole columns of one number a row at each step.
     Rows are written ``width`` at a time and the capacity is rounded up to a multiple of it, so that
-    a write never wraps and stays one in-place copy.
+    a write never wraps.
     """
 
-    rows: PyTree
+    rows: Float[Array, "capacity numbers"]
     written: Int[Array, ""]  # since the beginning, overwritten ones included
+    like: PyTree = eqx.field(static=True)  # shape and type of a row's leaves
 
     @staticmethod
     def empty(row: PyTree, capacity: int, width: int) -> "Replay":
         """Room for ``capacity`` rows shaped like ``row``."""
         capacity = -(-capacity // width) * width
-        rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), row)
-        return Replay(rows, jnp.array(0, jnp.int32))
-
-    @property
-    def capacity(self) -> int:
-        return jax.tree.leaves(self.rows)[0].shape[0]
+        like = jax.eval_shape(lambda: row)
+        numbers = sum(leaf.size for leaf in jax.tree.leaves(like))
+        return Replay(jnp.zeros((capacity, numbers)), jnp.array(0, jnp.int32), like)
 
     def add(self, rows: PyTree) -> "Replay":
         """Appends ``width`` rows."""
-        width = jax.tree.leaves(rows)[0].shape[0]
-        at = self.written % self.capacity
-        put = lambda old, new: lax.dynamic_update_slice_in_dim(old, new, at, axis=0)  # noqa: E731
-        return Replay(jax.tree.map(put, self.rows, rows), self.written + width)
+        leaves = jax.tree.leaves(rows)
+        width = leaves[0].shape[0]
+        packed = jnp.concatenate(
+            [leaf.reshape(width, -1).astype(jnp.float32) for leaf in leaves], axis=1
+        )
+        at = self.written % self.rows.shape[0]
+        matrix = lax.dynamic_update_slice_in_dim(self.rows, packed, at, axis=0)
+        return Replay(matrix, self.written + width, self.like)
 
     def sample(self, key: PRNGKeyArray, n: int) -> PyTree:
         """``n`` rows drawn uniformly with replacement; the cost does not grow with capacity."""
-        size = jnp.minimum(self.written, self.capacity)
+        size = jnp.minimum(self.written, self.rows.shape[0])
         # One draw of uniforms instead of randint's two; float32 splits [0, 1) into 2²³ parts.
         index = (jax.random.uniform(key, (n,)) * size).astype(jnp.int32)
-        return jax.tree.map(lambda x: x[index], self.rows)
+        return self.unpack(self.rows[index])
+
+    def unpack(self, packed: Float[Array, "n numbers"]) -> PyTree:
+        """Rows as they were before they were added."""
+        leaves, structure = jax.tree.flatten(self.like)
+        ends = [sum(leaf.size for leaf in leaves[: i + 1]) for i in range(len(leaves))]
+        parts = jnp.split(packed, ends[:-1], axis=1)
+        return jax.tree.unflatten(
+            structure,
+            [
+                part.reshape(-1, *leaf.shape).astype(leaf.dtype)
+                for part, leaf in zip(parts, leaves, strict=True)
+            ],
+        )

@@ -6,6 +6,7 @@ and, at the end, summary.json. The checkpoint is the truth: rows that are ahead 
 when a run is resumed, and then come again, the same to the last digit.
 """
 
+import contextlib
 import csv
 import datetime
 import math
@@ -13,7 +14,6 @@ import platform
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version as version_of
 from pathlib import Path
@@ -162,6 +162,7 @@ class Run:
             return
         chunks = math.ceil(steps / chunk_steps(self.task, self.agent))
         every = max(1, round(chunks / EVALUATIONS))
+        self._drop_rows_ahead()
         begun, saved = self.population.steps, perf_counter()
         start_seconds = self.seconds_train
         done = 0
@@ -311,25 +312,28 @@ class Run:
         self.evaluations = self._read_rows("evaluation.csv")
 
     def _read_rows(self, name: str) -> list[dict[str, float]]:
-        """The rows up to the checkpoint; later ones, or one cut short by a crash, are dropped."""
+        """The rows up to the checkpoint; later ones, or one cut short by a crash, do not count."""
         assert self.folder is not None
         path = self.folder / name
         if not path.exists():
             return []
         done = dict(zip(self.population.seeds, self.population.member_episodes, strict=True))
         rows = []
-        with path.open(newline="") as file:
+        with path.open(newline="", errors="replace") as file:
             for row in csv.DictReader(file):
-                try:
-                    values = {key: float(text) for key, text in row.items()}
+                with contextlib.suppress(TypeError, ValueError, KeyError):  # cut short
+                    values = {key: _number(text) for key, text in row.items()}
                     if values["episode"] <= done[int(values["seed"])]:
                         rows.append(values)
-                except (TypeError, ValueError, KeyError):
-                    continue  # cut short
-        path.unlink()
-        self._append(name, [r | {k: int(r[k]) for k in ("seed", "episode", "env_steps") if k in r}
-                            for r in rows])  # fmt: skip
         return rows
+
+    def _drop_rows_ahead(self) -> None:
+        """Brings the tables on disk back to the checkpoint, from which training goes on."""
+        if self.folder is None:
+            return
+        for name, rows in (("metrics.csv", self.metrics), ("evaluation.csv", self.evaluations)):
+            (self.folder / name).unlink(missing_ok=True)
+            self._append(name, rows)
 
 
 def train(
@@ -400,6 +404,11 @@ def _records(
         yield {"seed": seed, "episode": number[seed], **values}
 
 
+def _number(text: str) -> float:
+    number = float(text)
+    return int(number) if number.is_integer() and "." not in text else number
+
+
 def _named(tree: Any) -> dict[str, np.ndarray]:
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
@@ -420,7 +429,7 @@ def _fill(template: Any, arrays: dict[str, np.ndarray], path: Path) -> Any:
     return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])
 
 
-@contextmanager
+@contextlib.contextmanager
 def _interruptible() -> Iterator[threading.Event]:
     """Turns the first Ctrl-C into an event; a second one interrupts at once."""
     stop = threading.Event()

@@ -1,0 +1,58 @@
+"""The report's settings, and what one environment step with one update of them costs.
+
+Counted per agent and step: 2 operations for each multiply-add of the matrix products, 4 bytes for
+each number.
+"""
+
+from itertools import pairwise
+
+from qfolio.agents.dqn import DQN
+from qfolio.presets import preset
+from qfolio.tasks.pendulum import Pendulum
+
+EPISODES = preset("report").episodes
+
+PASSES = 12
+"""Over arrays of the network's size, in an update.
+
+Both networks are read forward and the Q-network once more backward (3); the gradient is written and
+read again (2); Adam reads and writes the weights and both moments (6); the target is written (1).
+"""
+
+
+def report() -> tuple[Pendulum, DQN]:
+    agent = preset("report").build()
+    assert isinstance(agent, DQN)
+    return Pendulum(), agent
+
+
+def layers(task: Pendulum, agent: DQN) -> list[tuple[int, int]]:
+    """Inputs and outputs of each layer; the pendulum's observation has three numbers."""
+    return list(pairwise((3, *agent.hidden, task.actions.n)))
+
+
+def products(task: Pendulum, agent: DQN) -> int:
+    """Matrix products of an update: those that ``operations`` counts."""
+    return 4 * len(layers(task, agent)) - 1
+
+
+def operations(task: Pendulum, agent: DQN) -> int:
+    """Of the matrix products of an update.
+
+    Forward through the Q-network and the target network, backward to the weights of all layers and
+    to the inputs of all but the first.
+    """
+    sizes = [inputs * outputs for inputs, outputs in layers(task, agent)]
+    return 2 * agent.batch_size * (3 * sum(sizes) + sum(sizes[1:]))
+
+
+def parameters(task: Pendulum, agent: DQN) -> int:
+    return sum((inputs + 1) * outputs for inputs, outputs in layers(task, agent))
+
+
+def bytes_moved(task: Pendulum, agent: DQN) -> int:
+    """What crosses the memory of a GPU at least, whose caches do not hold all agents' networks.
+
+    Activations and the batch are left out.
+    """
+    return 4 * PASSES * parameters(task, agent)
