@@ -24,7 +24,7 @@ class Replay(eqx.Module):
     def empty(row: PyTree, capacity: int, width: int) -> "Replay":
         """Room for ``capacity`` rows shaped like ``row``."""
         capacity = -(-capacity // width) * width
-        like = jax.eval_shape(lambda: row)
+        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), row)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(like))
         return Replay(jnp.zeros((capacity, numbers)), jnp.array(0, jnp.int32), like)
 
