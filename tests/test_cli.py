@@ -1,6 +1,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -66,7 +67,8 @@ def test_evaluate_prints_json(run, monkeypatch, capsys):
     assert result["starts"] == 32
     assert len(result["return_per_seed"]) == 2
     low, high = result["return_ci95"]
-    assert low <= result["return_mean"] <= high <= result["optimum"] <= 0
+    assert low < result["return_mean"] < high
+    assert result["return_mean"] <= result["optimum"] < 0
 
 
 def test_evaluate_agrees_with_the_summary(run, monkeypatch, capsys):
@@ -123,11 +125,14 @@ def test_live_shows_episodes_while_training(tmp_path):
         (["train", "--set", "learning_rat=1"], "did you mean learning_rate"),
         (["train", "--set", "discount=2"], "between 0 and 1"),
         (["train", "--set", "discount"], "name=value"),
-        (["train", "--set", "torques=1"], "at least 2"),
+        (["train", "--set", "torques=1"], "from 2 to 1001"),
         (["train", "--set", "replay_capacity=99999999999"], "replay_capacity|memory"),
         (["train", "--set", "hidden=100000,100000"], "GiB of memory"),
         (["train", "--episodes", "0"], "episodes is 0"),
         (["train", "--seeds", "-1"], "seeds is -1"),
+        (["train", "--seeds", "9999999999"], "seeds is 9999999999"),
+        (["train", "--set", "horizon=3e9"], "horizon is 3000000000"),
+        (["train", "--set", "learning_rate=inf"], "learning_rate is inf"),
         (["train", "--resume", "nowhere"], "nowhere is no run"),
         (["evaluate", "nowhere"], "nowhere is no run"),
         (["evaluate", "nowhere", "--episodes", "0"], "at least 1"),
@@ -150,7 +155,28 @@ def test_what_the_parser_refuses_is_code_2_too(monkeypatch, capsys, arguments):
     assert qfolio(monkeypatch, *arguments) == 2
 
 
-def test_resume_refuses_settings_it_would_ignore(run, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "ignored", [["--set", "discount=0.5"], ["--seed", "7"], ["--preset", "best"], ["pendulum"]]
+)
+def test_resume_refuses_what_it_would_ignore(run, monkeypatch, capsys, ignored):
     folder, _ = run
-    assert qfolio(monkeypatch, "train", "--resume", folder, "--set", "discount=0.5") == 2
-    assert "--resume" in capsys.readouterr().err
+    assert qfolio(monkeypatch, "train", *ignored, "--resume", folder) == 2
+    assert "--resume keeps" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("episodes", [0, -3])
+def test_resume_refuses_no_episodes_and_leaves_the_run_alone(run, monkeypatch, capsys, episodes):
+    folder, _ = run
+    before = (folder / "config.json").read_text()
+    assert qfolio(monkeypatch, "train", "--resume", folder, "--episodes", episodes) == 2
+    assert (folder / "config.json").read_text() == before
+
+
+def test_resume_finishes_a_contrast_that_was_interrupted(run, monkeypatch, capsys):
+    folder, _ = run
+    shutil.rmtree(folder / "contrast")
+    (folder / "report.html").unlink()
+    assert qfolio(monkeypatch, "train", "--resume", folder) == 0
+    assert (folder / "contrast" / "checkpoint.safetensors").exists()
+    assert (folder / "report.html").exists()
+    assert not (folder / "contrast" / "contrast").exists()

@@ -6,6 +6,9 @@ import pytest
 from qfolio.agents.dqn import DQN, bootstrap, huber_loss, td_target
 from qfolio.errors import QfolioError
 from qfolio.mdp import Transition
+from qfolio.presets import preset
+from qfolio.tasks.pendulum import Pendulum
+from qfolio.training import Population
 
 
 def rollout(agent, observation=1.0, reward=1.0, terminated=False, truncated=False):
@@ -45,7 +48,7 @@ def test_observing_learns_nothing(task, agent):
     state = agent.init(task, jax.random.key(0))
     after = agent.observe(state, rollout(agent))
     jax.tree.map(np.testing.assert_array_equal, after.online, state.online)
-    assert after.replay.written == agent.environments
+    assert after.replay.size == agent.environments
 
 
 @pytest.mark.parametrize(
@@ -82,6 +85,26 @@ def test_the_target_network_is_copied_every_period(task):
     assert same == [False, False, True, False, False, True]
 
 
+def test_the_report_presets_copies_come_at_the_end_of_each_episode():
+    """Every hyperparameter of the report, and the step at which it copies: 200, 400, …"""
+    agent, task = preset("report").build(), Pendulum()
+    assert agent == DQN(
+        hidden=(256, 256), environments=1, episode_steps=0, batch_size=64, updates=1,
+        replay_capacity=50_000, learning_starts=64, double=False, time_limit_terminal=False,
+        target_period=200, target_rate=1.0, discount=0.99, learning_rate=1e-3,
+        learning_rate_final=1.0, epsilon=1.0, epsilon_end=0.01, epsilon_decay=0.995,
+        huber=float("inf"), reward_scale=1.0, input_gain=0.0,
+    )  # fmt: skip
+    population = Population(task, agent, [0])
+    copied = []
+    for step in (63, 199, 200, 201, 399, 400):
+        while population.steps < step:
+            population.advance(step - population.steps)
+        state = population.fetch().agent
+        copied.append(bool((state.target.weights[0] == state.online.weights[0]).all()))
+    assert copied == [True, False, True, False, False, True]
+
+
 def test_the_target_network_follows_softly(task):
     agent = DQN(hidden=(8,), environments=1, batch_size=4, target_period=1, target_rate=0.25)
     before = agent.init(task, jax.random.key(0))
@@ -116,16 +139,14 @@ def test_explores_with_probability_epsilon(task, epsilon):
 
 
 def test_the_learning_rate_falls_along_a_cosine():
-    agent = DQN(learning_rate=2.0, learning_rate_end=1.0, learning_rate_steps=100.0)
+    agent = DQN(learning_rate=2.0, learning_rate_final=0.5, learning_rate_steps=100.0)
     rates = [float(agent._learning_rate(jnp.array(i))) for i in (0, 50, 100, 1000)]
     np.testing.assert_allclose(rates, [2, 1.5, 1, 1], rtol=1e-6)
 
 
 def test_adam_equals_its_formula(task):
     """One update against Adam written out (Kingma & Ba 2015, algorithm 1)."""
-    agent = DQN(
-        hidden=(8,), environments=1, batch_size=4, learning_rate=0.01, learning_rate_end=0.01
-    )
+    agent = DQN(hidden=(8,), environments=1, batch_size=4, learning_rate=0.01)
     before = agent.init(task, jax.random.key(0))
     after, _ = agent.learn(before, rollout(agent), jax.random.key(1))
     replay = agent.observe(before, rollout(agent)).replay

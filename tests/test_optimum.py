@@ -30,11 +30,12 @@ def test_beats_every_sequence_of_torques():
 
 
 def test_mean_return_over_the_start_distribution():
-    """−136.8 ± 1.1 (standard error) over 4,096 starts, known from an independent solution."""
-    returns = Pendulum().optimum().returns(start_keys(1024))
+    """An independent solution: −136.8 ± 1.1 (standard error) over 4,096 other starts."""
+    returns = Pendulum().optimum().returns(start_keys(4096))
     error = returns.std() / np.sqrt(len(returns))
-    assert abs(returns.mean() + 136.8) < 3 * np.hypot(error, 1.1)
-    assert 1.5 < error < 3
+    assert abs(returns.mean() + 136.8) < 2 * np.hypot(error, 1.1)
+    # What results are graded against must not move.
+    np.testing.assert_allclose(returns[:1024].mean(), -135.0, atol=0.3)
 
 
 def test_stationary_values_fulfil_the_bellman_equation():

@@ -21,4 +21,4 @@ def test_fast_preset_comes_within_5_percent_of_the_optimum():
 def test_report_preset_learns_in_50_episodes():
     """Far from the 600 that the preset trains, but the plain algorithm is there by then."""
     run = train(Pendulum(), preset("report").build(), episodes=50, seeds=2, seed=100)
-    assert np.mean(run.grade()["regret_per_seed"]) < 0.25
+    assert np.mean(run.grade()["regret_per_seed"]) < 0.15

@@ -16,7 +16,7 @@ def learned_values(task, observations, steps=1500, **changes):
         "hidden": (32,), "environments": 4, "batch_size": 32, "replay_capacity": 1000,
         "learning_starts": 100, "discount": DISCOUNT, "target_period": 1, "target_rate": 0.05,
         "learning_rate": 3e-3, "learning_rate_steps": 1500.0, "reward_scale": 1.0,
-        "epsilon_end": 0.2, "learning_rate_end": 0.0,
+        "epsilon_end": 0.2, "learning_rate_final": 0.0,
     }  # fmt: skip
     agent = DQN(**{**settings, **changes})
     population = Population(task, agent, [0])

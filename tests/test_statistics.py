@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from qfolio.statistics import bootstrap_interval, interquartile_mean
+from qfolio.statistics import bootstrap_interval, interquartile_mean, mean_interval
 
 
 @pytest.mark.parametrize(
@@ -75,3 +75,9 @@ def test_bootstrap_keeps_the_leading_shape() -> None:
 def test_bootstrap_refuses_bad_arguments(values: list[float], options: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"at least one|must lie"):
         bootstrap_interval(values, **options)  # type: ignore[arg-type]
+
+
+def test_mean_interval_by_hand() -> None:
+    # Mean 2, standard deviation 1, n = 3: 2 ± 4.3027 / √3.
+    low, high = mean_interval([1.0, 2.0, 3.0])
+    np.testing.assert_allclose([low, high], [2 - 2.48414, 2 + 2.48414], atol=1e-4)

@@ -107,7 +107,7 @@ def test_warm_up_stores_and_does_not_learn(task, agent):
     population.advance(1000)  # stops where learning begins
     after = population.fetch()
     assert after.steps == agent.warm_up() == 9
-    assert after.agent.replay.written == 18
+    assert after.agent.replay.size == 18
     same(agent.weights(after.agent), before)
 
 

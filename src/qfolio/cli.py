@@ -11,22 +11,24 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import tyro
 from tyro.conf import Positional, arg
 
+from qfolio import settings
 from qfolio.errors import QfolioError
 
 if TYPE_CHECKING:
     from qfolio.runs import Run
 
+OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
 
 
 def train(
-    task: Positional[str] = "pendulum",
+    task: Positional[str | None] = None,
     *,
-    agent: str = "dqn",
-    preset: str = "fast",
+    agent: str | None = None,
+    preset: str | None = None,
     episodes: int | None = None,
     seeds: int | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     out: Path | None = None,
     assignments: Annotated[tuple[str, ...], arg(name="set", metavar="NAME=VALUE …")] = (),
     resume: Path | None = None,
@@ -36,12 +38,13 @@ def train(
     """Train agents on a task, grade them against the exact optimum and write a report.
 
     Args:
-        task: What to learn: pendulum.
-        agent: Which algorithm: dqn.
-        preset: fast, best, or report (the run of the report that qfolio grew out of).
-        episodes: Training episodes of each agent; the preset says how many otherwise.
+        task: What to learn: pendulum (the default).
+        agent: Which algorithm: dqn (the default).
+        preset: fast (the default), best, or report (the run that qfolio grew out of).
+        episodes: Training episodes of each agent; the preset says how many otherwise. Those of
+            fast and best are short: 28 and 40 steps.
         seeds: How many agents are trained side by side; the preset says otherwise.
-        seed: The first agent's seed; the others' follow it.
+        seed: The first agent's seed, 0 unless given; the others' follow it.
         out: A new folder for the run; runs/… otherwise.
         assignments: Hyperparameters, for example --set discount=0.98 hidden=256,256
         resume: Go on with the run in this folder, up to --episodes if given.
@@ -56,19 +59,25 @@ def train(
 
     with _window(live) as show:
         if resume is None:
+            task, preset = task or "pendulum", preset or "fast"
             name = f"{task}-{preset}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
             folder = out or Path("runs") / name
-            run = _new_run(task, agent, preset, episodes, seeds, seed, folder, assignments)
-        elif assignments or seeds is not None or out is not None:
-            raise QfolioError(
-                "--resume keeps the run's settings and seeds; leave --set, --seeds and --out out."
-            )
+            chosen = settings.parse(assignments)
+            run = _new_run(task, agent or "dqn", preset, episodes, seeds, seed or 0, folder, chosen)
+        elif assignments or any(x is not None for x in (task, agent, preset, seeds, seed, out)):
+            raise QfolioError("--resume keeps what the run was started with; add only --episodes.")
         else:
             run, folder = Run.open(resume), resume
         console.say(console.describe(run))
-        _train(run, run.config["episodes"] if episodes is None else episodes, show)
-    comparison = _comparison(run, folder) if compare else None
-    _finish(run, folder, comparison)
+        _train(run, episodes, show)
+    contrast = None
+    if compare and not run.interrupted:
+        contrast = _contrast(run, folder)
+    if not run.interrupted:
+        _finish(run, folder, contrast)
+    if run.interrupted or (contrast is not None and contrast.interrupted):
+        console.say(f"Stopped. Go on with: qfolio train --resume {folder}")
+        sys.exit(INTERRUPTED)
 
 
 def evaluate(
@@ -139,15 +148,14 @@ def _new_run(
     seeds: int | None,
     seed: int,
     folder: Path,
-    assignments: tuple[str, ...],
+    chosen: dict[str, str],
 ) -> "Run":
-    from qfolio import presets, registry, settings
+    from qfolio import presets, registry
     from qfolio.runs import Run
 
     task_class = registry.find("task", registry.TASKS, task_name)
     registry.find("agent", registry.AGENTS, agent_name)
     preset = presets.preset(preset_name, task_name, agent_name)
-    chosen = settings.parse(assignments)
     task_settings = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
     return Run.create(
         settings.build(task_class, task_settings),
@@ -160,8 +168,8 @@ def _new_run(
     )
 
 
-def _train(run: "Run", episodes: int, show: Callable[["Run"], None] | None = None) -> None:
-    """Trains with live progress; leaves the process after Ctrl-C."""
+def _train(run: "Run", episodes: int | None, show: Callable[["Run"], None] | None = None) -> None:
+    """Trains with live progress, beside the optimum."""
     from qfolio import console
     from qfolio.evaluation import start_keys
     from qfolio.runs import CURVE_STARTS
@@ -171,15 +179,9 @@ def _train(run: "Run", episodes: int, show: Callable[["Run"], None] | None = Non
         with console.console.status("Solving for the exact optimum (once; then it is on disk)"):
             optimum = float(solution.returns(start_keys())[:CURVE_STARTS].mean())
     console.train(run, episodes, optimum, show)
-    if run.interrupted:
-        console.say(
-            f"Stopped after {run.episodes:,} episodes. "
-            f"Go on with: qfolio train --resume {run.folder}"
-        )
-        sys.exit(INTERRUPTED)
 
 
-def _comparison(run: "Run", folder: Path) -> "Run | None":
+def _contrast(run: "Run", folder: Path) -> "Run | None":
     """The same training with the one thing changed that the report contrasts; resumable too."""
     from qfolio.console import say
     from qfolio.runs import Run
@@ -208,14 +210,14 @@ def _comparison(run: "Run", folder: Path) -> "Run | None":
     return contrast
 
 
-def _finish(run: "Run", folder: Path, comparison: "Run | None") -> None:
+def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
     from qfolio.console import console, print_result, say
     from qfolio.report.collect import report_data
     from qfolio.report.page import write_report
 
     with console.status("Grading on 1,024 start states and writing the report"):
         summary = run.summary()
-        write_report(folder, report_data(run, summary, comparison, _command(run)))
+        write_report(folder, report_data(run, summary, contrast, _command(run)))
     print_result(run.population.seeds, summary)
     say(
         f"{summary['env_steps'] * summary['seeds']:,} steps in {summary['seconds_train']:.1f} s of "
@@ -227,11 +229,11 @@ def _finish(run: "Run", folder: Path, comparison: "Run | None") -> None:
 
 def _command(run: "Run") -> str:
     """The command line that repeats a run, and the one that goes on with it."""
-    from qfolio import settings
-    from qfolio.presets import preset
+    from qfolio.presets import PRESETS, preset
 
     config = run.config
-    name = config["preset"] or "report"  # whose settings are the agent's defaults
+    known = PRESETS.get((config["task"], config["agent"]), {})
+    name = config["preset"] if config["preset"] in known else "report"  # the agent's defaults
     default = settings.describe(preset(name, config["task"], config["agent"]).build())
     default |= settings.describe(type(run.task)())
     chosen = config["agent_settings"] | config["task_settings"]
@@ -289,6 +291,14 @@ def main() -> NoReturn:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         print(f"qfolio: {where}{error.strerror or error}.", file=sys.stderr)
+        sys.exit(2)
+    except MemoryError:
+        print(f"qfolio: {OUT_OF_MEMORY}", file=sys.stderr)
+        sys.exit(2)
+    except RuntimeError as error:  # jax's own, which cannot be imported here
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        print(f"qfolio: {OUT_OF_MEMORY}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("qfolio: interrupted", file=sys.stderr)

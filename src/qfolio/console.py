@@ -9,6 +9,8 @@ import rich.progress
 from rich.console import Console
 from rich.table import Table
 
+from qfolio.training import episode_steps
+
 if TYPE_CHECKING:
     from qfolio.runs import Progress, Run
 
@@ -31,31 +33,35 @@ def describe(run: "Run") -> str:
 
 def train(
     run: "Run",
-    episodes: int,
+    episodes: int | None,
     optimum: float | None,
     show: Callable[["Run"], None] | None = None,
 ) -> None:
-    """Trains up to ``episodes`` with a line for each point of the curve and a bar between them.
+    """Trains with a line for each point of the curve and a bar between them.
 
-    optimum: on the curve's start states. show: called with the run at each point of the curve.
+    episodes: those of the configuration where None. optimum: on the curve's start states.
+    show: called with the run at each point of the curve.
     """
-    columns = ("episodes", "return", "greedy", "optimum", "epsilon", "steps/s", "left")
+    steps = episode_steps(run.task, run.agent)
+    value = "return" if steps == run.task.horizon else f"return/{steps}"  # of shorter episodes
+    columns = ("episodes", value, "greedy", "optimum", "epsilon", "steps/s", "left")
     say("".join(f"{name:>11}" for name in columns))
     bar_columns = (
         rich.progress.BarColumn(bar_width=24),
         rich.progress.TextColumn("{task.description}"),
     )
+    total = run.config["episodes"] if episodes is None else episodes
     with rich.progress.Progress(
         *bar_columns, console=console, transient=True, disable=not console.is_terminal
     ) as live:
-        bar = live.add_task("compiling", total=episodes, completed=run.episodes)
+        bar = live.add_task("compiling", total=total, completed=run.episodes)
 
         def note(now: "Progress") -> None:
             done, value = f"{now.episodes:,}", number(now.mean_return)
             epsilon, rate = f"{now.epsilon:.2f}", f"{now.steps_per_second:,.0f}"
             left = str(datetime.timedelta(seconds=round(now.seconds_left)))
             status = f"{done} episodes  return {value}  ε {epsilon}  {rate} steps/s  {left} left"
-            live.update(bar, completed=min(now.episodes, episodes), description=status)
+            live.update(bar, completed=min(now.episodes, total), description=status)
             if now.greedy_return is not None:
                 cells = (done, value, number(now.greedy_return), number(optimum))
                 say("".join(f"{cell:>11}" for cell in (*cells, epsilon, rate, left)))
@@ -76,7 +82,9 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
     for seed, *values in zip(seeds, returns, regrets, over, strict=True):
         table.add_row(str(seed), *_cells(optimum, *values))
     table.add_section()
-    means = (sum(column) / len(column) for column in (returns, regrets, over))
+    means = (
+        sum(x or math.nan for x in column) / len(column) for column in (returns, regrets, over)
+    )
     table.add_row("mean", *_cells(optimum, *means))
     console.print(table)
     if result["return_ci95"]:
@@ -90,5 +98,5 @@ def number(value: float | None) -> str:
     return "–" if value is None or math.isnan(value) else f"{value:,.1f}"
 
 
-def _cells(optimum: str, value: float, regret: float, over: float) -> tuple[str, ...]:
+def _cells(optimum: str, value: float, regret: float, over: float | None) -> tuple[str, ...]:
     return number(value), optimum, f"{regret:.2%}", number(over)

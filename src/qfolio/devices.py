@@ -77,9 +77,9 @@ class Members:
     def __init__(self, count: int) -> None:
         devices = jax.devices()[: min(len(jax.devices()), count)]
         self._one_by_one = devices[0].platform not in LOCKSTEP
-        # At least two slots: XLA simplifies an axis of one away and then fuses, and so rounds,
-        # differently. A slot without a member costs memory, but no time.
-        slots = max(2, -(-count // len(devices)))
+        # Two slots or more where members take turns: XLA drops an axis of one and then rounds
+        # differently. There, a slot without a member costs memory, but no time.
+        slots = max(2 if self._one_by_one else 1, -(-count // len(devices)))
         shares = np.array_split(np.arange(count), len(devices))
         self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
         self._filling = np.concatenate([np.resize(share, slots) for share in shares])

@@ -1,5 +1,6 @@
 """How good a policy is: greedy returns from fixed starts, and how far its values overestimate."""
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -25,12 +26,19 @@ class Greedy(NamedTuple):
     overestimation: Float[Array, ""]  # NaN where the agent estimates no action values
 
 
-def evaluate(task: Task, agent: Agent, weights: PyTree, keys: Key[Array, " start"]) -> Greedy:
-    """Follows the greedy policy from each key's start state for twice the horizon.
+def tail_steps(discount: float) -> int:
+    """Steps after which a reward counts for less than 1 % (at most 2,000)."""
+    return min(2000, math.ceil(math.log(0.01) / math.log(min(max(discount, 1e-9), 1 - 1e-9))))
 
-    The return counts the first half. The overestimation is the mean over the states visited in it
-    of max_a Q(s, a) less the discounted return that really followed (van Hasselt et al. 2016,
-    section 3); the second half is there so that what follows is not cut off.
+
+def evaluate(
+    task: Task, agent: Agent, weights: PyTree, keys: Key[Array, " start"], tail: int
+) -> Greedy:
+    """Follows the greedy policy from each key's start state over the horizon and ``tail`` steps.
+
+    The return counts the horizon. The overestimation is the mean over the states visited in it of
+    max_a Q(s, a) less the discounted return that really followed (van Hasselt et al. 2016,
+    section 3); the tail is there so that what follows is not cut off.
     """
     starts = jax.vmap(task.reset)(keys)
 
@@ -46,7 +54,7 @@ def evaluate(task: Task, agent: Agent, weights: PyTree, keys: Key[Array, " start
         return (after.state, alive & ~after.terminated), (reward, best, alive)
 
     alive = jnp.ones(keys.shape, bool)
-    times = jnp.arange(2 * task.horizon)
+    times = jnp.arange(task.horizon + tail)
     _, (rewards, best, visited) = lax.scan(step, (starts, alive), times)
 
     def back(following: Array, reward: Array) -> tuple[Array, Array]:

@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -13,33 +12,35 @@ from safetensors.numpy import load, save
 
 from qfolio.errors import QfolioError
 
+UNFINISHED = ".part"
+"""Ending of files that a killed process may have left."""
+
 
 def cache_directory() -> Path:
     """Where compiled programs and solved optima are kept; safe to delete at any time."""
     if path := os.environ.get("QFOLIO_CACHE"):
         return Path(path)
     if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData/Local"))
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData/Local")
     elif sys.platform == "darwin":
         base = Path.home() / "Library/Caches"
     else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "qfolio"
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Writes to a temporary name beside ``path``, then renames: a reader sees all or nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
+        temporary.replace(path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
@@ -53,7 +54,7 @@ def read_json(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text())
     except OSError as error:
         raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise QfolioError(f"{path} is damaged, it holds no valid JSON ({error}).") from None
     if not isinstance(content, dict):
         raise QfolioError(f"{path} is damaged, it holds no JSON object.")

@@ -111,6 +111,10 @@ class Agent(eqx.Module):
     def learn(self, state: Any, rollout: Transition, key: PRNGKeyArray) -> tuple[Any, Metrics]:
         """Stores experience and learns from it."""
 
+    def monitor(self, state: Any) -> Metrics:
+        """Named scalars that describe the state at any time, before learning too."""
+        return {}
+
     @abc.abstractmethod
     def weights(self, state: Any) -> PyTree:
         """The part of the state that the learned policy needs."""

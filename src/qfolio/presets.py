@@ -31,13 +31,12 @@ _FAST = {
     "batch_size": 256,
     "replay_capacity": 65_536,
     "learning_starts": 1024,
-    "double": True,
     "target_period": 1,
     "target_rate": 0.03,
     "discount": 0.995,
     "learning_rate": 3e-3,
-    "learning_rate_end": 0.0,
-    "learning_rate_steps": 6000.0,
+    "learning_rate_final": 0.0,
+    "learning_rate_steps": 7500.0,
     "epsilon_decay": 0.995,
     "huber": 0.3,
     "reward_scale": 0.3,
@@ -54,7 +53,7 @@ _BEST = {
 
 PRESETS = {
     ("pendulum", "dqn"): {
-        "fast": Preset("dqn", _FAST, episodes=6912, seeds=8),
+        "fast": Preset("dqn", _FAST, episodes=8608, seeds=8),
         "best": Preset("dqn", _BEST, episodes=24_032, seeds=8),
         # Each hyperparameter of the report that qfolio grew out of; they are DQN's defaults.
         "report": Preset("dqn", {}, episodes=600, seeds=1),

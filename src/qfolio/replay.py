@@ -17,7 +17,8 @@ class Replay(eqx.Module):
     """
 
     rows: Float[Array, "capacity numbers"]
-    written: Int[Array, ""]  # since the beginning, overwritten ones included
+    position: Int[Array, ""]  # of the next write
+    size: Int[Array, ""]  # rows that hold something
     like: PyTree = eqx.field(static=True)  # shape and type of a row's leaves
 
     @staticmethod
@@ -26,7 +27,8 @@ class Replay(eqx.Module):
         capacity = -(-capacity // width) * width
         like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), row)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(like))
-        return Replay(jnp.zeros((capacity, numbers)), jnp.array(0, jnp.int32), like)
+        zero = jnp.array(0, jnp.int32)
+        return Replay(jnp.zeros((capacity, numbers)), zero, zero, like)
 
     def add(self, rows: PyTree) -> "Replay":
         """Appends ``width`` rows."""
@@ -35,15 +37,18 @@ class Replay(eqx.Module):
         packed = jnp.concatenate(
             [leaf.reshape(width, -1).astype(jnp.float32) for leaf in leaves], axis=1
         )
-        at = self.written % self.rows.shape[0]
-        matrix = lax.dynamic_update_slice_in_dim(self.rows, packed, at, axis=0)
-        return Replay(matrix, self.written + width, self.like)
+        capacity = self.rows.shape[0]
+        return Replay(
+            rows=lax.dynamic_update_slice_in_dim(self.rows, packed, self.position, axis=0),
+            position=(self.position + width) % capacity,
+            size=jnp.minimum(self.size + width, capacity),
+            like=self.like,
+        )
 
     def sample(self, key: PRNGKeyArray, n: int) -> PyTree:
         """``n`` rows drawn uniformly with replacement; the cost does not grow with capacity."""
-        size = jnp.minimum(self.written, self.rows.shape[0])
         # One draw of uniforms instead of randint's two; float32 splits [0, 1) into 2²³ parts.
-        index = (jax.random.uniform(key, (n,)) * size).astype(jnp.int32)
+        index = (jax.random.uniform(key, (n,)) * self.size).astype(jnp.int32)
         return self.unpack(self.rows[index])
 
     def unpack(self, packed: Float[Array, "n numbers"]) -> PyTree:

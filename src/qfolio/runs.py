@@ -9,9 +9,12 @@ when a run is resumed, and then come again, the same to the last digit.
 import contextlib
 import csv
 import datetime
+import io
 import math
+import os
 import platform
 import signal
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -27,11 +30,18 @@ import qfolio
 from qfolio import devices, settings
 from qfolio.errors import QfolioError
 from qfolio.evaluation import STARTS, start_keys
-from qfolio.files import read_arrays, read_json, write_arrays, write_json
+from qfolio.files import (
+    UNFINISHED,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_bytes,
+    write_json,
+)
 from qfolio.mdp import Agent, Task
 from qfolio.registry import AGENTS, TASKS, find, name_of
-from qfolio.statistics import bootstrap_interval
-from qfolio.training import Episodes, Population, chunk_steps
+from qfolio.statistics import mean_interval
+from qfolio.training import Episodes, Population
 
 FORMAT = 1
 """Of the run folder; raised whenever an older folder can no longer be read."""
@@ -85,17 +95,9 @@ class Run:
         out: Path | str | None = None,
     ) -> "Run":
         """A run before its first step; ``out`` must be a new or empty folder."""
-        for name, value in (("episodes", episodes), ("seeds", seeds)):
-            if value < 1:
-                raise QfolioError(f"{name} is {value}; it must be at least 1.")
-        if not 0 <= seed <= 2**32 - seeds:
-            raise QfolioError(f"seed is {seed}; it must be between 0 and 2³² − seeds.")
+        _check_counts(episodes, seeds, seed)
         folder = None if out is None else Path(out)
-        if (
-            folder is not None
-            and folder.exists()
-            and (not folder.is_dir() or any(folder.iterdir()))
-        ):
+        if folder is not None and folder.exists() and not _is_empty(folder):
             raise QfolioError(
                 f"{folder} is not empty; name a new folder, or go on with --resume {folder}."
             )
@@ -117,10 +119,17 @@ class Run:
             },
             "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         }
-        run = cls(task, agent, config, folder)
+        run = cls(task, agent, config, None)
         if folder is not None:
-            write_json(folder / "config.json", config)
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            # Under another name first: a folder with that name is a whole run at any moment.
+            run.folder = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+            write_json(run.folder / "config.json", config)
             run._write_checkpoint()
+            run.folder.chmod(0o777 & ~_umask())
+            if folder.exists():
+                folder.rmdir()
+            run.folder = run.folder.rename(folder)
         return run
 
     @classmethod
@@ -152,27 +161,26 @@ class Run:
         A first Ctrl-C stops after the current chunk, sets ``interrupted`` and leaves a checkpoint.
         A loss that is not finite raises QfolioError; the last good checkpoint stays.
         """
-        if episodes is not None and episodes != self.config["episodes"]:
-            self.config["episodes"] = episodes
-            if self.folder is not None:
-                write_json(self.folder / "config.json", self.config)
-        total = self.config["episodes"]
+        total = self.config["episodes"] if episodes is None else episodes
+        _check_counts(total, self.config["seeds"], self.config["seed"])
         steps = self.population.steps_left(total)
         if not steps:
             return
-        chunks = math.ceil(steps / chunk_steps(self.task, self.agent))
-        every = max(1, round(chunks / EVALUATIONS))
-        self._drop_rows_ahead()
+        self.config["episodes"] = total
+        if self.folder is not None:
+            write_json(self.folder / "config.json", self.config)
+        self._tidy()
+        # In steps since the very beginning, so that a resumed run has the same curve.
+        every = (self.population.steps + steps) / EVALUATIONS
         begun, saved = self.population.steps, perf_counter()
         start_seconds = self.seconds_train
-        done = 0
         with _interruptible() as stop:
             while True:
+                points = self.population.steps // every
                 records = self._advance(steps)
-                done += 1
                 steps = self.population.steps_left(total)
                 greedy = None
-                if done % every == 0 or not steps:
+                if self.population.steps // every > points or not steps:
                     greedy = self._evaluate()
                 if listener is not None:
                     rate = (self.population.steps - begun) / (self.seconds_train - start_seconds)
@@ -187,7 +195,7 @@ class Run:
 
     def first_weights(self) -> Any:
         """The first seed's learned weights."""
-        return jax.tree.map(lambda x: x[0], self.agent.weights(self.population.fetch().agent))
+        return jax.tree.map(lambda x: x[0], self.population.weights())
 
     def summary(self) -> dict[str, Any]:
         """Greedy returns on the fixed start states, the optimum on the same, and what it cost."""
@@ -223,13 +231,13 @@ class Run:
             regret = ((optimum - returns) / abs(optimum)).tolist()
         return {
             "return_mean": float(returns.mean()),
-            "return_ci95": [float(end) for end in bootstrap_interval(returns, np.mean)]
-            if len(returns) > 1
-            else None,
+            "return_ci95": list(mean_interval(returns)) if len(returns) > 1 else None,
             "return_per_seed": returns.tolist(),
             "optimum": optimum,
             "regret_per_seed": regret,
-            "overestimation_per_seed": greedy.overestimation.tolist(),
+            "overestimation_per_seed": [
+                float(error) if np.isfinite(error) else None for error in greedy.overestimation
+            ],
         }
 
     def _advance(self, steps: int) -> list[dict[str, float]]:
@@ -280,16 +288,10 @@ class Run:
             greedy_return=greedy,
         )
 
-    def _append(self, name: str, records: Sequence[dict[str, float]]) -> None:
-        if self.folder is None or not records:
-            return
-        path = self.folder / name
-        new = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(records[0]))
-            if new:
-                writer.writeheader()
-            writer.writerows(records)
+    def _append(self, name: str, rows: list[dict[str, float]]) -> None:
+        if self.folder is not None and rows:
+            with (self.folder / name).open("a", newline="") as file:
+                file.write(_csv(rows, header=file.tell() == 0))
 
     def _write_checkpoint(self) -> None:
         if self.folder is None:
@@ -317,23 +319,33 @@ class Run:
         path = self.folder / name
         if not path.exists():
             return []
-        done = dict(zip(self.population.seeds, self.population.member_episodes, strict=True))
+        episodes = dict(zip(self.population.seeds, self.population.member_episodes, strict=True))
+        steps = self.population.steps * self.agent.environments
+        try:
+            table = list(csv.DictReader(path.read_text(errors="replace").splitlines()))
+        except csv.Error as error:
+            raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
         rows = []
-        with path.open(newline="", errors="replace") as file:
-            for row in csv.DictReader(file):
-                with contextlib.suppress(TypeError, ValueError, KeyError):  # cut short
-                    values = {key: _number(text) for key, text in row.items()}
-                    if values["episode"] <= done[int(values["seed"])]:
-                        rows.append(values)
+        for row in table:
+            # A row that was cut short has too few numbers.
+            with contextlib.suppress(TypeError, ValueError, KeyError, OverflowError):
+                values = {key: _number(text) for key, text in row.items()}
+                done = values["episode"] <= episodes[int(values["seed"])]
+                if done and values.get("env_steps", 0) <= steps:
+                    rows.append(values)
         return rows
 
-    def _drop_rows_ahead(self) -> None:
-        """Brings the tables on disk back to the checkpoint, from which training goes on."""
+    def _tidy(self) -> None:
+        """Brings the folder back to the checkpoint, from which training goes on."""
         if self.folder is None:
             return
         for name, rows in (("metrics.csv", self.metrics), ("evaluation.csv", self.evaluations)):
-            (self.folder / name).unlink(missing_ok=True)
-            self._append(name, rows)
+            if rows:
+                write_bytes(self.folder / name, _csv(rows, header=True).encode())
+            else:
+                (self.folder / name).unlink(missing_ok=True)
+        for path in self.folder.glob(f".*{UNFINISHED}"):
+            path.unlink()
 
 
 def train(
@@ -358,28 +370,57 @@ def train(
 
 def read_config(folder: Path) -> dict[str, Any]:
     """config.json, or QfolioError where ``folder`` is no run of this version."""
-    if not (folder / "config.json").is_file():
+    path = folder / "config.json"
+    if not path.is_file():
         raise QfolioError(f"{folder} is no run: it has no config.json.")
-    config = read_json(folder / "config.json")
+    config = read_json(path)
     if config.get("format") != FORMAT:
         raise QfolioError(
             f"{folder} was written by qfolio {config.get('version', 'of an unknown version')} in "
             f"another format; this is {qfolio.__version__}: use that version, or train anew."
         )
-    wanted = {"task": str, "agent": str, "task_settings": dict, "agent_settings": dict,
-              "episodes": int, "seeds": int, "seed": int}  # fmt: skip
+    wanted = {
+        "task": str,
+        "agent": str,
+        "task_settings": dict,
+        "agent_settings": dict,
+        "episodes": int,
+        "seeds": int,
+        "seed": int,
+        "device": str,
+        "preset": str | None,
+    }
     for name, kind in wanted.items():
-        if not isinstance(config.get(name), kind):
-            raise QfolioError(
-                f"{folder / 'config.json'} is damaged: {name} is missing or no {kind.__name__}."
-            )
-    if not (
-        1 <= config["seeds"] <= 2**20 and config["episodes"] >= 1 and 0 <= config["seed"] < 2**32
-    ):
-        raise QfolioError(
-            f"{folder / 'config.json'} is damaged: seeds, seed or episodes are out of range."
-        )
+        if name not in config or not isinstance(config[name], kind):
+            raise QfolioError(f"{path} is damaged: {name} is missing or of the wrong type.")
+    try:
+        _check_counts(config["episodes"], config["seeds"], config["seed"])
+    except QfolioError as error:
+        raise QfolioError(f"{path} is damaged: {error}") from None
     return config
+
+
+def _check_counts(episodes: int, seeds: int, seed: int) -> None:
+    """Raises QfolioError where a run cannot have that many episodes or these seeds."""
+    bounds = {
+        "episodes": (episodes, 1, 2**31 - 1),
+        "seeds": (seeds, 1, 2**20),
+        "seed": (seed, 0, 2**32 - seeds),
+    }
+    for name, (value, low, high) in bounds.items():
+        if not low <= value <= high:
+            raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")
+
+
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and not any(folder.iterdir())
+
+
+def _umask() -> int:
+    """The permissions that the user's new files do without."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
 
 
 def configured_task(config: dict[str, Any]) -> Task:
@@ -402,6 +443,15 @@ def _records(
         number[seed] += 1
         values = {name: float(x[member, time, environment]) for name, x in columns.items()}
         yield {"seed": seed, "episode": number[seed], **values}
+
+
+def _csv(rows: list[dict[str, float]], header: bool) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    if header:
+        writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def _number(text: str) -> float:

@@ -77,3 +77,17 @@ def bootstrap_interval(
     tail = (1 - level) / 2
     low, high = np.quantile(np.stack(estimates), [tail, 1 - tail], axis=-1)
     return low.reshape(table.shape[:-1]), high.reshape(table.shape[:-1])
+
+
+def mean_interval(values: ArrayLike, level: float = 0.95) -> tuple[float, float]:
+    """Return Student's t interval of a mean, which keeps its level with few seeds, too.
+
+    Args:
+        values: At least two numbers, one per seed.
+        level: Coverage where the values are normal, between 0 and 1.
+    """
+    from scipy.special import stdtrit
+
+    sample = np.asarray(values, dtype=float)
+    margin = stdtrit(sample.size - 1, (1 + level) / 2) * sample.std(ddof=1) / np.sqrt(sample.size)
+    return float(sample.mean() - margin), float(sample.mean() + margin)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
 from qfolio.devices import Members, require_memory
 from qfolio.errors import QfolioError
-from qfolio.evaluation import Greedy, evaluate
+from qfolio.evaluation import Greedy, evaluate, tail_steps
 from qfolio.mdp import Agent, Metrics, Task, Transition
 
 CHUNK = 600
@@ -44,7 +44,7 @@ class TrainingState(eqx.Module):
     key: UInt32[Array, "2"]  # constant; each step folds its number in
     steps: Int[Array, ""]  # of each environment, since the beginning
     episodes: Int[Array, ""]  # finished, over all environments
-    healthy: Bool[Array, ""]  # no metric has been infinite or undefined so far
+    healthy: Bool[Array, ""]  # metrics and weights have been finite so far
 
 
 class Episodes(NamedTuple):
@@ -52,7 +52,7 @@ class Episodes(NamedTuple):
 
     finished: Bool[Array, "time environment"]
     returns: Float[Array, "time environment"]
-    metrics: dict[str, Float[Array, "time environment"]]  # means over the episode
+    metrics: dict[str, Float[Array, "time environment"]]  # as monitored, or means over the episode
 
 
 def begin(task: Task, agent: Agent, seed: Int[Array, ""]) -> TrainingState:
@@ -93,7 +93,10 @@ def advance(
         put = lambda all, one: lax.dynamic_update_index_in_dim(all, one, i, 0)  # noqa: E731
         return state, jax.tree.map(put, episodes, record)
 
-    return lax.fori_loop(0, steps, body, (state, empty))
+    state, episodes = lax.fori_loop(0, steps, body, (state, empty))
+    weights = jax.tree.leaves(agent.weights(state.agent))
+    finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in weights]).all()
+    return eqx.tree_at(lambda s: s.healthy, state, state.healthy & finite), episodes
 
 
 def chunk_steps(task: Task, agent: Agent) -> int:
@@ -136,7 +139,12 @@ def _step(
     sums = {name: total + metrics.get(name, 0.0) for name, total in state.tally.metrics.items()}
     learned = state.tally.learned + int(learning)
     reward = state.tally.reward + after.reward
-    record = Episodes(finished, reward, {name: total / learned for name, total in sums.items()})
+    means = {name: total / learned for name, total in sums.items()}
+    monitored = {
+        name: jnp.broadcast_to(value, reward.shape)
+        for name, value in agent.monitor(state.agent).items()
+    }
+    record = Episodes(finished, reward, monitored | means)
 
     def reset(states: PyTree) -> PyTree:
         fresh = jax.vmap(task.reset)(jax.random.split(reset_key, environments))
@@ -242,13 +250,19 @@ class Population:
     def evaluate(self, keys: Key[Array, " start"]) -> Greedy:
         """Greedy returns (member, start) and overestimation (member,) of the policies so far."""
 
+        tail = tail_steps(self.agent.discount)
+
         def program(member: tuple[PyTree, Agent], keys: Key[Array, " start"]) -> Any:
             weights, numbers = member
-            return evaluate(self.task, self._agent(numbers), weights, keys)
+            return evaluate(self.task, self._agent(numbers), weights, keys, tail)
 
         members = (self.agent.weights(self.state.agent), self._numbers)
         greedy = self._run(f"evaluate {len(keys)}", program, members, keys)
         return self._members.fetch(greedy)
+
+    def weights(self) -> PyTree:
+        """The members' learned weights as numpy arrays."""
+        return self._members.fetch(self.agent.weights(self.state.agent))
 
     def fetch(self) -> TrainingState:
         """The members' states as numpy arrays, with a leading member axis."""

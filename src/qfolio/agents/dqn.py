@@ -42,42 +42,54 @@ class DQNState(eqx.Module):
     optimizer: optax.ScaleByAdamState
     replay: Replay
     episodes: Int[Array, ""]  # finished; ε follows it
-    steps: Int[Array, ""]  # calls of learn; the target network follows it
+    steps: Int[Array, ""]  # of each environment; the target network follows them
+
+
+def _static(default: Any) -> Any:
+    """A setting that shapes the program."""
+    return eqx.field(static=True, default=default)
+
+
+def _number(default: float) -> Any:
+    """A setting that is an input of the program: members may differ in it."""
+    return eqx.field(converter=float, default=default)
 
 
 class DQN(Agent):
     """A deep Q-network; the defaults are those of the report that qfolio grew out of."""
 
-    hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))
-    input_gain: float = 0.0  # of the first layer, for observations scaled to ±1; 0: plain weights
-    environments: int = eqx.field(static=True, default=1)  # stepped side by side
-    episode_steps: int = eqx.field(static=True, default=0)  # cut training episodes; 0: the task's
-    batch_size: int = eqx.field(static=True, default=64)
-    updates: int = eqx.field(static=True, default=1)  # gradient steps per step of all environments
-    replay_capacity: int = eqx.field(static=True, default=50_000)  # transitions
-    learning_starts: int = eqx.field(static=True, default=64)  # transitions stored before learning
-    double: bool = eqx.field(static=True, default=False)
-    time_limit_terminal: bool = eqx.field(static=True, default=False)  # wrong, but often done
-    target_period: int = eqx.field(static=True, default=200)  # steps between target updates
-    target_rate: float = 1.0  # how far each goes towards the online network; 1 copies it
-    discount: float = 0.99
-    learning_rate: float = 1e-3
-    learning_rate_end: float = 1e-3
-    learning_rate_steps: float = 1e5  # gradient steps of the cosine from the one to the other
-    epsilon: float = 1.0
-    epsilon_end: float = 0.01
-    epsilon_decay: float = 0.995  # factor per finished episode
-    huber: float = math.inf  # |TD error| beyond which the loss is linear; inf squares all of it
-    reward_scale: float = 1.0  # the network learns values of scaled rewards
+    hidden: tuple[int, ...] = eqx.field(static=True, converter=tuple, default=(256, 256))
+    environments: int = _static(1)  # stepped side by side
+    episode_steps: int = _static(0)  # training episodes are cut here; 0: the task's horizon
+    batch_size: int = _static(64)
+    updates: int = _static(1)  # gradient steps per step of all environments
+    replay_capacity: int = _static(50_000)  # transitions
+    learning_starts: int = _static(64)  # transitions stored before learning
+    double: bool = _static(False)
+    time_limit_terminal: bool = _static(False)  # wrong, but often done
+    target_period: int = _static(200)  # steps between target updates
+    target_rate: float = _number(1.0)  # how far each goes towards the online network; 1 copies it
+    discount: float = _number(0.99)
+    learning_rate: float = _number(1e-3)
+    learning_rate_final: float = _number(1.0)  # share of it that is left at the end of the cosine
+    learning_rate_steps: float = _number(1e5)  # gradient steps of the cosine
+    epsilon: float = _number(1.0)
+    epsilon_end: float = _number(0.01)
+    epsilon_decay: float = _number(0.995)  # factor per finished episode
+    huber: float = _number(math.inf)  # |TD error| beyond which the loss is linear; inf: squared
+    reward_scale: float = _number(1.0)  # the network learns values of scaled rewards
+    input_gain: float = _number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
 
     def __check_init__(self) -> None:
-        counts = "environments batch_size updates replay_capacity target_period"
+        counts = "environments batch_size updates target_period"
         _require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        _require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         _require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
-        _require(self, "learning_rate_end input_gain", lambda x: x >= 0, "at least 0")
-        scales = "learning_rate learning_rate_steps huber reward_scale"
-        _require(self, scales, lambda x: x > 0, "greater than 0")
-        fractions = "discount target_rate epsilon epsilon_end epsilon_decay"
+        _require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        scales = "learning_rate learning_rate_steps reward_scale"
+        _require(self, scales, lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        _require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
+        fractions = "discount target_rate learning_rate_final epsilon epsilon_end epsilon_decay"
         _require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
         sizes = lambda x: len(x) > 0 and min(x) >= 1 and max(x) < 2**31  # noqa: E731
         _require(self, "hidden", sizes, "one or more layer sizes")
@@ -124,6 +136,9 @@ class DQN(Agent):
     def epsilon_now(self, state: DQNState) -> Float[Array, ""]:
         return jnp.maximum(self.epsilon_end, self.epsilon * self.epsilon_decay**state.episodes)
 
+    def monitor(self, state: DQNState) -> Metrics:
+        return {"epsilon": self.epsilon_now(state)}
+
     def weights(self, state: DQNState) -> MLP:
         return state.online
 
@@ -159,15 +174,14 @@ class DQN(Agent):
         )
         finished = (step.terminated | step.truncated).sum(dtype=jnp.int32)
         return eqx.tree_at(
-            lambda s: (s.replay, s.episodes),
+            lambda s: (s.replay, s.episodes, s.steps),
             state,
-            (state.replay.add(experience), state.episodes + finished),
+            (state.replay.add(experience), state.episodes + finished, state.steps + 1),
         )
 
     def learn(
         self, state: DQNState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[DQNState, Metrics]:
-        epsilon = self.epsilon_now(state)
         state = self.observe(state, rollout)
 
         def update(carry, key):  # type: ignore[no-untyped-def]
@@ -188,19 +202,20 @@ class DQN(Agent):
             keys = jax.random.split(key, self.updates)
             (online, optimizer), (loss, max_q) = lax.scan(update, carry, keys)
 
-        steps = state.steps + 1
-        due = steps % self.target_period == 0
+        due = state.steps % self.target_period == 0
         rate = self.target_rate if self.target_period == 1 else jnp.where(due, self.target_rate, 0)
-        target = jax.tree.map(lambda t, w: t + rate * (w - t), state.target, online)
-        metrics = {"loss": loss.mean(), "epsilon": epsilon, "max_q": max_q.mean()}
-        state = DQNState(online, target, optimizer, state.replay, state.episodes, steps)
-        return state, metrics
+        # This form is exact for rates of 0 and 1.
+        blend = lambda t, w: (1 - rate) * t + rate * w  # noqa: E731
+        target = jax.tree.map(blend, state.target, online)
+        state = DQNState(online, target, optimizer, state.replay, state.episodes, state.steps)
+        return state, {"loss": loss.mean(), "max_q": max_q.mean()}
 
     def _learning_rate(self, update: Int[Array, ""]) -> Float[Array, ""]:
-        """A cosine from ``learning_rate`` to ``learning_rate_end`` (Loshchilov & Hutter 2017)."""
+        """A cosine from ``learning_rate`` to its final share (Loshchilov & Hutter 2017)."""
         done = jnp.minimum(update / self.learning_rate_steps, 1.0)
         weight = (1 + jnp.cos(jnp.pi * done)) / 2
-        return self.learning_rate_end + weight * (self.learning_rate - self.learning_rate_end)
+        final = self.learning_rate_final
+        return self.learning_rate * (final + weight * (1 - final))
 
     def _loss(
         self, online: MLP, target: MLP, batch: Experience

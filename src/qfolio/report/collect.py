@@ -17,7 +17,7 @@ EPISODE_START = 3
 
 
 def report_data(
-    run: Run, summary: dict[str, Any], comparison: Run | None, command: str
+    run: Run, summary: dict[str, Any], contrast: Run | None, command: str
 ) -> ReportData:
     """Collects everything ``write_report`` needs. The maps and the episode are the first seed's."""
     rows = run.metrics if episode_steps(run.task, run.agent) == run.task.horizon else []
@@ -32,7 +32,7 @@ def report_data(
         summary=summary,
         config=run.config,
         curve=_curve(run),
-        comparison=None if comparison is None else _curve(comparison),
+        comparison=_curve(contrast) if contrast is not None and contrast.evaluations else None,
         training_episodes=np.array([row["episode"] for row in rows]),
         training_returns=np.array([row["return"] for row in rows]),
         optimum=optimum,
@@ -53,8 +53,8 @@ def greedy_episode(run: Run, task: Pendulum, start: int = EPISODE_START) -> Epis
 
 
 def _curve(run: Run) -> Curve:
-    rows = run.evaluations
     seeds = run.config["seeds"]
+    rows = run.evaluations[: len(run.evaluations) // seeds * seeds]
     table = {
         name: np.array([row[name] for row in rows]).reshape(-1, seeds)
         for name in ("episode", "return", "overestimation")

@@ -43,10 +43,10 @@ class Pendulum(Task):
     length = 1.0  # m
 
     def __check_init__(self) -> None:
-        if self.torques < 2:
-            raise QfolioError(f"torques is {self.torques}; the pendulum needs at least 2.")
-        if self.horizon < 1:
-            raise QfolioError(f"horizon is {self.horizon}; an episode needs at least 1 step.")
+        if not 2 <= self.torques <= 1001:
+            raise QfolioError(f"torques is {self.torques}; it must be from 2 to 1001.")
+        if not 1 <= self.horizon <= 5000:  # the exact optimum keeps a table for each step
+            raise QfolioError(f"horizon is {self.horizon}; it must be from 1 to 5000.")
 
     @property
     def actions(self) -> Discrete:
