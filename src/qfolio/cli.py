@@ -120,7 +120,10 @@ def watch(folder: Positional[Path], *, episodes: int = 3) -> None:
     from qfolio import devices
     from qfolio.watch import Window, has_display
 
+    if episodes < 1:
+        raise QfolioError(f"--episodes is {episodes}; it must be at least 1.")
     devices.configure()
+    from qfolio.evaluation import STARTS
     from qfolio.report.animation import pendulum_gif
     from qfolio.report.collect import EPISODE_START, greedy_episode
     from qfolio.runs import Run
@@ -128,8 +131,8 @@ def watch(folder: Positional[Path], *, episodes: int = 3) -> None:
     run = Run.open(folder)
     if has_display():
         window = Window(f"qfolio: {folder}")
-        for start in range(EPISODE_START, EPISODE_START + episodes):
-            episode = greedy_episode(run, run.task, start)
+        for number in range(episodes):
+            episode = greedy_episode(run, run.task, (EPISODE_START + number) % STARTS)
             if not window.show(episode.states, episode.torques):
                 break
         window.close()

@@ -174,6 +174,8 @@ class Run:
         every = (self.population.steps + steps) / EVALUATIONS
         begun, saved = self.population.steps, perf_counter()
         start_seconds = self.seconds_train
+        if not self.population.steps:
+            self._evaluate()
         with _interruptible() as stop:
             while True:
                 points = self.population.steps // every

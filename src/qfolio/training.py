@@ -22,7 +22,7 @@ from qfolio.errors import QfolioError
 from qfolio.evaluation import Greedy, evaluate, tail_steps
 from qfolio.mdp import Agent, Metrics, Task, Transition
 
-CHUNK = 600
+CHUNK = 400
 """Steps between two returns to Python, at least (whole episodes)."""
 
 
