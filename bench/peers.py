@@ -7,14 +7,13 @@ one round, answered by {"rate": 812.3}: steps a second, each with one update. In
 """
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from race import timed
+from race import serve, timed
 
 TORQUES = 11
 CHUNK = 600
@@ -131,10 +130,7 @@ def main() -> None:
     advance = rejax_dqn() if library == "rejax" else gymnasium_dqn(library)
     for _ in range(3):  # fills the replay beyond learning's start and compiles
         advance()
-    run = timed(advance)
-    print("ready", file=answers, flush=True)
-    for line in sys.stdin:
-        print(json.dumps({"rate": run(json.loads(line)["seconds"])}), file=answers, flush=True)
+    serve(timed(advance), answers)
 
 
 if __name__ == "__main__":

@@ -3,10 +3,13 @@
 Needs nothing but Python: the peers' environment, which has no qfolio, imports it too.
 """
 
+import json
 import statistics
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter, sleep
+from typing import TextIO
 
 Contestant = Callable[[float], float]
 """Runs for about that many seconds and returns environment steps a second."""
@@ -37,6 +40,13 @@ def timed(advance: Callable[[], int]) -> Contestant:
         return steps / elapsed
 
     return run
+
+
+def serve(run: Contestant, answers: TextIO) -> None:
+    """Runs a round for each question on standard input and answers with its rate."""
+    print("ready", file=answers, flush=True)
+    for line in sys.stdin:
+        print(json.dumps({"rate": run(json.loads(line)["seconds"])}), file=answers, flush=True)
 
 
 def race(contestants: dict[str, Contestant], rounds: int, seconds: float) -> Rates:

@@ -105,7 +105,9 @@ def against_peers(effort: Effort) -> Outcome:
         contestants: dict[str, Contestant] = {"qfolio": agents(1)}
         for library, (name, _) in libraries.items():
             for threads in THREADS:
-                contestants[spelled(name, threads)] = stack.enter_context(peer(library, threads))
+                command = [python(PEERS), "-W", "ignore", str(HERE / "peers.py"), library]
+                peer = process([*command, "--threads", str(threads)])
+                contestants[spelled(name, threads)] = stack.enter_context(peer)
         rates = race(contestants, effort.rounds, effort.seconds)
     figures = []
     for name, target in libraries.values():
@@ -130,10 +132,18 @@ def against_products(effort: Effort) -> Outcome:
 
 def on_all_cores(effort: Effort) -> Outcome:
     """Eight agents on all cores against one agent."""
-    contestants = {"one agent": agents(1), "eight agents": agents(8)}
-    rates = race(contestants, effort.rounds, effort.seconds)
-    gain = ratio(rates, "eight agents", "one agent")
-    return [times(f"Speed of eight agents on {os.cpu_count()} cores ÷ one agent", gain, 1.8)], rates
+    contestants: dict[str, Contestant] = {"one agent": agents(1), "eight agents": agents(8)}
+    eight = f"Speed of eight agents on {os.cpu_count()} cores"
+    with ExitStack() as stack:
+        if hasattr(os, "sched_setaffinity"):
+            one = stack.enter_context(process([sys.executable, str(HERE / "pinned.py")]))
+            contestants["one agent on one core"] = one
+        rates = race(contestants, effort.rounds, effort.seconds)
+    return [
+        times(f"{eight} ÷ {name}", ratio(rates, "eight agents", name), 1.8)
+        for name in ("one agent on one core", "one agent")
+        if name in rates
+    ], rates
 
 
 def of_one_run(effort: Effort) -> Outcome:
@@ -273,13 +283,10 @@ def count_products(hlo: str) -> tuple[int, int]:
 
 
 @contextmanager
-def peer(library: str, threads: int) -> Iterator[Contestant]:
-    """Another library's DQN, warm, in a process of its own that rests between rounds."""
-    command = [python(PEERS), "-W", "ignore", str(HERE / "peers.py"), library]
+def process(command: list[str]) -> Iterator[Contestant]:
+    """A contestant in a process of its own, which is warm, and rests between rounds."""
     pipe = subprocess.PIPE
-    with subprocess.Popen(
-        [*command, "--threads", str(threads)], stdin=pipe, stdout=pipe, text=True, env=ENVIRONMENT
-    ) as process:
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=ENVIRONMENT) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         questions, answers = process.stdin, process.stdout
@@ -287,7 +294,7 @@ def peer(library: str, threads: int) -> Iterator[Contestant]:
         def read() -> str:
             line = answers.readline()
             if not line:
-                raise RuntimeError(f"bench/peers.py {library} ended; its last words are above.")
+                raise RuntimeError(f"{' '.join(command)} ended; its last words are above.")
             return line
 
         def run(seconds: float) -> float:
