@@ -18,7 +18,7 @@ def test_fast_preset_comes_within_5_percent_of_the_optimum():
 
 
 @pytest.mark.slow
-def test_report_preset_learns_in_50_episodes():
-    """Far from the 600 that the preset trains, but the plain algorithm is there by then."""
-    run = train(Pendulum(), preset("report").build(), episodes=50, seeds=2, seed=100)
+def test_report_preset_learns_in_90_episodes():
+    """Where the plain algorithm is at its best; docs/dqn.md says what happens until 600."""
+    run = train(Pendulum(), preset("report").build(), episodes=90, seeds=4, seed=100)
     assert np.mean(run.grade()["regret_per_seed"]) < 0.15

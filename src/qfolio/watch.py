@@ -40,6 +40,11 @@ class Window:
             self._env.reset(seed=0)
         except pygame.error as error:
             raise QfolioError(f"No window can be opened here ({error}).") from None
+        driver = pygame.display.get_driver()
+        if driver in ("dummy", "offscreen") and os.environ.get("SDL_VIDEODRIVER") != driver:
+            # SDL falls back to these where the display does not answer.
+            display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+            raise QfolioError(f"No window can be opened on display {display}; unset it for a GIF.")
         self.caption(caption)
 
     def caption(self, text: str) -> None:
