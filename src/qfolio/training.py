@@ -100,7 +100,7 @@ def advance(
 
 
 def chunk_steps(task: Task, agent: Agent) -> int:
-    """Steps in a chunk: whole episodes where none ends early."""
+    """Steps in a chunk, a multiple of the steps of an episode that does not end early."""
     length = episode_steps(task, agent)
     return length * -(-CHUNK // length)
 
