@@ -21,17 +21,25 @@ OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size
 INTERRUPTED = 130  # what a shell expects after Ctrl-C
 
 
+Name = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
+Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
+Folder = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
+Assignments = Annotated[
+    tuple[str, ...], arg(name="set", metavar="NAME=VALUE …", help_behavior_hint="")
+]
+
+
 def train(
-    task: Positional[str | None] = None,
+    task: Positional[Name] = None,
     *,
-    agent: str | None = None,
-    preset: str | None = None,
-    episodes: int | None = None,
-    seeds: int | None = None,
-    seed: int | None = None,
-    out: Path | None = None,
-    assignments: Annotated[tuple[str, ...], arg(name="set", metavar="NAME=VALUE …")] = (),
-    resume: Path | None = None,
+    agent: Name = None,
+    preset: Name = None,
+    episodes: Count = None,
+    seeds: Count = None,
+    seed: Count = None,
+    out: Folder = None,
+    assignments: Assignments = (),
+    resume: Folder = None,
     compare: bool = True,
     live: bool = False,
 ) -> None:
@@ -46,7 +54,8 @@ def train(
         seeds: How many agents are trained side by side; the preset says otherwise.
         seed: The first agent's seed, 0 unless given; the others' follow it.
         out: A new folder for the run; runs/… otherwise.
-        assignments: Hyperparameters, for example --set discount=0.98 hidden=256,256
+        assignments: Hyperparameters, for example --set discount=0.98 hidden=256,256 (the settings
+            of a report and docs/dqn.md list them).
         resume: Go on with the run in this folder, up to --episodes if given.
         compare: Train two more agents with double DQN switched, for the report.
         live: Show an episode in a window now and then, while training.
