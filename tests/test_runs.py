@@ -110,6 +110,14 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(task, agent, tmp
     assert leftovers == []
 
 
+def test_killed_before_the_first_checkpoint(task, agent, tmp_path):
+    """The curve's point at the start is on disk by then, and must not come twice."""
+    create(task, agent, tmp_path / "straight").train()
+    create(task, agent, tmp_path / "killed")._evaluate()
+    Run.open(tmp_path / "killed").train()
+    assert_same(tmp_path / "killed", tmp_path / "straight")
+
+
 def test_ctrl_c_stops_with_a_checkpoint(task, agent, tmp_path):
     run = create(task, agent, tmp_path / "run", episodes=24 * 50)
 

@@ -169,6 +169,8 @@ class Run:
         self.config["episodes"] = total
         if self.folder is not None:
             write_json(self.folder / "config.json", self.config)
+        if not self.population.steps:
+            self.evaluations = []  # of a process that was killed before its first checkpoint
         self._tidy()
         # In steps since the very beginning, so that a resumed run has the same curve.
         every = (self.population.steps + steps) / EVALUATIONS
