@@ -52,6 +52,7 @@ def test_n_and_n_episodes_equal_2n(task, agent, tmp_path):
 
 
 SCRIPT = """
+import sys
 from qfolio import devices
 devices.configure()
 import qfolio.runs
@@ -62,37 +63,49 @@ agent = DQN(hidden=(16,), environments=2, batch_size=8, replay_capacity=200, lea
             episode_steps=0, learning_rate_steps=200.0)
 run = qfolio.runs.Run.create(Pendulum(horizon=25), agent, episodes={episodes}, seeds=2, out={out!r})
 print("started", flush=True)
-run.train(listener=lambda progress: print(progress.episodes, flush=True))
+def wait(progress):
+    print(progress.episodes, flush=True)
+    sys.stdin.readline()
+run.train(listener=wait)
 """
 
 
 @pytest.mark.slow
 def test_killed_at_a_random_moment(task, agent, tmp_path):
-    """SIGKILL falls anywhere, also into the writing of a checkpoint, which happens all the time."""
+    """SIGKILL falls anywhere, also into the writing of a checkpoint, which happens all the time.
+
+    The child asks before each chunk, so that it cannot be done before the signal comes.
+    """
     seed = time.time_ns()
     print("seed of the moments:", seed)  # shown if the test fails
     moments = random.Random(seed)
-    episodes = 2400
+    episodes = 960
     straight = create(task, agent, tmp_path / "straight", episodes=episodes, seeds=2)
     straight.train()
-    stopped_at = []
-    for i in range(3):
+    for i in range(4):
         folder = tmp_path / f"killed{i}"
         script = SCRIPT.format(episodes=episodes, out=str(folder))
         process = subprocess.Popen(
-            [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=os.environ
+            [sys.executable, "-c", script],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ,
         )
         assert process.stdout is not None
-        for _ in range(4):
+        assert process.stdin is not None
+        process.stdout.readline()
+        for _ in range(moments.randint(2, 20)):
             process.stdout.readline()
-        time.sleep(moments.uniform(0, 1.5))
+            process.stdin.write("go on\n")
+            process.stdin.flush()
+        time.sleep(moments.uniform(0, 0.05))
         process.send_signal(signal.SIGKILL)
         process.communicate()
         resumed = Run.open(folder)
-        stopped_at.append(resumed.episodes)
+        assert 0 < resumed.episodes < episodes
         resumed.train()
         assert_same(folder, tmp_path / "straight")
-    assert any(0 < stop < episodes for stop in stopped_at), stopped_at
 
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(task, agent, tmp_path, monkeypatch):
