@@ -6,6 +6,7 @@ import pytest
 from qfolio.agents.dqn import DQN, bootstrap, huber_loss, td_target
 from qfolio.errors import QfolioError
 from qfolio.mdp import Transition
+from qfolio.optimizer import learning_rate
 from qfolio.presets import preset
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.training import Population
@@ -14,9 +15,11 @@ from qfolio.training import Population
 def rollout(agent, observation=1.0, reward=1.0, terminated=False, truncated=False):
     shape = (1, agent.environments)
     return Transition(
+        state=None,
         observation=jnp.full((*shape, 3), observation),
         action=jnp.zeros(shape, jnp.int32),
         reward=jnp.full(shape, reward),
+        next_state=None,
         next_observation=jnp.full((*shape, 3), observation + 1),
         terminated=jnp.full(shape, terminated),
         truncated=jnp.full(shape, truncated),
@@ -80,8 +83,8 @@ def test_the_target_network_is_copied_every_period(task):
     state = agent.init(task, jax.random.key(0))
     same = []
     for i in range(6):
-        state, _ = agent.learn(state, rollout(agent), jax.random.key(i))
-        same.append(bool((state.target.weights[0] == state.online.weights[0]).all()))
+        state, _ = agent.learn(Pendulum(), state, rollout(agent), jax.random.key(i))
+        same.append(bool((state.target.mlp.weights[0] == state.online.mlp.weights[0]).all()))
     assert same == [False, False, True, False, False, True]
 
 
@@ -101,16 +104,16 @@ def test_the_report_presets_copies_come_at_the_end_of_each_episode():
         while population.steps < step:
             population.advance(step - population.steps)
         state = population.fetch().agent
-        copied.append(bool((state.target.weights[0] == state.online.weights[0]).all()))
+        copied.append(bool((state.target.mlp.weights[0] == state.online.mlp.weights[0]).all()))
     assert copied == [True, False, True, False, False, True]
 
 
 def test_the_target_network_follows_softly(task):
     agent = DQN(hidden=(8,), environments=1, batch_size=4, target_period=1, target_rate=0.25)
     before = agent.init(task, jax.random.key(0))
-    after, _ = agent.learn(before, rollout(agent), jax.random.key(1))
-    expected = 0.75 * before.target.weights[0] + 0.25 * after.online.weights[0]
-    np.testing.assert_allclose(after.target.weights[0], expected, rtol=1e-5, atol=1e-7)
+    after, _ = agent.learn(Pendulum(), before, rollout(agent), jax.random.key(1))
+    expected = 0.75 * before.target.mlp.weights[0] + 0.25 * after.online.mlp.weights[0]
+    np.testing.assert_allclose(after.target.mlp.weights[0], expected, rtol=1e-5, atol=1e-7)
 
 
 def test_epsilon_decays_with_finished_episodes(task):
@@ -140,7 +143,7 @@ def test_explores_with_probability_epsilon(task, epsilon):
 
 def test_the_learning_rate_falls_along_a_cosine():
     agent = DQN(learning_rate=2.0, learning_rate_final=0.5, learning_rate_steps=100.0)
-    rates = [float(agent._learning_rate(jnp.array(i))) for i in (0, 50, 100, 1000)]
+    rates = [float(learning_rate(agent, jnp.array(i))) for i in (0, 50, 100, 1000)]
     np.testing.assert_allclose(rates, [2, 1.5, 1, 1], rtol=1e-6)
 
 
@@ -148,7 +151,7 @@ def test_adam_equals_its_formula(task):
     """One update against Adam written out (Kingma & Ba 2015, algorithm 1)."""
     agent = DQN(hidden=(8,), environments=1, batch_size=4, learning_rate=0.01)
     before = agent.init(task, jax.random.key(0))
-    after, _ = agent.learn(before, rollout(agent), jax.random.key(1))
+    after, _ = agent.learn(Pendulum(), before, rollout(agent), jax.random.key(1))
     replay = agent.observe(before, rollout(agent)).replay
     batch = replay.sample(jax.random.key(1), 4)
     gradient = jax.grad(lambda w: agent._loss(w, before.target, batch)[0])(before.online)

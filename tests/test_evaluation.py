@@ -16,7 +16,7 @@ def constant(agent, task, values):
     weights = agent.init(task, jax.random.key(0)).online
     last = jnp.array(values) * agent.reward_scale
     zero = jax.tree.map(jnp.zeros_like, weights)
-    zero.biases[-1] = last
+    zero.mlp.biases[-1] = last
     return zero
 
 

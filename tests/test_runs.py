@@ -208,9 +208,10 @@ def test_the_policy_file_holds_the_weights_only(task, agent, tmp_path):
     run = create(task, agent, tmp_path / "run", seeds=2)
     policy = load_file(tmp_path / "run" / "policy.safetensors")
     assert {name: array.shape for name, array in policy.items()} == {
-        "weights/0": (2, 3, 16), "weights/1": (2, 16, 11), "biases/0": (2, 16), "biases/1": (2, 11),
+        "mlp/weights/0": (2, 3, 16), "mlp/weights/1": (2, 16, 11),
+        "mlp/biases/0": (2, 16), "mlp/biases/1": (2, 11),
     }  # fmt: skip
-    np.testing.assert_array_equal(policy["weights/0"][0], run.first_weights().weights[0])
+    np.testing.assert_array_equal(policy["mlp/weights/0"][0], run.first_weights().mlp.weights[0])
 
 
 def test_summary(task, agent, tmp_path):

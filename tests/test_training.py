@@ -39,7 +39,7 @@ def test_a_seed_alone_equals_the_seed_among_others(task, agent):
 
 def test_different_seeds_differ(task, agent):
     population, _ = trained(task, agent, range(3), [60])
-    weights = agent.weights(population.fetch().agent).weights[0]
+    weights = agent.weights(population.fetch().agent).mlp.weights[0]
     assert not np.array_equal(weights[0], weights[1])
     assert not np.array_equal(weights[1], weights[2])
 
@@ -134,7 +134,7 @@ def test_hyperparameters_can_differ_between_members(task, agent):
         varied = eqx.tree_at(lambda a: a.learning_rate, agent, rate)
         state = begin(task, varied, jnp.array(0))
         state, _ = advance(task, varied, state, jnp.array(15), learning=True)
-        return state.agent.online.weights[0]
+        return state.agent.online.mlp.weights[0]
 
     slow, fast = jax.vmap(weights_after)(jnp.array([1e-3, 1e-2]))
     assert not np.allclose(slow, fast)
@@ -145,5 +145,5 @@ def test_lockstep_members_learn_the_same(task, agent, monkeypatch):
     one_by_one, _ = trained(task, agent, [0, 1, 2], [30])
     monkeypatch.setattr("qfolio.devices.LOCKSTEP", {"cpu"})
     lockstep, _ = trained(task, agent, [0, 1, 2], [30])
-    expected, actual = (p.fetch().agent.online.weights for p in (one_by_one, lockstep))
+    expected, actual = (p.fetch().agent.online.mlp.weights for p in (one_by_one, lockstep))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), expected, actual)

@@ -98,25 +98,29 @@ class Members:
         """The members as numpy arrays."""
         return jax.tree.map(lambda x: np.asarray(x)[self._slots], tree)
 
-    def compile(self, function: Callable[..., Any], *example: Any, donate: bool = False) -> Any:
-        """``function(member, *shared)`` as a program over all members' slots.
+    def compile(
+        self, function: Callable[..., Any], *example: Any, split: int = 1, donate: bool = False
+    ) -> Any:
+        """``function(*members, *shared)`` as a program over all members' slots.
 
-        example: arguments shaped like those to come. ``donate``: the first one's memory is reused.
+        example: arguments shaped like those to come; the first ``split`` of them have an axis of
+        slots, the others go to each member as they are. donate: the first one's memory is reused.
         """
 
-        def on_device(taken: Array, members: Any, *shared: Any) -> Any:
-            one = lambda member: function(member, *shared)  # noqa: E731
+        def on_device(taken: Array, *args: Any) -> Any:
+            one = lambda members: function(*members, *args[split:])  # noqa: E731
+            members = args[:split]
             return _map(one, members, taken[0]) if self._one_by_one else jax.vmap(one)(members)
 
-        def on_all(taken: Array, members: Any, *shared: Any) -> Any:
-            split, same = self._sharding.spec, PartitionSpec()
+        def on_all(taken: Array, *args: Any) -> Any:
+            each, same = self._sharding.spec, PartitionSpec()
             return jax.shard_map(
                 on_device,
                 mesh=self._sharding.mesh,
-                in_specs=(split, split, *[same] * len(shared)),
-                out_specs=split,
+                in_specs=(each, *[each] * split, *[same] * (len(args) - split)),
+                out_specs=each,
                 check_vma=False,
-            )(taken, members, *shared)
+            )(taken, *args)
 
         program = jax.jit(on_all, donate_argnums=1 if donate else ())
         return partial(program.lower(self._taken, *example).compile(), self._taken)

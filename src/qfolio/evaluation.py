@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 
-from qfolio.mdp import Agent, Task
+from qfolio.mdp import Agent, Policy, Task
 
 STARTS = 1024
 """Start states that results are graded on; those along the learning curve are the first of them."""
@@ -26,8 +26,10 @@ class Greedy(NamedTuple):
     overestimation: Float[Array, ""]  # NaN where the agent estimates no action values
 
 
-def tail_steps(discount: float) -> int:
+def tail_steps(discount: float | None) -> int:
     """Steps after which a reward counts for less than 1 % (at most 2,000)."""
+    if discount is None:
+        return 0
     return min(2000, math.ceil(math.log(0.01) / math.log(min(max(discount, 1e-9), 1 - 1e-9))))
 
 
@@ -53,18 +55,30 @@ def evaluate(
         reward = jnp.where(alive, after.reward, 0.0)
         return (after.state, alive & ~after.terminated), (reward, best, alive)
 
+    discount = 1.0 if agent.discount is None else agent.discount
+
     alive = jnp.ones(keys.shape, bool)
     times = jnp.arange(task.horizon + tail)
     _, (rewards, best, visited) = lax.scan(step, (starts, alive), times)
 
     def back(following: Array, reward: Array) -> tuple[Array, Array]:
-        now = reward + agent.discount * following
+        now = reward + discount * following
         return now, now
 
     _, discounted = lax.scan(back, jnp.zeros(keys.shape), rewards, reverse=True)
     first = slice(0, task.horizon)
     error = jnp.where(visited, best - discounted, 0.0)[first].sum() / visited[first].sum()
     return Greedy(rewards[first].sum(0), error)
+
+
+def greedy(task: Task, agent: Agent, weights: PyTree) -> Policy:
+    """What an agent's greedy policy intends in a state."""
+
+    def policy(state: PyTree) -> Array:
+        view = jax.tree.map(lambda x: x[None], task.observe(state))
+        return task.intent(state, agent.policy(weights, view)[0])
+
+    return policy
 
 
 class Episode(NamedTuple):

@@ -1,8 +1,11 @@
 """Files that are never half-written and never executed: atomic writes, safetensors, the cache."""
 
+import contextlib
 import json
 import os
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +47,29 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise
 
 
+def require_new(folder: Path) -> None:
+    """Raises QfolioError where ``folder`` already holds something."""
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise QfolioError(
+            f"{folder} is not empty; name a new folder, or go on with --resume {folder}."
+        )
+
+
+@contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Another name to fill the folder under; at the end it is renamed, so it is whole or absent."""
+    require_new(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    yield temporary
+    mask = os.umask(0)
+    os.umask(mask)
+    temporary.chmod(0o777 & ~mask)  # as the user's new folders are
+    if folder.exists():
+        folder.rmdir()
+    temporary.rename(folder)
+
+
 def write_json(path: Path, content: Any) -> None:
     write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
@@ -76,3 +102,32 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise QfolioError(
             f"{path} is no safetensors file or is damaged ({error}); restore it or train anew."
         ) from None
+
+
+def write_tree(path: Path, tree: Any) -> None:
+    """The arrays of a pytree, by the names of their places in it."""
+    write_arrays(path, _named(tree))
+
+
+def read_tree(path: Path, template: Any) -> Any:
+    """``template`` with its arrays from a file, which must fit it name by name."""
+    import jax
+
+    arrays, wanted = read_arrays(path), _named(template)
+    fits = wanted.keys() == arrays.keys() and all(
+        arrays[name].shape == leaf.shape and arrays[name].dtype == leaf.dtype
+        for name, leaf in wanted.items()
+    )
+    if not fits:
+        raise QfolioError(
+            f"{path} does not belong to the settings in config.json beside it; "
+            "restore the two together, or train anew."
+        )
+    return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])
+
+
+def _named(tree: Any) -> dict[str, Any]:
+    import jax
+
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

@@ -6,17 +6,57 @@ know only this file.
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 
 class Discrete(eqx.Module):
-    """A choice among ``n`` actions, numbered from 0."""
+    """A choice among ``n`` actions, numbered from 0.
+
+    In a market, the first ``pooled`` may concern all of it, and the others come in ``each`` blocks
+    of one action per asset.
+    """
 
     n: int = eqx.field(static=True)
+    pooled: int = eqx.field(static=True, default=0)
+    each: int = eqx.field(static=True, default=0)
+
+
+class Simplex(eqx.Module):
+    """Weights of cash (first) and ``assets`` assets: none negative, their sum 1.
+
+    cap: the largest weight of one asset; cash has none.
+    """
+
+    assets: int = eqx.field(static=True)
+    cap: float = eqx.field(static=True, default=1.0)
+
+    @property
+    def caps(self) -> np.ndarray:
+        """The largest weight of each entry."""
+        return np.append(1.0, np.full(self.assets, self.cap))
+
+
+class Box(eqx.Module):
+    """``n`` numbers without bounds."""
+
+    n: int = eqx.field(static=True)
+
+
+Actions = Discrete | Simplex | Box
+
+
+class View(NamedTuple):
+    """What an agent may see of a market: what is known of each asset, and what it holds."""
+
+    features: Float[Array, "*batch asset time channel"]
+    holding: Float[Array, "*batch asset"]  # weights, without cash
 
 
 class Step(NamedTuple):
@@ -32,12 +72,15 @@ class Transition(NamedTuple):
 
     ``next_observation`` is the true one, from before any reset. ``terminated`` (nothing follows)
     and ``truncated`` (the clock ran out) stay apart, because the value of what follows a truncation
-    is not zero (Pardo et al. 2018, "Time limits in reinforcement learning").
+    is not zero (Pardo et al. 2018, "Time limits in reinforcement learning"). The task's own states
+    are there for agents that know the task; the others look at observations only.
     """
 
+    state: PyTree
     observation: PyTree
     action: Array
     reward: Array
+    next_state: PyTree
     next_observation: PyTree
     terminated: Array
     truncated: Array
@@ -52,18 +95,22 @@ class Optimum(Protocol):
         ...
 
 
+Policy = Callable[[PyTree], Array]
+"""From a state of a task to what its policy intends."""
+
+
 class Task(eqx.Module):
     """A Markov decision process with a time limit; no method resets the task by itself."""
 
     horizon: eqx.AbstractVar[int]
-    actions: eqx.AbstractVar[Discrete]
+    actions: eqx.AbstractVar[Actions]
 
     @abc.abstractmethod
     def reset(self, key: PRNGKeyArray) -> PyTree:
         """A start state."""
 
     @abc.abstractmethod
-    def observe(self, state: PyTree) -> Array:
+    def observe(self, state: PyTree) -> PyTree:
         """What the agent may see of a state; nothing later than now."""
 
     @property
@@ -79,6 +126,57 @@ class Task(eqx.Module):
         """The exact solution, where one is known."""
         return None
 
+    def intent(self, state: PyTree, action: Array) -> Array:
+        """What an action asks for, where it is a number from a menu; else the action itself."""
+        return action
+
+    def rule(self, policy: Policy) -> dict[str, float]:
+        """The few numbers that say what a policy does, in tasks where there are such."""
+        return {}
+
+
+class Position(NamedTuple):
+    """The state of an exogenous task: the part that actions leave alone, and the part they make."""
+
+    market: PyTree
+    holding: PyTree
+
+
+class ExogenousTask(Task):
+    """A task whose randomness does not answer to actions, such as prices that we only take.
+
+    One observed move of the market then tells the outcome of every action from every holding, by
+    ``settle`` (hindsight learning for exogenous inputs, Sinclair et al. 2023). Agents may use it on
+    moves that they have seen; ``reset_market`` and ``next_market`` are the loop's alone.
+    """
+
+    @abc.abstractmethod
+    def reset_market(self, key: PRNGKeyArray) -> PyTree:
+        """A market to start from."""
+
+    @abc.abstractmethod
+    def next_market(self, market: PyTree, key: PRNGKeyArray) -> PyTree:
+        """Where the market goes, whatever we do."""
+
+    @abc.abstractmethod
+    def draw_holding(self, key: PRNGKeyArray) -> PyTree:
+        """A random holding; learning from many shows an agent what to do from any."""
+
+    @abc.abstractmethod
+    def settle(
+        self, market: PyTree, next_market: PyTree, holding: PyTree, action: Array
+    ) -> tuple[Float[Array, ""], PyTree]:
+        """Reward and next holding of an action, given how the market moved."""
+
+    def reset(self, key: PRNGKeyArray) -> Position:
+        market_key, holding_key = jax.random.split(key)
+        return Position(self.reset_market(market_key), self.draw_holding(holding_key))
+
+    def step(self, state: Position, action: Array, key: PRNGKeyArray) -> Step:
+        market = self.next_market(state.market, key)
+        reward, holding = self.settle(state.market, market, state.holding, action)
+        return Step(Position(market, holding), reward, jnp.array(False))
+
 
 Metrics = dict[str, Array]
 """Named scalars that an agent reports at every step."""
@@ -89,7 +187,12 @@ class Agent(eqx.Module):
 
     environments: eqx.AbstractVar[int]  # stepped side by side
     episode_steps: eqx.AbstractVar[int]  # training episodes are cut here; 0: the task's horizon
-    discount: eqx.AbstractVar[Any]
+    discount: eqx.AbstractVar[Any]  # of the action values; None where it estimates none
+
+    @property
+    def rollout_steps(self) -> int:
+        """Steps of each environment that the agent learns from at once."""
+        return 1
 
     @abc.abstractmethod
     def init(self, task: Task, key: PRNGKeyArray) -> Any:
@@ -100,7 +203,7 @@ class Agent(eqx.Module):
         """Steps of each environment that are only observed before learning starts."""
 
     @abc.abstractmethod
-    def act(self, state: Any, observation: Array, key: PRNGKeyArray) -> Array:
+    def act(self, state: Any, observation: PyTree, key: PRNGKeyArray) -> Array:
         """Actions for a batch of observations, with exploration."""
 
     @abc.abstractmethod
@@ -108,8 +211,10 @@ class Agent(eqx.Module):
         """Stores experience and learns nothing."""
 
     @abc.abstractmethod
-    def learn(self, state: Any, rollout: Transition, key: PRNGKeyArray) -> tuple[Any, Metrics]:
-        """Stores experience and learns from it."""
+    def learn(
+        self, task: Task, state: Any, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[Any, Metrics]:
+        """Stores experience and learns from it; only exogenous tasks may be asked what would be."""
 
     def monitor(self, state: Any) -> Metrics:
         """Named scalars that describe the state at any time, before learning too."""
@@ -119,14 +224,29 @@ class Agent(eqx.Module):
     def weights(self, state: Any) -> PyTree:
         """The part of the state that the learned policy needs."""
 
+    def carry_over(self, state: Any, fresh: Any) -> Any:
+        """The state to go on learning with on other data: what was learned, not what was stored.
+
+        fresh: a state before any experience, of the same settings.
+        """
+        return state
+
     @abc.abstractmethod
-    def policy(self, weights: PyTree, observation: Array) -> Array:
+    def policy(self, weights: PyTree, observation: PyTree) -> Array:
         """Actions for a batch of observations, without exploration."""
 
-    def action_values(self, weights: PyTree, observation: Array) -> Array | None:
+    def action_values(self, weights: PyTree, observation: PyTree) -> Array | None:
         """Q(s, ·) for a batch of observations, where the agent estimates it."""
         return None
 
-    def contrast(self) -> "tuple[str, Agent] | None":
-        """A variant with one thing changed that a report sets beside this agent, and its name."""
+    def contrast(self) -> "Contrast | None":
+        """A variant with one thing changed, for a report to set beside this agent."""
         return None
+
+
+class Contrast(NamedTuple):
+    """A variant of an agent, and how the two are called where they stand side by side."""
+
+    name: str
+    variant_name: str
+    variant: Agent

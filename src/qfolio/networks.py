@@ -1,11 +1,16 @@
 """Networks as plain matrix products over batches."""
 
 from itertools import pairwise
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jax import lax
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from qfolio.errors import QfolioError
+from qfolio.mdp import View
 
 
 class MLP(eqx.Module):
@@ -28,16 +33,167 @@ class MLP(eqx.Module):
         for inputs, outputs in pairwise(sizes):
             key, weight_key, bias_key = jax.random.split(key, 3)
             bound = inputs**-0.5
-            shape = (inputs, outputs)
-            self.weights.append(jax.random.uniform(weight_key, shape, minval=-bound, maxval=bound))
-            self.biases.append(
-                jax.random.uniform(bias_key, (outputs,), minval=-bound, maxval=bound)
-            )
+            self.weights.append(_uniform(weight_key, (inputs, outputs), bound))
+            self.biases.append(_uniform(bias_key, (outputs,), bound))
         self.weights[0] = jnp.broadcast_to(input_gain, sizes[:1])[:, None] * self.weights[0]
 
-    def __call__(self, x: Float[Array, "batch inputs"]) -> Float[Array, "batch outputs"]:
+    def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         *hidden, last = zip(self.weights, self.biases, strict=True)
         for weight, bias in hidden:
             x = jax.nn.relu(x @ weight + bias)
         weight, bias = last
         return x @ weight + bias
+
+
+class Flat(eqx.Module):
+    """An MLP over everything that is observed, in one row of numbers."""
+
+    mlp: MLP
+
+    def __init__(
+        self, observation: PyTree, hidden: tuple[int, ...], outputs: int, key: PRNGKeyArray,
+        input_gain: Float[Array, "*inputs"] | float = 1.0,
+    ) -> None:  # fmt: skip
+        inputs = sum(leaf.size for leaf in jax.tree.leaves(observation))
+        self.mlp = MLP((inputs, *hidden, outputs), key, input_gain)
+
+    def __call__(self, observation: PyTree) -> Float[Array, "batch outputs"]:
+        leaves = jax.tree.leaves(observation)
+        rows = [leaf.reshape(leaf.shape[0], -1) for leaf in leaves]
+        return self.mlp(jnp.concatenate(rows, axis=1))
+
+
+class Reading(NamedTuple):
+    """What a shared network makes of the windows alone."""
+
+    joined: Float[Array, "*batch asset width"]
+    direct: Float[Array, "*batch asset outputs"]
+
+
+class Shared(eqx.Module):
+    """One network for all assets of a market, so that the order of the columns does not matter.
+
+    An encoder reads each asset's own window. What it found is joined with the mean over all assets
+    and with the holding, and goes through the remaining layers, asset by asset (ensemble of
+    identical independent evaluators, Jiang et al. 2017, section 5; the mean over assets: Zaheer et
+    al. 2017, "Deep Sets"). A linear path from window and holding to the outputs lies beside it.
+    Outputs of the whole market are means over the assets.
+    """
+
+    encoder: "MLP | CNN | RNN"
+    join: Float[Array, "inputs width"]
+    head: MLP
+    linear: Float[Array, "numbers outputs"]
+    pooled: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        kind: str,
+        view: View,
+        hidden: tuple[int, ...],
+        pooled: int,
+        each: int,
+        key: PRNGKeyArray,
+    ) -> None:
+        """``pooled`` outputs for the market and ``each`` for every asset."""
+        time, channels = view.features.shape[-2:]
+        keys = jax.random.split(key, 3)
+        width, *rest = hidden
+        self.encoder = _ENCODERS[kind](time, channels, width, keys[0])
+        joined = rest[0] if rest else width
+        inputs = 2 * width + 2
+        self.join = _uniform(keys[1], (inputs, joined), inputs**-0.5)
+        self.head = MLP((joined, *rest[1:], pooled + each), keys[2])
+        self.linear = jnp.zeros((time * channels + 1, pooled + each))
+        self.pooled = pooled
+
+    def __call__(
+        self, view: View
+    ) -> tuple[Float[Array, "batch pooled"], Float[Array, "batch asset each"]]:
+        return self.answer(self.read(view.features), view.holding)
+
+    def read(self, features: Float[Array, "*batch asset time channel"]) -> Reading:
+        """All that does not depend on the holding, once for many holdings."""
+        found = jax.nn.relu(self.encoder(features))
+        width = found.shape[-1]
+        of_window, of_market = self.join[:width], self.join[width : 2 * width]
+        joined = found @ of_window + (found.mean(-2) @ of_market)[..., None, :]
+        flat = features.reshape(*features.shape[:-2], -1)
+        return Reading(joined, flat @ self.linear[:-1])
+
+    def answer(
+        self, reading: Reading, holding: Float[Array, "*batch asset"]
+    ) -> tuple[Float[Array, "*batch pooled"], Float[Array, "*batch asset each"]]:
+        own = holding[..., None]
+        of_own, of_all = self.join[-2], self.join[-1]
+        joined = reading.joined + own * of_own + own.sum(-2, keepdims=True) * of_all
+        output = self.head(jax.nn.relu(joined)) + reading.direct + own * self.linear[-1]
+        return output[..., : self.pooled].mean(-2), output[..., self.pooled :]
+
+
+class CNN(eqx.Module):
+    """Two convolutions along time: the first over three rows, the second over all that is left."""
+
+    first: MLP
+    second: MLP
+
+    ROWS = 3
+
+    def __init__(self, time: int, channels: int, width: int, key: PRNGKeyArray) -> None:
+        if time < self.ROWS:
+            raise QfolioError(f"A CNN needs windows of {self.ROWS} rows or more; here: {time}.")
+        first, second = jax.random.split(key)
+        narrow = max(2, width // 8)
+        self.first = MLP((self.ROWS * channels, narrow), first)
+        self.second = MLP(((time - self.ROWS + 1) * narrow, width), second)
+
+    def __call__(self, x: Float[Array, "*batch time channel"]) -> Float[Array, "*batch width"]:
+        count = x.shape[-2] - self.ROWS + 1
+        rows = jnp.concatenate([x[..., i : i + count, :] for i in range(self.ROWS)], axis=-1)
+        found = jax.nn.relu(self.first(rows))
+        return self.second(found.reshape(*found.shape[:-2], -1))
+
+
+class RNN(eqx.Module):
+    """A gated recurrent unit along time (Cho et al. 2014); its last state."""
+
+    inputs: MLP
+    state: Float[Array, "width gates"]
+
+    def __init__(self, time: int, channels: int, width: int, key: PRNGKeyArray) -> None:
+        inputs, state = jax.random.split(key)
+        self.inputs = MLP((channels, 3 * width), inputs)
+        self.state = _uniform(state, (width, 3 * width), width**-0.5)
+
+    def __call__(self, x: Float[Array, "*batch time channel"]) -> Float[Array, "*batch width"]:
+        gates = jnp.moveaxis(self.inputs(x), -2, 0)
+
+        def step(state: Array, gate: Array) -> tuple[Array, None]:
+            reset, update, new = jnp.split(gate, 3, axis=-1)
+            own_reset, own_update, own_new = jnp.split(state @ self.state, 3, axis=-1)
+            update = jax.nn.sigmoid(update + own_update)
+            candidate = jnp.tanh(new + jax.nn.sigmoid(reset + own_reset) * own_new)
+            return update * state + (1 - update) * candidate, None
+
+        start = jnp.zeros((*x.shape[:-2], self.state.shape[0]))
+        return lax.scan(step, start, gates)[0]
+
+
+class _Window(MLP):
+    """An MLP of one layer over a window's numbers."""
+
+    def __init__(self, time: int, channels: int, width: int, key: PRNGKeyArray) -> None:
+        super().__init__((time * channels, width), key)
+
+    def __call__(self, x: Float[Array, "*batch time channel"]) -> Float[Array, "*batch width"]:
+        return super().__call__(x.reshape(*x.shape[:-2], -1))
+
+
+_ENCODERS: dict[str, Any] = {"mlp": _Window, "cnn": CNN, "rnn": RNN}
+
+SHARED = tuple(_ENCODERS)
+"""Kinds of networks that assets share."""
+
+
+def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], bound: float) -> Array:
+    return jax.random.uniform(key, shape, minval=-bound, maxval=bound)

@@ -1,5 +1,7 @@
 """Hyperparameters that belong together: what was tuned for which task."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from qfolio import settings
@@ -17,6 +19,7 @@ class Preset(NamedTuple):
     settings: dict[str, Any]
     episodes: int
     seeds: int
+    task: Mapping[str, Any] = MappingProxyType({})  # of the task's settings, those it goes with
 
     def build(self, **changes: Any) -> "Agent":
         """The agent, with some settings changed."""
@@ -51,15 +54,124 @@ _BEST = {
     "learning_rate_steps": 30_000.0,
 }
 
+_PORTFOLIO_TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
+
+_PORTFOLIO_DQN = {
+    "network": "mlp",
+    "hidden": (16, 16),
+    "all_actions": True,
+    "market_baseline": True,
+    "environments": 8,
+    "batch_size": 64,
+    "replay_capacity": 8192,
+    "learning_starts": 3200,
+    "target_period": 1,
+    "target_rate": 0.05,
+    "discount": 0.99,
+    "learning_rate": 3e-4,
+    "learning_rate_final": 0.0,
+    "learning_rate_steps": 600.0,
+    "reward_scale": 100.0,
+}
+
+_PORTFOLIO_PATHWISE = {
+    "hidden": (16, 16),
+    "rollout": 25,
+    "environments": 16,
+    "learning_rate": 5e-4,
+    "learning_rate_final": 0.0,
+    "learning_rate_steps": 100.0,
+    "reward_scale": 100.0,
+    "gradient_norm": 1.0,
+}
+
+_MARKET_PATHWISE = {"hidden": (16, 16), "learning_rate": 1e-2, "learning_rate_final": 0.0}
+
+_MARKET_DQN = {
+    "hidden": (32,),
+    "all_actions": True,
+    "double": True,
+    "environments": 1024,
+    "replay_capacity": 524_288,
+    "learning_starts": 1024,
+    "target_period": 1,
+    "target_rate": 0.05,
+    "discount": 0.97,
+    "learning_rate": 3e-2,
+    "learning_rate_final": 0.0,
+    "epsilon_end": 1.0,  # what is explored does not matter where all actions are learned
+    "reward_scale": 100.0,
+}
+
+
+def _pathwise(episodes: int, **changes: Any) -> dict[str, Preset]:
+    """An episode is a rollout, so that each starts from a holding drawn anew."""
+    changes["episode_steps"] = changes["rollout"]
+    return {"fast": Preset("pathwise", {**_MARKET_PATHWISE, **changes}, episodes, seeds=5)}
+
+
+def _all_actions(episodes: int, **changes: Any) -> dict[str, Preset]:
+    changes = {**_MARKET_DQN, **changes}
+    return {"fast": Preset("dqn", changes, episodes, seeds=5, task={"menu": "grid:10"})}
+
+
 PRESETS = {
     ("pendulum", "dqn"): {
         "fast": Preset("dqn", _FAST, episodes=8608, seeds=8),
         "best": Preset("dqn", _BEST, episodes=24_032, seeds=8),
         # Each hyperparameter of the report that qfolio grew out of; they are DQN's defaults.
         "report": Preset("dqn", {}, episodes=600, seeds=1),
-    }
+    },
+    ("market/kelly", "pathwise"): _pathwise(
+        307_200, environments=1024, rollout=5, learning_rate_steps=300.0, reward_scale=10.0
+    ),
+    ("market/merton", "pathwise"): _pathwise(
+        153_600, environments=512, rollout=5, learning_rate_steps=300.0, reward_scale=10.0
+    ),
+    ("market/regime", "pathwise"): _pathwise(
+        12_800, environments=64, rollout=50, learning_rate_steps=200.0, reward_scale=100.0
+    ),
+    ("market/regime", "dqn"): _all_actions(2048, batch_size=512, learning_rate_steps=500.0),
+    ("market/ar1", "pathwise"): _pathwise(
+        25_600, environments=64, rollout=63, tail=21, learning_rate_steps=400.0, reward_scale=100.0
+    ),
+    ("market/ar1", "dqn"): _all_actions(8192, batch_size=1024, learning_rate_steps=2016.0),
+    ("market/no-trade", "pathwise"): _pathwise(
+        19_200,
+        environments=64,
+        rollout=120,
+        tail=60,
+        learning_rate_steps=300.0,
+        reward_scale=1000.0,
+    ),
+    ("market/garleanu-pedersen", "pathwise"): _pathwise(
+        25_600,
+        environments=64,
+        rollout=50,
+        tail=20,
+        learning_rate_steps=400.0,
+        reward_scale=10.0,
+        gradient_norm=0.3,
+    ),
+    ("portfolio", "dqn"): {
+        "fast": Preset(
+            "dqn",
+            _PORTFOLIO_DQN,
+            episodes=160,
+            seeds=5,
+            task={**_PORTFOLIO_TASK, "menu": "overweight:0.1"},
+        ),
+    },
+    ("portfolio", "pathwise"): {
+        "fast": Preset("pathwise", _PORTFOLIO_PATHWISE, episodes=800, seeds=5, task=_PORTFOLIO_TASK)
+    },
 }
 """By task and agent."""
+
+
+def default_agent(task: str) -> str:
+    """The first agent that has presets for a task, which may be none that there is."""
+    return next((agent for name, agent in PRESETS if name == task), "dqn")
 
 
 def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:

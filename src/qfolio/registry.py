@@ -5,8 +5,16 @@ from importlib import import_module
 
 from qfolio.errors import QfolioError
 
-TASKS = {"pendulum": "qfolio.tasks.pendulum:Pendulum"}
-AGENTS = {"dqn": "qfolio.agents.dqn:DQN"}
+TASKS = {
+    "pendulum": "qfolio.tasks.pendulum:Pendulum",
+    "market/kelly": "qfolio.tasks.synthetic:Kelly",
+    "market/merton": "qfolio.tasks.synthetic:Merton",
+    "market/regime": "qfolio.tasks.synthetic:Regime",
+    "market/ar1": "qfolio.tasks.synthetic:Ar1",
+    "market/no-trade": "qfolio.tasks.synthetic:NoTrade",
+    "market/garleanu-pedersen": "qfolio.tasks.synthetic:GarleanuPedersen",
+}
+AGENTS = {"dqn": "qfolio.agents.dqn:DQN", "pathwise": "qfolio.agents.pathwise:Pathwise"}
 
 
 def find(kind: str, table: dict[str, str], name: str) -> type:

@@ -11,13 +11,12 @@ import csv
 import datetime
 import io
 import math
-import os
 import platform
 import signal
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version as version_of
 from pathlib import Path
 from time import perf_counter
@@ -29,21 +28,24 @@ import numpy as np
 import qfolio
 from qfolio import devices, settings
 from qfolio.errors import QfolioError
-from qfolio.evaluation import STARTS, start_keys
+from qfolio.evaluation import STARTS, greedy, start_keys
 from qfolio.files import (
     UNFINISHED,
-    read_arrays,
+    new_folder,
     read_json,
-    write_arrays,
+    read_tree,
+    require_new,
     write_bytes,
     write_json,
+    write_tree,
 )
-from qfolio.mdp import Agent, Task
+from qfolio.mdp import Agent, Optimum, Task
+from qfolio.optimum.followed import FollowedOptimum
 from qfolio.registry import AGENTS, TASKS, find, name_of
 from qfolio.statistics import mean_interval
 from qfolio.training import Episodes, Population
 
-FORMAT = 1
+FORMAT = 2
 """Of the run folder; raised whenever an older folder can no longer be read."""
 
 CURVE_STARTS = 64
@@ -95,12 +97,10 @@ class Run:
         out: Path | str | None = None,
     ) -> "Run":
         """A run before its first step; ``out`` must be a new or empty folder."""
-        _check_counts(episodes, seeds, seed)
+        check_counts(episodes, seeds, seed)
         folder = None if out is None else Path(out)
-        if folder is not None and folder.exists() and not _is_empty(folder):
-            raise QfolioError(
-                f"{folder} is not empty; name a new folder, or go on with --resume {folder}."
-            )
+        if folder is not None:
+            require_new(folder)
         config = {
             "format": FORMAT,
             "version": qfolio.__version__,
@@ -121,15 +121,10 @@ class Run:
         }
         run = cls(task, agent, config, None)
         if folder is not None:
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            # Under another name first: a folder with that name is a whole run at any moment.
-            run.folder = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-            write_json(run.folder / "config.json", config)
-            run._write_checkpoint()
-            run.folder.chmod(0o777 & ~_umask())
-            if folder.exists():
-                folder.rmdir()
-            run.folder = run.folder.rename(folder)
+            with new_folder(folder) as run.folder:
+                write_json(run.folder / "config.json", config)
+                run._write_checkpoint()
+            run.folder = folder
         return run
 
     @classmethod
@@ -162,7 +157,7 @@ class Run:
         A loss that is not finite raises QfolioError; the last good checkpoint stays.
         """
         total = self.config["episodes"] if episodes is None else episodes
-        _check_counts(total, self.config["seeds"], self.config["seed"])
+        check_counts(total, self.config["seeds"], self.config["seed"])
         steps = self.population.steps_left(total)
         if not steps:
             return
@@ -178,7 +173,7 @@ class Run:
         start_seconds = self.seconds_train
         if not self.population.steps:
             self._evaluate()
-        with _interruptible() as stop:
+        with interruptible() as stop:
             while True:
                 points = self.population.steps // every
                 records = self._advance(steps)
@@ -226,8 +221,8 @@ class Run:
     def grade(self, starts: int = STARTS) -> dict[str, Any]:
         """Returns, optimum and regret of each seed's policy on the first fixed start states."""
         keys = start_keys(starts)
-        greedy = self.population.evaluate(keys)
-        returns = greedy.returns.mean(1)
+        played = self.population.evaluate(keys)
+        returns = played.returns.mean(1)
         solution = self.task.optimum()
         optimum, regret = None, None
         if solution is not None:
@@ -240,8 +235,24 @@ class Run:
             "optimum": optimum,
             "regret_per_seed": regret,
             "overestimation_per_seed": [
-                float(error) if np.isfinite(error) else None for error in greedy.overestimation
+                float(error) if np.isfinite(error) else None for error in played.overestimation
             ],
+            "rule": self._rule(solution),
+        }
+
+    def _rule(self, solution: Optimum | None) -> dict[str, Any] | None:
+        """What the seeds' policies do beside what is best, in tasks where few numbers say it."""
+        if not isinstance(solution, FollowedOptimum):
+            return None
+        members = self.population.weights()
+        play = jax.jit(lambda weights, state: greedy(self.task, self.agent, weights)(state))
+        policies = (
+            partial(play, jax.tree.map(lambda x, i=i: x[i], members))
+            for i in range(len(self.population.seeds))
+        )
+        return {
+            "exact": self.task.rule(solution.policy),
+            "per_seed": [self.task.rule(policy) for policy in policies],
         }
 
     def _advance(self, steps: int) -> list[dict[str, float]]:
@@ -302,16 +313,15 @@ class Run:
             return
         state = self._snapshot()
         weights = self.agent.weights(state["training"].agent)
-        write_arrays(self.folder / "policy.safetensors", _named(weights))
-        write_arrays(self.folder / "checkpoint.safetensors", _named(state))
+        write_tree(self.folder / "policy.safetensors", weights)
+        write_tree(self.folder / "checkpoint.safetensors", state)
 
     def _snapshot(self) -> dict[str, Any]:
         return {"training": self.population.fetch(), "seconds_train": np.array(self.seconds_train)}
 
     def _read_checkpoint(self) -> None:
         assert self.folder is not None
-        path = self.folder / "checkpoint.safetensors"
-        state = _fill(self._snapshot(), read_arrays(path), path)
+        state = read_tree(self.folder / "checkpoint.safetensors", self._snapshot())
         self.seconds_train = float(state["seconds_train"])
         self.population.restore(state["training"])
         self.metrics = self._read_rows("metrics.csv")
@@ -398,13 +408,13 @@ def read_config(folder: Path) -> dict[str, Any]:
         if name not in config or not isinstance(config[name], kind):
             raise QfolioError(f"{path} is damaged: {name} is missing or of the wrong type.")
     try:
-        _check_counts(config["episodes"], config["seeds"], config["seed"])
+        check_counts(config["episodes"], config["seeds"], config["seed"])
     except QfolioError as error:
         raise QfolioError(f"{path} is damaged: {error}") from None
     return config
 
 
-def _check_counts(episodes: int, seeds: int, seed: int) -> None:
+def check_counts(episodes: int, seeds: int, seed: int) -> None:
     """Raises QfolioError where a run cannot have that many episodes or these seeds."""
     bounds = {
         "episodes": (episodes, 1, 2**31 - 1),
@@ -414,17 +424,6 @@ def _check_counts(episodes: int, seeds: int, seed: int) -> None:
     for name, (value, low, high) in bounds.items():
         if not low <= value <= high:
             raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")
-
-
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())
-
-
-def _umask() -> int:
-    """The permissions that the user's new files do without."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def configured_task(config: dict[str, Any]) -> Task:
@@ -463,28 +462,8 @@ def _number(text: str) -> float:
     return int(number) if number.is_integer() and "." not in text else number
 
 
-def _named(tree: Any) -> dict[str, np.ndarray]:
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
-
-
-def _fill(template: Any, arrays: dict[str, np.ndarray], path: Path) -> Any:
-    """``template`` with its leaves from ``arrays``, which must fit it name by name."""
-    wanted = _named(template)
-    fits = wanted.keys() == arrays.keys() and all(
-        arrays[name].shape == leaf.shape and arrays[name].dtype == leaf.dtype
-        for name, leaf in wanted.items()
-    )
-    if not fits:
-        raise QfolioError(
-            f"{path} does not belong to the settings in config.json beside it; "
-            "restore the two together, or train anew."
-        )
-    return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])
-
-
 @contextlib.contextmanager
-def _interruptible() -> Iterator[threading.Event]:
+def interruptible() -> Iterator[threading.Event]:
     """Turns the first Ctrl-C into an event; a second one interrupts at once."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():

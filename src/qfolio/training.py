@@ -5,7 +5,8 @@ A ``Population`` runs it for all members, in chunks, from Python; everything els
 Ctrl-C) happens between chunks, and nothing calls back from inside.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from functools import partial
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -72,36 +73,38 @@ def begin(task: Task, agent: Agent, seed: Int[Array, ""]) -> TrainingState:
         episodes=zero,
         healthy=jnp.array(True),
     )
-    _, _, metrics = jax.eval_shape(partial(_step, task, agent, learning=True), started)
+    _, _, metrics = jax.eval_shape(partial(_rollout, task, agent, learning=True), started)
     return eqx.tree_at(lambda s: s.tally.metrics, started, dict.fromkeys(metrics, zeros))
 
 
 def advance(
     task: Task, agent: Agent, state: TrainingState, steps: Int[Array, ""], *, learning: bool
 ) -> tuple[TrainingState, Episodes]:
-    """``steps`` steps of all environments, each followed by learning if ``learning``.
+    """``steps`` steps of all environments, with learning after each rollout if ``learning``.
 
-    ``steps`` is at most ``chunk_steps``; the records beyond it stay empty.
+    ``steps`` is a multiple of the agent's rollouts and at most ``chunk_steps``; the records beyond
+    it stay empty.
     """
-    _, record, _ = jax.eval_shape(partial(_step, task, agent, learning=learning), state)
+    length = agent.rollout_steps
+    _, record, _ = jax.eval_shape(partial(_rollout, task, agent, learning=learning), state)
     rows = chunk_steps(task, agent)
-    empty = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), record)
+    empty = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape[1:]), x.dtype), record)
 
     def body(i: Array, carry: tuple[TrainingState, Episodes]) -> tuple[TrainingState, Episodes]:
         state, episodes = carry
-        state, record, _ = _step(task, agent, state, learning=learning)
-        put = lambda all, one: lax.dynamic_update_index_in_dim(all, one, i, 0)  # noqa: E731
+        state, record, _ = _rollout(task, agent, state, learning=learning)
+        put = lambda all, some: lax.dynamic_update_slice_in_dim(all, some, i * length, 0)  # noqa: E731
         return state, jax.tree.map(put, episodes, record)
 
-    state, episodes = lax.fori_loop(0, steps, body, (state, empty))
+    state, episodes = lax.fori_loop(0, steps // length, body, (state, empty))
     weights = jax.tree.leaves(agent.weights(state.agent))
     finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in weights]).all()
     return eqx.tree_at(lambda s: s.healthy, state, state.healthy & finite), episodes
 
 
 def chunk_steps(task: Task, agent: Agent) -> int:
-    """Steps in a chunk, a multiple of the steps of an episode that does not end early."""
-    length = episode_steps(task, agent)
+    """Steps in a chunk: whole rollouts, and whole episodes of those that do not end early."""
+    length = math.lcm(episode_steps(task, agent), agent.rollout_steps)
     return length * -(-CHUNK // length)
 
 
@@ -109,61 +112,76 @@ def episode_steps(task: Task, agent: Agent) -> int:
     return agent.episode_steps or task.horizon
 
 
-def _step(
+def _rollout(
     task: Task, agent: Agent, state: TrainingState, *, learning: bool
 ) -> tuple[TrainingState, Episodes, Metrics]:
-    act_key, task_key, reset_key, learn_key = jax.random.split(
-        jax.random.fold_in(jax.random.wrap_key_data(state.key), state.steps), 4
-    )
-    environments = agent.environments
-    observation = jax.vmap(task.observe)(state.task)
-    action = agent.act(state.agent, observation, act_key)
-    after = jax.vmap(task.step)(state.task, action, jax.random.split(task_key, environments))
-    length = state.tally.steps + 1
-    truncated = (length >= episode_steps(task, agent)) & ~after.terminated
-    finished = after.terminated | truncated
-    rollout = Transition(
-        observation=observation,
-        action=action,
-        reward=after.reward,
-        next_observation=jax.vmap(task.observe)(after.state),
-        terminated=after.terminated,
-        truncated=truncated,
-    )
-    rollout = jax.tree.map(lambda x: x[None], rollout)  # a rollout of one step
+    """One rollout, then learning from it; the records have a leading time axis."""
+    key = jax.random.wrap_key_data(state.key)
+
+    def step(carry: tuple[PyTree, Array], time: Array) -> tuple[tuple[PyTree, Array], tuple]:
+        states, length = carry
+        act_key, task_key, reset_key, _ = jax.random.split(jax.random.fold_in(key, time), 4)
+        observation = jax.vmap(task.observe)(states)
+        action = agent.act(state.agent, observation, act_key)
+        after = jax.vmap(task.step)(states, action, jax.random.split(task_key, len(length)))
+        truncated = (length + 1 >= episode_steps(task, agent)) & ~after.terminated
+        finished = after.terminated | truncated
+        transition = Transition(
+            state=states,
+            observation=observation,
+            action=action,
+            reward=after.reward,
+            next_state=after.state,
+            next_observation=jax.vmap(task.observe)(after.state),
+            terminated=after.terminated,
+            truncated=truncated,
+        )
+
+        def reset(states: PyTree) -> PyTree:
+            fresh = jax.vmap(task.reset)(jax.random.split(reset_key, len(length)))
+            return jax.tree.map(partial(_select, finished), fresh, states)
+
+        # The branch carries the environments only, never the agent with its replay buffer.
+        states = lax.cond(finished.any(), reset, lambda states: states, after.state)
+        return (states, jnp.where(finished, 0, length + 1)), transition
+
+    times = state.steps + jnp.arange(agent.rollout_steps)
+    (states, _), rollout = _scan(step, (state.task, state.tally.steps), times)
     if learning:
-        learner, metrics = agent.learn(state.agent, rollout, learn_key)
+        learn_key = jax.random.split(jax.random.fold_in(key, times[-1]), 4)[3]
+        learner, metrics = agent.learn(task, state.agent, rollout, learn_key)
     else:
         learner, metrics = agent.observe(state.agent, rollout), {}
+    monitored = agent.monitor(state.agent)
 
-    sums = {name: total + metrics.get(name, 0.0) for name, total in state.tally.metrics.items()}
-    learned = state.tally.learned + int(learning)
-    reward = state.tally.reward + after.reward
-    means = {name: total / learned for name, total in sums.items()}
-    monitored = {
-        name: jnp.broadcast_to(value, reward.shape)
-        for name, value in agent.monitor(state.agent).items()
-    }
-    record = Episodes(finished, reward, monitored | means)
+    def count(tally: Tally, transition: Transition) -> tuple[Tally, Episodes]:
+        sums = {name: total + metrics.get(name, 0.0) for name, total in tally.metrics.items()}
+        learned = tally.learned + int(learning)
+        reward = tally.reward + transition.reward
+        means = {name: total / learned for name, total in sums.items()}
+        now = {name: jnp.broadcast_to(value, reward.shape) for name, value in monitored.items()}
+        finished = transition.terminated | transition.truncated
+        record = Episodes(finished, reward, now | means)
+        tally = Tally(tally.steps + 1, learned, reward, sums)
+        return jax.tree.map(lambda x: jnp.where(finished, jnp.zeros_like(x), x), tally), record
 
-    def reset(states: PyTree) -> PyTree:
-        fresh = jax.vmap(task.reset)(jax.random.split(reset_key, environments))
-        return jax.tree.map(partial(_select, finished), fresh, states)
-
-    # The branch carries the environments only, never the agent with its replay buffer.
-    next_states = lax.cond(finished.any(), reset, lambda states: states, after.state)
-    tally = Tally(length, learned, reward, sums)
+    tally, records = _scan(count, state.tally, rollout)
     finite = [jnp.isfinite(metric).all() for metric in metrics.values()]
     state = TrainingState(
         agent=learner,
-        task=next_states,
-        tally=jax.tree.map(lambda x: jnp.where(finished, jnp.zeros_like(x), x), tally),
+        task=states,
+        tally=tally,
         key=state.key,
-        steps=state.steps + 1,
-        episodes=state.episodes + finished.sum(dtype=jnp.int32),
+        steps=state.steps + agent.rollout_steps,
+        episodes=state.episodes + records.finished.sum(dtype=jnp.int32),
         healthy=state.healthy & jnp.stack([jnp.array(True), *finite]).all(),
     )
-    return state, record, metrics
+    return state, records, metrics
+
+
+def _scan(function: Callable[..., Any], carry: Any, xs: Any) -> tuple[Any, Any]:
+    """``lax.scan``; a single step stands in line, without a loop."""
+    return lax.scan(function, carry, xs, unroll=jax.tree.leaves(xs)[0].shape[0] == 1)
 
 
 def _select(mask: Bool[Array, " environment"], new: Array, old: Array) -> Array:
@@ -173,26 +191,38 @@ def _select(mask: Bool[Array, " environment"], new: Array, old: Array) -> Array:
 class Population:
     """Members trained side by side, and the programs that do it.
 
+    tasks: one for all members, or one for each, which may differ in numbers and arrays.
     state: the members' TrainingState, with a leading member axis.
     """
 
-    def __init__(self, task: Task, agent: Agent, seeds: Sequence[int]) -> None:
-        self.task, self.agent, self.seeds = task, agent, list(seeds)
+    def __init__(self, tasks: Task | Sequence[Task], agent: Agent, seeds: Sequence[int]) -> None:
+        self.agent, self.seeds = agent, list(seeds)
+        tasks = [tasks] * len(self.seeds) if isinstance(tasks, Task) else list(tasks)
+        self.task = tasks[0]
         self._members = Members(len(self.seeds))
-        # Numeric hyperparameters are arrays of each member, so that one program serves them all.
-        static, numbers = eqx.partition(agent, lambda x: not isinstance(x, float))
-        numbers = jax.tree.map(lambda x: np.full(len(self.seeds), x, np.float32), numbers)
-        self._numbers = self._members.place(numbers)
-        self._agent = lambda numbers: eqx.combine(static, numbers)
+        own, self._shared, self._join = _split([(task, agent) for task in tasks])
+        self._own = self._members.place(own)
         self._programs: dict[str, Any] = {}
         self.seconds_compile = 0.0
-        first = jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))
+        first = jax.eval_shape(lambda: begin(self.task, agent, jnp.array(0, jnp.uint32)))
         require_memory(first, len(self.seeds))
-        self.state: TrainingState = self._run(
+        self.state = self._begin()
+
+    def restart(self, tasks: Sequence[Task], seeds: Sequence[int]) -> None:
+        """From the beginning with as many others, by the programs that are compiled already."""
+        assert len(tasks) == len(seeds) == len(self.seeds)
+        self.seeds = list(seeds)
+        own, self._shared, _ = _split([(task, self.agent) for task in tasks])
+        self._own = self._members.place(own)
+        self.state = self._begin()
+
+    def _begin(self) -> TrainingState:
+        state: TrainingState = self._run(
             "begin",
-            lambda member: begin(task, self._agent(member[1]), member[0]),
-            (self._members.place(np.array(self.seeds, np.uint32)), self._numbers),
+            lambda task, agent, seed: begin(task, agent, seed),
+            self._members.place(np.array(self.seeds, np.uint32)),
         )
+        return state
 
     @property
     def steps(self) -> int:
@@ -223,21 +253,19 @@ class Population:
 
         Raises QfolioError, and leaves ``state`` undefined, if a loss is not finite.
         """
-        warm_up = self.agent.warm_up() - self.steps
+        length = self.agent.rollout_steps
+        warm_up = -(-self.agent.warm_up() // length) * length - self.steps
         learning = warm_up <= 0
         steps = min(steps, chunk_steps(self.task, self.agent), steps if learning else warm_up)
 
-        def program(member: tuple[TrainingState, Agent], steps: Array) -> Any:
-            state, numbers = member
-            state, episodes = advance(
-                self.task, self._agent(numbers), state, steps, learning=learning
-            )
-            return (state, numbers), episodes
+        def program(
+            task: Task, agent: Agent, state: TrainingState, steps: Array
+        ) -> tuple[TrainingState, Episodes]:
+            return advance(task, agent, state, steps, learning=learning)
 
         name = "learn" if learning else "collect"
-        (self.state, self._numbers), episodes = self._run(
-            name, program, (self.state, self._numbers), np.int32(steps), donate=True
-        )
+        count = np.int32(-(-steps // length) * length)
+        self.state, episodes = self._run(name, program, self.state, count, donate=True)
         healthy = self._members.fetch(self.state.healthy)
         if not healthy.all():
             seeds = ", ".join(str(s) for s, ok in zip(self.seeds, healthy, strict=True) if not ok)
@@ -252,12 +280,11 @@ class Population:
 
         tail = tail_steps(self.agent.discount)
 
-        def program(member: tuple[PyTree, Agent], keys: Key[Array, " start"]) -> Any:
-            weights, numbers = member
-            return evaluate(self.task, self._agent(numbers), weights, keys, tail)
+        def program(task: Task, agent: Agent, weights: PyTree, keys: Array) -> Greedy:
+            return evaluate(task, agent, weights, keys, tail)
 
-        members = (self.agent.weights(self.state.agent), self._numbers)
-        greedy = self._run(f"evaluate {len(keys)}", program, members, keys)
+        weights = self.agent.weights(self.state.agent)
+        greedy = self._run(f"evaluate {len(keys)}", program, weights, keys)
         return self._members.fetch(greedy)
 
     def weights(self) -> PyTree:
@@ -273,11 +300,53 @@ class Population:
         self.state = self._members.place(state)
 
     def _run(
-        self, name: str, function: Any, members: Any, *shared: Any, donate: bool = False
+        self,
+        name: str,
+        function: Callable[..., Any],
+        members: Any,
+        *args: Any,
+        donate: bool = False,
     ) -> Any:
-        """Runs the program of that name, which is compiled at its first use."""
+        """Runs ``function(task, agent, member, *args)`` for all members as one program.
+
+        It is compiled at the first use of the name.
+        """
+
+        def one(member: Any, own: Any, shared: Any, *args: Any) -> Any:
+            return function(*self._join(own, shared), member, *args)
+
+        args = (members, self._own, self._shared, *args)
         if name not in self._programs:
             start = perf_counter()
-            self._programs[name] = self._members.compile(function, members, *shared, donate=donate)
+            self._programs[name] = self._members.compile(one, *args, split=2, donate=donate)
             self.seconds_compile += perf_counter() - start
-        return jax.block_until_ready(self._programs[name](members, *shared))
+        return jax.block_until_ready(self._programs[name](*args))
+
+
+def _split(
+    members: Sequence[PyTree],
+) -> tuple[list[np.ndarray], list[Array], Callable[[Any, Any], PyTree]]:
+    """Parts the members' numbers and arrays into each one's own and those that all share.
+
+    Numbers are each one's own, so that one program serves them all; an array is shared if it is
+    the same object in all. Returns the own with a leading member axis, the shared, and a function
+    that puts one member together again.
+    """
+    columns = list(zip(*(jax.tree.leaves(member) for member in members), strict=True))
+    structure = jax.tree.structure(members[0])
+    is_own = [
+        isinstance(column[0], float) or any(leaf is not column[0] for leaf in column)
+        for column in columns
+    ]
+    own = [
+        np.stack([np.asarray(x, np.float32 if isinstance(x, float) else None) for x in column])
+        for column, mine in zip(columns, is_own, strict=True)
+        if mine
+    ]
+    shared = [column[0] for column, mine in zip(columns, is_own, strict=True) if not mine]
+
+    def join(own: list[Array], shared: list[Array]) -> PyTree:
+        mine, common = iter(own), iter(shared)
+        return jax.tree.unflatten(structure, [next(mine if m else common) for m in is_own])
+
+    return own, shared, join

@@ -2,132 +2,192 @@
 
 A Q-network estimates the discounted return of each action. Collecting: actions are ε-greedy on it,
 and transitions go into a replay buffer. Training: it regresses, on batches from the buffer, towards
-r + γ max_a Q'(s', a), where Q' is a target network that follows it slowly. docs/dqn.md holds every
-formula, the place where it stands here, and each deviation from the paper.
+r + γ max_a Q'(s', a), where Q' is a target network that follows it slowly. In an exogenous task one
+move of the market tells the outcome of all actions from any holding, and ``all_actions`` regresses
+them together. docs/dqn.md holds every formula, the place where it stands here, and each deviation
+from the paper.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from qfolio import optimizer
 from qfolio.errors import QfolioError
-from qfolio.mdp import Agent, Metrics, Task, Transition
-from qfolio.networks import MLP
+from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.mdp import (
+    Agent,
+    Contrast,
+    Discrete,
+    ExogenousTask,
+    Metrics,
+    Position,
+    Task,
+    Transition,
+    View,
+)
+from qfolio.networks import SHARED, Flat, Shared
 from qfolio.replay import Replay
 
 
 class Experience(NamedTuple):
     """What the buffer keeps of a transition; nothing is bootstrapped behind ``terminal``."""
 
-    observation: Float[Array, "batch observation"]
-    action: Int[Array, " batch"]
-    reward: Float[Array, " batch"]
-    next_observation: Float[Array, "batch observation"]
-    terminal: Bool[Array, " batch"]
+    observation: PyTree
+    action: Int[Array, "*batch"]
+    reward: Float[Array, "*batch"]
+    next_observation: PyTree
+    terminal: Bool[Array, "*batch"]
+
+
+class Move(NamedTuple):
+    """What the buffer keeps for all actions: how the market moved."""
+
+    market: PyTree
+    next_market: PyTree
+
+
+class SharedQ(eqx.Module):
+    """Q-values of a menu whose choices concern the whole market or one asset each."""
+
+    network: Shared
+
+    def __call__(self, view: View) -> Float[Array, "batch action"]:
+        market, each = self.network(view)
+        blocks = jnp.swapaxes(each, -1, -2)  # all assets' first choice, then their second, …
+        return jnp.concatenate([market, blocks.reshape(*market.shape[:-1], -1)], -1)
+
+
+Network = Flat | SharedQ
 
 
 class DQNState(eqx.Module):
     """All that a DQN agent learns and remembers."""
 
-    online: MLP
-    target: MLP
-    optimizer: optax.ScaleByAdamState
+    online: Network
+    target: Network
+    optimizer: optimizer.Optimizer
     replay: Replay
     episodes: Int[Array, ""]  # finished; ε follows it
     steps: Int[Array, ""]  # of each environment; the target network follows them
 
 
-def _static(default: Any) -> Any:
-    """A setting that shapes the program."""
-    return eqx.field(static=True, default=default)
-
-
-def _number(default: float) -> Any:
-    """A setting that is an input of the program: members may differ in it."""
-    return eqx.field(converter=float, default=default)
+KINDS = ("flat", *SHARED)
 
 
 class DQN(Agent):
     """A deep Q-network; the defaults are those of the report that qfolio grew out of."""
 
-    hidden: tuple[int, ...] = eqx.field(static=True, converter=tuple, default=(256, 256))
-    environments: int = _static(1)  # stepped side by side
-    episode_steps: int = _static(0)  # training episodes are cut here; 0: the task's horizon
-    batch_size: int = _static(64)
-    updates: int = _static(1)  # gradient steps per step of all environments
-    replay_capacity: int = _static(50_000)  # transitions
-    learning_starts: int = _static(64)  # transitions stored before learning
-    double: bool = _static(False)
-    time_limit_terminal: bool = _static(False)  # wrong, but often done
-    target_period: int = _static(200)  # steps between target updates
-    target_rate: float = _number(1.0)  # how far each goes towards the online network; 1 copies it
-    discount: float = _number(0.99)
-    learning_rate: float = _number(1e-3)
-    learning_rate_final: float = _number(1.0)  # share of it that is left at the end of the cosine
-    learning_rate_steps: float = _number(1e5)  # gradient steps of the cosine
-    epsilon: float = _number(1.0)
-    epsilon_end: float = _number(0.01)
-    epsilon_decay: float = _number(0.995)  # factor per finished episode
-    huber: float = _number(math.inf)  # |TD error| beyond which the loss is linear; inf: squared
-    reward_scale: float = _number(1.0)  # the network learns values of scaled rewards
-    input_gain: float = _number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
+    network: str = static("flat")  # over everything observed; or mlp, cnn, rnn, shared by assets
+    hidden: tuple[int, ...] = sizes(256, 256)
+    environments: int = static(1)  # stepped side by side
+    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
+    batch_size: int = static(64)
+    updates: int = static(1)  # gradient steps per step of all environments
+    replay_capacity: int = static(50_000)  # transitions
+    learning_starts: int = static(64)  # transitions stored before learning
+    double: bool = static(False)
+    all_actions: bool = static(False)  # learn every action at once, from re-drawn holdings
+    market_baseline: bool = static(False)  # with all_actions: rewards above those of other holdings
+    time_limit_terminal: bool = static(False)  # wrong, but often done
+    target_period: int = static(200)  # steps between target updates
+    target_rate: float = number(1.0)  # how far each goes towards the online network; 1 copies it
+    discount: float = number(0.99)
+    learning_rate: float = number(1e-3)
+    learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
+    learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
+    epsilon: float = number(1.0)
+    epsilon_end: float = number(0.01)
+    epsilon_decay: float = number(0.995)  # factor per finished episode
+    huber: float = number(math.inf)  # |TD error| beyond which the loss is linear; inf: squared
+    reward_scale: float = number(1.0)  # the network learns values of scaled rewards
+    input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
 
     def __check_init__(self) -> None:
         counts = "environments batch_size updates target_period"
-        _require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        _require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
-        _require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
-        _require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        scales = "learning_rate learning_rate_steps reward_scale"
-        _require(self, scales, lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-        _require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
-        fractions = "discount target_rate learning_rate_final epsilon epsilon_end epsilon_decay"
-        _require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
-        sizes = lambda x: len(x) > 0 and min(x) >= 1 and max(x) < 2**31  # noqa: E731
-        _require(self, "hidden", sizes, "one or more layer sizes")
+        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
+        require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        optimizer.require_schedule(self)
+        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
+        fractions = "discount target_rate epsilon epsilon_end epsilon_decay"
+        require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
+        require_sizes(self)
+        require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+        if self.market_baseline and self.batch_size < 2:
+            raise QfolioError(
+                "market_baseline compares holders; it needs a batch_size of 2 or more."
+            )
         if self.learning_starts > self.replay_capacity:
             raise QfolioError(
                 f"learning_starts is {self.learning_starts}, more than replay_capacity "
                 f"({self.replay_capacity}) can hold; lower the one or raise the other."
             )
 
-    def contrast(self) -> tuple[str, "DQN"]:
-        label = "without double DQN" if self.double else "with double DQN"
-        return label, dataclasses.replace(self, double=not self.double)
+    def contrast(self) -> Contrast:
+        if self.all_actions:
+            single = dataclasses.replace(self, all_actions=False)
+            return Contrast("all actions at once", "one action at a time", single)
+        names = ("without double DQN", "double DQN")
+        other = dataclasses.replace(self, double=not self.double)
+        return Contrast(names[self.double], names[not self.double], other)
 
     def init(self, task: Task, key: PRNGKeyArray) -> DQNState:
-        observation = task.observe(task.reset(key))
-        online = MLP(
-            (observation.shape[-1], *self.hidden, task.actions.n),
-            key,
-            # Small weights on a bounded observation make a Q-function too smooth for the task.
-            input_gain=jnp.where(
-                self.input_gain > 0, self.input_gain / jnp.array(task.observation_scale), 1.0
-            ),
-        )
-        row = Experience(
+        state = task.reset(key)
+        observation = task.observe(state)
+        online = self._network(task, observation, key)
+        row: Experience | Move = Experience(
             observation=observation,
             action=jnp.array(0, jnp.int32),
             reward=jnp.array(0.0),
             next_observation=observation,
             terminal=jnp.array(False),
         )
+        if self.all_actions:
+            if not isinstance(task, ExogenousTask):
+                raise QfolioError(
+                    "all_actions needs a market, whose prices do not answer to actions; "
+                    f"{type(task).__name__} is none."
+                )
+            row = Move(state.market, state.market)
         zero = jnp.array(0, jnp.int32)
         return DQNState(
             online=online,
             target=online,
-            optimizer=optax.scale_by_adam().init(online),
+            optimizer=optimizer.begin(online),
             replay=Replay.empty(row, self.replay_capacity, self.environments),
             episodes=zero,
             steps=zero,
+        )
+
+    def _network(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Network:
+        actions = task.actions
+        if not isinstance(actions, Discrete):
+            raise QfolioError(
+                f"dqn chooses among numbered actions, and those of {type(task).__name__} are "
+                "continuous; in a market, give it a menu of allocations (menu=grid:10)."
+            )
+        if self.network == "flat":
+            # Small weights on a bounded observation make a Q-function too smooth for the task.
+            scale = jnp.array(task.observation_scale)
+            gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
+            return Flat(observation, self.hidden, actions.n, key, gain)
+        if not actions.each:
+            raise QfolioError(
+                f"network={self.network} is shared by assets and needs a menu with choices for "
+                "each, such as menu=tilts:0.1; otherwise take network=flat."
+            )
+        return SharedQ(
+            Shared(self.network, observation, self.hidden, actions.pooled, actions.each, key)
         )
 
     def warm_up(self) -> int:
@@ -139,25 +199,24 @@ class DQN(Agent):
     def monitor(self, state: DQNState) -> Metrics:
         return {"epsilon": self.epsilon_now(state)}
 
-    def weights(self, state: DQNState) -> MLP:
+    def carry_over(self, state: DQNState, fresh: DQNState) -> DQNState:
+        return eqx.tree_at(lambda s: s.replay, state, fresh.replay)
+
+    def weights(self, state: DQNState) -> Network:
         return state.online
 
     def action_values(
-        self, weights: MLP, observation: Float[Array, "batch observation"]
-    ) -> Float[Array, "batch action"]:
-        """Q(s, ·) in units of the task's reward."""
-        return weights(observation) / self.reward_scale
+        self, weights: Network, observation: PyTree
+    ) -> Float[Array, "batch action"] | None:
+        """Q(s, ·) in units of the task's reward; none where they are above a baseline."""
+        return None if self.market_baseline else weights(observation) / self.reward_scale
 
-    def policy(
-        self, weights: MLP, observation: Float[Array, "batch observation"]
-    ) -> Int[Array, " batch"]:
+    def policy(self, weights: Network, observation: PyTree) -> Int[Array, " batch"]:
         return weights(observation).argmax(-1)
 
-    def act(
-        self, state: DQNState, observation: Float[Array, "batch observation"], key: PRNGKeyArray
-    ) -> Int[Array, " batch"]:
-        greedy = self.policy(state.online, observation)
-        n = state.online.biases[-1].shape[0]
+    def act(self, state: DQNState, observation: PyTree, key: PRNGKeyArray) -> Int[Array, " batch"]:
+        values = state.online(observation)
+        n, greedy = values.shape[-1], values.argmax(-1)
         # One uniform decides both: below ε explore, and where below ε it fell picks the action.
         uniform = jax.random.uniform(key, greedy.shape)
         epsilon = self.epsilon_now(state)
@@ -169,9 +228,11 @@ class DQN(Agent):
         terminal = step.terminated
         if self.time_limit_terminal:
             terminal = terminal | step.truncated
-        experience = Experience(
+        experience: Experience | Move = Experience(
             step.observation, step.action, step.reward, step.next_observation, terminal
         )
+        if self.all_actions:
+            experience = Move(step.state.market, step.next_state.market)
         finished = (step.terminated | step.truncated).sum(dtype=jnp.int32)
         return eqx.tree_at(
             lambda s: (s.replay, s.episodes, s.steps),
@@ -180,45 +241,36 @@ class DQN(Agent):
         )
 
     def learn(
-        self, state: DQNState, rollout: Transition, key: PRNGKeyArray
+        self, task: Task, state: DQNState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[DQNState, Metrics]:
         state = self.observe(state, rollout)
 
         def update(carry, key):  # type: ignore[no-untyped-def]
-            online, optimizer = carry
-            batch = state.replay.sample(key, self.batch_size)
-            (loss, max_q), gradient = jax.value_and_grad(self._loss, has_aux=True)(
-                online, state.target, batch
-            )
-            direction, optimizer = optax.scale_by_adam().update(gradient, optimizer)
-            rate = self._learning_rate(optimizer.count)
-            online = jax.tree.map(lambda w, d: w - rate * d, online, direction)
-            return (online, optimizer), (loss, max_q)
+            online, adam = carry
+            sample_key, holding_key = jax.random.split(key) if self.all_actions else (key, key)
+            batch = state.replay.sample(sample_key, self.batch_size)
+            every = partial(self._all_action_loss, task, holding_key)
+            loss_of = jax.value_and_grad(every if self.all_actions else self._loss, has_aux=True)
+            (loss, max_q), gradient = loss_of(online, state.target, batch)
+            return optimizer.descend(self, online, gradient, adam), (loss, max_q)
 
         carry = (state.online, state.optimizer)
         if self.updates == 1:
-            (online, optimizer), (loss, max_q) = update(carry, key)
+            (online, adam), (loss, max_q) = update(carry, key)
         else:
             keys = jax.random.split(key, self.updates)
-            (online, optimizer), (loss, max_q) = lax.scan(update, carry, keys)
+            (online, adam), (loss, max_q) = lax.scan(update, carry, keys)
 
         due = state.steps % self.target_period == 0
         rate = self.target_rate if self.target_period == 1 else jnp.where(due, self.target_rate, 0)
         # This form is exact for rates of 0 and 1.
         blend = lambda t, w: (1 - rate) * t + rate * w  # noqa: E731
         target = jax.tree.map(blend, state.target, online)
-        state = DQNState(online, target, optimizer, state.replay, state.episodes, state.steps)
+        state = DQNState(online, target, adam, state.replay, state.episodes, state.steps)
         return state, {"loss": loss.mean(), "max_q": max_q.mean()}
 
-    def _learning_rate(self, update: Int[Array, ""]) -> Float[Array, ""]:
-        """A cosine from ``learning_rate`` to its final share (Loshchilov & Hutter 2017)."""
-        done = jnp.minimum(update / self.learning_rate_steps, 1.0)
-        weight = (1 + jnp.cos(jnp.pi * done)) / 2
-        final = self.learning_rate_final
-        return self.learning_rate * (final + weight * (1 - final))
-
     def _loss(
-        self, online: MLP, target: MLP, batch: Experience
+        self, online: Network, target: Network, batch: Experience
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Mean loss, and the batch's mean max_a Q(s, a) in units of reward."""
         q = online(batch.observation)
@@ -229,6 +281,37 @@ class DQN(Agent):
         goal = td_target(self.reward_scale * batch.reward, batch.terminal, following, self.discount)
         error = lax.stop_gradient(goal) - taken
         return huber_loss(error, self.huber).mean(), q.max(1).mean() / self.reward_scale
+
+    def _all_action_loss(
+        self, task: ExogenousTask, key: PRNGKeyArray, online: Network, target: Network, moves: Move
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The same, over every action from holdings drawn anew: what each would have led to."""
+        holdings = jax.vmap(task.draw_holding)(jax.random.split(key, self.batch_size))
+        q = online(jax.vmap(task.observe)(Position(moves.market, holdings)))
+
+        def after(holdings: PyTree, action: Array) -> tuple[Array, PyTree]:
+            settle = jax.vmap(task.settle, (0, 0, 0, None))
+            return settle(moves.market, moves.next_market, holdings, action)
+
+        actions = jnp.arange(q.shape[-1])
+        reward, next_holdings = jax.vmap(partial(after, holdings))(actions)  # (action, batch)
+        if self.market_baseline:
+            # What the same move pays another holder, on average over his actions, depends on the
+            # market alone: taking it off leaves the best policy as it is, and takes off what all
+            # actions have in common of the market's noise (input-dependent baselines, Mao et al.
+            # 2019).
+            others = jax.tree.map(lambda x: jnp.roll(x, 1, 0), holdings)
+            reward = reward - jax.vmap(partial(after, others))(actions)[0].mean(0)
+        never = jnp.zeros(reward.shape[1:], bool)
+
+        def goal(reward: Array, holding: PyTree) -> Array:
+            view = jax.vmap(task.observe)(Position(moves.next_market, holding))
+            q_next = target(view)
+            following = bootstrap(q_next, online(view) if self.double else q_next)
+            return td_target(self.reward_scale * reward, never, following, self.discount)
+
+        goals = lax.stop_gradient(jax.vmap(goal)(reward, next_holdings)).T
+        return huber_loss(goals - q, self.huber).mean(), q.max(1).mean() / self.reward_scale
 
 
 def bootstrap(
@@ -258,10 +341,3 @@ def huber_loss(
     """½e² up to |e| = δ and δ(|e| − ½δ) beyond (Huber 1964); δ = ∞ squares everything."""
     clipped = jnp.clip(error, -delta, delta)
     return clipped * (error - clipped / 2)
-
-
-def _require(agent: DQN, names: str, holds: Callable[[Any], bool], wanted: str) -> None:
-    for name in names.split():
-        value = getattr(agent, name)
-        if not holds(value):
-            raise QfolioError(f"{name} is {value}; it must be {wanted}.")

@@ -1,0 +1,207 @@
+"""Pathwise policy gradient: net growth, differentiated through the episode.
+
+Where prices do not answer to our trades, the reward of a whole episode is a differentiable function
+of the policy: each action earns what the market then did, pays what it costs to get there from the
+last holding, and leaves the next one. The gradient of that sum is exact for the paths seen; nothing
+is estimated by perturbing actions (Moody & Saffell 1998; Jiang et al. 2017, eq. 21–22, whose
+memory of previous weights is the holding here). docs/pathwise.md lists formulas and deviations.
+"""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from qfolio import optimizer, simplex
+from qfolio.errors import QfolioError
+from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.mdp import (
+    Agent,
+    Box,
+    Discrete,
+    ExogenousTask,
+    Metrics,
+    Position,
+    Simplex,
+    Task,
+    Transition,
+    View,
+)
+from qfolio.networks import SHARED, Reading, Shared
+
+
+class Policy(eqx.Module):
+    """From a view of the market to target weights, or to positions where they are unbounded.
+
+    The network names two edges for each asset, and a trade is only ever to the nearer one. With
+    proportional costs the best policy has this form (Davis & Norman 1990; as a network: Imaki et
+    al. 2021, "No-transaction band network"); two edges that meet say where to go from anywhere.
+    They start close together, so that both are traded to and have gradients, around equal weights
+    or around no position.
+    """
+
+    network: Shared
+    actions: Simplex | Box
+
+    def __call__(self, view: View) -> Float[Array, "batch entry"]:
+        return self.allowed(self.wanted(self.network.read(view.features), view.holding))
+
+    def allowed(self, wanted: Float[Array, "batch entry"]) -> Float[Array, "batch entry"]:
+        """What is wanted, brought to the nearest point of the simplex."""
+        if isinstance(self.actions, Box):
+            return wanted
+        return simplex.project(wanted, jnp.asarray(self.actions.caps))
+
+    def wanted(
+        self, reading: Reading, holding: Float[Array, "batch asset"]
+    ) -> Float[Array, "batch entry"]:
+        """The holding, brought between the edges; cash is what is left of 1."""
+        box = isinstance(self.actions, Box)
+        start, unit = (0.0, 1.0) if box else [1 / (1 + self.actions.assets)] * 2
+        # Among many assets weights are small, and so is what an output of one should mean.
+        scale = 1.0 if box else 2 * unit
+        edges = (
+            start
+            + unit / 8 * jnp.array([-1.0, 1.0])
+            + scale * self.network.answer(reading, holding)[1]
+        )
+        assets = jnp.clip(holding, edges.min(-1), edges.max(-1))
+        if box:
+            return assets
+        return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
+
+
+class PathwiseState(eqx.Module):
+    policy: Policy
+    optimizer: optimizer.Optimizer
+    steps: Int[Array, ""]
+
+
+class Pathwise(Agent):
+    """Gradient ascent on net growth through whole rollouts."""
+
+    network: str = static("mlp")  # mlp, cnn or rnn, shared by all assets
+    hidden: tuple[int, ...] = sizes(32, 32)
+    environments: int = static(64)  # paths in a batch
+    rollout: int = static(50)  # steps of each path that a gradient goes through
+    tail: int = static(0)  # of these, the last ones only show what followed
+    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
+    updates: int = static(1)  # gradient steps per rollout
+    learning_rate: float = number(1e-3)
+    learning_rate_final: float = number(1.0)  # share left at the end of the cosine
+    learning_rate_steps: float = number(1e4)  # gradient steps of the cosine
+    gradient_norm: float = number(math.inf)  # longer gradients are cut to it
+    reward_scale: float = number(1.0)
+    pull: float = number(0.01)  # back to the simplex, where the gradient of what is off it is zero
+
+    def __check_init__(self) -> None:
+        if self.network not in SHARED:
+            raise QfolioError(
+                f"network is {self.network!r}; it must be one of {', '.join(SHARED)}."
+            )
+        require(self, "environments rollout updates", lambda x: x >= 1, "at least 1")
+        require(self, "episode_steps tail", lambda x: x >= 0, "at least 0")
+        require(self, "gradient_norm", lambda x: x > 0, "greater than 0")
+        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        optimizer.require_schedule(self)
+        require_sizes(self)
+        if self.tail >= self.rollout:
+            raise QfolioError(f"tail is {self.tail}; it must be less than rollout, {self.rollout}.")
+
+    @property
+    def discount(self) -> None:
+        return None
+
+    @property
+    def rollout_steps(self) -> int:
+        return self.rollout
+
+    def init(self, task: Task, key: PRNGKeyArray) -> PathwiseState:
+        if not isinstance(task, ExogenousTask) or isinstance(task.actions, Discrete):
+            raise QfolioError(
+                "pathwise needs a market whose actions are weights or positions; "
+                f"{type(task).__name__} is none (in a market, leave menu empty)."
+            )
+        episode = self.episode_steps or task.horizon
+        if episode % self.rollout:
+            raise QfolioError(
+                f"rollout is {self.rollout}; it must divide the {episode} steps of an episode "
+                "(episode_steps, or the task's horizon)."
+            )
+        view = task.observe(task.reset(key))
+        network = Shared(self.network, view, self.hidden, pooled=0, each=2, key=key)
+        # An output layer of zeros: the first policy is the one that ``Policy`` starts from.
+        last = lambda n: (n.head.weights[-1], n.head.biases[-1])  # noqa: E731
+        network = eqx.tree_at(last, network, replace_fn=jnp.zeros_like)
+        policy = Policy(network, task.actions)
+        return PathwiseState(
+            policy=policy,
+            optimizer=optimizer.begin(policy),
+            steps=jnp.array(0, jnp.int32),
+        )
+
+    def warm_up(self) -> int:
+        return 0
+
+    def weights(self, state: PathwiseState) -> Policy:
+        return state.policy
+
+    def policy(self, weights: Policy, observation: View) -> Float[Array, "batch entry"]:
+        return weights(observation)
+
+    def act(
+        self, state: PathwiseState, observation: View, key: PRNGKeyArray
+    ) -> Float[Array, "batch entry"]:
+        return state.policy(observation)
+
+    def observe(self, state: PathwiseState, rollout: Transition) -> PathwiseState:
+        return state
+
+    def learn(
+        self, task: Task, state: PathwiseState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[PathwiseState, Metrics]:
+        assert isinstance(task, ExogenousTask)
+
+        def update(carry: Any, _: None) -> Any:
+            policy, adam = carry
+            loss, gradient = jax.value_and_grad(self._loss)(policy, task, rollout)
+            gradient = optimizer.clip(gradient, self.gradient_norm)
+            return optimizer.descend(self, policy, gradient, adam), loss
+
+        carry = (state.policy, state.optimizer)
+        (policy, adam), losses = lax.scan(update, carry, None, length=self.updates)
+        return PathwiseState(policy, adam, state.steps + 1), {"loss": losses.mean()}
+
+    def _loss(self, policy: Policy, task: ExogenousTask, rollout: Transition) -> Float[Array, ""]:
+        """Minus the mean reward a step of following ``policy`` along the rollout's market."""
+
+        def follow(policy: Policy, holding: PyTree, steps: slice) -> Any:
+            def step(holding: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
+                market, next_market, reading = moves
+                view = jax.vmap(task.observe)(Position(market, holding))
+                wanted = policy.wanted(reading, view.holding)
+                action = policy.allowed(wanted)
+                off = ((wanted - action) ** 2).sum(-1)
+                reward, holding = jax.vmap(task.settle)(market, next_market, holding, action)
+                return holding, (reward, off)
+
+            moves = (rollout.state.market, rollout.next_state.market, rollout.observation)
+            market, next_market, seen = jax.tree.map(lambda x: x[steps], moves)
+            # Windows are read before the holdings go through time, all at once.
+            return lax.scan(
+                step, holding, (market, next_market, policy.network.read(seen.features))
+            )
+
+        start = jax.tree.map(lambda x: x[0], rollout.state.holding)
+        cut = self.rollout - self.tail
+        holding, (rewards, off) = follow(policy, start, slice(None, cut))
+        total = rewards.sum()
+        if self.tail:
+            # A trade near the end would be paid for without earning what it was made for.
+            _, (later, _) = follow(lax.stop_gradient(policy), holding, slice(cut, None))
+            total += later.sum()
+        return self.pull * off.mean() - self.reward_scale * total / rewards.size

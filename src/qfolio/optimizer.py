@@ -1,0 +1,48 @@
+"""Adam (Kingma & Ba 2015) with a cosine learning rate (Loshchilov & Hutter 2017)."""
+
+from typing import Any, TypeAlias, TypeVar
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PyTree
+
+from qfolio.fields import require
+
+Weights = TypeVar("Weights", bound=PyTree)
+
+Optimizer: TypeAlias = optax.ScaleByAdamState
+
+
+def begin(weights: Weights) -> Optimizer:
+    return optax.scale_by_adam().init(weights)
+
+
+def descend(
+    agent: Any, weights: Weights, gradient: Weights, optimizer: Optimizer
+) -> tuple[Weights, Optimizer]:
+    """One step down the gradient, at the learning rate of ``agent``'s settings."""
+    direction, optimizer = optax.scale_by_adam().update(gradient, optimizer)
+    rate = learning_rate(agent, optimizer.count)
+    return jax.tree.map(lambda w, d: w - rate * d, weights, direction), optimizer
+
+
+def clip(gradient: Weights, norm: Float[Array, ""] | float) -> Weights:
+    """The gradient, or where it is longer than ``norm``, its direction at that length."""
+    factor = jnp.minimum(1.0, norm / jnp.maximum(optax.tree.norm(gradient), 1e-30))
+    return jax.tree.map(lambda g: factor * g, gradient)
+
+
+def learning_rate(agent: Any, update: Int[Array, ""]) -> Float[Array, ""]:
+    """A cosine from ``learning_rate`` to its final share, over ``learning_rate_steps`` updates."""
+    done = jnp.minimum(update / agent.learning_rate_steps, 1.0)
+    weight = (1 + jnp.cos(jnp.pi * done)) / 2
+    final = agent.learning_rate_final
+    return agent.learning_rate * (final + weight * (1 - final))
+
+
+def require_schedule(agent: Any) -> None:
+    """Raises QfolioError where the settings of the learning rate are out of range."""
+    scales = "learning_rate learning_rate_steps"
+    require(agent, scales, lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+    require(agent, "learning_rate_final", lambda x: 0 <= x <= 1, "between 0 and 1")
