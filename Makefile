@@ -1,11 +1,17 @@
 # One environment for users and developers: .venv. `make demo` and `make test` create it.
 PYTHON ?= python3
 BIN := .venv/bin
+NOW := $(shell date +%Y%m%d-%H%M%S)
 
 .PHONY: demo test test-fast check format bench bench-gpu clean
 
 demo: .venv/installed
-	$(BIN)/qfolio train pendulum
+	$(BIN)/qfolio train pendulum --no-compare --out runs/demo-$(NOW)/pendulum
+	$(BIN)/qfolio backtest --test 4y --seeds 2 --out runs/demo-$(NOW)/portfolio
+	@echo
+	@echo "The two reports:"
+	@echo "  runs/demo-$(NOW)/pendulum/report.html"
+	@echo "  runs/demo-$(NOW)/portfolio/report.html"
 
 test: .venv/installed-dev
 	$(BIN)/pytest

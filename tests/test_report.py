@@ -1,21 +1,30 @@
-"""Reports from synthetic data: a real, coarse solution of the pendulum with noise put on top."""
+"""Reports from synthetic data: a real, coarse solution of the pendulum with noise put on top, and a
+market whose exact policy stays within a region."""
 
 import io
+import math
 import re
 from dataclasses import replace
 from functools import lru_cache
 from html.parser import HTMLParser
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from qfolio.agents.dqn import DQN
+from qfolio.agents.pathwise import Pathwise
+from qfolio.mdp import Position, View
 from qfolio.report import Curve, Episode, Maps, ReportData, write_report
 from qfolio.report.animation import FADE_FRAMES, SIZE, pendulum_frames, pendulum_gif
-from qfolio.report.figures import overestimation, value
+from qfolio.report.collect import constant_weights, report_data, responses
+from qfolio.report.data import MarketData, Responses, Weights, decimals
+from qfolio.report.figures import draw_learning_curve, draw_policy, overestimation, policy, value
 from qfolio.report.page import (
     amount,
     duration,
@@ -25,6 +34,8 @@ from qfolio.report.page import (
     setting_groups,
     verdict,
 )
+from qfolio.runs import Run
+from qfolio.tasks.synthetic import GarleanuPedersen, NoTrade, Regime
 
 Floats = NDArray[np.float64]
 
@@ -248,7 +259,7 @@ def test_page_is_repeatable() -> None:
 
 
 def test_one_seed_one_evaluation_and_no_extras(tmp_path: Path) -> None:
-    for name in ("value.png", "episode.gif"):
+    for name in ("value.png", "policy.png", "episode.gif"):
         (tmp_path / name).write_bytes(b"from an earlier report")
     data = make_data(seeds=1, points=1, steps=2)
     write_report(tmp_path, replace(data, comparison=None, maps=None, episode=None))
@@ -351,3 +362,229 @@ def test_setting_groups() -> None:
         ("general", [("a", "true"), ("f", "x")]),
         ("b", [("c.d", "[1, 2]"), ("e", "null")]),
     ]
+
+
+LOW, HIGH = 0.41, 0.59
+HELD = np.linspace(0, 1, 101)
+
+
+def make_market(seeds: int = 3) -> ReportData:
+    """A run of an agent without action values, whose seeds have found edges of their own."""
+    edges = np.array([[LOW, HIGH], [0.40, 0.60], [0.45, 0.58]])[:seeds]
+    learned = np.stack([np.clip(HELD, *ends) for ends in edges])[:, None]
+    returns = 0.19 - 0.15 * np.exp(-np.arange(10.0))[:, None] - 0.0004 * np.arange(seeds)
+    nothing = np.full(returns.shape, np.nan)
+    summary = {
+        "task": "market/no-trade",
+        "agent": "pathwise",
+        "preset": None,
+        "seeds": seeds,
+        "episodes": 640,
+        "env_steps": 307_200,
+        "seconds_compile": 3.0,
+        "seconds_train": 4.0,
+        "steps_per_second": 230_400.0,
+        "return_mean": 0.19055,
+        "return_ci95": [0.1891, 0.1915] if seeds > 1 else None,
+        "return_per_seed": [0.1914, 0.19057, 0.18968][:seeds],
+        "optimum": 0.19197,
+        "regret_per_seed": [0.003, 0.0073, 0.0119][:seeds],
+        "overestimation_per_seed": [None] * seeds,
+        "rule": {
+            "exact": {"low": LOW, "high at -0.2": HIGH},
+            "per_seed": [{"low": a, "high at -0.2": b} for a, b in edges],
+        },
+    }
+    return ReportData(
+        title="Pathwise gradients in a market",
+        command="qfolio train market/no-trade",
+        summary=summary,
+        config={"seed": 0},
+        curve=Curve("greedy return", 64 * np.arange(10), returns, nothing),
+        comparison=None,
+        training_episodes=np.array([]),
+        training_returns=np.array([]),
+        optimum=0.1903,
+        maps=None,
+        episode=None,
+        market=MarketData(
+            about="One asset grows faster than cash.",
+            measure="log growth",
+            meaning="",
+            rule="Low and high are the edges.",
+            horizon=480,
+            period="year",
+            periods=40.0,
+            policy=Responses(
+                scenes=("at any time",),
+                held=HELD,
+                exact=np.clip(HELD, LOW, HIGH)[None],
+                learned=learned,
+                weights=True,
+                region=(LOW, HIGH),
+            ),
+        ),
+    )
+
+
+def text_of(page: str) -> str:
+    """What is to be read: a space for each tag, figures and style left out."""
+    page = re.sub(r"<(svg|style).*?</\1>", "", page, flags=re.DOTALL)
+    page = page.replace("\N{NARROW NO-BREAK SPACE}", " ").replace("\N{MINUS SIGN}", "-")
+    return " ".join(re.sub(r"<[^>]*>", " ", page).split())
+
+
+def test_market_report(tmp_path: Path) -> None:
+    for name in ("value.png", "episode.gif"):
+        (tmp_path / name).write_bytes(b"from an earlier report")
+    write_report(tmp_path, make_market())
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"report.html", "learning_curve.png", "policy.png"}
+    text = text_of((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert "Three agents reached a mean log growth of 0.1905 over 480 steps (95 % interval" in text
+    assert "0.7 % below the exact optimum of 0.1920" in text
+    assert "Growth a year 0.476 % exact: 0.480 %" in text
+    assert "low 0.410 0.420 0.450" in text  # exact, mean, farthest
+    assert "high at -0.2 0.590 0.590 0.600" in text
+    assert "3 0.1897 1.19 % Mean" in text
+    assert "In the shaded region the exact policy does not trade" in text
+    for word in ("pendulum", "torque", "swing", "estimation", "Epsilon", "Grey", "None", "nan"):
+        assert word not in text, word
+
+
+def test_market_with_one_seed() -> None:
+    text = text_of(render_page(make_market(seeds=1)))
+    assert "low 0.410 0.410 high" in text
+    assert "farthest" not in text.lower()
+
+
+def test_market_compares_two_agents_that_estimate_values() -> None:
+    data = make_market()
+    values = replace(
+        data.curve, label="all at once", overestimation=data.curve.returns * 0 - 0.0123
+    )
+    other = replace(values, label="one at a time", overestimation=data.curve.returns * 0 + 0.004)
+    summary = {**data.summary, "overestimation_per_seed": [0.01, 0.02, 0.03]}
+    page = render_page(replace(data, summary=summary, curve=values, comparison=other))
+    curve = page[page.index('aria-label="Log growth over training') :]
+    curve = curve[: curve.index("</figure>")]
+    assert curve.count(">all at once<") == curve.count(">one at a time<") == 2  # wide and narrow
+    text = text_of(page)
+    assert "excess is -0.012 for “all at once” and +0.004 for “one at a time”" in text
+    assert "Epsilon" in text
+    assert "Double DQN" not in text
+
+
+def test_market_text_is_escaped() -> None:
+    data, attack = make_market(), "<script>alert(1)</script>"
+    assert data.market is not None
+    drawn = replace(data.market.policy, scenes=(attack, attack))
+    drawn = replace(drawn, exact=drawn.exact.repeat(2, 0), learned=drawn.learned.repeat(2, 1))
+    rule = {"exact": {attack: 1.0}, "per_seed": [{attack: 1.0}] * 3}
+    words = dict.fromkeys(("about", "measure", "meaning", "rule"), attack)
+    market = replace(data.market, **words, policy=drawn)
+    page = render_page(replace(data, summary={**data.summary, "rule": rule}, market=market))
+    assert "<script" not in page.lower()
+    assert page.count("&lt;script&gt;alert(1)&lt;/script&gt;") >= 8
+
+
+def test_policy_is_drawn_beside_the_exact_one() -> None:
+    data = make_market()
+    (axes,) = draw_policy(data, 7.2).axes
+    lines = {
+        tuple(np.round(line.get_ydata(), 6)) for line in axes.lines if len(line.get_ydata()) > 2
+    }
+    drawn = data.market.policy  # type: ignore[union-attr]
+    wanted = [drawn.exact[0], *drawn.learned[:, 0], drawn.learned[:, 0].mean(0)]
+    assert lines == {tuple(np.round(line, 6)) for line in wanted}
+    (region,) = axes.patches
+    assert region.get_x() == LOW
+    assert region.get_width() == pytest.approx(HIGH - LOW)
+
+
+def test_weights_are_drawn_beside_the_exact_ones() -> None:
+    data = make_market()
+    learned = np.array([[0.5, 0.4], [0.6, 0.2]])
+    drawn = Weights(("one", "two"), np.array([0.55, 0.45]), learned)
+    data = replace(data, market=replace(data.market, policy=drawn))  # type: ignore[arg-type]
+    (axes,) = draw_policy(data, 7.2).axes
+    seeds, mean, exact = (list(line.get_xdata()) for line in axes.lines)
+    assert sorted(seeds) == [0.2, 0.4, 0.5, 0.6]
+    assert mean == pytest.approx([0.55, 0.3])
+    assert exact == [0.55, 0.45]
+    assert "One row for each asset" in render_page(data)
+
+
+def test_policy_needs_a_market() -> None:
+    with pytest.raises(ValueError, match="policies of a market"):
+        policy(io.BytesIO(), replace(make_market(), market=None))
+
+
+def test_a_beginner_far_off_does_not_hide_the_curve() -> None:
+    data = make_market()
+    returns = data.curve.returns.copy()
+    returns[0] = -1e17
+    far = draw_learning_curve(replace(data, curve=replace(data.curve, returns=returns)), 10.5)
+    assert far.axes[0].get_ylim()[0] > -1
+    assert any("off the scale" in text.get_text() for text in far.axes[0].texts)
+
+
+def test_decimals() -> None:
+    assert [decimals(x) for x in (0.19055, -137.3, 5.663, 0.0, math.nan)] == [4, 1, 3, 1, 1]
+    assert decimals(0.0034, 2, least=2) == 4
+
+
+PATHWISE = Pathwise(environments=2, rollout=5, hidden=(4, 4))
+CHOOSER = DQN(environments=2, hidden=(4,), all_actions=True)
+
+
+def test_a_market_is_collected() -> None:
+    """Of a run before its first step."""
+    run = Run.create(NoTrade(horizon=6, menu="grid:4"), CHOOSER, episodes=2, seeds=2)
+    data = report_data(run, {"task": "market/no-trade", "agent": "dqn", "rule": None}, None, "")
+    assert data.title == "DQN in a market with a no-trade region"
+    assert data.curve.label == "all actions at once"
+    assert data.market is not None
+    assert data.market.about
+    assert (data.market.measure, data.market.period) == ("log growth", "year")
+    assert data.market.periods == pytest.approx(0.5)
+    assert isinstance(data.market.policy, Responses)
+    assert data.market.policy.learned.shape == (2, 1, 201)
+
+
+@pytest.mark.parametrize(
+    ("task", "agent"),
+    [(NoTrade(), PATHWISE), (GarleanuPedersen(), PATHWISE), (Regime(menu="grid:4"), CHOOSER)],
+)
+def test_learned_and_exact_policies(task, agent) -> None:
+    """Seed by seed as by hand."""
+    keys = jax.random.split(jax.random.key(3), 2)
+    seeds = [agent.weights(agent.init(task, key)) for key in keys]
+    members = jax.tree.map(lambda *x: jnp.stack(x), *seeds)
+    drawn = responses(task, agent, members, task.optimum().policy, "in {}")
+    position = isinstance(task, GarleanuPedersen)
+    if isinstance(task, NoTrade):
+        np.testing.assert_allclose(drawn.exact[0], np.clip(drawn.held, *drawn.region), atol=1e-6)
+    elif position:
+        slopes = np.diff(drawn.exact) / np.diff(drawn.held)
+        np.testing.assert_allclose(slopes, 0.6457, atol=1e-3)
+    else:
+        assert drawn.scenes == ("in bad", "in good")
+        assert (drawn.exact == [[0], [1]]).all()
+    for seed, weights in enumerate(seeds):
+        for scene, (_, market) in enumerate(task.scenes()):
+            for i in (0, 50, 200):
+                held = jnp.array([drawn.held[i]], jnp.float32)
+                holding = held if position else task.hold(jnp.concatenate([1 - held, held]))
+                view = task.observe(Position(market, holding))
+                action = agent.policy(weights, View(view.features[None], view.holding[None]))[0]
+                wanted = task.intent(Position(market, holding), action)[-1]
+                assert drawn.learned[seed, scene, i] == pytest.approx(float(wanted), abs=1e-5)
+
+
+def test_weights_of_a_rule() -> None:
+    rule = {"exact": {"weight of asset 1": 0.3, "weight of asset 2": 0.0}}
+    drawn = constant_weights({**rule, "per_seed": [{"weight of asset 1": 0.2, "x": 0.1}]})
+    assert drawn.names == ("asset 1", "asset 2")
+    assert drawn.exact.tolist() == [0.3, 0.0]
+    assert drawn.learned.tolist() == [[0.2, 0.1]]

@@ -1,6 +1,12 @@
 """qfolio: reinforcement learning for portfolio optimization.
 
 >>> import qfolio
+>>> prices = qfolio.load_prices("prices.csv")
+>>> agents = {"pathwise": qfolio.preset("fast", "portfolio", "pathwise")}
+>>> backtest = qfolio.Backtest.create(prices, agents, out="runs/mine")
+>>> backtest.run()
+>>> backtest.policy().weights(prices)
+
 >>> run = qfolio.train(qfolio.Pendulum(), qfolio.DQN(), episodes=200, seeds=8)
 >>> run.grade()["regret_per_seed"]
 """
@@ -12,26 +18,37 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from qfolio.agents.dqn import DQN as DQN
+    from qfolio.agents.pathwise import Pathwise as Pathwise
+    from qfolio.backtest.run import Backtest as Backtest
     from qfolio.errors import QfolioError as QfolioError
+    from qfolio.markets.prices import load as load_prices  # noqa: F401
+    from qfolio.policy import Policy as Policy
     from qfolio.presets import preset as preset
     from qfolio.runs import Run as Run
     from qfolio.runs import train as train
     from qfolio.tasks.pendulum import Pendulum as Pendulum
+    from qfolio.tasks.portfolio import Portfolio as Portfolio
 
 _HOMES = {
-    "DQN": "qfolio.agents.dqn",
-    "Pendulum": "qfolio.tasks.pendulum",
-    "QfolioError": "qfolio.errors",
-    "Run": "qfolio.runs",
-    "preset": "qfolio.presets",
-    "train": "qfolio.runs",
+    "Backtest": "qfolio.backtest.run:Backtest",
+    "DQN": "qfolio.agents.dqn:DQN",
+    "Pathwise": "qfolio.agents.pathwise:Pathwise",
+    "Pendulum": "qfolio.tasks.pendulum:Pendulum",
+    "Policy": "qfolio.policy:Policy",
+    "Portfolio": "qfolio.tasks.portfolio:Portfolio",
+    "QfolioError": "qfolio.errors:QfolioError",
+    "Run": "qfolio.runs:Run",
+    "load_prices": "qfolio.markets.prices:load",
+    "preset": "qfolio.presets:preset",
+    "train": "qfolio.runs:train",
 }
 
-__all__ = ["DQN", "Pendulum", "QfolioError", "Run", "__version__", "preset", "train"]
+__all__ = ["__version__", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
     # Imported on first use, so that `qfolio --help` does not wait for jax.
     if name not in _HOMES:
         raise AttributeError(f"module 'qfolio' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    module, _, attribute = _HOMES[name].partition(":")
+    return getattr(import_module(module), attribute)

@@ -8,10 +8,16 @@ from typing import TYPE_CHECKING, Any
 import rich.progress
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from qfolio.training import episode_steps
 
 if TYPE_CHECKING:
+    from qfolio.allocation import Allocation
+    from qfolio.backtest import run as backtesting
+    from qfolio.backtest.performance import Assessment
+    from qfolio.backtest.run import Backtest
+    from qfolio.markets.checks import Finding
     from qfolio.runs import Progress, Run
 
 console = Console(highlight=False)
@@ -58,7 +64,8 @@ def train(
 
         def note(now: "Progress") -> None:
             done, value = f"{now.episodes:,}", number(now.mean_return)
-            epsilon, rate = f"{now.epsilon:.2f}", f"{now.steps_per_second:,.0f}"
+            rate = f"{now.steps_per_second:,.0f}"
+            epsilon = "–" if math.isnan(now.epsilon) else f"{now.epsilon:.2f}"
             left = str(datetime.timedelta(seconds=round(now.seconds_left)))
             status = f"{done} episodes  return {value}  ε {epsilon}  {rate} steps/s  {left} left"
             live.update(bar, completed=min(now.episodes, total), description=status)
@@ -89,14 +96,147 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
     console.print(table)
     if result["return_ci95"]:
         low, high = result["return_ci95"]
-        say(f"95 % interval of the mean return over seeds: {low:.1f} to {high:.1f}")
+        say(f"95 % interval of the mean return over seeds: {number(low)} to {number(high)}")
     else:
         say("One seed has no interval; train several with --seeds.")
 
 
 def number(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:,.1f}"
+    """One decimal, or four digits that matter where that says too little."""
+    if value is None or math.isnan(value):
+        return "–"
+    return f"{value:,.1f}" if abs(value) >= 10 or not value else f"{value:#.4g}"
 
 
 def _cells(optimum: str, value: float, regret: float, over: float | None) -> tuple[str, ...]:
     return number(value), optimum, f"{regret:.2%}", number(over)
+
+
+def print_rule(rule: dict[str, Any]) -> None:
+    """What the learned policies do, beside what is best, from ``Run.grade``."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("rule")
+    for name in ("exact", "learned, mean", "farthest seed"):
+        table.add_column(name, justify="right")
+    for name, exact in rule["exact"].items():
+        learned = [seed[name] for seed in rule["per_seed"]]
+        farthest = max(learned, key=lambda value: abs(value - exact))
+        mean = sum(learned) / len(learned)
+        table.add_row(name, f"{exact:.4f}", f"{mean:.4f}", f"{farthest:.4f}")
+    console.print(table)
+
+
+def print_findings(findings: "list[Finding]") -> None:
+    """What is wrong with a price table, errors first."""
+    for finding in sorted(findings, key=lambda finding: finding.severity != "error"):
+        said = f"{finding.severity}: {finding}".removesuffix("?")
+        say(f"{said}. {finding.advice or ''}".rstrip())
+    errors = sum(finding.count for finding in findings if finding.severity == "error")
+    warnings = sum(finding.count for finding in findings if finding.severity == "warning")
+    if findings:
+        say(f"{errors:,} errors, {warnings:,} warnings.")
+
+
+def print_prices(facts: dict[str, Any]) -> None:
+    """What a price table holds, from ``prices.describe``."""
+    say(
+        f"{facts['source']}: {facts['rows']:,} rows of {facts['assets']:,} assets, "
+        f"{facts['first']} to {facts['last']}, about {facts['periods_per_year']:g} a year."
+    )
+    if facts["features"]:
+        say(f"Features: {', '.join(facts['features'])}.")
+    if facts["note"]:
+        say(f"Note: {facts['note']}")
+
+
+def describe_backtest(backtest: "Backtest") -> str:
+    config = backtest.config
+    return (
+        f"{len(backtest.folds)} folds ({backtest.folds[0].name} to {str(backtest.dates[-1])[:10]}) "
+        f"· {len(backtest.prices.assets)} assets · {' and '.join(backtest.agents)} · "
+        f"{config['seeds']} seeds · {config['cost'] * 1e4:g} bp · lag {config['lag']} · "
+        f"{config['device']}"
+    )
+
+
+def run_backtest(backtest: "Backtest") -> None:
+    """Trains with a bar and the time left."""
+    with rich.progress.Progress(
+        rich.progress.BarColumn(bar_width=24),
+        rich.progress.TextColumn("{task.description}"),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    ) as live:
+        bar = live.add_task("compiling", total=1.0)
+        last = ""
+
+        def note(now: "backtesting.Progress") -> None:
+            nonlocal last
+            left = datetime.timedelta(seconds=round(now.seconds_left))
+            description = f"training {now.agent}  {now.done:.0%}  {left} left"
+            live.update(bar, completed=now.done, description=description)
+            if not console.is_terminal and f"{now.done:.1f}" != last:  # a line for each tenth
+                last = f"{now.done:.1f}"
+                say(description)
+
+        backtest.run(note)
+
+
+def print_assessment(assessment: "Assessment") -> None:
+    """A row for each strategy, and what follows from it in words."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("after costs, a year", min_width=24)
+    for name in ("growth", "volatility", "Sharpe", "drawdown", "turnover", "cost drag"):
+        table.add_column(name, justify="right")
+    for name, strategy in assessment.strategies.items():
+        value = {key: measure.mean for key, measure in strategy.measures.items()}
+        style = "bold" if strategy.kind == "agent" else None
+        table.add_row(
+            name,
+            f"{value['growth']:.2%}",
+            f"{value['volatility']:.1%}",
+            f"{value['sharpe']:.2f}",
+            f"{value['drawdown']:.1%}",
+            f"{value['turnover']:.1f}",
+            f"{value['cost_drag']:.2%}",
+            style=style,
+        )
+    console.print(table)
+    for strategy in assessment.strategies.values():
+        if strategy.kind == "agent" and strategy.to_reference is not None:
+            say(strategy.to_reference.verdict)
+
+
+def print_allocation(allocation: "Allocation") -> None:
+    """The trades of tomorrow, and what they cost."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("asset")
+    for name in ("price", "weight now", "target", "trade, money", "trade, shares"):
+        table.add_column(name, justify="right")
+    held, targets = allocation.held, allocation.weights
+    rows = zip(
+        allocation.assets,
+        allocation.prices,
+        held[1:],
+        targets[1:],
+        allocation.trades,
+        strict=True,
+    )
+    for asset, price, now, target, trade in rows:
+        if now or target or trade:
+            table.add_row(
+                Text(asset),
+                f"{price:,.2f}",
+                f"{now:.2%}",
+                f"{target:.2%}",
+                f"{trade * price:+,.2f}",
+                f"{trade:+,.4g}",
+            )
+    table.add_row("cash", "", f"{held[0]:.2%}", f"{targets[0]:.2%}", "", "")
+    console.print(table)
+    say(
+        f"After the close of {allocation.date}: wealth {allocation.wealth:,.2f}, expected cost "
+        f"{allocation.cost:,.2f}, cash left {allocation.cash_after:,.2f}. "
+        "Assets that are neither held nor wanted are left out."
+    )

@@ -1,4 +1,4 @@
-"""The commands; jax is imported only by those that compute."""
+"""The commands that train agents on a task, grade them and show them."""
 
 import contextlib
 import datetime
@@ -6,27 +6,16 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
-import tyro
 from tyro.conf import Positional, arg
 
 from qfolio import settings
+from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, Name
 from qfolio.errors import QfolioError
 
 if TYPE_CHECKING:
     from qfolio.runs import Run
-
-OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
-INTERRUPTED = 130  # what a shell expects after Ctrl-C
-
-
-Name = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
-Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
-Folder = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
-Assignments = Annotated[
-    tuple[str, ...], arg(name="set", metavar="NAME=VALUE …", help_behavior_hint="")
-]
 
 
 def train(
@@ -46,9 +35,11 @@ def train(
     """Train agents on a task, grade them against the exact optimum and write a report.
 
     Args:
-        task: What to learn: pendulum (the default).
-        agent: Which algorithm: dqn (the default).
-        preset: fast (the default), best, or report (the run that qfolio grew out of).
+        task: What to learn: pendulum (the default), or a market with a known optimum: market/kelly,
+            market/merton, market/regime, market/ar1, market/no-trade, market/garleanu-pedersen.
+        agent: Which algorithm: dqn, pathwise; the first that has presets for the task otherwise.
+        preset: fast (the default); for the pendulum also best, and report (the run that qfolio grew
+            out of).
         episodes: Training episodes of each agent; the preset says how many otherwise. Those of
             fast and best are short: 28 and 40 steps.
         seeds: How many agents are trained side by side; the preset says otherwise.
@@ -57,22 +48,28 @@ def train(
         assignments: Hyperparameters, for example --set discount=0.98 hidden=256,256 (the settings
             of a report and docs/dqn.md list them).
         resume: Go on with the run in this folder, up to --episodes if given.
-        compare: Train two more agents with double DQN switched, for the report.
+        compare: Train two more agents with one thing changed, for the report (DQN: double DQN; in
+            markets, one action at a time instead of all at once).
         live: Show an episode in a window now and then, while training.
     """
     from qfolio import devices
 
     devices.configure()
-    from qfolio import console
+    from qfolio import console, presets
     from qfolio.runs import Run
 
+    if live and task not in (None, "pendulum"):
+        raise QfolioError(f"--live shows the pendulum; there is nothing to see of {task}.")
     with _window(live) as show:
         if resume is None:
             task, preset = task or "pendulum", preset or "fast"
-            name = f"{task}-{preset}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+            agent = agent or presets.default_agent(task)
+            name = (
+                f"{task.replace('/', '-')}-{agent}-{preset}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+            )
             folder = out or Path("runs") / name
             chosen = settings.parse(assignments)
-            run = _new_run(task, agent or "dqn", preset, episodes, seeds, seed or 0, folder, chosen)
+            run = _new_run(task, agent, preset, episodes, seeds, seed or 0, folder, chosen)
         elif assignments or any(x is not None for x in (task, agent, preset, seeds, seed, out)):
             raise QfolioError("--resume keeps what the run was started with; add only --episodes.")
         else:
@@ -136,8 +133,13 @@ def watch(folder: Positional[Path], *, episodes: int = 3) -> None:
     from qfolio.report.animation import pendulum_gif
     from qfolio.report.collect import EPISODE_START, greedy_episode
     from qfolio.runs import Run
+    from qfolio.tasks.pendulum import Pendulum
 
     run = Run.open(folder)
+    if not isinstance(run.task, Pendulum):
+        raise QfolioError(
+            f"{folder} is a run on {run.config['task']}; only a pendulum can be seen."
+        )
     if has_display():
         window = Window(f"qfolio: {folder}")
         for number in range(episodes):
@@ -170,7 +172,7 @@ def _new_run(
     preset = presets.preset(preset_name, task_name, agent_name)
     task_settings = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
     return Run.create(
-        settings.build(task_class, task_settings),
+        settings.build(task_class, {**preset.task, **task_settings}),
         preset.build(**chosen),
         episodes=preset.episodes if episodes is None else episodes,
         seeds=preset.seeds if seeds is None else seeds,
@@ -201,7 +203,6 @@ def _contrast(run: "Run", folder: Path) -> "Run | None":
     variant = run.agent.contrast()
     if variant is None:
         return None
-    label, agent = variant
     place = folder / "contrast"
     if (place / "checkpoint.safetensors").exists():
         contrast = Run.open(place)
@@ -209,7 +210,7 @@ def _contrast(run: "Run", folder: Path) -> "Run | None":
         config = run.config
         contrast = Run.create(
             run.task,
-            agent,
+            variant.variant,
             episodes=config["episodes"],
             seeds=min(2, config["seeds"]),
             seed=config["seed"],
@@ -217,13 +218,13 @@ def _contrast(run: "Run", folder: Path) -> "Run | None":
             out=place,
         )
     if contrast.population.steps_left(run.config["episodes"]):
-        say(f"\nFor contrast, {label} ({contrast.config['seeds']} of the seeds):")
+        say(f"\nFor contrast, {variant.variant_name} ({contrast.config['seeds']} of the seeds):")
         _train(contrast, run.config["episodes"])
     return contrast
 
 
 def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
-    from qfolio.console import console, print_result, say
+    from qfolio.console import console, print_result, print_rule, say
     from qfolio.report.collect import report_data
     from qfolio.report.page import write_report
 
@@ -231,6 +232,8 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
         summary = run.summary()
         write_report(folder, report_data(run, summary, contrast, _command(run)))
     print_result(run.population.seeds, summary)
+    if summary["rule"]:
+        print_rule(summary["rule"])
     say(
         f"{summary['env_steps'] * summary['seeds']:,} steps in {summary['seconds_train']:.1f} s of "
         f"training ({summary['steps_per_second']:,.0f} a second), "
@@ -244,10 +247,13 @@ def _command(run: "Run") -> str:
     from qfolio.presets import PRESETS, preset
 
     config = run.config
+    resume = f"qfolio train --resume {run.folder}"
     known = PRESETS.get((config["task"], config["agent"]), {})
-    name = config["preset"] if config["preset"] in known else "report"  # the agent's defaults
+    if not known:
+        return resume
+    name = config["preset"] if config["preset"] in known else next(iter(known))
     default = settings.describe(preset(name, config["task"], config["agent"]).build())
-    default |= settings.describe(type(run.task)())
+    default |= settings.describe(type(run.task)(**known[name].task))
     chosen = config["agent_settings"] | config["task_settings"]
     changed = [
         f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}"
@@ -257,7 +263,7 @@ def _command(run: "Run") -> str:
     words = ["qfolio train", config["task"], "--agent", config["agent"], "--preset"]
     words += [name, "--episodes", config["episodes"], "--seeds", config["seeds"]]
     words += ["--seed", config["seed"], *(["--set", *changed] if changed else [])]
-    return f"{' '.join(map(str, words))}\nqfolio train --resume {run.folder}"
+    return f"{' '.join(map(str, words))}\n{resume}"
 
 
 @contextlib.contextmanager
@@ -283,36 +289,3 @@ def _window(live: bool) -> Iterator[Callable[["Run"], None] | None]:
         yield show
     finally:
         window.close()
-
-
-def main() -> NoReturn:
-    """The entry point: errors meant for people become one sentence and exit code 2."""
-    commands: dict[str, Callable[..., Any]] = {
-        "train": train, "evaluate": evaluate, "watch": watch,
-    }  # fmt: skip
-    try:
-        tyro.extras.subcommand_cli_from_dict(
-            commands,
-            prog="qfolio",
-            description="Reinforcement learning for portfolio optimization, "
-            "graded against exact optima.",
-        )
-    except QfolioError as error:
-        print(f"qfolio: {error}", file=sys.stderr)
-        sys.exit(2)
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        print(f"qfolio: {where}{error.strerror or error}.", file=sys.stderr)
-        sys.exit(2)
-    except MemoryError:
-        print(f"qfolio: {OUT_OF_MEMORY}", file=sys.stderr)
-        sys.exit(2)
-    except RuntimeError as error:  # jax's own, which cannot be imported here
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        print(f"qfolio: {OUT_OF_MEMORY}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("qfolio: interrupted", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-    sys.exit(0)

@@ -1,16 +1,92 @@
-"""From a finished run to the numbers that its report shows."""
+"""From a finished run or backtest to the numbers that its report shows."""
 
-from typing import Any
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, PyTree
 
-from qfolio.evaluation import play, start_keys
-from qfolio.report.data import Curve, Episode, Maps, ReportData
+from qfolio.backtest.performance import Assessment
+from qfolio.backtest.run import Backtest, Entry
+from qfolio.evaluation import greedy, play, start_keys
+from qfolio.mdp import Agent, Policy, Position
+from qfolio.optimum.followed import FollowedOptimum
+from qfolio.report.backtest import BacktestData, StrategySeries
+from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
 from qfolio.runs import CURVE_STARTS, Run
+from qfolio.tasks.market import Market
 from qfolio.tasks.pendulum import Pendulum, PendulumState
+from qfolio.tasks.synthetic import Ar1, NoTrade, OneAsset, Synthetic
 from qfolio.training import episode_steps
+
+
+class _Words(NamedTuple):
+    where: str  # an agent was trained, for the title
+    about: str = ""
+    meaning: str = ""  # of a return, where it is more than the sum of rewards
+    rule: str = ""  # what the numbers of its rule are
+    scene: str = "{}"  # what the name of a scene stands for
+
+
+_WEIGHT_WANTED = "Each number is the weight that is wanted, from a weight that is held."
+
+_TASKS = {
+    "pendulum": _Words("on the pendulum"),
+    "market/kelly": _Words(
+        "on Kelly’s bet",
+        "A bet on good odds, repeated. The best policy stakes one fraction of the wealth, whatever "
+        "is at stake already (Kelly, 1956).",
+        rule="The fraction is the share of the wealth at stake.",
+    ),
+    "market/merton": _Words(
+        "in Merton’s market",
+        "Three assets and cash with the same chances at every step. The best weights therefore "
+        "never change (Merton, 1969), and here one of the assets is not worth holding.",
+        rule="What the three weights leave is held in cash.",
+    ),
+    "market/regime": _Words(
+        "in a market of good and bad times",
+        "One asset rises in good times and falls in bad ones, and trading costs. The best policy "
+        "is all in or all out, and changes over only where that earns more than it costs.",
+        rule=_WEIGHT_WANTED,
+        scene="{} times",
+    ),
+    "market/ar1": _Words(
+        "in a market with a signal",
+        "A slowly fading signal foretells the return of one asset, and trading costs. The best "
+        "policy, computed for weights in tenths, moves only where the signal is worth the cost, "
+        "and else keeps what it holds.",
+        rule=f"{_WEIGHT_WANTED} Signals are in standard deviations.",
+        scene="signal {}",
+    ),
+    "market/no-trade": _Words(
+        "in a market with a no-trade region",
+        "One asset grows faster than cash, and trading costs. The best policy does nothing inside "
+        "a region of weights; outside of it, it trades just to the nearest edge.",
+        "Each step counts with its expected growth, so that the luck of its price does not.",
+        rule="Low and high are the edges of the region: where a holder of too little stops buying, "
+        "and a holder of too much stops selling.",
+    ),
+    "market/garleanu-pedersen": _Words(
+        "in the market of Gârleanu and Pedersen",
+        "A fading signal foretells the return of one asset, and costs grow with the square of a "
+        "trade. The best policy therefore goes only part of the way to where it aims (Gârleanu "
+        "and Pedersen, 2013).",
+        "It counts what a position earns, less its risk and the costs of trading, each step "
+        "discounted.",
+        rule="What is wanted is a sum of two parts. The coefficient of the position held is one "
+        "less the trading rate; the other is that of the factor, the signal.",
+    ),
+}
+"""What the report says of a task, by name."""
+
+_AGENTS = {"dqn": "DQN", "pathwise": "Pathwise gradients"}
+
+_HELD = 201
+"""At how many weights or positions a policy is drawn."""
 
 EPISODE_START = 53
 """Which of the fixed starts the animation shows: one that hangs and has to be swung up."""
@@ -20,24 +96,74 @@ def report_data(
     run: Run, summary: dict[str, Any], contrast: Run | None, command: str
 ) -> ReportData:
     """Collects everything ``write_report`` needs. The maps and the episode are the first seed's."""
-    rows = run.metrics if episode_steps(run.task, run.agent) == run.task.horizon else []
     solution = run.task.optimum()
     optimum = np.nan
     if solution is not None:
         optimum = float(solution.returns(start_keys())[:CURVE_STARTS].mean())
     pendulum = run.task if isinstance(run.task, Pendulum) else None
+    known = solution if isinstance(solution, FollowedOptimum) else None
+    # In a market, training episodes have luck of their own: their returns do not compare.
+    whole = known is None and episode_steps(run.task, run.agent) == run.task.horizon
+    rows = run.metrics if whole else []
+    variant = run.agent.contrast()
+    names = ("greedy return", "") if variant is None else (variant.name, variant.variant_name)
+    agent, task = summary["agent"], summary["task"]
+    where = _TASKS.get(task, _Words(f"on the {task}")).where
     return ReportData(
-        title=f"{summary['agent'].upper()} on the {summary['task']}",
+        title=f"{_AGENTS.get(agent, agent)} {where}",
         command=command,
         summary=summary,
         config=run.config,
-        curve=_curve(run),
-        comparison=_curve(contrast) if contrast is not None and contrast.evaluations else None,
+        curve=_curve(run, names[0]),
+        comparison=_curve(contrast, names[1]) if contrast and contrast.evaluations else None,
         training_episodes=np.array([row["episode"] for row in rows]),
         training_returns=np.array([row["return"] for row in rows]),
         optimum=optimum,
         maps=_maps(run, pendulum) if pendulum else None,
         episode=greedy_episode(run, pendulum) if pendulum else None,
+        market=_market(run, summary, known) if known else None,
+    )
+
+
+def backtest_data(
+    backtest: Backtest,
+    entries: dict[str, Entry],
+    assessment: Assessment,
+    notes: Sequence[str],
+) -> BacktestData:
+    """Collects everything ``write_backtest_report`` needs."""
+    config, dates = backtest.config, backtest.prices.dates
+    shift = config["lag"] + 1
+    day = lambda row: str(dates[row])[:10]  # noqa: E731
+    return BacktestData(
+        title=f"{' and '.join(backtest.agents)} on {len(backtest.prices.assets)} assets",
+        command=config["command"],
+        assessment=assessment,
+        dates=backtest.dates,
+        assets=backtest.prices.assets,
+        strategies={
+            name: StrategySeries(
+                entry.kind,
+                entry.simulation.returns,
+                entry.simulation.turnover,
+                entry.simulation.cost,
+                entry.simulation.weights.mean(0),
+            )
+            for name, entry in entries.items()
+        },
+        prices=config["prices"],
+        config={key: value for key, value in config.items() if key not in ("prices", "assets")},
+        folds=[
+            {
+                "name": fold.name,
+                "train_first": day(fold.train.start),
+                "train_last": day(fold.train.stop - 1),
+                "test_first": day(fold.decisions.start + shift),
+                "test_last": day(fold.decisions.stop - 1 + shift),
+            }
+            for fold in backtest.folds
+        ],
+        notes=list(notes),
     )
 
 
@@ -52,15 +178,82 @@ def greedy_episode(run: Run, task: Pendulum, start: int = EPISODE_START) -> Epis
     )
 
 
-def _curve(run: Run) -> Curve:
+def _curve(run: Run, label: str) -> Curve:
     seeds = run.config["seeds"]
     rows = run.evaluations[: len(run.evaluations) // seeds * seeds]
     table = {
         name: np.array([row[name] for row in rows]).reshape(-1, seeds)
         for name in ("episode", "return", "overestimation")
     }
-    label = "double DQN" if getattr(run.agent, "double", False) else "without double DQN"
     return Curve(label, table["episode"].mean(1), table["return"], table["overestimation"])
+
+
+def _market(run: Run, summary: dict[str, Any], solution: FollowedOptimum) -> MarketData:
+    task = run.task
+    words = _TASKS.get(summary["task"], _Words(""))
+    growth = isinstance(task, Market) and task.reward == "log"
+    years = task.horizon * task.dt if isinstance(task, NoTrade) else None
+    return MarketData(
+        about=words.about,
+        meaning=words.meaning,
+        rule=words.rule,
+        measure="log growth" if growth else "return",
+        horizon=task.horizon,
+        period="" if not growth else "year" if years else "step",
+        periods=years or float(task.horizon),
+        policy=_policy(run, summary["rule"], solution.policy, words.scene),
+    )
+
+
+def _policy(
+    run: Run, rule: dict[str, Any] | None, best: Policy, scene: str
+) -> Responses | Weights | None:
+    if isinstance(run.task, Synthetic) and run.task.scenes():
+        return responses(run.task, run.agent, run.population.weights(), best, scene)
+    return constant_weights(rule) if rule and rule["exact"] else None
+
+
+def constant_weights(rule: dict[str, Any]) -> Weights:
+    """The weights that a summary's rule tells."""
+    return Weights(
+        names=tuple(name.removeprefix("weight of ") for name in rule["exact"]),
+        exact=np.array(list(rule["exact"].values())),
+        learned=np.array([list(seed.values()) for seed in rule["per_seed"]]),
+    )
+
+
+def responses(
+    task: Synthetic, agent: Agent, members: PyTree, best: Policy, scene: str = "{}"
+) -> Responses:
+    """What learned policies and the best one want in the scenes of a market, by what is held.
+
+    members: weights of the agents, with a leading axis. scene: with the name of a scene put into
+    it, what it is called.
+    """
+    names, markets = zip(*task.scenes(), strict=True)
+    scenes = jax.tree.map(lambda *leaves: jnp.stack(leaves), *markets)
+    ends = (0.0, 1.0) if isinstance(task, OneAsset) else (-2.0, 2.0)
+    # Between levels, an exact policy that knows only those would have to round.
+    held = jnp.linspace(*ends, task.levels if isinstance(task, Ar1) else _HELD)
+
+    def wanted(policy: Policy, market: Any, held: Array) -> Array:
+        one = isinstance(task, OneAsset)
+        holding = task.hold(jnp.stack([1 - held, held])) if one else held[None]
+        return policy(Position(market, holding))[-1]  # of weights, the asset's
+
+    def table(policy: Policy) -> Array:
+        each = jax.vmap(partial(wanted, policy), (None, 0))
+        return jax.vmap(each, (0, None))(scenes, held)
+
+    learned = jax.jit(jax.vmap(lambda weights: table(greedy(task, agent, weights))))
+    return Responses(
+        scenes=tuple(scene.format(name.replace("-", "\N{MINUS SIGN}")) for name in names),
+        held=np.asarray(held),
+        exact=np.asarray(jax.jit(lambda: table(best))()),
+        learned=np.asarray(learned(members)),
+        weights=isinstance(task, OneAsset),
+        region=task.region()[:2] if isinstance(task, NoTrade) else None,
+    )
 
 
 def _maps(run: Run, task: Pendulum) -> Maps | None:

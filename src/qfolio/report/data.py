@@ -1,5 +1,6 @@
 """What a report is made of: plain arrays and dictionaries, independent of how they came about."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +9,13 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
 Numbers = NDArray[np.floating[Any] | np.integer[Any]]
+
+
+def decimals(size: float, figures: int = 4, least: int = 1) -> int:
+    """Return how many decimals show that many figures of numbers of about this size."""
+    if not math.isfinite(size) or size == 0:
+        return least
+    return min(max(least, figures - 1 - math.floor(math.log10(abs(size)))), 9)
 
 
 @dataclass(frozen=True)
@@ -19,7 +27,7 @@ class Curve:
         episodes: Training episodes finished at each evaluation, shape (P,).
         returns: Mean greedy return on fixed starts, shape (P, S).
         overestimation: Mean of the largest action value at the visited states less the
-            discounted return that followed, shape (P, S).
+            discounted return that followed, shape (P, S); NaN where no values are estimated.
     """
 
     label: str
@@ -68,6 +76,67 @@ class Episode:
 
 
 @dataclass(frozen=True)
+class Responses:
+    """What each seed's policy wants, by what is held, in some scenes of a market.
+
+    Attributes:
+        scenes: What the c scenes are called.
+        held: Weights or positions held, shape (h,).
+        exact: What the exact policy wants, shape (c, h).
+        learned: What each of S seeds wants, shape (S, c, h).
+        weights: Whether these are weights, from 0 to 1, and not positions without bounds.
+        region: Ends of the exact no-trade region, or None where there is no one such region.
+    """
+
+    scenes: tuple[str, ...]
+    held: Floats
+    exact: Floats
+    learned: Floats
+    weights: bool
+    region: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What each seed's policy wants where that is always the same.
+
+    Attributes:
+        names: What the n weights are called.
+        exact: Weights of the exact policy, shape (n,).
+        learned: Weights of each of S seeds, shape (S, n).
+    """
+
+    names: tuple[str, ...]
+    exact: Floats
+    learned: Floats
+
+
+@dataclass(frozen=True)
+class MarketData:
+    """What a report tells of a market whose best policy is known.
+
+    Attributes:
+        about: Sentences on the market and its best policy.
+        measure: What a return is called: 'log growth', or 'return' where it is another sum.
+        meaning: A sentence that says what a return counts, where that needs one.
+        rule: A sentence that says what the numbers of the summary's rule are.
+        horizon: Steps of an episode.
+        period: Name of the span that growth is given for, or '' where returns are not growth.
+        periods: Such spans in an episode.
+        policy: Learned and exact policy, or None where there is nothing to draw.
+    """
+
+    about: str
+    measure: str
+    meaning: str
+    rule: str
+    horizon: int
+    period: str
+    periods: float
+    policy: Responses | Weights | None
+
+
+@dataclass(frozen=True)
 class ReportData:
     """Everything a report shows.
 
@@ -77,16 +146,19 @@ class ReportData:
         summary: The results: task, agent, preset, seeds, episodes, env_steps, seconds_compile,
             seconds_train, steps_per_second, return_mean, return_ci95 (low, high;
             None for one seed),
-            return_per_seed, optimum, regret_per_seed (fractions of the optimum) and
-            overestimation_per_seed.
+            return_per_seed, optimum, regret_per_seed (fractions of the optimum),
+            overestimation_per_seed (None where no action values are estimated) and, in markets,
+            rule: a few numbers that say what a policy does, "exact" and "per_seed".
         config: All settings, a nested dictionary.
         curve: The run that is reported.
         comparison: The same run with one thing changed, or None.
         training_episodes: Number of each finished training episode of every seed, shape (R,).
-        training_returns: Return of those episodes, shape (R,).
+        training_returns: Return of those episodes, shape (R,); none where they cannot be set
+            beside the curve.
         optimum: Mean return of the exact optimum on the evaluation starts of the curve.
         maps: Solutions over the state space, or None for tasks without a 2-D state.
         episode: A greedy episode to be shown, or None.
+        market: What there is to tell of a market, or None for other tasks.
     """
 
     title: str
@@ -100,3 +172,4 @@ class ReportData:
     optimum: float
     maps: Maps | None
     episode: Episode | None
+    market: MarketData | None = None

@@ -7,13 +7,24 @@ import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.report import palette
-from qfolio.report.data import Curve, Episode, Floats, Maps, Numbers, ReportData
+from qfolio.report.data import (
+    Curve,
+    Episode,
+    Floats,
+    Maps,
+    Numbers,
+    ReportData,
+    Responses,
+    Weights,
+    decimals,
+)
+from qfolio.report.rendering import number
 from qfolio.statistics import bootstrap_interval, interquartile_mean
 
 if TYPE_CHECKING:
@@ -22,6 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
+T = TypeVar("T")
 Draw = Callable[[ReportData, float], "Figure"]
 Panels = NDArray[np.object_]
 Target = str | Path | IO[bytes]
@@ -74,7 +86,7 @@ _style_lock = threading.Lock()
 
 def learning_curve(target: Target, data: ReportData) -> None:
     """Save the greedy return over training, with a close view near the optimum, as PNG."""
-    _save_png(target, draw_learning_curve, data, LEAD)
+    save_png(target, draw_learning_curve, data, LEAD)
 
 
 def value(target: Target, data: ReportData) -> None:
@@ -83,12 +95,21 @@ def value(target: Target, data: ReportData) -> None:
     Raises:
         ValueError: The data has no maps.
     """
-    _save_png(target, draw_value, data, WIDE)
+    save_png(target, draw_value, data, WIDE)
+
+
+def policy(target: Target, data: ReportData) -> None:
+    """Save what the learned policies want beside what is best as PNG.
+
+    Raises:
+        ValueError: The data has no policy of a market.
+    """
+    save_png(target, draw_policy, data, WIDE)
 
 
 def overestimation(target: Target, data: ReportData) -> None:
     """Save the overestimation of action values over training as PNG."""
-    _save_png(target, draw_overestimation, data, WIDE)
+    save_png(target, draw_overestimation, data, WIDE)
 
 
 def inline_svg(draw: Draw, data: ReportData, width: float) -> str:
@@ -120,25 +141,37 @@ def inline_svg(draw: Draw, data: ReportData, width: float) -> str:
 
 
 def draw_learning_curve(data: ReportData, width: float) -> Figure:
-    """Draw the greedy return over training, and once more near the optimum where that helps."""
+    """Draw the greedy return over training, and once more near the optimum where that helps.
+
+    In a market, where training returns are not drawn, the comparison is.
+    """
     window = _near_optimum(data)
     panels = 1 if window is None else 2
-    figure = _figure(width, 3.7 if width > NARROW or panels == 1 else 6.4)
+    figure = new_figure(width, 3.7 if width > NARROW or panels == 1 else 6.4)
     if width > NARROW:
         axes = figure.subplots(1, panels, squeeze=False, width_ratios=[1.25, 1][:panels])
     else:
         axes = figure.subplots(panels, 1, squeeze=False)
+    name = data.market.measure if data.market else "return"
+    curves = [(data.curve, palette.ACCENT)]
+    if data.market and data.comparison:
+        curves.append((data.comparison, palette.SECOND))
+    kind = None if data.market else "greedy"
     whole = axes.flat[0]
-    _line_axes(whole, "Return over the whole run", "training episodes")
-    _draw_runs(whole, data.curve.episodes, data.curve.returns, palette.ACCENT, "greedy")
+    _line_axes(whole, f"{name.capitalize()} over the whole run", "training episodes")
+    for curve, colour in curves:
+        _draw_runs(whole, curve.episodes, curve.returns, colour, kind, curve.label)
     _draw_training(whole, data)
     whole.set_xlim(left=0)
     _draw_optimum(whole, data, label=panels == 1)
+    if data.market:
+        _cut_beginning(whole, data.optimum)
     whole.legend(loc="best", labelcolor=palette.MUTED)
     if window is not None:
         close = axes.flat[1]
         _line_axes(close, "The same near the optimum", "training episodes")
-        _draw_runs(close, data.curve.episodes, data.curve.returns, palette.ACCENT)
+        for curve, colour in curves:
+            _draw_runs(close, curve.episodes, curve.returns, colour)
         left, low, high = window
         close.set_xlim(left, data.curve.episodes[-1])
         close.set_ylim(low, high)
@@ -151,7 +184,7 @@ def draw_value(data: ReportData, width: float) -> Figure:
     maps = data.maps
     if maps is None:
         raise ValueError("the value figure needs maps of the state space")
-    figure = _figure(width, 0.98 * width if width > NARROW else 1.2 * width)
+    figure = new_figure(width, 0.98 * width if width > NARROW else 1.2 * width)
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     low = min(maps.value.min(), maps.exact_value.min())
     high = max(maps.value.max(), maps.exact_value.max())
@@ -184,9 +217,19 @@ def draw_value(data: ReportData, width: float) -> Figure:
     return figure
 
 
+def draw_policy(data: ReportData, width: float) -> Figure:
+    """Draw what the learned policies want in a market, and what is best."""
+    drawn = data.market.policy if data.market else None
+    if drawn is None:
+        raise ValueError("the policy figure needs the policies of a market")
+    if isinstance(drawn, Weights):
+        return _draw_weights(drawn, width)
+    return _draw_responses(drawn, width)
+
+
 def draw_overestimation(data: ReportData, width: float) -> Figure:
     """Draw how far the action values lie above the returns that really followed."""
-    figure = _figure(width, 3.5 if width > NARROW else 3.2)
+    figure = new_figure(width, 3.5 if width > NARROW else 3.2)
     axes = figure.subplots()
     _line_axes(axes, "", "training episodes")
     curves = [data.curve] if data.comparison is None else [data.curve, data.comparison]
@@ -197,14 +240,16 @@ def draw_overestimation(data: ReportData, width: float) -> Figure:
     low, high, clipped = _settled_range(curves)
     axes.set_xlim(left=0)
     axes.set_ylim(low, high)
-    axes.set_title("Action value less the return that followed", pad=26)
+    # On a phone, long names do not fit beside each other.
+    beside = width > NARROW or sum(len(curve.label) for curve in curves) < 32
+    axes.set_title("Action value less the return that followed", pad=26 if beside else 40)
     if clipped:
         _line_label(axes, high, "beginning off the scale", below=True, color=palette.MUTED)
     axes.legend(
         *(),
         loc="lower left",
         bbox_to_anchor=(0, 1.0),
-        ncols=2,
+        ncols=2 if beside else 1,
         labelcolor="linecolor",
         borderpad=0.3,
         columnspacing=1.4,
@@ -212,12 +257,17 @@ def draw_overestimation(data: ReportData, width: float) -> Figure:
     return figure
 
 
-def _save_png(target: Target, draw: Draw, data: ReportData, width: float) -> None:
+def save_png(target: Target, draw: Callable[[T, float], Figure], data: T, width: float) -> None:
+    """Save what a function draws from some data in the style of all figures."""
     _save(draw, data, width, target, format="png", dpi=160, facecolor=palette.PAPER)
 
 
 def _save(
-    draw: Draw, data: ReportData, width: float, target: Target | IO[str], **options: Any
+    draw: Callable[[T, float], Figure],
+    data: T,
+    width: float,
+    target: Target | IO[str],
+    **options: Any,
 ) -> None:
     import matplotlib as mpl
 
@@ -225,7 +275,8 @@ def _save(
         draw(data, width).savefig(target, **options)
 
 
-def _figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, without pyplot and its global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -294,7 +345,7 @@ def _draw_training(axes: Axes, data: ReportData) -> None:
 def _draw_optimum(axes: Axes, data: ReportData, *, label: bool) -> None:
     axes.axhline(data.optimum, color=palette.INK, linewidth=0.9, dashes=(4, 3))
     if label:
-        text = f"exact optimum {data.optimum:.1f}".replace("-", "\N{MINUS SIGN}")
+        text = f"exact optimum {number(data.optimum, decimals(data.optimum))}"
         _line_label(axes, data.optimum, text)
 
 
@@ -313,6 +364,15 @@ def _line_label(
     )
 
 
+def _cut_beginning(axes: Axes, optimum: float) -> None:
+    """Leave off the scale what lies far below zero, where a market can throw beginners."""
+    low, high = axes.get_ylim()
+    floor = min(0.0, optimum) - 2 * abs(optimum)
+    if low < floor:
+        axes.set_ylim(floor, min(high, optimum + abs(optimum)))
+        _line_label(axes, floor, "beginning off the scale", color=palette.MUTED)
+
+
 def _near_optimum(data: ReportData) -> tuple[float, float, float] | None:
     """Return the left, lower and upper ends of the close view, or None where none is needed."""
     returns, episodes = data.curve.returns, data.curve.episodes
@@ -327,6 +387,139 @@ def _near_optimum(data: ReportData) -> tuple[float, float, float] | None:
     if high - low > whole / 3 or inside.size == 0 or inside[0] + 1 >= len(episodes):
         return None
     return float(episodes[inside[0]]), low, high
+
+
+def _draw_responses(drawn: Responses, width: float) -> Figure:
+    """Draw what is wanted over what is held: weights by scene, or all scenes of a position."""
+    count = len(drawn.scenes) if drawn.weights else 1
+    columns = min(2, count)
+    rows = -(-count // columns)
+    side = width / columns if columns > 1 else 0.66 * width if width > NARROW else 0.9 * width
+    figure = new_figure(width, rows * side + 0.5)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for panel in axes.flat[count:]:
+        panel.set_visible(False)
+    for scene, name in enumerate(drawn.scenes):
+        panel = axes.flat[scene if drawn.weights else 0]
+        lines = _draw_scene(panel, drawn, scene)
+        if not drawn.weights:
+            _end_label(panel, drawn.held[-1], drawn.exact[scene, -1], name)
+        elif count > 1:
+            panel.set_title(name, pad=6)
+    noun = "weight" if drawn.weights else "position"
+    place = float(np.quantile(drawn.held, 0.72 if columns == 1 else 0.58))
+    for panel in axes.flat:
+        panel.grid()
+        panel.set_xlim(drawn.held[0], drawn.held[-1])
+        panel.locator_params(nbins=5)
+        if drawn.weights:
+            ticks = np.linspace(0, 1, 3 if columns > 1 and width <= NARROW else 5)
+            panel.set(xticks=ticks, yticks=ticks, ylim=(-0.03, 1.03))
+        _draw_no_trade(panel, drawn, place if panel is axes[0, 0] else None)
+    for panel in axes[-1]:
+        panel.set_xlabel(f"{noun} held")
+    for panel in axes[:, 0]:
+        panel.set_ylabel(f"{noun} wanted")
+    _legend_above(figure, lines, few=width <= NARROW)
+    return figure
+
+
+def _draw_scene(axes: Axes, drawn: Responses, scene: int) -> dict[str, Any]:
+    """Draw a thin line per seed, their mean and the exact policy; return them by name."""
+    learned, held = drawn.learned[:, scene], drawn.held
+    seeds = len(learned)
+    lines = {}
+    if seeds > 1:
+        alpha = max(0.15, min(0.45, 3 / seeds))
+        thin = axes.plot(held, learned.T, color=palette.ACCENT, linewidth=0.8, alpha=alpha)
+        lines["each seed"] = thin[0]
+    name = f"mean of {seeds} seeds" if seeds > 1 else "learned"
+    (lines[name],) = axes.plot(held, learned.mean(0), color=palette.ACCENT, linewidth=2)
+    (lines["exact"],) = axes.plot(
+        held, drawn.exact[scene], color=palette.INK, linewidth=1.1, dashes=(4, 3)
+    )
+    return lines
+
+
+def _draw_no_trade(axes: Axes, drawn: Responses, place: float | None) -> None:
+    """Draw the diagonal, where what is wanted is what is held, and the region of no trade.
+
+    place: where on the diagonal to write what it is.
+    """
+    low, high = drawn.held[0], drawn.held[-1]
+    axes.plot([low, high], [low, high], color=palette.MUTED, linewidth=0.8, zorder=1.5)
+    if place is not None:
+        axes.text(
+            place,
+            place - 0.015 * (high - low),
+            "no trade",
+            color=palette.MUTED,
+            rotation=45,
+            rotation_mode="anchor",
+            transform_rotates_text=True,
+            va="top",
+        )
+    if drawn.region is not None:
+        axes.axvspan(*drawn.region, color=palette.HAIRLINE, alpha=0.6, linewidth=0, zorder=0.5)
+
+
+def _draw_weights(drawn: Weights, width: float) -> Figure:
+    """Draw weights that never change: a dot per seed, their mean, and the exact weight."""
+    count, seeds = len(drawn.names), len(drawn.learned)
+    figure = new_figure(width, 0.62 * count + 1.2)
+    axes = figure.subplots()
+    rows = np.arange(count)
+    marks: dict[str, Any] = {}
+    dot: dict[str, Any] = {
+        "marker": "o",
+        "linestyle": "",
+        "color": palette.ACCENT,
+        "markeredgewidth": 0,
+    }
+    if seeds > 1:
+        strip = 0.24 + np.linspace(-0.06, 0.06, seeds)  # below the mean
+        places = rows[:, None] + np.broadcast_to(strip, (count, seeds))
+        (marks["each seed"],) = axes.plot(
+            drawn.learned.T.ravel(), places.ravel(), markersize=4, alpha=0.55, **dot
+        )
+    name = f"mean of {seeds} seeds" if seeds > 1 else "learned"
+    (marks[name],) = axes.plot(drawn.learned.mean(0), rows, markersize=8, clip_on=False, **dot)
+    (marks["exact"],) = axes.plot(
+        drawn.exact, rows, "|", color=palette.INK, markersize=24, markeredgewidth=1.6, clip_on=False
+    )
+    axes.set_yticks(rows, drawn.names)
+    axes.set_ylim(count - 0.5, -0.5)
+    axes.set_xlim(left=0)
+    axes.grid(axis="x")
+    axes.set_xlabel("weight")
+    _legend_above(figure, marks, few=width <= NARROW)
+    return figure
+
+
+def _legend_above(figure: Figure, marks: dict[str, Any], *, few: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    legend = figure.legend(
+        list(marks.values()),
+        list(marks),
+        loc="outside upper left",
+        ncols=3,
+        labelcolor=palette.MUTED,
+        columnspacing=1.0 if few else 1.6,
+        handletextpad=0.6,
+        borderpad=0.3,
+    )
+    for handle in legend.legend_handles:
+        if not isinstance(handle, Line2D):
+            continue
+        handle.set_alpha(max(0.7, handle.get_alpha() or 1.0))
+        handle.set_markersize(min(10, handle.get_markersize()))
+
+
+def _end_label(axes: Axes, x: float, y: float, text: str) -> None:
+    axes.annotate(
+        text, (x, y), xytext=(4, 0), textcoords="offset points", va="center", color=palette.MUTED
+    )
 
 
 def _settled_range(curves: list[Curve]) -> tuple[float, float, bool]:

@@ -2,35 +2,36 @@
 
 import base64
 import io
-import json
-from importlib import resources
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
-from qfolio.report import figures, palette
+from qfolio.report import figures
 from qfolio.report.animation import pendulum_gif
-from qfolio.report.data import Curve, ReportData
-from qfolio.statistics import interquartile_mean
-
-_NUMBER_WORDS = (
-    *("No", "One", "Two", "Three", "Four", "Five", "Six"),
-    *("Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve"),
+from qfolio.report.data import MarketData, ReportData, decimals
+from qfolio.report.rendering import (
+    THIN_SPACE,
+    amount,
+    counted,
+    duration,
+    number,
+    percent,
+    render,
+    setting_groups,
 )
-_COLUMNS = ("return_per_seed", "regret_per_seed", "overestimation_per_seed")
-_THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
+from qfolio.statistics import interquartile_mean
 
 
 def write_report(folder: Path, data: ReportData) -> None:
-    """Write report.html, learning_curve.png, value.png and episode.gif into a folder.
+    """Write report.html, learning_curve.png and what else applies into a folder.
 
-    The page needs no other file and no network. The figure value.png is left out when there are
-    no maps, and the animation when there is no episode; files of these names from an earlier
-    report are then removed, so that a folder never mixes two reports.
+    That is value.png where there are maps, policy.png where there is the policy of a market, and
+    episode.gif where there is an episode; otherwise files of these names from an earlier report are
+    removed, so that a folder never mixes two reports. The page needs no other file and no network.
 
     Args:
         folder: Where to write; made if missing.
@@ -42,10 +43,14 @@ def write_report(folder: Path, data: ReportData) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     figures.learning_curve(folder / "learning_curve.png", data)
-    if data.maps is None:
-        (folder / "value.png").unlink(missing_ok=True)
-    else:
-        figures.value(folder / "value.png", data)
+    for name, draw, applies in (
+        ("value.png", figures.value, data.maps is not None),
+        ("policy.png", figures.policy, _has_policy(data)),
+    ):
+        if applies:
+            draw(folder / name, data)
+        else:
+            (folder / name).unlink(missing_ok=True)
     animation = folder / "episode.gif"
     if data.episode is None:
         animation.unlink(missing_ok=True)
@@ -58,136 +63,145 @@ def write_report(folder: Path, data: ReportData) -> None:
 
 def render_page(data: ReportData, gif: bytes | None = None) -> str:
     """Return the text of the page, with the bytes of the animation if there is one."""
-    source = resources.files(__package__).joinpath("template.html").read_text(encoding="utf-8")
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters.update(number=number, percent=percent)
-    return environment.from_string(source).render(
+    biases = _biases(data)
+    return render(
+        "template.html",
         data=data,
         summary=data.summary,
-        palette=palette,
+        market=data.market,
+        measure=data.market.measure if data.market else "return",
         seeds=len(data.summary["return_per_seed"]),
-        verdict=verdict(data.summary),
-        facts=_facts(data.summary),
-        biases=[(curve.label, _last(curve)) for curve in (data.curve, data.comparison) if curve],
-        agents=_agents(data.summary),
-        means=[float(np.mean(data.summary[column])) for column in _COLUMNS],
+        verdict=verdict(data.summary, data.market),
+        facts=_facts(data.summary, data.market),
+        biases=[(label, number(bias, _bias_digits(data), sign=True)) for label, bias in biases],
+        doubled=any("double DQN" in label for label, _ in biases),
+        agents=_agents(data),
+        rule=_rule(data.summary.get("rule")),
         settings=setting_groups(data.config),
         gif=None if gif is None else _data_uri("image/gif", gif),
         still=None if gif is None else _data_uri("image/png", _first_frame(gif)),
         learning=_svgs(figures.draw_learning_curve, data, figures.LEAD),
         value=None if data.maps is None else _svgs(figures.draw_value, data, figures.WIDE),
-        overestimation=_svgs(figures.draw_overestimation, data, figures.WIDE),
+        policy=_svgs(figures.draw_policy, data, figures.WIDE) if _has_policy(data) else None,
+        overestimation=_svgs(figures.draw_overestimation, data, figures.WIDE) if biases else None,
     )
 
 
-def verdict(summary: dict[str, Any]) -> str:
+def verdict(summary: dict[str, Any], market: MarketData | None = None) -> str:
     """Return the result in one or two plain sentences."""
     count = len(summary["return_per_seed"])
-    word = _NUMBER_WORDS[count] if count < len(_NUMBER_WORDS) else str(count)
-    agents = f"{word} agent{'s' if count != 1 else ''}"
-    mean, optimum = number(summary["return_mean"]), number(summary["optimum"])
-    regret = float(np.mean(summary["regret_per_seed"]))
+    agents = counted(count, "agent")
+    digits = decimals(summary["optimum"])
+    mean, optimum = number(summary["return_mean"], digits), number(summary["optimum"], digits)
+    regret = _mean_regret(summary)
     interval = ""
     if count > 1:
-        low, high = (number(end) for end in summary["return_ci95"])
-        interval = f" (95{_THIN_SPACE}% interval {low} to {high})"
+        low, high = (number(end, digits) for end in summary["return_ci95"])
+        interval = f" (95{THIN_SPACE}% interval {low} to {high})"
     side = "below" if regret >= 0 else "above"
     share = percent(abs(regret))
     distance = f"{share} {side} the exact optimum of {optimum}"
     if share == percent(0):
         distance = f"equal to the exact optimum of {optimum} within a tenth of a percent"
-    sentence = f"{agents} reached a mean return of {mean}{interval}, {distance}."
+    measure = market.measure if market else "return"
+    span = f" over {number(market.horizon, 0)} steps" if market else ""
+    sentence = f"{agents} reached a mean {measure} of {mean}{span}{interval}, {distance}."
     if count == 1:
         sentence += " A single seed says nothing about the spread, so no interval is given."
     return sentence
 
 
-def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
-    """Return a number with a true minus sign and thin spaces between thousands."""
-    text = f"{value:{'+' if sign else ''},.{digits}f}"
-    if not text.strip("+-0.,"):
-        text = text.lstrip("+-")
-    return text.replace(",", _THIN_SPACE).replace("-", "\N{MINUS SIGN}")
-
-
-def percent(fraction: float) -> str:
-    """Return a fraction as a percentage with one decimal."""
-    return f"{number(100 * fraction)}{_THIN_SPACE}%"
-
-
-def setting_groups(config: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return all settings by group: the plain ones first, then one group per nested dictionary."""
-    plain = {key: value for key, value in config.items() if not isinstance(value, dict)}
-    nested = {key: value for key, value in config.items() if isinstance(value, dict)}
-    groups = {"general": plain, **nested} if plain else nested
-    return [(str(name), _flat(group)) for name, group in groups.items()]
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    rows: list[tuple[str, str]] = []
-    for key, value in settings.items():
-        if isinstance(value, dict):
-            rows += _flat(value, f"{prefix}{key}.")
-        else:
-            plain = value is None or isinstance(value, bool | int | float | list | tuple)
-            text = json.dumps(value, default=str, ensure_ascii=False) if plain else str(value)
-            rows.append((f"{prefix}{key}", text))
-    return rows
-
-
-def _facts(summary: dict[str, Any]) -> list[tuple[str, str, str]]:
+def _facts(summary: dict[str, Any], market: MarketData | None) -> list[tuple[str, str, str]]:
     """Return the key figures: name, value and a remark."""
     several = len(summary["return_per_seed"]) > 1
     spread = "one seed, no interval"
+    digits = decimals(summary["optimum"])
     if several:
-        low, high = (number(end) for end in summary["return_ci95"])
-        spread = f"95{_THIN_SPACE}%: {low} to {high}"
+        low, high = (number(end, digits) for end in summary["return_ci95"])
+        spread = f"95{THIN_SPACE}%: {low} to {high}"
     together = "all seeds together" if several else "while training"
-    return [
-        ("Return", number(summary["return_mean"]), spread),
-        ("Exact optimum", number(summary["optimum"]), "on the same starts"),
-        ("Regret", percent(float(np.mean(summary["regret_per_seed"]))), "of the optimum"),
+    speed = ("Steps per second", amount(summary["steps_per_second"]), together)
+    facts = [
+        ("Return", number(summary["return_mean"], digits), spread),
+        ("Exact optimum", number(summary["optimum"], digits), "on the same starts"),
+        ("Regret", percent(_mean_regret(summary), 2 if market else 1), "of the optimum"),
         (
             "Training time",
             duration(summary["seconds_train"]),
             f"and {duration(summary['seconds_compile'])} to compile",
         ),
-        ("Steps per second", amount(summary["steps_per_second"]), together),
+        speed,
         (
             "Environment steps",
             amount(summary["env_steps"]),
             f"{amount(summary['episodes'])} episodes per seed",
         ),
     ]
+    if market:
+        facts[0] = (market.measure.capitalize(), *facts[0][1:])
+        facts[1] = (*facts[1][:2], "on the same random paths")
+    if market and market.period:
+        learned, best = (summary[name] / market.periods for name in ("return_mean", "optimum"))
+        fine = decimals(100 * best, 3)
+        exact = f"exact: {percent(best, fine)}"
+        facts.remove(speed)
+        facts.insert(3, (f"Growth a {market.period}", percent(learned, fine), exact))
+    return facts
 
 
-def duration(seconds: float) -> str:
-    """Return a time span in the unit that suits it."""
-    if seconds < 10:
-        return f"{seconds:.1f}{_THIN_SPACE}s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    parts = [(hours, "h"), (minutes, "min"), (rest, "s")]
-    kept = [f"{count}{_THIN_SPACE}{unit}" for count, unit in parts if count]
-    return " ".join(kept[:2])
+def _agents(data: ReportData) -> list[tuple[str, list[str]]]:
+    """Return a row for each agent, and one for their mean: return, regret and overestimation."""
+    summary = data.summary
+    columns = [
+        (summary["return_per_seed"], lambda x: number(x, decimals(summary["optimum"]))),
+        (summary["regret_per_seed"], lambda x: percent(x, 2 if data.market else 1)),
+    ]
+    excess = summary["overestimation_per_seed"]
+    if None not in excess:
+        columns.append((excess, lambda x: number(x, _bias_digits(data), sign=True)))
+    table = [[*map(write, values), write(float(np.mean(values)))] for values, write in columns]
+    names = [*map(str, range(1, len(excess) + 1)), "Mean"]
+    return [(name, list(row)) for name, *row in zip(names, *table, strict=True)]
 
 
-def amount(count: float) -> str:
-    """Return a large whole number with three or more digits that matter."""
-    if count >= 1e6:
-        return f"{number(count / 1e6, 2)} million"
-    return number(count, 0)
+def _rule(rule: dict[str, Any] | None) -> list[tuple[str, str, str, str]]:
+    """Return what each number of a rule is called, its exact value, the mean and the farthest."""
+    if rule is None:
+        return []
+    rows = []
+    for name, exact in rule["exact"].items():
+        learned = [seed[name] for seed in rule["per_seed"]]
+        farthest = max(learned, key=lambda value: abs(value - exact))
+        mean = float(np.mean(learned))
+        rows.append((_signed(name), number(exact, 3), number(mean, 3), number(farthest, 3)))
+    return rows
 
 
-def _agents(summary: dict[str, Any]) -> list[tuple[int, float, float, float]]:
-    rows = zip(*(summary[column] for column in _COLUMNS), strict=True)
-    return [(index, *row) for index, row in enumerate(rows, start=1)]
+def _signed(text: str) -> str:
+    """Return a text with true minus signs before its numbers."""
+    return re.sub(r"-(?=\d)", "\N{MINUS SIGN}", text)
 
 
-def _last(curve: Curve) -> float:
-    return float(interquartile_mean(curve.overestimation[-1]))
+def _mean_regret(summary: dict[str, Any]) -> float:
+    return float(np.mean(summary["regret_per_seed"]))
+
+
+def _has_policy(data: ReportData) -> bool:
+    return data.market is not None and data.market.policy is not None
+
+
+def _biases(data: ReportData) -> list[tuple[str, float]]:
+    """Return the last overestimation of each curve, where action values were estimated."""
+    curves = [curve for curve in (data.curve, data.comparison) if curve]
+    last = [(x.label, float(interquartile_mean(x.overestimation[-1]))) for x in curves]
+    return last if all(np.isfinite(bias) for _, bias in last) else []
+
+
+def _bias_digits(data: ReportData) -> int:
+    """Return with how many decimals to write an overestimation."""
+    if data.market is None:
+        return 2
+    return decimals(max((abs(bias) for _, bias in _biases(data)), default=1.0), 2, least=2)
 
 
 def _svgs(draw: figures.Draw, data: ReportData, width: float) -> dict[str, Markup]:

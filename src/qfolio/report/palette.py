@@ -23,3 +23,47 @@ CSS_VARIABLES = {
 PATH = "#f28c3c"
 VALUE_MAP = ["#0a1a2f", "#0c3d6b", "#1f72b0", "#7db8d8", "#f7f1e1"]
 TORQUE_MAP = [SECOND, "#e5a878", "#f6f3ee", "#86b5d9", ACCENT]
+
+LIGHT = {
+    "paper": "#fdfdfb",
+    "wash": "#f5f5f1",
+    "ink": INK,
+    "muted": MUTED,
+    "faint": "#98a1ab",
+    "hairline": HAIRLINE,
+    "accent": ACCENT,
+    "second": SECOND,
+    "agent-1": ACCENT,
+    "agent-2": SECOND,
+    "agent-3": "#1b7a5a",
+    "agent-4": "#7a3f98",
+    "agent-5": "#a8324e",
+    "agent-6": "#7a6200",
+}
+DARK = {
+    "paper": "#14181d",
+    "wash": "#1b2027",
+    "ink": "#e7eaee",
+    "muted": "#98a3af",
+    "faint": "#6b7683",
+    "hairline": "#2d343d",
+    "accent": "#66b0ee",
+    "second": "#f0935a",
+    "agent-1": "#66b0ee",
+    "agent-2": "#f0935a",
+    "agent-3": "#5ac79c",
+    "agent-4": "#c49ae6",
+    "agent-5": "#f08ba0",
+    "agent-6": "#d8bd4c",
+}
+"""The page's variables in its light and its dark scheme."""
+
+AGENTS = 6
+"""How many colours there are for agents; further agents begin again with a dashed line."""
+
+ASSETS = (
+    *("#4c78a8", "#d98c3f", "#5fa37a", "#b66a8f", "#8c7bb5", "#c9b04e", "#6db0bf", "#b5695a"),
+    *("#7f8f4e", "#9fb3d1", "#e0b48a", "#a3cfae", "#cf9fba", "#bdb3d8", "#e3d497", "#a9d3dc"),
+    *("#dba79b", "#b9c48d", "#5a7391", "#a0703f"),
+)
+"""Calm colours for stacked areas, the same in both schemes."""

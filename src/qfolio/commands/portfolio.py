@@ -1,0 +1,260 @@
+"""The commands about prices: check a table, backtest agents on it, and allocate for tomorrow."""
+
+import datetime
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from qfolio import settings
+from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, File, Folder, Name, Names
+from qfolio.errors import QfolioError
+
+if TYPE_CHECKING:
+    from qfolio.backtest.run import Backtest
+    from qfolio.presets import Preset
+
+Missing = Literal["error", "drop-asset", "forward-fill"]
+Late = Literal["error", "drop-asset", "trim", "join"]
+
+BASIS_POINT = 1e-4
+
+
+def prices(
+    file: Positional[File] = None,
+    *,
+    missing: Missing = "error",
+    late: Late = "error",
+    features: Names = (),
+    date: Name = None,
+) -> None:
+    """Check a price table and say what is wrong with it, by row and column.
+
+    Args:
+        file: CSV or Parquet, wide (date × asset) or long (date, asset, price); the 20 US stocks
+            that come with qfolio if none is given.
+        missing: What becomes of a missing price.
+        late: What becomes of assets that start later than others.
+        features: Columns of further numbers, which are no assets.
+        date: The column of dates, where its name does not tell.
+    """
+    from qfolio import console
+    from qfolio.markets.prices import check, describe, load
+
+    options: dict[str, Any] = dict(missing=missing, late=late, features=features, date=date)
+    findings = check(file, **options)
+    console.print_findings(findings)
+    if any(finding.severity == "error" for finding in findings):
+        sys.exit(2)
+    console.print_prices(describe(load(file, **options)))
+
+
+def backtest(
+    file: Positional[File] = None,
+    *,
+    agents: str = "dqn,pathwise",
+    preset: str = "fast",
+    cost_bps: float = 10.0,
+    lag: int = 1,
+    train: str = "5y",
+    test: str = "1y",
+    rolling: bool = False,
+    cap: float = 1.0,
+    seeds: Count = None,
+    seed: int = 0,
+    episodes: Count = None,
+    trials: int = 0,
+    assignments: Assignments = (),
+    out: Folder = None,
+    resume: Folder = None,
+    missing: Missing = "error",
+    late: Late = "error",
+    features: Names = (),
+    date: Name = None,
+) -> None:
+    """Train agents walk-forward on a price table and compare them with classical allocators.
+
+    Args:
+        file: CSV or Parquet with prices (qfolio prices checks it); the 20 US stocks that come with
+            qfolio if none is given.
+        agents: Which, with commas between: dqn, pathwise.
+        preset: fast (the default).
+        cost_bps: Cost of buying or selling, in basis points of what is traded.
+        lag: Rows between the close that a decision sees and the close at which it trades.
+        train: Rows to learn from before the first fold: 5y, 6m, 8w or 500d (d counts rows).
+        test: Rows to trade before learning anew.
+        rolling: Learn from the last --train only, instead of all rows so far.
+        cap: Most that one asset may weigh, from 0 to 1.
+        seeds: Agents of each kind; the preset says otherwise.
+        seed: The first agent's seed.
+        episodes: Training episodes of each agent and fold; the preset says otherwise.
+        trials: Earlier trials on these prices, which the deflated Sharpe ratio must count too.
+        assignments: Hyperparameters, for all agents that have them (learning_rate=1e-3) or one of
+            them (dqn.discount=0.9), or of the task (window=20 reward=crra).
+        out: A new folder; runs/… otherwise.
+        resume: Go on with the backtest in this folder.
+        missing: What becomes of a missing price.
+        late: What becomes of assets that start later than others.
+        features: Columns of further numbers that agents may see.
+        date: The column of dates, where its name does not tell.
+    """
+    from qfolio import devices
+
+    devices.configure()
+    from qfolio import console
+    from qfolio.backtest.run import Backtest
+    from qfolio.markets.prices import load
+
+    if resume is None:
+        table = load(file, missing=missing, late=late, features=features, date=date)
+        chosen = {name: _preset(name, preset, episodes) for name in _split(agents)}
+        chosen = _assign(chosen, settings.parse(assignments))
+        folder = out or Path("runs") / f"backtest-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+        test_run = Backtest.create(
+            table,
+            chosen,
+            train=train,
+            test=test,
+            expanding=not rolling,
+            lag=lag,
+            cost=cost_bps * BASIS_POINT,
+            cap=cap,
+            seeds=max((p.seeds for p in chosen.values()), default=1) if seeds is None else seeds,
+            seed=seed,
+            trials=trials,
+            command=shlex.join(["qfolio", *sys.argv[1:]]),
+            out=folder,
+        )
+    else:
+        test_run, folder = Backtest.open(resume), resume
+    console.say(console.describe_backtest(test_run))
+    console.run_backtest(test_run)
+    if test_run.interrupted:
+        console.say(f"Stopped. Go on with: qfolio backtest --resume {folder}")
+        sys.exit(INTERRUPTED)
+    _report(test_run, folder)
+
+
+def allocate(
+    folder: Positional[Path],
+    *,
+    prices: File = None,
+    holdings: File = None,
+    capital: Annotated[float | None, arg(metavar="X", help_behavior_hint="")] = None,
+    agent: Name = None,
+    whole_shares: bool = False,
+    as_of: Annotated[str | None, arg(metavar="DATE", help_behavior_hint="")] = None,
+    update: bool = False,
+    missing: Missing = "error",
+    features: Names = (),
+    date: Name = None,
+    as_json: Annotated[bool, arg(name="json")] = False,
+) -> None:
+    """Tomorrow's target weights, and the trades that lead there.
+
+    Args:
+        folder: The folder of a backtest; its policy was trained on the latest rows, too.
+        prices: The latest prices, CSV or Parquet, with the assets of the backtest; those of the
+            backtest itself if none are given.
+        holdings: CSV with the columns asset and shares; a row "cash" holds money. Without it, all
+            is cash.
+        capital: Money in cash; without holdings, all there is.
+        agent: Whose weights; the backtest's first agent otherwise.
+        whole_shares: Round trades so that no fractions of shares are needed.
+        as_of: The day for which weights are wanted (today otherwise); prices may be at most a week
+            older.
+        update: Go on learning from the new rows before answering, and keep what was learned.
+        missing: What becomes of a missing price.
+        features: Columns of further numbers, as in the backtest.
+        date: The column of dates, where its name does not tell.
+        as_json: Print JSON instead of a table.
+    """
+    from qfolio import devices
+
+    devices.configure()
+    from qfolio import console
+    from qfolio.allocation import Allocation, read_holdings, require_fresh
+    from qfolio.backtest.run import Backtest
+    from qfolio.markets.prices import load
+
+    test_run = Backtest.open(folder)
+    policy = test_run.policy(agent)
+    table = test_run.prices
+    if prices is not None:
+        options: dict[str, Any] = dict(missing=missing, features=features, date=date)
+        table = policy.table(load(prices, **options))
+    require_fresh(table, as_of)
+    shares, cash = read_holdings(holdings, table.assets, capital)
+    if update:
+        policy = test_run.update(agent, table)
+    allocation = Allocation.of(policy, table, shares, cash, whole_shares=whole_shares)
+    if as_json:
+        print(json.dumps(allocation.to_json(), indent=2))
+    else:
+        console.print_allocation(allocation)
+
+
+def _split(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if len(set(names)) < len(names):
+        raise QfolioError(f"--agents {text} names an agent twice.")
+    return names
+
+
+def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
+    from qfolio import presets, registry
+
+    registry.find("agent", registry.AGENTS, name)
+    chosen = presets.preset(preset, "portfolio", name)
+    return chosen if episodes is None else chosen._replace(episodes=episodes)
+
+
+def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
+    """Presets with settings changed: of one agent (dqn.discount), of all that have it, or the
+    task's."""
+    from qfolio import registry
+    from qfolio.tasks.portfolio import Portfolio
+
+    used = set()
+    changed = {}
+    for name, preset in presets.items():
+        kind = registry.find("agent", registry.AGENTS, preset.agent)
+        own, task = {}, {}
+        for key, value in chosen.items():
+            who, dot, rest = key.rpartition(".")
+            if dot and who != name:
+                continue
+            if rest in settings.names(kind):
+                own[rest] = value
+            elif rest in settings.names(Portfolio) - {"lag", "cost", "cap"}:
+                task[rest] = value
+            else:
+                continue
+            used.add(key)
+        changed[name] = preset._replace(
+            settings={**preset.settings, **settings.convert(kind, own)},
+            task={**preset.task, **settings.convert(Portfolio, task)},
+        )
+    for key in chosen.keys() - used:
+        raise QfolioError(
+            f"--set {key}: none of {', '.join(presets)} has this setting, nor the portfolio task "
+            "(lag, cost and cap have options of their own)."
+        )
+    return changed
+
+
+def _report(test_run: "Backtest", folder: Path) -> None:
+    from qfolio import console
+    from qfolio.report.backtest import write_backtest_report
+    from qfolio.report.collect import backtest_data
+
+    with console.console.status("Replaying all strategies, drawing histories, writing the report"):
+        entries, notes = test_run.entries()
+        assessment = test_run.assess(entries)
+        test_run.write_tables(entries, assessment)
+        write_backtest_report(folder, backtest_data(test_run, entries, assessment, notes))
+    console.print_assessment(assessment)
+    console.say(f"Report: {folder / 'report.html'}")

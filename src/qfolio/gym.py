@@ -1,0 +1,234 @@
+"""The portfolio task as an environment of Gymnasium, for other libraries' agents.
+
+>>> import gymnasium, qfolio.gym
+>>> env = gymnasium.make("qfolio/Portfolio-v0", prices="prices.csv", cost=0.001, horizon=250)
+"""
+
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from qfolio import settings
+from qfolio.backtest.simulation import simulate
+from qfolio.errors import QfolioError
+from qfolio.markets.costs import drift
+from qfolio.markets.prices import load
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ImportError:
+    raise QfolioError("qfolio.gym needs Gymnasium: pip install 'qfolio[gym]'.") from None
+
+ID = "qfolio/Portfolio-v0"
+
+Observation = dict[str, np.ndarray]
+
+
+class PortfolioEnv(gymnasium.Env[Observation, Any]):
+    """Trade the assets of a price table over ``horizon`` rows, starting from cash.
+
+    **Observation**: "features", for each asset the window of scaled log returns (and any other
+    features) up to today, of shape (assets, window, channels); and "holding", the weights of the
+    assets held now (the rest is cash).
+
+    **Action**: N + 1 numbers, cash first, of which the nearest point of the simplex is taken as
+    target weights (Euclidean projection, no asset above ``cap``); so weights stand for themselves.
+    With ``menu`` ("grid:10", "tilts:0.1"), the number of an allocation instead.
+
+    **Step**: a decision at row t is executed at the close of row t + lag, and its reward is that of
+    the return of row t + lag + 1, net of the exact cost. Wealth is kept in double precision, by the
+    same replay as the backtest's. Episodes are truncated after ``horizon`` steps and never
+    terminate.
+
+    ``info`` holds "wealth" (1 at the start), "cost" (share of wealth paid for this step's trade),
+    "turnover", "target" (weights decided, cash first), "date" (of the row observed) and
+    "return_date" (of the row that earned the last return). It knows more than an agent may.
+
+    Args:
+        prices: Anything that ``qfolio.markets.prices.load`` reads; None for skfolio's 20 stocks.
+        scaled_by: The table that the scale of observations comes from, if not ``prices``: to test
+            on later prices, give those that were trained on.
+        render_mode: "ansi" for a line of text, or None.
+        task: Settings of the portfolio task: window, lag, cost, cap, menu, reward, horizon, ….
+
+    ``reset`` draws the first row, unless told ``options={"start": row}``.
+    """
+
+    metadata = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012
+
+    def __init__(
+        self,
+        prices: Any = None,
+        *,
+        scaled_by: Any = None,
+        render_mode: str | None = None,
+        **task: Any,
+    ) -> None:
+        from qfolio.tasks.portfolio import Portfolio
+
+        if render_mode not in (None, "ansi"):
+            raise QfolioError(f"render_mode is {render_mode!r}; it must be 'ansi' or None.")
+        self.render_mode = render_mode
+        self.prices = load(prices)
+        chosen = settings.convert(Portfolio, task)
+        self.task = Portfolio.of(self.prices, **chosen)
+        if scaled_by is not None:
+            other = load(scaled_by)
+            if (other.assets, other.feature_names) != (
+                self.prices.assets,
+                self.prices.feature_names,
+            ):
+                raise QfolioError("scaled_by must have the assets and features of prices.")
+            scale = Portfolio.of(other, **chosen)
+            self.task = _programs().scaled(self.task, scale)
+        assets, channels = len(self.prices.assets), self.task.center.shape[0]
+        self.first = int(self.task.first)
+        self.last = int(self.task.last) - self.task.horizon + 1
+        largest = np.finfo(np.float32).max
+        self.observation_space = spaces.Dict(
+            {
+                "features": spaces.Box(
+                    -largest, largest, (assets, self.task.window, channels), np.float32
+                ),
+                "holding": spaces.Box(0.0, 1.0, (assets,), np.float32),
+            }
+        )
+        self.action_space = (
+            spaces.Discrete(self.task.actions.n)
+            if self.task.menu
+            else spaces.Box(-1.0, 1.0, (assets + 1,), np.float32)
+        )
+        self._row, self._steps = -1, self.task.horizon  # over
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts in cash, at a row from ``first`` to ``last``."""
+        super().reset(seed=seed)
+        start = (options or {}).get("start")
+        if start is None:
+            start = self.np_random.integers(self.first, self.last + 1)
+        elif not isinstance(start, int | np.integer) or not self.first <= start <= self.last:
+            raise QfolioError(
+                f"start is {start!r}; an episode of {self.task.horizon} steps can start at rows "
+                f"{self.first} to {self.last} of this table."
+            )
+        self._row, self._steps, self._wealth = int(start), 0, 1.0
+        self._held = np.eye(len(self.prices.assets) + 1)[0]
+        self._moments = np.asarray(self.task.hold(self._held).moments, float)
+        self._target, self._cost, self._turnover = self._held, 0.0, 0.0
+        return self._observe(), self._info()
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Decides for today's row and moves to the next."""
+        if self._steps >= self.task.horizon:
+            raise QfolioError("The episode is over; call reset() first.")
+        row, lag = self._row, self.task.lag
+        self._target = _programs().target(self.task, self._held, self._checked(action))
+        values = self.prices.values[row : row + lag + 2]
+        traded = simulate(
+            values, self._target[None], first=0, cost=self.task.cost, lag=lag, start=self._held
+        )
+        growth = 1 + float(traded.returns[0])
+        reward, self._moments = _programs().utility(self.task, growth, self._moments)
+        self._held = drift(self._target, np.nan_to_num(values[1] / values[0], nan=1.0))
+        self._wealth *= growth
+        self._cost, self._turnover = float(traded.cost[0]), float(traded.turnover[0])
+        self._row, self._steps = row + 1, self._steps + 1
+        over = self._steps >= self.task.horizon
+        return self._observe(), float(reward), False, over, self._info()
+
+    def render(self) -> str | None:
+        """Date, wealth and what is held, in a line."""
+        if self.render_mode is None or self._row < 0:
+            return None
+        named = zip(("cash", *self.prices.assets), self._held, strict=True)
+        held = ", ".join(f"{name} {weight:.0%}" for name, weight in named if weight >= 0.005)
+        return f"{self._day(self._row)}  wealth {self._wealth:.4f}  {held}\n"
+
+    def _checked(self, action: Any) -> np.ndarray:
+        space = self.action_space
+        if isinstance(space, spaces.Discrete):
+            if not space.contains(action):
+                raise QfolioError(f"The action is {action!r}; it must be from 0 to {space.n - 1}.")
+            return np.asarray(action, np.int32)
+        try:
+            scores = np.asarray(action, float)
+        except (TypeError, ValueError):
+            scores = np.empty(0)
+        if scores.shape != space.shape or not np.isfinite(scores).all():
+            raise QfolioError(
+                f"An action must be {space.shape[0]} finite numbers, cash first; this one has the "
+                f"shape {scores.shape}."
+            )
+        return scores
+
+    def _observe(self) -> Observation:
+        return {
+            "features": _programs().features(self.task, self._row),
+            "holding": np.clip(self._held[1:], 0, 1).astype(np.float32),
+        }
+
+    def _info(self) -> dict[str, Any]:
+        earned = self._row + self.task.lag if self._steps else self._row
+        return {
+            "wealth": self._wealth,
+            "cost": self._cost,
+            "turnover": self._turnover,
+            "target": self._target.copy(),
+            "date": self._day(self._row),
+            "return_date": self._day(earned),
+        }
+
+    def _day(self, row: int) -> str:
+        return str(self.prices.dates[row])[:10]
+
+
+class _Programs:
+    """The task's own rules, compiled once for all environments; jax is imported at first use.
+
+    They run in double precision where their inputs are.
+    """
+
+    def __init__(self) -> None:
+        import equinox as eqx
+        import jax
+
+        from qfolio import devices, simplex
+        from qfolio.mdp import Position
+
+        devices.configure()
+
+        @jax.jit
+        def target(task: Any, held: Any, action: Any) -> Any:
+            if not task.menu:
+                action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
+            return task.intent(Position(task.first, task.hold(held)), action)
+
+        self._target = target
+        self._utility = jax.jit(lambda task, growth, moments: task.utility(growth, moments))
+        self._features = jax.jit(lambda task, row: task.features(row))
+        self._double = partial(jax.enable_x64, True)
+        where = lambda task: (task.center, task.scale)  # noqa: E731
+        self.scaled = lambda task, by: eqx.tree_at(where, task, where(by))
+
+    def target(self, task: Any, held: np.ndarray, action: np.ndarray) -> np.ndarray:
+        with self._double():
+            weights = np.asarray(self._target(task, held, action), float)
+        return np.asarray(weights / weights.sum())
+
+    def utility(self, task: Any, growth: float, moments: np.ndarray) -> tuple[float, np.ndarray]:
+        with self._double():
+            reward, moments = self._utility(task, np.asarray(growth), moments)
+            return float(reward), np.asarray(moments)
+
+    def features(self, task: Any, row: int) -> np.ndarray:
+        return np.array(self._features(task, np.int32(row)))
+
+
+_programs = cache(_Programs)
+
+if ID not in gymnasium.registry:
+    gymnasium.register(ID, entry_point="qfolio.gym:PortfolioEnv")

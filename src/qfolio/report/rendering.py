@@ -1,0 +1,96 @@
+"""What the pages share: templates, their style, and how numbers and settings are written."""
+
+import json
+import math
+from importlib import resources
+from typing import Any
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+from qfolio.report import palette
+
+THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
+
+_NUMBER_WORDS = (
+    *("No", "One", "Two", "Three", "Four", "Five", "Six"),
+    *("Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve"),
+)
+
+
+def source(name: str) -> str:
+    """Return the text of a file that lies beside this module."""
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+
+def render(template: str, **context: Any) -> str:
+    """Return the text of a page; everything put into it is escaped, unless it is Markup."""
+    environment = Environment(
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=FunctionLoader(source),
+    )
+    environment.filters.update(number=number, percent=percent)
+    return environment.get_template(template).render(palette=palette, **context)
+
+
+def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
+    """Return a number with a true minus sign and thin spaces between thousands."""
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "\N{MINUS SIGN}∞" if value < 0 else "+∞" if sign else "∞"
+    text = f"{value:{'+' if sign else ''},.{digits}f}"
+    if not text.strip("+-0.,"):
+        text = text.lstrip("+-")
+    return text.replace(",", THIN_SPACE).replace("-", "\N{MINUS SIGN}")
+
+
+def percent(fraction: float, digits: int = 1, *, sign: bool = False) -> str:
+    """Return a fraction as a percentage."""
+    return f"{number(100 * fraction, digits, sign=sign)}{THIN_SPACE}%"
+
+
+def amount(count: float) -> str:
+    """Return a large whole number with three or more digits that matter."""
+    if count >= 1e6:
+        return f"{number(count / 1e6, 2)} million"
+    return number(count, 0)
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count in words that begin a sentence, for example 'Two agents'."""
+    word = _NUMBER_WORDS[count] if count < len(_NUMBER_WORDS) else str(count)
+    return f"{word} {noun}{'s' if count != 1 else ''}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time span in the unit that suits it."""
+    if seconds < 10:
+        return f"{seconds:.1f}{THIN_SPACE}s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    parts = [(hours, "h"), (minutes, "min"), (rest, "s")]
+    kept = [f"{count}{THIN_SPACE}{unit}" for count, unit in parts if count]
+    return " ".join(kept[:2])
+
+
+def setting_groups(config: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return all settings by group: the plain ones first, then one group per nested dictionary."""
+    plain = {key: value for key, value in config.items() if not isinstance(value, dict)}
+    nested = {key: value for key, value in config.items() if isinstance(value, dict)}
+    groups = {"general": plain, **nested} if plain else nested
+    return [(str(name), _flat(group)) for name, group in groups.items()]
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            rows += _flat(value, f"{prefix}{key}.")
+        else:
+            plain = value is None or isinstance(value, bool | int | float | list | tuple)
+            text = json.dumps(value, default=str, ensure_ascii=False) if plain else str(value)
+            rows.append((f"{prefix}{key}", text))
+    return rows
