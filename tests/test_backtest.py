@@ -7,8 +7,10 @@ import pytest
 
 from qfolio.backtest.baselines import BASELINES
 from qfolio.backtest.run import LATEST, Backtest
+from qfolio.backtest.simulation import simulate
 from qfolio.errors import QfolioError
 from qfolio.markets.prices import Prices
+from qfolio.policy import follow
 from qfolio.presets import Preset
 
 AGENTS = {
@@ -55,15 +57,58 @@ def finished(tmp_path_factory):
 
 def test_all_strategies_are_replayed_on_the_same_days(finished):
     entries, _ = finished.entries()
-    assert list(entries) == [*AGENTS, *BASELINES]
+    agents = ["dqn", "dqn-together", "pathwise", "pathwise-together"]
+    assert list(entries) == [*agents, *BASELINES]
     assert len(finished.folds) == 4
     assert len(finished.dates) == 260 - 100
     for name, entry in entries.items():
-        seeds = 2 if entry.kind == "agent" else 1
+        seeds = 2 if name in AGENTS else 1
         assert entry.simulation.returns.shape == (seeds, 160), name
     assessment = finished.assess(entries)
-    assert assessment.trials == 4
+    assert assessment.trials == 6
     assert assessment.strategies["dqn"].to_reference.reference == "equal-weight"
+
+
+def test_costs_are_charged(finished):
+    """Each entry is what an independent replay of its decisions earns, at the cost asked for."""
+    entries, _ = finished.entries()
+    first = finished.folds[0].decisions.start
+    for name, entry in entries.items():
+        replay = {
+            cost: simulate(finished.prices.values, entry.decisions, first=first, cost=cost, lag=1)
+            for cost in (0.0, 0.002)
+        }
+        np.testing.assert_array_equal(entry.simulation.returns, replay[0.002].returns)
+        paid = np.log1p(replay[0.0].returns).sum() - np.log1p(replay[0.002].returns).sum()
+        assert paid == pytest.approx(-np.log1p(-entry.simulation.cost).sum(), rel=1e-6), name
+    assert entries["equal-weight"].simulation.cost.sum() > 0.002
+
+
+@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("together", [False, True])
+def test_holdings_carry_over_from_fold_to_fold(finished, name, together, monkeypatch):
+    """Folds that all have one policy decide as that policy does in a single stretch."""
+    same = Backtest.open(finished.folder)
+    fold, members = same.folds[0], same._members(name, same.folds[0].name)
+    task = same._part(same.tasks[name], fold)
+    monkeypatch.setattr(same, "_members", lambda *_: members)
+    monkeypatch.setattr(same, "_part", lambda *_: task)
+    held = np.zeros((1 if together else 2, 4))
+    held[:, 0] = 1
+    agent, first = same.agents[name], fold.decisions.start
+    targets, _ = follow(task, agent, members, first, held, 160, together=together)
+    np.testing.assert_allclose(same._decide(name, together), targets, atol=1e-6)
+
+
+def test_what_is_learned_does_not_depend_on_the_group(finished, tmp_path, monkeypatch):
+    """A backtest that is resumed has other groups of folds."""
+    alone = create(tmp_path / "run", agents={"pathwise": AGENTS["pathwise"]})
+    monkeypatch.setattr(alone, "_groups", lambda name: [[job] for job in alone._jobs])
+    alone.run()
+    for fold in alone.folds:
+        one, other = (b._members("pathwise", fold.name) for b in (alone, finished))
+        for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
+            np.testing.assert_array_equal(x, y)
 
 
 def test_seeds_differ_and_opening_gives_the_same(finished):
@@ -128,7 +173,7 @@ def test_tables_say_what_was_replayed(finished):
     entries, _ = finished.entries()
     finished.write_tables(entries, finished.assess(entries))
     lines = (finished.folder / "returns.csv").read_text().splitlines()
-    assert lines[0].split(",")[:4] == ["date", "dqn/0", "dqn/1", "pathwise/0"]
+    assert lines[0].split(",")[:4] == ["date", "dqn/0", "dqn/1", "dqn-together"]
     assert len(lines) == 161
     assert float(lines[1].split(",")[1]) == entries["dqn"].simulation.returns[0, 0]
     assert (finished.folder / "weights.csv").read_text().startswith("date,strategy,cash,A,B,<b>C")
@@ -140,10 +185,10 @@ def test_an_asset_joins_at_the_first_fold_that_it_covers():
     values = table().values.copy()
     values[:120, 1] = np.nan
     prices = Prices(table().dates, table().assets, values)
-    backtest = create(prices=prices)
+    backtest = create(prices=prices, expanding=True)
     backtest.run()
     entries, _ = backtest.entries()
-    starts = [fold.train.start for fold in backtest.folds]
+    starts = [fold.recent.start for fold in backtest.folds]
     first = next(i for i, start in enumerate(starts) if start >= 120)
     day = backtest.folds[first].decisions.start - backtest.folds[0].decisions.start
     for name, entry in entries.items():
@@ -183,8 +228,12 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
     folder = shutil.copytree(finished.folder, tmp_path / "copy")
     newer = table(280)
     before = Backtest.open(folder).policy(agent)
-    after = Backtest.open(folder).update(agent, newer)
+    after = before.update(newer)
+    Backtest.open(folder).keep(agent, after)
     kept = Backtest.open(folder).policy(agent)
+    assert (before.learned, kept.learned) == (table().dates[-1], newer.dates[-1])
+    with pytest.raises(QfolioError, match="nothing new to learn"):
+        kept.update(newer)
     assert (before.updates, after.updates, kept.updates) == (0, 1, 1)
     for x, y, z in zip(*(jax.tree.leaves(p.members) for p in (before, after, kept)), strict=True):
         assert not np.array_equal(x, y)

@@ -36,8 +36,28 @@ def test_calendar_lengths():
     leap = np.array(["2000-02-29", "2000-03-31", "2001-02-28", "2001-03-01"], "datetime64[D]")
     folds = walk_forward(leap, "1y", "1y", 0)
     assert folds[0].name == "2001-02-28"
-    assert latest(DAYS, "1m") == slice(len(DAYS) - 32, len(DAYS))
-    assert latest(DAYS, "1m", expanding=True) == slice(0, len(DAYS))
+    assert latest("x", DAYS, "1m").train == slice(len(DAYS) - 32, len(DAYS))
+    assert latest("x", DAYS, "1m", expanding=True).train == slice(0, len(DAYS))
+
+
+def test_folds_within_a_day_have_names_of_their_own():
+    hours = np.arange("2020-01-01T00", "2020-02-01T00", dtype="datetime64[h]")
+    folds = walk_forward(hours, "300d", "9d", 1)
+    assert len({fold.name for fold in folds}) == len(folds) > 40
+    assert folds[0].name == "2020-01-13-120000"
+
+
+def test_an_asset_is_tradable_once_the_last_stretch_covers_it():
+    values = np.ones((len(DAYS), 2))
+    values[400:, 1] = 2.0
+    values[:400, 1] = np.nan
+    for expanding in (False, True):
+        folds = walk_forward(DAYS, "365d", "100d", 1, expanding)
+        starts = [fold.recent.start for fold in folds]
+        traded = [bool(fold.tradable(values)[1]) for fold in folds]
+        assert traded == [start >= 400 for start in starts]
+        assert any(traded)
+        assert not all(traded)
 
 
 @pytest.mark.parametrize("length", ["", "y", "0y", "-1y", "5 years", "1e3d", "٣y"])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from qfolio import policy as module
+from qfolio import training
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.errors import QfolioError
@@ -68,6 +69,10 @@ def test_it_decides_by_the_mean_of_its_agents(policy):
     again, _ = policy.decide(table(), 71, after[0], 4)
     np.testing.assert_allclose(again, targets[1:], atol=1e-5)
     np.testing.assert_allclose(targets.sum(1), 1, atol=1e-12)
+    replayed = follow(task, policy.agent, policy.members, 70, held[None], 5, together=True)
+    for one, other in zip(replayed, (targets, after), strict=True):
+        assert one.shape == (1, 5, 4)
+        np.testing.assert_allclose(one[0], other, atol=1e-6)
 
 
 def test_it_comes_back_from_disk(policy, tmp_path):
@@ -76,6 +81,7 @@ def test_it_comes_back_from_disk(policy, tmp_path):
     assert (kept.assets, kept.features, kept.seeds, kept.rows) == (("a", "b", "c"), ("f0",), 2, 60)
     assert kept.weights(table()) == policy.weights(table())
     assert same(kept.learner, policy.learner)
+    assert kept.learned == policy.learned == np.datetime64("2020-02-29")
     updated, kept_updated = (p.update(table(), 8) for p in (policy, kept))
     assert same(updated.learner, kept_updated.learner)
     updated.save(tmp_path / "updated")
@@ -98,6 +104,7 @@ def test_a_damaged_folder_is_refused(policy, tmp_path):
         ("seeds", 3),
         ("seeds", 10**12),
         ("rows", "many"),
+        ("learned", "some day"),
         ("task", {"window": 0}),
         ("task", []),
         ("settings", {**config["settings"], "hidden": [9, 9]}),
@@ -135,7 +142,7 @@ def test_it_goes_on_from_where_it_was(policy):
              strict=True)]  # fmt: skip
     assert 0 < max(moved) < 25 * policy.agent.learning_rate * module.UPDATE_RATE * 4
     assert same(policy.update(table(), 2 * environments).learner, updated.learner)
-    again = updated.update(table())
+    again = updated.update(table(ROWS + 1))
     assert again.updates == 2
     assert not same(again.learner, updated.learner)
 
@@ -147,7 +154,47 @@ def test_no_update_without_learning_state(policy):
     with pytest.raises(QfolioError, match="features"):
         policy.update(table(features=2))
     with pytest.raises(QfolioError, match="too few"):
-        policy.update(table(rows=12))
+        policy.update(table().between(-12, None))
+    with pytest.raises(QfolioError, match="episodes is 0"):
+        policy.update(table(), 0)
+
+
+def test_nothing_is_learned_twice(policy):
+    with pytest.raises(QfolioError, match="up to 2020-02-29 already: there is nothing new"):
+        policy.update(table().between(0, 60))
+    updated = policy.update(table().between(0, 61))
+    assert updated.learned == np.datetime64("2020-03-01")
+    with pytest.raises(QfolioError, match="2020-03-01 already"):
+        updated.update(table().between(0, 61))
+
+
+def test_an_asset_needs_a_price_all_over_the_window(policy):
+    def joined(row):
+        new = table()
+        values = np.array(new.values)
+        values[:row, 1] = np.nan
+        return Prices(new.dates, new.assets, values, new.features, new.feature_names)
+
+    last = ROWS - 1
+    weights = policy.weights(joined(last - WINDOW))
+    assert weights == policy.weights(table())  # nothing before the window matters
+    with pytest.raises(QfolioError, match="begins on 2020-03-15, when there was no price of 'b'"):
+        policy.weights(joined(last - WINDOW + 1))
+    # What it may not hold may be younger, but needs a price to be sold at.
+    task = dataclasses.replace(policy.task, largest=policy.task.largest.at[1].set(0.0))
+    without = Policy(task, policy.agent, policy.members, policy.assets, policy.features)
+    assert without.weights(joined(last), {"b": 0.5})["b"] == 0
+    with pytest.raises(QfolioError, match="no price of 'b'"):
+        without.weights(joined(ROWS))
+
+
+def test_odd_holdings_are_refused(policy):
+    for holdings, said in (({"a": "x"}, "'x'; it must be a number"), ({"a": None}, "None; it must"),
+                           ({"a": -0.1}, "from 0 to 1"), ({"a": np.nan}, "from 0 to 1"),
+                           ({"d": 0.5}, "'d'"), ({"a": 0.7, "b": 0.7}, "sum to 1.4"),
+                           ({"a": 0.5, "cash": 0.4}, "sum to 0.9")):  # fmt: skip
+        with pytest.raises(QfolioError, match=said):
+            policy.weights(table(), holdings)
 
 
 def test_programs_that_are_used_again_learn_the_same():
@@ -156,7 +203,7 @@ def test_programs_that_are_used_again_learn_the_same():
     used = [learned("pathwise"), learned("pathwise", agent=fast), learned("pathwise")]
     assert same(used[0].learner, used[2].learner)
     assert not same(used[0].learner, used[1].learner)
-    module._idle.clear()
+    training._programs.cache_clear()
     assert same(learned("pathwise", agent=fast).learner, used[1].learner)
 
 
@@ -169,6 +216,8 @@ def test_progress_and_settings():
         ({"episodes": None}, "how many episodes"),
         ({"episodes": 0}, "episodes is 0"),
         ({"seeds": 0}, "seeds is 0"),
+        ({"seed": -1}, "seed is -1"),
+        ({"seed": 2**32 - 1}, "seed is 4294967295"),
         ({"windw": 3}, "did you mean window"),
         ({"agent": "dqm"}, "no preset"),
     ):

@@ -174,17 +174,19 @@ def test_limits():
 
 
 def test_menus():
-    grid = Menu("grid:4", 1)
+    grid = Menu("grid:4", jnp.ones(1))
     assert grid.actions == Discrete(5)
     np.testing.assert_allclose(grid.weights(jnp.array([1.0, 0]), jnp.array(3)), [0.25, 0.75])
-    tilts = Menu("tilts:0.1", 2)
+    tilts = Menu("tilts:0.1", jnp.ones(2))
     assert tilts.actions == Discrete(7, pooled=3, each=2)
     held = jnp.array([0.5, 0.3, 0.2])
     choices = [tilts.weights(held, jnp.array(i)) for i in range(7)]
     expected = [held, [1, 0, 0], [0, 0.5, 0.5], [0, 1, 0], [0, 0, 1], [0.45, 0.37, 0.18],
                 [0.45, 0.27, 0.28]]  # fmt: skip
     np.testing.assert_allclose(choices, np.array(expected), atol=1e-6)
-    over = Menu("overweight:0.1", 2)
+    some = Menu("tilts:0.1", jnp.array([0.5, 0.0, 0.5]))
+    np.testing.assert_allclose(some.weights(jnp.ones(4) / 4, jnp.array(2)), [0, 0.5, 0, 0.5])
+    over = Menu("overweight:0.1", jnp.ones(2))
     assert over.actions == Discrete(5, pooled=3, each=1)
     choices = [over.weights(held, jnp.array(i)) for i in (0, 2, 3, 4)]
     expected = [held, [0, 0.5, 0.5], [0, 0.55, 0.45], [0, 0.45, 0.55]]
@@ -204,6 +206,9 @@ def test_utilities_by_hand():
     np.testing.assert_allclose(utility()[0], np.log(1.02), rtol=1e-5)
     np.testing.assert_allclose(
         utility(reward="crra", risk_aversion=3.0)[0], (1.02**-2 - 1) / -2, rtol=1e-4
+    )
+    np.testing.assert_allclose(
+        utility(reward="crra", risk_aversion=1.0)[0], np.log(1.02), rtol=1e-5
     )
     np.testing.assert_allclose(
         utility(reward="mean-variance", risk_aversion=3.0)[0], 0.02 - 1.5 * 0.02**2, rtol=1e-4

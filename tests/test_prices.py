@@ -397,6 +397,19 @@ def test_assets_with_gaps_are_dropped_on_demand():
         load(table[["B", "C"]], missing="drop-asset")
 
 
+@pytest.mark.parametrize("name", ["cash", "Cash", "CASH"])
+def test_no_asset_may_be_called_cash(name: str):
+    """Weights and holdings have money under this name."""
+    table = frame(A=A, **{name: B})
+    long = table.rename_axis("date").reset_index().melt("date", var_name="asset")
+    for source, advice in ((table, "its column"), (long, "Rename or remove it")):
+        with pytest.raises(QfolioError, match=f"the asset '{name}' has the name of the money"):
+            load(source)
+        assert advice in errors(source)[0].advice
+    assert load(frame(A=A, cashmere=B)).assets == ("A", "cashmere")
+    assert load(table, features=(name,)).assets == ("A",)
+
+
 def test_late_assets_need_a_choice():
     nan = np.nan
     table = frame(A=A, B=[nan, nan, *B[2:]])

@@ -245,6 +245,7 @@ def test_it_goes_on_learning_day_by_day(agent):
         by_hand.partial_fit(today)
     assert by_hand.policy_.updates == 3
     assert by_hand.returns_.shape == (TRAIN, 3)
+    assert by_hand.n_samples_seen_ == TRAIN + 3
     assert by_hand.observations_.equals(x.index[3 : TRAIN + 3])
     old, new = (p.learner.optimizer.count for p in (before, by_hand.policy_))
     assert (new > old).all()

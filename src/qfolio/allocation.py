@@ -18,6 +18,10 @@ from qfolio.policy import Policy
 MAX_AGE = np.timedelta64(7, "D")
 """Prices older than this are not those of today."""
 
+NOISE = 1e-6
+"""Targets that differ from what is held by this weight at most are no orders: policies decide in
+float32."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Allocation:
@@ -45,8 +49,8 @@ class Allocation:
         """The policy's target after the table's last row, for who holds ``shares`` and ``cash``.
 
         The targets are scaled to what is left after costs (the transaction remainder factor), so
-        that the trades never need more money than there is. Whole shares are rounded down when
-        bought and sold up to the next one.
+        that the trades never need more money than there is. Whole shares are rounded toward zero;
+        where less is sold by this than is spent, fewer of the cheapest assets are bought.
 
         Raises:
             QfolioError: There is nothing to allocate.
@@ -61,12 +65,14 @@ class Allocation:
         held = np.append(cash, values) / wealth
         names = ("cash", *prices.assets)
         targets = policy.weights(prices, dict(zip(names, held.tolist(), strict=True)))
-        weights = np.array([targets[name] for name in names])
-        remainder = float(remainder_factor(held, weights, rate))
-        trades = remainder * weights[1:] * wealth / last - shares
+        weights = _ordered(np.array([targets[name] for name in names]), held)
+        if np.array_equal(weights, held):
+            trades = np.zeros(len(shares))
+        else:
+            remainder = float(remainder_factor(held, weights, rate))
+            trades = remainder * weights[1:] * wealth / last - shares
         if whole_shares:
-            trades = np.floor(trades + 1e-9)
-            trades = np.maximum(trades, -shares)
+            trades = _whole(trades, last, cash, rate)
         money = trades * last
         spent, received = money[money > 0].sum(), -money[money < 0].sum()
         # Buying an amount takes amount / (1 − c) of cash; selling it yields (1 − c) of it.
@@ -115,6 +121,30 @@ class Allocation:
         }
 
 
+def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """The targets without noise; exactly what is held where nothing is ordered. Cash first."""
+    orders = np.abs(targets - held) > NOISE
+    if not orders[1:].any():
+        return held
+    weights = np.where(orders, targets, held)
+    weights[0] = max(0.0, 1 - weights[1:].sum())
+    return np.asarray(weights / weights.sum())
+
+
+def _whole(trades: np.ndarray, prices: np.ndarray, cash: float, rate: float) -> np.ndarray:
+    """Trades rounded toward zero, and fewer of the cheapest bought where money would not do."""
+    trades = np.trunc(trades + np.copysign(1e-9, trades)) + 0.0  # no -0
+    spent, received = np.maximum(trades, 0) @ prices, np.maximum(-trades, 0) @ prices
+    budget = (cash + received * (1 - rate)) * (1 - rate)
+    short = spent - budget * (1 + 1e-12)  # of rounding
+    for i in np.argsort(prices):
+        if short > 0 and trades[i] > 0:
+            fewer = min(trades[i], np.ceil(short / prices[i]))
+            trades[i] -= fewer
+            short -= fewer * prices[i]
+    return np.asarray(trades)
+
+
 def read_holdings(
     path: Path | None, assets: Sequence[str], capital: float | None
 ) -> tuple[np.ndarray, float]:
@@ -154,7 +184,7 @@ def read_holdings(
         if name in seen:
             raise QfolioError(f"{where}: {quote(name)} comes twice; add the two up.")
         seen.add(name)
-        if name.lower() == "cash" and name not in assets:
+        if name.lower() == "cash":
             if capital is not None:
                 raise QfolioError(f"{where}: cash is also given by --capital; leave out one.")
             cash = amount

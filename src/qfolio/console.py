@@ -186,9 +186,9 @@ def run_backtest(backtest: "Backtest") -> None:
 def print_assessment(assessment: "Assessment") -> None:
     """A row for each strategy, and what follows from it in words."""
     table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column("after costs, a year", min_width=24)
-    for name in ("growth", "volatility", "Sharpe", "drawdown", "turnover", "cost drag"):
-        table.add_column(name, justify="right")
+    table.add_column("a year, net")
+    for name in ("growth", "vol.", "Sharpe", "fall", "traded", "cost"):
+        table.add_column(name, justify="right", no_wrap=True)
     for name, strategy in assessment.strategies.items():
         value = {key: measure.mean for key, measure in strategy.measures.items()}
         style = "bold" if strategy.kind == "agent" else None
@@ -204,8 +204,9 @@ def print_assessment(assessment: "Assessment") -> None:
         )
     console.print(table)
     for strategy in assessment.strategies.values():
-        if strategy.kind == "agent" and strategy.to_reference is not None:
-            say(strategy.to_reference.verdict)
+        for difference in (strategy.to_reference, strategy.to_best_baseline):
+            if strategy.kind == "agent" and difference is not None:
+                say(difference.verdict)
 
 
 def print_allocation(allocation: "Allocation") -> None:

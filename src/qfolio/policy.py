@@ -4,10 +4,10 @@ The policy is the mean over the agents of all seeds. It lives in a folder: what 
 (JSON), its weights, and the whole learning state, from which it can go on learning.
 """
 
-import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +21,23 @@ from jaxtyping import Array, Float, PyTree
 from qfolio import settings
 from qfolio.errors import QfolioError
 from qfolio.files import new_folder, read_json, read_tree, write_json, write_tree
+from qfolio.markets.checks import day
 from qfolio.markets.costs import drift
 from qfolio.markets.prices import Prices, load
 from qfolio.mdp import Agent, View
 from qfolio.presets import Preset, preset
 from qfolio.registry import AGENTS, find, name_of
+from qfolio.runs import check_counts
 from qfolio.tasks.portfolio import Portfolio
 from qfolio.training import Population, episode_steps
 
-FORMAT = 1
+FORMAT = 2
 """Of a policy's folder; raised whenever an older folder can no longer be read."""
 
 UPDATE_RATE = 0.1
 """Share of the learning rate with which a policy goes on learning."""
+
+UNKNOWN = np.datetime64("NaT", "s")
 
 Listener = Callable[[float], None]
 """Is told the share of training that is done, after each chunk."""
@@ -74,15 +78,19 @@ def train(
     if episodes is None:
         raise QfolioError("An agent without a preset needs to be told how many episodes to train.")
     count = 5 if seeds is None else seeds
-    for name, value in (("episodes", episodes), ("seeds", count)):
-        if value < 1:
-            raise QfolioError(f"{name} is {value}; it must be at least 1.")
+    check_counts(episodes, count, seed)
     portfolio = Portfolio.of(table, **settings.convert(Portfolio, task))
-    with _population(portfolio, agent, range(seed, seed + count)) as population:
-        _learn(population, episodes, listener)
-        learner = population.fetch().agent
+    population = Population(portfolio, agent, range(seed, seed + count))
+    _learn(population, episodes, listener)
+    learner = population.fetch().agent
     return Policy(
-        portfolio, agent, agent.weights(learner), table.assets, table.feature_names, learner
+        portfolio,
+        agent,
+        agent.weights(learner),
+        table.assets,
+        table.feature_names,
+        learner,
+        learned=table.dates[-1],
     )
 
 
@@ -93,6 +101,7 @@ class Policy:
     members: what each agent learned, with a leading seed axis.
     learner: the agents' whole states, likewise; without, the policy cannot be updated.
     updates: how often it has gone on learning.
+    learned: the date of the last row that it has learned from; NaT where that is not known.
     """
 
     def __init__(
@@ -104,10 +113,11 @@ class Policy:
         features: Sequence[str] = (),
         learner: PyTree = None,
         updates: int = 0,
+        learned: np.datetime64 = UNKNOWN,
     ) -> None:
         self.task, self.agent, self.members = task, agent, members
         self.assets, self.features = tuple(assets), tuple(features)
-        self.learner, self.updates = learner, updates
+        self.learner, self.updates, self.learned = learner, updates, learned
 
     def weights(self, prices: Any, holdings: Any = None, **options: Any) -> dict[str, float]:
         """Target weights after the last row of a price table, by asset, with "cash" first.
@@ -119,7 +129,8 @@ class Policy:
             holdings: Weights held now, by asset (what is left is cash); None for cash alone.
 
         Raises:
-            QfolioError: The assets are not those of the policy, or there are too few rows.
+            QfolioError: The assets are not those of the policy, or prices are missing in its
+                window.
         """
         table = self.table(prices, **options)
         targets, _ = self.decide(table, len(table) - 1, self.holdings(holdings), 1)
@@ -144,14 +155,23 @@ class Policy:
             episodes: In which each agent learns; one for each of its environments, if not named.
 
         Raises:
-            QfolioError: The learning state was not kept, or the table does not fit.
+            QfolioError: The learning state was not kept, the table does not fit, or it has no row
+                that is newer than those that were learned from.
         """
         if self.learner is None:
             raise QfolioError(
                 "This policy was kept without its learning state and cannot go on learning; train "
                 "it anew."
             )
+        wanted = self.agent.environments if episodes is None else episodes
+        check_counts(wanted, self.seeds, 0)
         table = self.table(prices, **options)
+        if table.dates[-1] <= self.learned:
+            raise QfolioError(
+                f"The prices end on {day(table.dates[-1])}, and the policy has learned from those "
+                f"up to {day(self.learned)} already: there is nothing new to learn; bring newer "
+                "prices, or go without an update."
+            )
         table = table.between(max(0, len(table) - self.rows), None)
         task = self._moved(table)
         agent = dataclasses.replace(
@@ -162,13 +182,12 @@ class Policy:
         draws = [np.random.SeedSequence((i, self.updates + 1)) for i in range(self.seeds)]
         seeds = [int(draw.generate_state(1)[0]) for draw in draws]
         unlearned = -(-agent.warm_up() // episode_steps(task, agent)) * agent.environments
-        wanted = agent.environments if episodes is None else episodes
-        with _population(task, agent, seeds) as population:
-            state = population.fetch()
-            learner = agent.carry_over(self.learner, state.agent)
-            population.restore(eqx.tree_at(lambda s: s.agent, state, learner))
-            _learn(population, unlearned + wanted, listener)
-            learner = population.fetch().agent
+        population = Population(task, agent, seeds)
+        state = population.fetch()
+        learner = agent.carry_over(self.learner, state.agent)
+        population.restore(eqx.tree_at(lambda s: s.agent, state, learner))
+        _learn(population, unlearned + wanted, listener)
+        learner = population.fetch().agent
         return Policy(
             task,
             self.agent,
@@ -177,6 +196,7 @@ class Policy:
             self.features,
             learner,
             self.updates + 1,
+            table.dates[-1],
         )
 
     @property
@@ -210,19 +230,33 @@ class Policy:
                 f"The price table has {len(table)} rows; the policy's window needs at least "
                 f"{self.task.window + 1}."
             )
-        return table.select(self.assets)
+        table = table.select(self.assets)
+        # An asset that may be held needs a price all over the window, the others one at its end.
+        tradable, last = np.asarray(self.task.largest) > 0, len(table) - 1
+        begin = last - self.task.window
+        late = table.first_rows > np.where(tradable, begin, last)
+        if late.any():
+            raise QfolioError(
+                f"The policy's window begins on {day(table.dates[begin])}, when there was no price "
+                f"of {_list([n for n, is_late in zip(self.assets, late, strict=True) if is_late])} "
+                "yet; bring earlier prices, or wait until there are enough."
+            )
+        return table
 
     def holdings(self, holdings: Mapping[str, float] | None) -> np.ndarray:
         """Weights with cash first, from weights by asset."""
         held = np.zeros(1 + len(self.assets))
-        for name, weight in dict(holdings or {}).items():
+        given = {} if holdings is None else dict(holdings)
+        for name, weight in given.items():
             if name != "cash" and name not in self.assets:
                 raise QfolioError(f"The holdings name {name!r}, which the policy does not know.")
-            if not 0 <= weight <= 1 + 1e-9:
-                raise QfolioError(f"The weight of {name!r} is {weight}; it must be from 0 to 1.")
+            if not isinstance(weight, Real) or not 0 <= weight <= 1 + 1e-9:
+                raise QfolioError(
+                    f"The weight of {name!r} is {weight!r}; it must be a number from 0 to 1."
+                )
             held[0 if name == "cash" else 1 + self.assets.index(name)] = weight
         total = held[1:].sum()
-        if total > 1 + 1e-9 or ("cash" in (holdings or {}) and abs(held.sum() - 1) > 1e-6):
+        if total > 1 + 1e-9 or ("cash" in given and abs(held.sum() - 1) > 1e-6):
             raise QfolioError(f"The weights held sum to {held.sum():.6g}; they must sum to 1.")
         held[0] = max(0.0, 1 - total)
         return held / held.sum()
@@ -236,9 +270,8 @@ class Policy:
         drifted to the row after each decision.
         """
         task = on_table(self.task, prices)
-        one = jax.tree.map(lambda x: x[None], self.members)
-        results = _follow(task, self.agent, one, *_start(first, held[None]), count)
-        targets, after = (np.asarray(x[0], float) for x in results)
+        results = follow(task, self.agent, self.members, first, held[None], count, together=True)
+        targets, after = (x[0].astype(float) for x in results)
         return tuple(x / x.sum(-1, keepdims=True) for x in (targets, after))
 
     def save(self, folder: Path | str) -> None:
@@ -257,6 +290,7 @@ class Policy:
                     "seeds": self.seeds,
                     "rows": self.rows,
                     "updates": self.updates,
+                    "learned": str(self.learned),
                     "learns": self.learner is not None,
                 },
             )
@@ -278,7 +312,7 @@ class Policy:
             chosen = settings.convert(Portfolio, config["task"])
             assets, features = tuple(config["assets"]), tuple(config["features"])
             seeds, rows, updates = (int(config[name]) for name in ("seeds", "rows", "updates"))
-            learns = bool(config["learns"])
+            learned, learns = np.datetime64(config["learned"], "s"), bool(config["learns"])
             bounds = (len(assets) > 0, 1 <= seeds < 2**20, 1 <= rows < 2**31, updates >= 0)
             if not all(bounds) or not all(isinstance(name, str) for name in assets + features):
                 raise ValueError
@@ -291,7 +325,7 @@ class Policy:
         members = kept.pop("members")
         task = dataclasses.replace(task, **jax.tree.map(jnp.asarray, kept))
         learner = read_tree(path.with_name("learning.safetensors"), state) if learns else None
-        return cls(task, agent, members, assets, features, learner, updates)
+        return cls(task, agent, members, assets, features, learner, updates, learned)
 
     def _moved(self, table: Prices) -> Portfolio:
         """The task on all rows of another table, with the scale of the old one."""
@@ -345,20 +379,26 @@ def on_table(task: Portfolio, prices: Prices) -> Portfolio:
 
 
 def follow(
-    task: Portfolio, agent: Agent, members: PyTree, first: int, held: np.ndarray, count: int
+    task: Portfolio,
+    agent: Agent,
+    members: PyTree,
+    first: int,
+    held: np.ndarray,
+    count: int,
+    *,
+    together: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Greedy decisions of each member by itself from row ``first`` on.
+    """Greedy decisions from row ``first`` on: of each member by itself, or of all together.
 
-    held: at row ``first``, shape (seed, entry). The results are target weights, and what is held
-    one row after each decision, both (seed, count, entry).
+    Together, they hold one portfolio and follow the mean of their targets.
+
+    held: at row ``first``, shape (seed, entry), or (1, entry) if together. The results are target
+    weights, and what is held one row after each decision, both (seed or 1, count, entry).
     """
-    each = jax.tree.map(lambda x: x[:, None], members)
-    targets, after = _follow(task, agent, each, *_start(first, held), count)
+    portfolios = jax.tree.map(lambda x: x[None] if together else x[:, None], members)
+    start = jnp.array(first, jnp.int32), jnp.asarray(held, jnp.float32)
+    targets, after = _follow(task, agent, portfolios, *start, count)
     return np.asarray(targets), np.asarray(after)
-
-
-def _start(first: int, held: np.ndarray) -> tuple[Array, Array]:
-    return jnp.array(first, jnp.int32), jnp.asarray(held, jnp.float32)
 
 
 @partial(eqx.filter_jit, donate="none")
@@ -389,29 +429,6 @@ def _learn(population: Population, episodes: int, listener: Listener | None) -> 
         population.advance(left)
         if listener is not None:
             listener(min(1.0, population.steps / total))
-
-
-_idle: dict[Any, Population] = {}
-IDLE = 4
-"""Populations whose programs are kept for the next one of the same shapes."""
-
-
-@contextlib.contextmanager
-def _population(task: Portfolio, agent: Agent, seeds: Sequence[int]) -> Iterator[Population]:
-    """A population before its first step; compiling takes longer than many an update."""
-    leaves, structure = jax.tree.flatten((task, agent))
-    shapes = tuple((type(x), getattr(x, "shape", ()), getattr(x, "dtype", None)) for x in leaves)
-    key = (structure, shapes, len(seeds))
-    population = _idle.pop(key, None)
-    if population is None:
-        population = Population(task, agent, seeds)
-    else:
-        population.agent = agent  # its numbers may differ
-        population.restart([task] * len(seeds), seeds)
-    yield population
-    _idle[key] = population  # not after an error, which may have left it undefined
-    while len(_idle) > IDLE:
-        _idle.pop(next(iter(_idle)), None)
 
 
 def _list(names: list[str]) -> str:

@@ -103,6 +103,9 @@ class PortfolioPolicy(BaseOptimization):
     observations_ : pandas.Index or None
         Their dates.
 
+    n_samples_seen_ : int
+        Number of all returns that were seen, also of those that are no longer kept.
+
     n_features_in_, feature_names_in_ :
         Number and names of the assets.
     """
@@ -110,6 +113,7 @@ class PortfolioPolicy(BaseOptimization):
     policy_: Any
     returns_: np.ndarray
     observations_: Any
+    n_samples_seen_: int
 
     def __init__(
         self,
@@ -162,6 +166,7 @@ class PortfolioPolicy(BaseOptimization):
         chosen, task = self._chosen()
         self._held()  # odd holdings are refused before time is spent on training
         self.returns_, self.observations_ = returns, _dates(X)
+        self.n_samples_seen_ = len(returns)
         self.policy_ = train(
             self._learned(),
             chosen,
@@ -192,6 +197,7 @@ class PortfolioPolicy(BaseOptimization):
                 )
             self.observations_ = self.observations_.append(dates)[-len(self.returns_) :]
         self.returns_ = np.concatenate([self.returns_, returns])[-len(self.returns_) :]
+        self.n_samples_seen_ += len(returns)
         self.policy_ = self.policy_.update(self._learned(), self.update_episodes)
         self.weights_ = self._tomorrow()
         return self
@@ -236,7 +242,9 @@ class PortfolioPolicy(BaseOptimization):
 
     def _learned(self) -> Prices:
         """The rows up to the first decision that a prediction begins with."""
-        return _prices(self.returns_[: len(self.returns_) - self.lag], self._assets())
+        learned = self.returns_[: len(self.returns_) - self.lag]
+        dropped = self.n_samples_seen_ - len(self.returns_)
+        return _prices(learned, self._assets(), first=dropped)
 
     def _assets(self) -> tuple[str, ...]:
         named = getattr(self, "feature_names_in_", None)
@@ -345,8 +353,8 @@ def _dates(X: Any) -> Any:
     return index if index.is_monotonic_increasing and index.is_unique and not counted else None
 
 
-def _prices(returns: np.ndarray, assets: tuple[str, ...]) -> Prices:
-    """Prices that begin with 1 and have these simple returns."""
+def _prices(returns: np.ndarray, assets: tuple[str, ...], first: int = 0) -> Prices:
+    """Prices that begin with 1 and have these simple returns; days are counted from ``first``."""
     if not (returns > -1).all():
         row, asset = np.argwhere(~(returns > -1))[0]
         raise ValueError(
@@ -354,5 +362,5 @@ def _prices(returns: np.ndarray, assets: tuple[str, ...]) -> Prices:
             "return must be above -1."
         )
     values = np.cumprod(np.concatenate([np.ones((1, len(assets))), 1 + returns]), axis=0)
-    days = np.datetime64("1970-01-01") + np.arange(len(values))
+    days = np.datetime64("1970-01-01") + first + np.arange(len(values))
     return Prices(days, assets, values)

@@ -6,8 +6,8 @@ Ctrl-C) happens between chunks, and nothing calls back from inside.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Hashable, Sequence
+from functools import lru_cache, partial
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -109,7 +109,8 @@ def chunk_steps(task: Task, agent: Agent) -> int:
 
 
 def episode_steps(task: Task, agent: Agent) -> int:
-    return agent.episode_steps or task.horizon
+    """Steps of a training episode: the task's horizon, or fewer."""
+    return min(agent.episode_steps or task.horizon, task.horizon)
 
 
 def _rollout(
@@ -200,29 +201,17 @@ class Population:
         tasks = [tasks] * len(self.seeds) if isinstance(tasks, Task) else list(tasks)
         self.task = tasks[0]
         self._members = Members(len(self.seeds))
-        own, self._shared, self._join = _split([(task, agent) for task in tasks])
+        own, self._shared, self._join, form = _split([(task, agent) for task in tasks])
         self._own = self._members.place(own)
-        self._programs: dict[str, Any] = {}
+        self._programs = _programs((form, len(self.seeds)))
         self.seconds_compile = 0.0
         first = jax.eval_shape(lambda: begin(self.task, agent, jnp.array(0, jnp.uint32)))
         require_memory(first, len(self.seeds))
-        self.state = self._begin()
-
-    def restart(self, tasks: Sequence[Task], seeds: Sequence[int]) -> None:
-        """From the beginning with as many others, by the programs that are compiled already."""
-        assert len(tasks) == len(seeds) == len(self.seeds)
-        self.seeds = list(seeds)
-        own, self._shared, _ = _split([(task, self.agent) for task in tasks])
-        self._own = self._members.place(own)
-        self.state = self._begin()
-
-    def _begin(self) -> TrainingState:
-        state: TrainingState = self._run(
+        self.state: TrainingState = self._run(
             "begin",
             lambda task, agent, seed: begin(task, agent, seed),
             self._members.place(np.array(self.seeds, np.uint32)),
         )
-        return state
 
     @property
     def steps(self) -> int:
@@ -268,10 +257,11 @@ class Population:
         self.state, episodes = self._run(name, program, self.state, count, donate=True)
         healthy = self._members.fetch(self.state.healthy)
         if not healthy.all():
-            seeds = ", ".join(str(s) for s, ok in zip(self.seeds, healthy, strict=True) if not ok)
+            bad = {str(s): None for s, ok in zip(self.seeds, healthy, strict=True) if not ok}
             raise QfolioError(
-                f"The loss of seed {seeds} is no longer finite after {self.steps} steps; "
-                "lower learning_rate, or set huber=1 to bound the gradient."
+                f"The loss of seed {', '.join(bad)} is no longer finite after {self.steps} steps; "
+                "lower learning_rate, or bound the gradient (huber of dqn, gradient_norm of "
+                "pathwise)."
             )
         return self._members.fetch(episodes)
 
@@ -284,7 +274,7 @@ class Population:
             return evaluate(task, agent, weights, keys, tail)
 
         weights = self.agent.weights(self.state.agent)
-        greedy = self._run(f"evaluate {len(keys)}", program, weights, keys)
+        greedy = self._run(f"evaluate {len(keys)} {tail}", program, weights, keys)
         return self._members.fetch(greedy)
 
     def weights(self) -> PyTree:
@@ -323,14 +313,20 @@ class Population:
         return jax.block_until_ready(self._programs[name](*args))
 
 
+@lru_cache(maxsize=8)
+def _programs(form: Hashable) -> dict[str, Any]:
+    """Compiled programs by name, for all populations of one form: compiling takes long."""
+    return {}
+
+
 def _split(
     members: Sequence[PyTree],
-) -> tuple[list[np.ndarray], list[Array], Callable[[Any, Any], PyTree]]:
+) -> tuple[list[np.ndarray], list[Array], Callable[[Any, Any], PyTree], Hashable]:
     """Parts the members' numbers and arrays into each one's own and those that all share.
 
     Numbers are each one's own, so that one program serves them all; an array is shared if it is
-    the same object in all. Returns the own with a leading member axis, the shared, and a function
-    that puts one member together again.
+    the same object in all. Returns the own with a leading member axis, the shared, a function that
+    puts one member together again, and what a program for them depends on.
     """
     columns = list(zip(*(jax.tree.leaves(member) for member in members), strict=True))
     structure = jax.tree.structure(members[0])
@@ -349,4 +345,7 @@ def _split(
         mine, common = iter(own), iter(shared)
         return jax.tree.unflatten(structure, [next(mine if m else common) for m in is_own])
 
-    return own, shared, join
+    shapes = tuple(
+        (np.shape(column[0]), getattr(column[0], "dtype", type(column[0]))) for column in columns
+    )
+    return own, shared, join, (structure, tuple(is_own), shapes)

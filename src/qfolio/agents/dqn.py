@@ -158,6 +158,11 @@ class DQN(Agent):
                     "all_actions needs a market, whose prices do not answer to actions; "
                     f"{type(task).__name__} is none."
                 )
+            if getattr(task, "reward", "") == "differential-sharpe":
+                raise QfolioError(
+                    "all_actions draws holdings without a past, and differential-sharpe rewards "
+                    "what comes after one; take reward=crra, or all_actions=false."
+                )
             row = Move(state.market, state.market)
         zero = jnp.array(0, jnp.int32)
         return DQNState(

@@ -34,7 +34,7 @@ from qfolio.mdp import (
 from qfolio.networks import SHARED, Reading, Shared
 
 
-class Policy(eqx.Module):
+class Band(eqx.Module):
     """From a view of the market to target weights, or to positions where they are unbounded.
 
     The network names two edges for each asset, and a trade is only ever to the nearer one. With
@@ -76,7 +76,7 @@ class Policy(eqx.Module):
 
 
 class PathwiseState(eqx.Module):
-    policy: Policy
+    policy: Band
     optimizer: optimizer.Optimizer
     steps: Int[Array, ""]
 
@@ -126,7 +126,7 @@ class Pathwise(Agent):
                 "pathwise needs a market whose actions are weights or positions; "
                 f"{type(task).__name__} is none (in a market, leave menu empty)."
             )
-        episode = self.episode_steps or task.horizon
+        episode = min(self.episode_steps or task.horizon, task.horizon)
         if episode % self.rollout:
             raise QfolioError(
                 f"rollout is {self.rollout}; it must divide the {episode} steps of an episode "
@@ -137,7 +137,7 @@ class Pathwise(Agent):
         # An output layer of zeros: the first policy is the one that ``Policy`` starts from.
         last = lambda n: (n.head.weights[-1], n.head.biases[-1])  # noqa: E731
         network = eqx.tree_at(last, network, replace_fn=jnp.zeros_like)
-        policy = Policy(network, task.actions)
+        policy = Band(network, task.actions)
         return PathwiseState(
             policy=policy,
             optimizer=optimizer.begin(policy),
@@ -147,10 +147,10 @@ class Pathwise(Agent):
     def warm_up(self) -> int:
         return 0
 
-    def weights(self, state: PathwiseState) -> Policy:
+    def weights(self, state: PathwiseState) -> Band:
         return state.policy
 
-    def policy(self, weights: Policy, observation: View) -> Float[Array, "batch entry"]:
+    def policy(self, weights: Band, observation: View) -> Float[Array, "batch entry"]:
         return weights(observation)
 
     def act(
@@ -176,10 +176,10 @@ class Pathwise(Agent):
         (policy, adam), losses = lax.scan(update, carry, None, length=self.updates)
         return PathwiseState(policy, adam, state.steps + 1), {"loss": losses.mean()}
 
-    def _loss(self, policy: Policy, task: ExogenousTask, rollout: Transition) -> Float[Array, ""]:
+    def _loss(self, policy: Band, task: ExogenousTask, rollout: Transition) -> Float[Array, ""]:
         """Minus the mean reward a step of following ``policy`` along the rollout's market."""
 
-        def follow(policy: Policy, holding: PyTree, steps: slice) -> Any:
+        def follow(policy: Band, holding: PyTree, steps: slice) -> Any:
             def step(holding: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
                 market, next_market, reading = moves
                 view = jax.vmap(task.observe)(Position(market, holding))

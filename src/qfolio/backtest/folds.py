@@ -11,13 +11,20 @@ from qfolio.errors import QfolioError
 class Fold(NamedTuple):
     """Rows of a price table that a policy learns from, and rows at which it then decides."""
 
-    name: str  # date of the first return that it earns
+    name: str  # date, and where there is one the time, of the first return that it earns
     train: slice
     decisions: slice
+    recent: slice  # the last rows of training, as many as it has at least
 
     def tradable(self, values: np.ndarray) -> np.ndarray:
-        """Assets with a price in every row of training, shape (asset,)."""
-        return ~np.isnan(values[self.train]).any(0)
+        """Assets with a price in every recent row of training, shape (asset,)."""
+        return ~np.isnan(values[self.recent]).any(0)
+
+    def complete(self, values: np.ndarray) -> "Fold":
+        """The fold, trained on the rows in which all of its tradable assets have prices only."""
+        gaps = np.isnan(values[self.train][:, self.tradable(values)]).any(1)
+        begin = self.train.start + int(gaps.sum())  # prices are missing before a start only
+        return self._replace(train=slice(begin, self.train.stop))
 
 
 def walk_forward(
@@ -44,11 +51,13 @@ def walk_forward(
     while start < len(dates):
         end = min(_after(dates, start, test), len(dates))  # behind its last return
         first = start - lag - 1
-        begin = 0 if expanding or not folds else _before(dates, first, train)
+        recent = _before(dates, first, train) if folds else 0
+        begin = 0 if expanding else recent
         if first - begin < 1:
             raise QfolioError(f"train={train} is shorter than the lag of {lag}; make it longer.")
         decisions = slice(first, end - lag - 1)
-        folds.append(Fold(str(dates[start])[:10], slice(begin, first + 1), decisions))
+        name = spell(dates[start], dates)
+        folds.append(Fold(name, slice(begin, first + 1), decisions, slice(recent, first + 1)))
         start = end
     if not folds:
         raise QfolioError(
@@ -58,10 +67,20 @@ def walk_forward(
     return folds
 
 
-def latest(dates: np.ndarray, train: str, expanding: bool = False) -> slice:
-    """Rows that a policy for tomorrow learns from: the last stretch of the table."""
-    last = len(dates) - 1
-    return slice(0 if expanding else _before(dates, last, train), last + 1)
+def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) -> Fold:
+    """What a policy for tomorrow learns from: the last stretch of the table, or all of it."""
+    end = len(dates)
+    recent = _before(dates, end - 1, train)
+    begin = 0 if expanding else recent
+    return Fold(name, slice(begin, end), slice(end, end), slice(recent, end))
+
+
+def spell(date: np.datetime64, dates: np.ndarray) -> str:
+    """A date as text; with its time where rows are less than a day apart."""
+    days = dates.astype("datetime64[D]")
+    if (days[1:] > days[:-1]).all():
+        return str(date.astype("datetime64[D]"))
+    return str(date.astype("datetime64[s]")).replace(":", "").replace("T", "-")
 
 
 def parse_length(text: str) -> tuple[int, str]:

@@ -19,7 +19,7 @@ defined, NaN. In JSON, infinite and undefined numbers are null.
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -579,7 +579,7 @@ def assess(
     *,
     periods_per_year: float,
     reference: str = "equal weight",
-    other_trials: Sequence[float | None] = (),
+    other_trials: int = 0,
     resamples: int = 2000,
     seed: int = 0,
 ) -> Assessment:
@@ -602,8 +602,8 @@ def assess(
         dates: Days on which the returns were earned, shape (periods,), strictly increasing.
         periods_per_year: For example 252 for days of trading.
         reference: The name of the baseline to compare with in the first place.
-        other_trials: Annual Sharpe ratios of further trials, None for each that is not known.
-            Every seed of every agent is counted as a trial already.
+        other_trials: How many more trials there were on these days. Every seed of every agent is
+            counted already.
         resamples: How many histories the bootstrap draws.
         seed: Seed of the drawing.
 
@@ -645,13 +645,9 @@ def assess(
 
     best = max(baselines, key=lambda name: _mean(sampled[name].observed["sharpe"]))
     agents = [name for name in tracks if name not in baselines]
-    trials = len(other_trials) + sum(tracks[name].shape[1] for name in agents)
-    variance = _trial_variance(
-        [sharpe for sharpe in other_trials if sharpe is not None]
-        + [sharpe for name in agents for sharpe in sampled[name].observed["sharpe"]],
-        periods,
-        periods_per_year,
-    )
+    trials = other_trials + sum(tracks[name].shape[1] for name in agents)
+    known = [sharpe for name in agents for sharpe in sampled[name].observed["sharpe"]]
+    variance = _trial_variance(known, periods, periods_per_year)
 
     def compare(name: str, other: str) -> Difference | None:
         return None if name == other else _compare(name, sampled[name], other, sampled[other])
@@ -750,12 +746,14 @@ def _sharpe_test(
 def _trial_variance(annual: list[float], periods: int, periods_per_year: float) -> float:
     """The variance of the trials' Sharpe ratios per period.
 
-    Where fewer than two are known: that of an estimate from normal returns without skill.
+    At least that of an estimate from normal returns without skill: seeds of one agent are alike,
+    and their spread says too little of what other trials could have found by luck.
     """
     known = np.sort(annual)  # so that the order of the seeds cannot move the last digit
+    luck = 1 / (periods - 1)
     if len(known) < 2 or not np.isfinite(known).all():
-        return 1 / (periods - 1)
-    return float(np.var(known, ddof=1) / periods_per_year)
+        return luck
+    return max(luck, float(np.var(known, ddof=1) / periods_per_year))
 
 
 def _common_block(series: list[Floats]) -> float:

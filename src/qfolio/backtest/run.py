@@ -28,7 +28,7 @@ import numpy as np
 import qfolio
 from qfolio import devices, settings
 from qfolio.backtest import baselines, performance
-from qfolio.backtest.folds import Fold, latest, walk_forward
+from qfolio.backtest.folds import Fold, latest, spell, walk_forward
 from qfolio.backtest.simulation import Simulation, simulate
 from qfolio.errors import QfolioError
 from qfolio.files import (
@@ -55,6 +55,12 @@ LATEST = "latest"
 
 EQUAL_WEIGHT = "equal-weight"
 
+TOGETHER_NAME = "-together"
+"""Behind an agent's name: all its seeds as one, which is the policy for tomorrow."""
+
+TOGETHER = 8
+"""Folds that train at once where members advance in lockstep; what is done after them stays."""
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -79,16 +85,18 @@ class Backtest:
 
     def __init__(self, prices: Prices, config: dict[str, Any], folder: Path | None) -> None:
         self.prices, self.config, self.folder = prices, config, folder
+        _check(config)
         for entry in config["agents"].values():
             check_counts(entry["episodes"], config["seeds"], config["seed"])
-        self.folds = walk_forward(
-            prices.dates, config["train"], config["test"], config["lag"], config["expanding"]
-        )
+        dates, length, expanding = prices.dates, config["train"], config["expanding"]
+        folds = walk_forward(dates, length, config["test"], config["lag"], expanding)
+        self.folds = [fold.complete(prices.values) for fold in folds]
+        last = latest(LATEST, dates, length, expanding).complete(prices.values)
+        self._jobs = [*self.folds, last]
         self.agents = {name: _agent(entry) for name, entry in config["agents"].items()}
         self.tasks = {name: self._task(name) for name in self.agents}
         self.interrupted = False
         self._policies: dict[tuple[str, str], Any] = {}  # of a backtest without a folder
-        self._jobs = [*self.folds, self._latest()]
         for task in self.tasks.values():
             for job in self._jobs:
                 self._part(task, job)
@@ -138,12 +146,12 @@ class Backtest:
             "train": train,
             "test": test,
             "expanding": expanding,
-            "lag": lag,
-            "cost": cost,
-            "cap": cap,
-            "seeds": seeds,
-            "seed": seed,
-            "trials": trials,
+            "lag": int(lag),
+            "cost": float(cost),
+            "cap": float(cap),
+            "seeds": int(seeds),
+            "seed": int(seed),
+            "trials": int(trials),
             "command": command,
             "agents": {
                 name: {
@@ -187,7 +195,7 @@ class Backtest:
         with interruptible() as stop:
             for name, group in groups:
                 for share in self._train(name, group):
-                    if stop.is_set():
+                    if stop.is_set() and share < 1:
                         self.interrupted = True
                         return
                     if listener is not None:
@@ -204,9 +212,8 @@ class Backtest:
                 f"The backtest has no agent {name!r}; there is {', '.join(self.agents)}."
             )
         task, trained = self._part(self.tasks[name], self._jobs[-1]), self.agents[name]
-        seeds = self.config["seeds"]
-        template = {"learner": state_template(task, trained, seeds), "updates": np.array(0)}
-        kept = self._load(name, LATEST, template)
+        state = state_template(task, trained, self.config["seeds"])
+        kept = self._load(name, LATEST, _learning(state, 0, self.prices.dates[-1]))
         return Policy(
             task,
             trained,
@@ -215,19 +222,27 @@ class Backtest:
             self.prices.feature_names,
             kept["learner"],
             int(kept["updates"]),
+            kept["learned"].astype("datetime64[s]")[()],
         )
 
-    def update(self, agent: str | None, prices: Prices) -> Policy:
-        """The policy for tomorrow after it has gone on learning from a newer table; it is kept."""
+    def keep(self, agent: str | None, policy: Policy) -> None:
+        """Keeps a policy that has gone on learning as the agent's for tomorrow."""
         name = next(iter(self.agents)) if agent is None else agent
-        policy = self.policy(name).update(prices)
-        self._keep(name, LATEST, _learning(policy.learner, policy.updates))
-        return policy
+        self._keep(name, LATEST, _learning(policy.learner, policy.updates, policy.learned))
 
     def entries(self) -> tuple[dict[str, Entry], list[str]]:
         """Every strategy replayed over all folds, and notes on what went wrong on the way."""
-        notes: list[str] = []
-        entries = {name: self._entry("agent", self._decide(name)) for name in self.agents}
+        notes = [
+            f"Fold {fold.name} does without {', '.join(self._late(fold))}, which started too late."
+            for fold in self.folds
+            if self._late(fold)
+        ]
+        entries = {}
+        for name in self.agents:
+            entries[name] = self._entry("agent", self._decide(name))
+            if self.config["seeds"] > 1:
+                together = self._decide(name, together=True)
+                entries[f"{name}{TOGETHER_NAME}"] = self._entry("agent", together)
         for name in baselines.BASELINES:
             decided = baselines.decisions(
                 name, self.folds, self.prices.values, cap=self.config["cap"]
@@ -258,15 +273,15 @@ class Backtest:
             self.dates,
             periods_per_year=self.prices.periods_per_year,
             reference=EQUAL_WEIGHT,
-            other_trials=[None] * self.config["trials"],
+            other_trials=self.config["trials"],
         )
 
     def write_tables(self, entries: dict[str, Entry], assessment: performance.Assessment) -> None:
         """returns.csv (a column per strategy and seed), weights.csv (means) and summary.json."""
         assert self.folder is not None
-        days = [str(date)[:10] for date in self.dates]
+        days = [spell(date, self.prices.dates) for date in self.dates]
         columns = {
-            f"{name}/{self.config['seed'] + i}" if entry.kind == "agent" else name: series
+            f"{name}/{self.config['seed'] + i}" if name in self.agents else name: series
             for name, entry in entries.items()
             for i, series in enumerate(entry.simulation.returns)
         }
@@ -289,11 +304,6 @@ class Backtest:
         entry = config["agents"][name]["task"]
         return Portfolio.of(self.prices, **settings.convert(Portfolio, {**entry, **own}))
 
-    def _latest(self) -> Fold:
-        rows = latest(self.prices.dates, self.config["train"], self.config["expanding"])
-        end = len(self.prices)
-        return Fold(LATEST, rows, slice(end, end))
-
     def _part(self, task: Portfolio, job: Fold) -> Portfolio:
         values = self.prices.values
         return task.part(job.train.start, job.train.stop - 1, job.tradable(values))
@@ -301,8 +311,8 @@ class Backtest:
     def _groups(self, name: str) -> list[list[Fold]]:
         """The folds that are still to be trained, in groups that fill the devices."""
         missing = [job for job in self._jobs if not self._is_trained(name, job.name)]
-        platform = jax.devices()[0].platform
-        size = len(missing) if platform in devices.LOCKSTEP else len(jax.devices())
+        lockstep = jax.devices()[0].platform in devices.LOCKSTEP
+        size = max(len(jax.devices()), TOGETHER if lockstep else 1)
         return [missing[i : i + size] for i in range(0, len(missing), size)]
 
     def _train(self, name: str, group: list[Fold]) -> Iterator[float]:
@@ -310,27 +320,26 @@ class Backtest:
         seeds = [self.config["seed"] + i for i in range(self.config["seeds"])]
         tasks = [self._part(self.tasks[name], job) for job in group for _ in seeds]
         members = seeds * len(group)
-        population = self._population
-        if population is None or population.agent is not self.agents[name] or len(
-            population.seeds
-        ) != len(members):  # fmt: skip
-            population = self._population = Population(tasks, self.agents[name], members)
-        else:
-            population.restart(tasks, members)
-        total = population.steps_left(self.config["agents"][name]["episodes"])
-        while left := population.steps_left(self.config["agents"][name]["episodes"]):
+        population = Population(tasks, self.agents[name], members)
+        episodes = self.config["agents"][name]["episodes"]
+        total = population.steps_left(episodes)
+        while left := population.steps_left(episodes):
+            yield population.steps / total
             population.advance(left)
-            yield min(1.0, population.steps / total)
         weights, state = population.weights(), population.fetch().agent
         for i, job in enumerate(group):
             mine = slice(i * len(seeds), (i + 1) * len(seeds))
             if job.name == LATEST:
                 learner = jax.tree.map(lambda x, s=mine: x[s], state)
-                self._keep(name, job.name, _learning(learner, 0))
+                self._keep(name, job.name, _learning(learner, 0, self.prices.dates[-1]))
             else:
                 self._keep(name, job.name, jax.tree.map(lambda x, s=mine: x[s], weights))
+        yield 1.0
 
-    _population: Population | None = None
+    def _late(self, fold: Fold) -> list[str]:
+        """Assets that a fold does without."""
+        tradable = fold.tradable(self.prices.values)
+        return [name for name, yes in zip(self.prices.assets, tradable, strict=True) if not yes]
 
     def _is_trained(self, name: str, job: str) -> bool:
         if self.folder is None:
@@ -363,12 +372,14 @@ class Backtest:
 
     # Deciding ------------------------------------------------------------------------------------
 
-    def _decide(self, name: str) -> np.ndarray:
+    def _decide(self, name: str, together: bool = False) -> np.ndarray:
         """Decisions over all folds, (seed, day, entry); each goes on with what the last one held.
 
-        The agents see their portfolio in float32; the replay is in float64.
+        With ``together`` it is the mean of all seeds that trades, as one. The agents see their
+        portfolio in float32; the replay is in float64.
         """
-        held = np.zeros((self.config["seeds"], 1 + len(self.prices.assets)))
+        seeds = 1 if together else self.config["seeds"]
+        held = np.zeros((seeds, 1 + len(self.prices.assets)))
         held[:, 0] = 1.0
         longest = max(fold.decisions.stop - fold.decisions.start for fold in self.folds)
         parts = []
@@ -383,6 +394,7 @@ class Backtest:
                 fold.decisions.start,
                 held,
                 longest,
+                together=together,
             )
             parts.append(targets[:, :count])
             held = after[:, count - 1]
@@ -399,9 +411,10 @@ class Backtest:
         return Entry(kind, decisions, simulation)
 
 
-def _learning(learner: Any, updates: int) -> dict[str, Any]:
+def _learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, Any]:
     """What is kept of the policy for tomorrow: one file, so that it is always of one piece."""
-    return {"learner": learner, "updates": np.array(updates)}
+    seconds = np.array(learned, "datetime64[s]").astype(np.int64)
+    return {"learner": learner, "updates": np.array(updates), "learned": seconds}
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -413,6 +426,15 @@ def read_config(folder: Path) -> dict[str, Any]:
     if config.get("format") != FORMAT or config.get("kind") != "backtest":
         what = "is a training run" if "task" in config else "was written in another format"
         raise QfolioError(f"{folder} {what}; this needs the folder of a qfolio backtest.")
+    try:
+        _check(config)
+    except QfolioError as error:
+        raise QfolioError(f"{path} is damaged: {error}") from None
+    return config
+
+
+def _check(config: dict[str, Any]) -> None:
+    """Raises QfolioError where settings are missing, of the wrong type or out of range."""
     wanted = {
         "assets": list, "feature_names": list, "train": str, "test": str, "expanding": bool,
         "lag": int, "cost": float, "cap": float, "seeds": int, "seed": int, "trials": int,
@@ -420,14 +442,21 @@ def read_config(folder: Path) -> dict[str, Any]:
     }  # fmt: skip
     for name, kind in wanted.items():
         if not isinstance(config.get(name), kind):
-            raise QfolioError(f"{path} is damaged: {name} is missing or of the wrong type.")
+            raise QfolioError(f"{name} is missing or of the wrong type.")
+    if not {"source", "rows", "first", "last", "digest"} <= config["prices"].keys():
+        raise QfolioError("prices is not described.")
+    if not 0 <= config["trials"] <= 10**9:
+        raise QfolioError(f"trials is {config['trials']}; it must be from 0 to 10⁹.")
     parts = {"agent": str, "settings": dict, "task": dict, "episodes": int}
     for name, entry in config["agents"].items():
-        # Names become folders: none may lead elsewhere.
-        whole = isinstance(entry, dict) and all(isinstance(entry.get(k), parts[k]) for k in parts)
-        if not (whole and re.fullmatch(r"[A-Za-z0-9_-]+", name)):
-            raise QfolioError(f"{path} is damaged: the agent {name!r} is not described.")
-    return config
+        if not (isinstance(entry, dict) and all(isinstance(entry.get(k), parts[k]) for k in parts)):
+            raise QfolioError(f"the agent {name!r} is not described.")
+        # Names become folders, and stand beside those of the baselines.
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", name) or name in baselines.BASELINES:
+            raise QfolioError(
+                f"an agent cannot be called {name!r}; take letters, digits, - and _, and no "
+                "name of a baseline."
+            )
 
 
 def _agent(entry: dict[str, Any]) -> Agent:

@@ -1,6 +1,7 @@
 """The commands about prices: check a table, backtest agents on it, and allocate for tomorrow."""
 
 import datetime
+import inspect
 import json
 import shlex
 import sys
@@ -101,6 +102,7 @@ def backtest(
         features: Columns of further numbers that agents may see.
         date: The column of dates, where its name does not tell.
     """
+    options = dict(locals())
     from qfolio import devices
 
     devices.configure()
@@ -129,6 +131,9 @@ def backtest(
             out=folder,
         )
     else:
+        defaults = inspect.signature(backtest).parameters
+        if any(options[name] != p.default for name, p in defaults.items() if name != "resume"):
+            raise QfolioError("--resume keeps what the backtest was started with; add nothing.")
         test_run, folder = Backtest.open(resume), resume
     console.say(console.describe_backtest(test_run))
     console.run_backtest(test_run)
@@ -184,17 +189,20 @@ def allocate(
     policy = test_run.policy(agent)
     table = test_run.prices
     if prices is not None:
+        # The policy looks at the last rows only; assets may start at any row before.
         options: dict[str, Any] = dict(missing=missing, features=features, date=date)
-        table = policy.table(load(prices, **options))
+        table = policy.table(load(prices, late="join", **options))
     require_fresh(table, as_of)
     shares, cash = read_holdings(holdings, table.assets, capital)
     if update:
-        policy = test_run.update(agent, table)
+        policy = policy.update(table)
     allocation = Allocation.of(policy, table, shares, cash, whole_shares=whole_shares)
     if as_json:
         print(json.dumps(allocation.to_json(), indent=2))
     else:
         console.print_allocation(allocation)
+    if update:
+        test_run.keep(agent, policy)
 
 
 def _split(text: str) -> list[str]:

@@ -442,6 +442,12 @@ def _check_cells(grid: _Grid, findings: _Findings) -> None:
     table = grid.table
     if not grid.assets:
         findings.error("there is no asset", advice="Give a column of prices for each asset.")
+    for name in grid.assets:
+        if name.strip().lower() == "cash":
+            findings.error(
+                f"the asset {quote(name)} has the name of the money that is not invested",
+                advice="Rename or remove its column." if not grid.long else "Rename or remove it.",
+            )
     if len(grid.dates) < FEWEST_ROWS:
         findings.error(
             f"the table has {amount(len(grid.dates), 'row')}; at least {FEWEST_ROWS} are needed",

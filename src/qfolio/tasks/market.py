@@ -43,6 +43,7 @@ class Relatives(NamedTuple):
 class Menu(eqx.Module):
     """Allocations to choose from: each keeps a share of the holding and fills up with a target.
 
+    limits: the largest weights; assets with 0 have no part in equal weights.
     text: "grid:10" for all weights in tenths; "tilts:0.1" for: no order, all cash, equal weights,
     all in one asset, and a tenth of the holding moved into one asset (each for every asset);
     "overweight:0.1" for: no order, all cash, equal weights, and equal weights with a tenth of the
@@ -53,10 +54,12 @@ class Menu(eqx.Module):
     target: Float[Array, "choice entry"]
     actions: Discrete
 
-    def __init__(self, text: str, assets: int) -> None:
+    def __init__(self, text: str, limits: Float[Array, " asset"]) -> None:
         kind, _, size = text.partition(":")
+        assets = limits.shape[0]
         each = jnp.eye(assets + 1)[1:]
-        cash, equal = jnp.eye(assets + 1)[:1], each.mean(0, keepdims=True)
+        open_to = jnp.append(0.0, limits > 0)
+        cash, equal = jnp.eye(assets + 1)[:1], (open_to / open_to.sum())[None]
         try:
             value = float(size)
         except ValueError:
@@ -121,13 +124,13 @@ class Market(ExogenousTask):
 
     @property
     def actions(self) -> Actions:
-        assets = self.limits.shape[0]
-        return Menu(self.menu, assets).actions if self.menu else Simplex(assets)
+        if self.menu:
+            return Menu(self.menu, self.limits).actions
+        return Simplex(self.limits.shape[0])
 
     def target(self, held: Float[Array, " entry"], action: Array) -> Float[Array, " entry"]:
         """Target weights of an action; what is above an asset's limit stays in cash."""
-        assets = self.limits.shape[0]
-        weights = Menu(self.menu, assets).weights(held, action) if self.menu else action
+        weights = Menu(self.menu, self.limits).weights(held, action) if self.menu else action
         return self._limited(weights)
 
     def _limited(self, weights: Float[Array, " entry"]) -> Float[Array, " entry"]:
@@ -171,8 +174,11 @@ class Market(ExogenousTask):
         if self.reward == "log":
             return jnp.log(growth), moments
         if self.reward == "crra":
-            power = 1 - self.risk_aversion
-            return jnp.expm1(power * jnp.log(growth)) / power, moments
+            power = 1 - jnp.asarray(self.risk_aversion)
+            log = abs(power) < 1e-6  # the limit
+            safe = jnp.where(log, 1.0, power)
+            utility = jnp.expm1(safe * jnp.log(growth)) / safe
+            return jnp.where(log, jnp.log(growth), utility), moments
         if self.reward == "mean-variance":
             return gain - self.risk_aversion / 2 * gain**2, moments
         mean, square = moments

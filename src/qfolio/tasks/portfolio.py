@@ -78,7 +78,11 @@ class Portfolio(Market):
         require(self, "lag", lambda x: 0 <= x <= 1000, "from 0 to 1000 rows")
         require(self, "cap", lambda x: 0 < x <= 1, "above 0 and at most 1")
         require(self, "reward", lambda x: x in REWARDS, f"one of {', '.join(REWARDS)}")
-        for name, low, high in (("cost", 0, 0.2), ("risk_aversion", 0, 100), ("sharpe_rate", 0, 1)):
+        for name, low, high in (
+            ("cost", 0, 0.2),
+            ("risk_aversion", 0, 100),
+            ("sharpe_rate", 0, 0.5),
+        ):
             value = getattr(self, name)
             if isinstance(value, float) and not low <= value <= high:
                 raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")
@@ -131,7 +135,8 @@ class Portfolio(Market):
         return self.first + jnp.floor(jax.random.uniform(key) * starts).astype(jnp.int32)
 
     def next_market(self, market: Row, key: PRNGKeyArray) -> Row:
-        return jnp.minimum(market + 1, self.last)
+        # One row on, the last decision's outcome is known; episodes end there at the latest.
+        return jnp.minimum(market + 1, self.last + 1)
 
     def features(self, market: Row) -> Float[Array, "asset time channel"]:
         start = market - self.window + 1

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.fields import constant, number, static
+from qfolio.errors import QfolioError
+from qfolio.fields import constant, number, require, static
 from qfolio.markets.costs import drift, remainder_factor
 from qfolio.mdp import Box, ExogenousTask, Policy, Position, View
 from qfolio.optimum import markets as exact
@@ -25,6 +26,9 @@ from qfolio.tasks.market import Holding, Market, Relatives
 
 class Synthetic(ExogenousTask):
     """A market with a known best policy: from a state to target weights, or to a position."""
+
+    def __check_init__(self) -> None:
+        require(self, "horizon", lambda x: 1 <= x <= 100_000, "from 1 to 100,000")
 
     @abc.abstractmethod
     def best(self) -> Policy:
@@ -37,6 +41,10 @@ class Synthetic(ExogenousTask):
     def optimum(self) -> FollowedOptimum:
         continuous = dataclasses.replace(self, menu="") if hasattr(self, "menu") else self
         return FollowedOptimum(continuous, self.best())
+
+
+def _require_cost(task: Any) -> None:
+    require(task, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
 
 
 class OneAsset(Market, Synthetic):
@@ -62,6 +70,11 @@ class Kelly(OneAsset):
     horizon: int = static(100)
 
     cost = 0.0
+
+    def __check_init__(self) -> None:
+        require(self, "up", lambda x: 1 < x <= 100, "above 1 and at most 100")
+        require(self, "down", lambda x: 0.01 <= x < 1, "at least 0.01 and below 1")
+        require(self, "probability", lambda x: 0 < x < 1, "between 0 and 1")
 
     def reset_market(self, key: PRNGKeyArray) -> Float[Array, ""]:
         return jnp.array(1.0)
@@ -157,6 +170,11 @@ class Regime(OneAsset):
     menu: str = static("")
     horizon: int = static(250)
 
+    def __check_init__(self) -> None:
+        require(self, "stay", lambda x: 0 <= x < 1, "at least 0 and below 1")
+        require(self, "mean", lambda x: 0 < x <= 0.5, "above 0 and at most 0.5")
+        _require_cost(self)
+
     def reset_market(self, key: PRNGKeyArray) -> Int[Array, ""]:
         return jax.random.bernoulli(key).astype(jnp.int32)
 
@@ -215,6 +233,17 @@ class Ar1(OneAsset):
 
     levels = 11
     optimum_discount = 0.97
+
+    def __check_init__(self) -> None:
+        require(self, "rho", lambda x: 0 <= x <= 0.999, "from 0 to 0.999")
+        require(self, "noise volatility", lambda x: 0 < x <= 10, "above 0 and at most 10")
+        _require_cost(self)
+        # Five standard deviations of the signal and of the return must leave something.
+        worst = abs(self.drift) + 5 * abs(self.slope) * self.spread + 5 * self.volatility
+        if worst >= 1:
+            raise QfolioError(
+                "Returns below −100 % are too likely; lower slope, noise, rho or volatility."
+            )
 
     @property
     def spread(self) -> float:
@@ -283,6 +312,16 @@ class NoTrade(OneAsset):
     horizon: int = static(480)
 
     NODES = 5
+
+    def __check_init__(self) -> None:
+        require(self, "volatility", lambda x: 0.01 <= x <= 2, "from 0.01 to 2")
+        require(self, "dt", lambda x: 0.001 <= x <= 1, "from 0.001 to 1 years")
+        _require_cost(self)
+        if not 0.01 <= self.rate / self.volatility**2 <= 0.99:
+            raise QfolioError(
+                f"The best weight without costs is {self.rate / self.volatility**2:.3g}; rate and "
+                "volatility must leave it between 0.01 and 0.99."
+            )
 
     def reset_market(self, key: PRNGKeyArray) -> Float[Array, ""]:
         return jnp.array(0.0)
@@ -356,6 +395,12 @@ class GarleanuPedersen(Synthetic):
     variance: float = number(0.04)
     rho: float = number(0.01)
     horizon: int = static(300)
+
+    def __check_init__(self) -> None:
+        require(self, "phi", lambda x: 0 < x <= 1, "above 0 and at most 1")
+        require(self, "rho", lambda x: 0 < x < 1, "between 0 and 1")
+        positive = "noise risk_aversion cost_scale variance"
+        require(self, positive, lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")
 
     @property
     def actions(self) -> Box:
