@@ -5,8 +5,10 @@ Needs nothing but Python: the peers' environment, which has no qfolio, imports i
 
 import json
 import statistics
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter, sleep
 from typing import TextIO
@@ -47,6 +49,30 @@ def serve(run: Contestant, answers: TextIO) -> None:
     print("ready", file=answers, flush=True)
     for line in sys.stdin:
         print(json.dumps({"rate": run(json.loads(line)["seconds"])}), file=answers, flush=True)
+
+
+@contextmanager
+def process(command: list[str], environment: dict[str, str] | None = None) -> Iterator[Contestant]:
+    """A contestant in a process of its own, which is warm, and rests between rounds."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        questions, answers = process.stdin, process.stdout
+
+        def read() -> str:
+            line = answers.readline()
+            if not line:
+                raise RuntimeError(f"{' '.join(command)} ended; its last words are above.")
+            return line
+
+        def run(seconds: float) -> float:
+            print(json.dumps({"seconds": seconds}), file=questions, flush=True)
+            return json.loads(read())["rate"]
+
+        read()  # it is warm
+        yield run
+        questions.close()  # which ends it
 
 
 def race(contestants: dict[str, Contestant], rounds: int, seconds: float) -> Rates:

@@ -12,19 +12,18 @@ left out where it is not installed.
 """
 
 import argparse
-import json
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
-from race import Contestant, Rates, race, serve, timed
+from race import Contestant, Rates, process, race, serve, timed
 
 ROOT = Path(__file__).resolve().parents[1]
 PEERS = ROOT / ".venv-bench"
@@ -120,32 +119,12 @@ def answer(path: str, strategies: int) -> None:
     serve(timed(advance), answers)
 
 
-@contextmanager
-def elsewhere(interpreter: Path, path: str, strategies: int) -> Iterator[Contestant]:
-    """vectorbt in a process of its own, warm and asleep between rounds."""
-    command = [
+def elsewhere(interpreter: Path, path: str, strategies: int) -> list[str]:
+    """The command that runs vectorbt."""
+    return [
         *(str(interpreter), "-W", "ignore", __file__),
         *("--serve", path, "--strategies", str(strategies)),
     ]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        questions, answers = process.stdin, process.stdout
-
-        def read() -> str:
-            line = answers.readline()
-            if not line:
-                raise RuntimeError("vectorbt's process ended; its last words are above.")
-            return line
-
-        def run(seconds: float) -> float:
-            print(json.dumps({"seconds": seconds}), file=questions, flush=True)
-            return json.loads(read())["rate"]
-
-        read()  # it is warm
-        yield run
-        questions.close()  # which ends it
 
 
 def interpreter(environment: Path) -> Path | None:
@@ -173,7 +152,9 @@ def measure(*, rounds: int = 5, seconds: float = 1.5, peers: Path = PEERS) -> Ra
                 ("vectorbt, one strategy", ONE),
                 (f"vectorbt, {VECTORBT_MANY} strategies at once", VECTORBT_MANY),
             ):
-                contestants[name] = stack.enter_context(elsewhere(python, path, strategies))
+                contestants[name] = stack.enter_context(
+                    process(elsewhere(python, path, strategies))
+                )
         for run in contestants.values():
             run(0.1)
         return race(contestants, rounds, seconds)

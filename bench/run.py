@@ -14,8 +14,8 @@ import subprocess
 import sys
 import tempfile
 import venv
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from importlib.metadata import version
@@ -35,9 +35,10 @@ import jax.numpy as jnp  # noqa: E402
 import tyro  # noqa: E402
 from jax import lax  # noqa: E402
 
+import replay  # noqa: E402
 from qfolio.presets import preset  # noqa: E402
 from qfolio.training import CHUNK, Population  # noqa: E402
-from race import Contestant, Rates, Ratio, race, ratio, timed  # noqa: E402
+from race import Contestant, Rates, Ratio, process, race, ratio, timed  # noqa: E402
 from workload import EPISODES, layers, products, report  # noqa: E402
 
 HERE = Path(__file__).parent
@@ -106,7 +107,7 @@ def against_peers(effort: Effort) -> Outcome:
         for library, (name, _) in libraries.items():
             for threads in THREADS:
                 command = [python(PEERS), "-W", "ignore", str(HERE / "peers.py"), library]
-                peer = process([*command, "--threads", str(threads)])
+                peer = process([*command, "--threads", str(threads)], ENVIRONMENT)
                 contestants[spelled(name, threads)] = stack.enter_context(peer)
         rates = race(contestants, effort.rounds, effort.seconds)
     figures = []
@@ -136,7 +137,9 @@ def on_all_cores(effort: Effort) -> Outcome:
     eight = f"Speed of eight agents on {os.cpu_count()} cores"
     with ExitStack() as stack:
         if hasattr(os, "sched_setaffinity"):
-            one = stack.enter_context(process([sys.executable, str(HERE / "pinned.py")]))
+            one = stack.enter_context(
+                process([sys.executable, str(HERE / "pinned.py")], ENVIRONMENT)
+            )
             contestants["one agent on one core"] = one
         rates = race(contestants, effort.rounds, effort.seconds)
     return [
@@ -196,6 +199,19 @@ def of_preset(name: str, effort: Effort) -> Outcome:
         ),
         most(f"Preset {name}: mean regret of 16 agents", statistics.mean(regrets), "{:.2%}"),
     ], {}
+
+
+def of_replays(effort: Effort) -> Outcome:
+    """The backtest's engine, beside those of other libraries."""
+    install_peers()
+    rates = replay.measure(rounds=effort.rounds, seconds=effort.seconds)
+    figures = []
+    for name in (n for n in rates if n.startswith("qfolio")):
+        ordered = sorted(rate / 1e6 for rate in rates[name])
+        what = f"Replay, million asset-days a second: {name.removeprefix('qfolio, ')}"
+        middle = statistics.median(ordered)
+        figures.append(Figure(what, middle, "{:.0f}", ordered[0], ordered[-1], target=10.0))
+    return figures, rates
 
 
 def spelled(library: str, threads: int) -> str:
@@ -280,30 +296,6 @@ def count_products(hlo: str) -> tuple[int, int]:
     (loop,) = re.findall(r"body=%([\w.-]+)", hlo)
     (entry,) = re.findall(r"^ENTRY %([\w.-]+)", hlo, re.MULTILINE)
     return count(entry), count(loop)
-
-
-@contextmanager
-def process(command: list[str]) -> Iterator[Contestant]:
-    """A contestant in a process of its own, which is warm, and rests between rounds."""
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=ENVIRONMENT) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        questions, answers = process.stdin, process.stdout
-
-        def read() -> str:
-            line = answers.readline()
-            if not line:
-                raise RuntimeError(f"{' '.join(command)} ended; its last words are above.")
-            return line
-
-        def run(seconds: float) -> float:
-            print(json.dumps({"seconds": seconds}), file=questions, flush=True)
-            return json.loads(read())["rate"]
-
-        read()  # it is warm
-        yield run
-        questions.close()  # which ends it
 
 
 def install_peers() -> None:
@@ -402,7 +394,9 @@ def tables(results: dict[str, Any]) -> str:
         for who, all in part["rates"].items()
     ]
     if rates:
-        text += "\n" + table(["environment steps a second", "median", "range"], rates)
+        text += "\n" + table(
+            ["environment steps (replay: asset-days) a second", "median", "range"], rates
+        )
     machines = dict.fromkeys(part["machine"] for part in results.values())
     loads = ", ".join(f"{part['load']} ({name})" for name, part in results.items())
     return f"{text}\n{'; '.join(machines)}; load average before each part: {loads}.\n"
@@ -428,12 +422,16 @@ PARTS: dict[str, Callable[[Effort], Outcome]] = {
     "c": on_all_cores,
     "d": of_one_run,
     "e": partial(of_preset, "fast"),
+    "replay": of_replays,
     "best": partial(of_preset, "best"),
 }
 
 
 def main(
-    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART …")] = ("a", "b", "c", "d", "e"),
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART …")] = (
+        *("a", "b", "c", "d", "e"),
+        "replay",
+    ),
     best: bool = False,
     quick: bool = False,
 ) -> None:
@@ -441,7 +439,7 @@ def main(
 
     Args:
         only: Parts to run: a (peers), b (matrix products), c (cores), d (memory and start),
-            e (preset fast).
+            e (preset fast), replay (the backtest's engine).
         best: Measure the preset best, too.
         quick: Short rounds and short runs, to see that all works; leaves the files as they are.
     """

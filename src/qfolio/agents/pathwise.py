@@ -37,9 +37,11 @@ from qfolio.networks import SHARED, Reading, Shared
 class Band(eqx.Module):
     """From a view of the market to target weights, or to positions where they are unbounded.
 
-    The network names two edges for each asset, and a trade is only ever to the nearer one. With
-    proportional costs the best policy has this form (Davis & Norman 1990; as a network: Imaki et
-    al. 2021, "No-transaction band network"); two edges that meet say where to go from anywhere.
+    The network names two edges for each asset, and a holding outside them wants to go to the nearer
+    one. With proportional costs the best policy of one asset has this form (Davis & Norman 1990; as
+    a network: Imaki et al. 2021, "No-transaction band network"); two edges that meet say where to
+    go from anywhere. Where all that is wanted sums to more than 1, the projection takes some of it
+    away, also from assets inside their edges.
     They start close together, so that both are traded to and have gradients, around equal weights
     or around no position.
     """
@@ -134,7 +136,7 @@ class Pathwise(Agent):
             )
         view = task.observe(task.reset(key))
         network = Shared(self.network, view, self.hidden, pooled=0, each=2, key=key)
-        # An output layer of zeros: the first policy is the one that ``Policy`` starts from.
+        # An output layer of zeros: the first policy is the band that it starts from.
         last = lambda n: (n.head.weights[-1], n.head.biases[-1])  # noqa: E731
         network = eqx.tree_at(last, network, replace_fn=jnp.zeros_like)
         policy = Band(network, task.actions)

@@ -198,9 +198,9 @@ class Backtest:
                     if stop.is_set() and share < 1:
                         self.interrupted = True
                         return
-                    if listener is not None:
-                        done = (finished + share) / len(groups)
-                        left = (perf_counter() - begun) * (1 / max(done, 1e-9) - 1)
+                    done = (finished + share) / len(groups)
+                    if listener is not None and done > 0:
+                        left = (perf_counter() - begun) * (1 / done - 1)
                         listener(Progress(name, done, left))
                 finished += 1
 
@@ -258,19 +258,21 @@ class Backtest:
         first, last = self.folds[0].decisions.start, self.folds[-1].decisions.stop
         return self.prices.dates[first + shift : last + shift]
 
-    def assess(self, entries: dict[str, Entry]) -> performance.Assessment:
-        """The statistics of all strategies."""
+    def assess(self, entries: dict[str, Entry], since: str | None = None) -> performance.Assessment:
+        """The statistics of all strategies, over all days of the test or those from a date on."""
+        first = 0 if since is None else int(np.searchsorted(self.dates, np.datetime64(since)))
+        days = slice(first, None)
         return performance.assess(
             {
                 name: performance.Strategy(
                     entry.kind,
-                    entry.simulation.returns,
-                    entry.simulation.turnover,
-                    entry.simulation.cost,
+                    entry.simulation.returns[:, days],
+                    entry.simulation.turnover[:, days],
+                    entry.simulation.cost[:, days],
                 )
                 for name, entry in entries.items()
             },
-            self.dates,
+            self.dates[days],
             periods_per_year=self.prices.periods_per_year,
             reference=EQUAL_WEIGHT,
             other_trials=self.config["trials"],
