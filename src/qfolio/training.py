@@ -182,7 +182,10 @@ def _rollout(
 
 def _scan(function: Callable[..., Any], carry: Any, xs: Any) -> tuple[Any, Any]:
     """``lax.scan``; a single step stands in line, without a loop."""
-    return lax.scan(function, carry, xs, unroll=jax.tree.leaves(xs)[0].shape[0] == 1)
+    if jax.tree.leaves(xs)[0].shape[0] > 1:
+        return lax.scan(function, carry, xs)
+    carry, y = function(carry, jax.tree.map(lambda x: x[0], xs))
+    return carry, jax.tree.map(lambda y: y[None], y)
 
 
 def _select(mask: Bool[Array, " environment"], new: Array, old: Array) -> Array:
