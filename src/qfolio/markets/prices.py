@@ -65,6 +65,8 @@ class Prices:
             )
         if len(set(assets)) < len(assets) or len(set(channels)) < len(channels):
             raise QfolioError("names of assets and features must not repeat.")
+        if "cash" in map(str.lower, assets):
+            raise QfolioError("an asset cannot be called cash, which is money; rename the column.")
         if np.isnat(dates).any() or (np.diff(dates) <= np.timedelta64(0, "s")).any():
             raise QfolioError("dates must increase from row to row.")
         started = np.logical_or.accumulate(~np.isnan(values), axis=0)
