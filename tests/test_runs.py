@@ -14,8 +14,10 @@ from safetensors.numpy import load_file, save_file
 
 import qfolio.files
 from qfolio.agents.dqn import DQN
+from qfolio.agents.pathwise import Pathwise
 from qfolio.errors import QfolioError
 from qfolio.runs import Run, train
+from qfolio.tasks.synthetic import Ar1
 
 from probes import Explosive
 
@@ -48,6 +50,25 @@ def test_n_and_n_episodes_equal_2n(task, agent, tmp_path):
     again = Run.open(tmp_path / "halves")
     assert again.episodes == 12
     again.train(24)
+    assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
+
+
+IN_A_MARKET = {
+    "pathwise": (Ar1(horizon=20), Pathwise(rollout=10, environments=3, hidden=(4, 4))),
+    "dqn": (
+        Ar1(horizon=20, menu="grid:2"),
+        DQN(hidden=(8,), all_actions=True, environments=2, batch_size=8, replay_capacity=100,
+            learning_starts=20, episode_steps=0, learning_rate_steps=200.0),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", IN_A_MARKET)
+def test_n_and_n_episodes_equal_2n_in_a_market(name, tmp_path):
+    task, agent = IN_A_MARKET[name]
+    create(task, agent, tmp_path / "straight", episodes=240, seeds=2).train()
+    create(task, agent, tmp_path / "halves", episodes=120, seeds=2).train()
+    Run.open(tmp_path / "halves").train(240)
     assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
 
 
