@@ -147,7 +147,7 @@ def test_the_check_of_prices(monkeypatch, capsys, tmp_path):
         (["--agents", "dqn,dqn"], "twice"), (["--agents", ""], "at least one agent"),
         (["--preset", "quick"], "no preset"), (["--set", "lag=2"], "options of their own"),
         (["--set", "dqn.windw=2"], "has this setting"), (["--train", "90y"], "nothing to test"),
-        (["--seeds", "0"], "seeds is 0"), (["--cost-bps", "-5"], "cost is"),
+        (["--seeds", "0"], "seeds is 0"), (["--cost-bps", "-5"], "--cost-bps is -5"),
     ],
 )  # fmt: skip
 def test_backtests_that_are_refused(monkeypatch, capsys, tmp_path, options, message):

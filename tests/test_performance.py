@@ -343,7 +343,8 @@ def test_verdict_at_the_boundary() -> None:
     assert verdict("dqn", "equal weight", 0.01, 0.0, 0.02).startswith(nothing)
     assert verdict("dqn", "equal weight", -0.01, -0.02, 0.0).startswith(nothing)
     assert verdict("dqn", "equal weight", 0.0, 0.0, 0.0).startswith(nothing)
-    least = math.ulp(0.0)
+    assert verdict("dqn", "equal weight", 1e-8, 0.9e-6, 1e-8).startswith(nothing)  # rounding
+    least = 1.1e-6
     assert verdict("dqn", "it", 0.01, least, 0.02).startswith("dqn beats it after costs: ")
     assert verdict("dqn", "it", -0.01, -0.02, -least).startswith("dqn falls short of it after ")
     assert verdict("dqn", "it", math.nan, math.nan, math.nan).startswith("No evidence")

@@ -109,7 +109,7 @@ def number(value: float | None) -> str:
 
 
 def _cells(optimum: str, value: float, regret: float, over: float | None) -> tuple[str, ...]:
-    return number(value), optimum, f"{regret:.2%}", number(over)
+    return number(value), optimum, f"{round(regret, 4) + 0.0:.2%}", number(over)
 
 
 def print_rule(rule: dict[str, Any]) -> None:
@@ -203,10 +203,14 @@ def print_assessment(assessment: "Assessment") -> None:
             style=style,
         )
     console.print(table)
-    for strategy in assessment.strategies.values():
-        for difference in (strategy.to_reference, strategy.to_best_baseline):
-            if strategy.kind == "agent" and difference is not None:
-                say(difference.verdict)
+    verdicts = [
+        difference.verdict
+        for strategy in assessment.strategies.values()
+        for difference in (strategy.to_reference, strategy.to_best_baseline)
+        if strategy.kind == "agent" and difference is not None
+    ]
+    for verdict in dict.fromkeys(verdicts):  # the two are one where equal weights are the best
+        say(verdict)
 
 
 def print_allocation(allocation: "Allocation") -> None:

@@ -388,6 +388,10 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise QfolioError(f"{folder} is no run: it has no config.json.")
     config = read_json(path)
+    if config.get("kind") == "backtest":
+        raise QfolioError(
+            f"{folder} is a backtest, not a training run; see qfolio backtest --help."
+        )
     if config.get("format") != FORMAT:
         raise QfolioError(
             f"{folder} was written by qfolio {config.get('version', 'of an unknown version')} in "

@@ -32,6 +32,10 @@ Floats = NDArray[np.float64]
 Range = tuple[float, float]
 
 LEVEL = 0.95
+
+MARGIN = 1e-6
+"""Of growth a year: less than this is rounding, and no evidence of anything."""
+
 """Coverage of every interval here, and the level a probability must reach to count as evidence."""
 
 MEASURES = (
@@ -423,8 +427,8 @@ def _shape(returns: Floats) -> tuple[float, float]:
 def verdict(agent: str, reference: str, difference: float, low: float, high: float) -> str:
     """Say in words what an interval of the difference in annual log growth shows.
 
-    Only an interval that lies wholly on one side of zero is evidence; one that touches zero is
-    none.
+    Only an interval that lies wholly on one side of zero, by more than ``MARGIN``, is evidence; one
+    that touches it is none.
 
     Args:
         agent: Whose growth it is.
@@ -433,9 +437,9 @@ def verdict(agent: str, reference: str, difference: float, low: float, high: flo
         low: Lower end of the 95 % interval.
         high: Upper end.
     """
-    if low > 0:
+    if low > MARGIN:
         finding = f"{agent} beats {reference} after costs"
-    elif high < 0:
+    elif high < -MARGIN:
         finding = f"{agent} falls short of {reference} after costs"
     else:
         finding = f"No evidence that {agent} beats {reference} after costs"

@@ -88,7 +88,7 @@ def backtest(
         train: Rows to learn from before the first fold: 5y, 6m, 8w or 500d (d counts rows).
         test: Rows to trade before learning anew.
         rolling: Learn from the last --train only, instead of all rows so far.
-        cap: Most that one asset may weigh, from 0 to 1.
+        cap: Most that one asset may weigh when it is ordered, from 0 to 1.
         seeds: Agents of each kind; the preset says otherwise.
         seed: The first agent's seed.
         episodes: Training episodes of each agent and fold; the preset says otherwise.
@@ -110,6 +110,8 @@ def backtest(
     from qfolio.backtest.run import Backtest
     from qfolio.markets.prices import load
 
+    if not 0 <= cost_bps <= 2000:
+        raise QfolioError(f"--cost-bps is {cost_bps:g}; it must be from 0 to 2000.")
     if resume is None:
         table = load(file, missing=missing, late=late, features=features, date=date)
         chosen = {name: _preset(name, preset, episodes) for name in _split(agents)}
@@ -173,7 +175,7 @@ def allocate(
             older.
         update: Go on learning from the new rows before answering, and keep what was learned.
         missing: What becomes of a missing price.
-        features: Columns of further numbers, as in the backtest.
+        features: Columns of further numbers; those of the backtest otherwise.
         date: The column of dates, where its name does not tell.
         as_json: Print JSON instead of a table.
     """
@@ -190,7 +192,8 @@ def allocate(
     table = test_run.prices
     if prices is not None:
         # The policy looks at the last rows only; assets may start at any row before.
-        options: dict[str, Any] = dict(missing=missing, features=features, date=date)
+        known = features or tuple(test_run.config["feature_names"])
+        options: dict[str, Any] = dict(missing=missing, features=known, date=date)
         table = policy.table(load(prices, late="join", **options))
     require_fresh(table, as_of)
     shares, cash = read_holdings(holdings, table.assets, capital)
