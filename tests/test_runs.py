@@ -116,7 +116,8 @@ def test_killed_at_a_random_moment(task, agent, tmp_path):
         assert process.stdout is not None
         assert process.stdin is not None
         process.stdout.readline()
-        for _ in range(moments.randint(2, 20)):
+        # The first chunk only collects, and a checkpoint is written after the child has asked.
+        for _ in range(moments.randint(3, 20)):
             process.stdout.readline()
             process.stdin.write("go on\n")
             process.stdin.flush()
