@@ -145,5 +145,6 @@ def test_lockstep_members_learn_the_same(task, agent, monkeypatch):
     one_by_one, _ = trained(task, agent, [0, 1, 2], [30])
     monkeypatch.setattr("qfolio.devices.LOCKSTEP", {"cpu"})
     lockstep, _ = trained(task, agent, [0, 1, 2], [30])
+    assert lockstep._programs is not one_by_one._programs  # or this would compare like with like
     expected, actual = (p.fetch().agent.online.mlp.weights for p in (one_by_one, lockstep))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), expected, actual)

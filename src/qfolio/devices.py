@@ -70,16 +70,18 @@ def require_memory(tree: Any, count: int) -> None:
 class Members:
     """``count`` members spread over the devices, each in a slot of its device.
 
+    one_by_one: whether members of a device take turns; else they advance in lockstep.
+
     Outside, leaves have a leading axis of ``count``; on the devices, one of slots. ``place`` and
     ``fetch`` go from the one to the other.
     """
 
     def __init__(self, count: int) -> None:
         devices = jax.devices()[: min(len(jax.devices()), count)]
-        self._one_by_one = devices[0].platform not in LOCKSTEP
+        self.one_by_one = devices[0].platform not in LOCKSTEP
         # Two slots or more where members take turns: XLA drops an axis of one and then rounds
         # differently. There, a slot without a member costs memory, but no time.
-        slots = max(2 if self._one_by_one else 1, -(-count // len(devices)))
+        slots = max(2 if self.one_by_one else 1, -(-count // len(devices)))
         shares = np.array_split(np.arange(count), len(devices))
         self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
         self._filling = np.concatenate([np.resize(share, slots) for share in shares])
@@ -110,7 +112,7 @@ class Members:
         def on_device(taken: Array, *args: Any) -> Any:
             one = lambda members: function(*members, *args[split:])  # noqa: E731
             members = args[:split]
-            return _map(one, members, taken[0]) if self._one_by_one else jax.vmap(one)(members)
+            return _map(one, members, taken[0]) if self.one_by_one else jax.vmap(one)(members)
 
         def on_all(taken: Array, *args: Any) -> Any:
             each, same = self._sharding.spec, PartitionSpec()

@@ -35,6 +35,7 @@ from qfolio.files import (
     read_json,
     read_tree,
     require_new,
+    require_types,
     write_bytes,
     write_json,
     write_tree,
@@ -408,10 +409,8 @@ def read_config(folder: Path) -> dict[str, Any]:
         "device": str,
         "preset": str | None,
     }
-    for name, kind in wanted.items():
-        if name not in config or not isinstance(config[name], kind):
-            raise QfolioError(f"{path} is damaged: {name} is missing or of the wrong type.")
     try:
+        require_types(config, wanted)
         check_counts(config["episodes"], config["seeds"], config["seed"])
     except QfolioError as error:
         raise QfolioError(f"{path} is damaged: {error}") from None

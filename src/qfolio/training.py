@@ -206,7 +206,9 @@ class Population:
         self._members = Members(len(self.seeds))
         own, self._shared, self._join, form = _split([(task, agent) for task in tasks])
         self._own = self._members.place(own)
-        self._programs = _programs((form, len(self.seeds)))
+        # Nothing else may change what is compiled under a name.
+        rows = chunk_steps(self.task, agent)
+        self._programs = _programs((form, len(self.seeds), self._members.one_by_one, rows))
         self.seconds_compile = 0.0
         first = jax.eval_shape(lambda: begin(self.task, agent, jnp.array(0, jnp.uint32)))
         require_memory(first, len(self.seeds))

@@ -36,6 +36,7 @@ from qfolio.files import (
     read_arrays,
     read_json,
     read_tree,
+    require_types,
     write_arrays,
     write_bytes,
     write_json,
@@ -55,10 +56,10 @@ LATEST = "latest"
 
 EQUAL_WEIGHT = "equal-weight"
 
-TOGETHER_NAME = "-together"
+TOGETHER = "-together"
 """Behind an agent's name: all its seeds as one, which is the policy for tomorrow."""
 
-TOGETHER = 8
+FOLDS_AT_ONCE = 8
 """Folds that train at once where members advance in lockstep; what is done after them stays."""
 
 
@@ -206,11 +207,7 @@ class Backtest:
 
     def policy(self, agent: str | None = None) -> Policy:
         """The policy for tomorrow of an agent (the first, if not named)."""
-        name = next(iter(self.agents)) if agent is None else agent
-        if name not in self.agents:
-            raise QfolioError(
-                f"The backtest has no agent {name!r}; there is {', '.join(self.agents)}."
-            )
+        name = self._name(agent)
         task, trained = self._part(self.tasks[name], self._jobs[-1]), self.agents[name]
         state = state_template(task, trained, self.config["seeds"])
         kept = self._load(name, LATEST, _learning(state, 0, self.prices.dates[-1]))
@@ -227,7 +224,7 @@ class Backtest:
 
     def keep(self, agent: str | None, policy: Policy) -> None:
         """Keeps a policy that has gone on learning as the agent's for tomorrow."""
-        name = next(iter(self.agents)) if agent is None else agent
+        name = self._name(agent)
         self._keep(name, LATEST, _learning(policy.learner, policy.updates, policy.learned))
 
     def entries(self) -> tuple[dict[str, Entry], list[str]]:
@@ -242,7 +239,7 @@ class Backtest:
             entries[name] = self._entry("agent", self._decide(name))
             if self.config["seeds"] > 1:
                 together = self._decide(name, together=True)
-                entries[f"{name}{TOGETHER_NAME}"] = self._entry("agent", together)
+                entries[f"{name}{TOGETHER}"] = self._entry("agent", together)
         for name in baselines.BASELINES:
             decided = baselines.decisions(
                 name, self.folds, self.prices.values, cap=self.config["cap"]
@@ -298,6 +295,15 @@ class Backtest:
         write_bytes(self.folder / "weights.csv", _csv(header, weights))
         write_json(self.folder / "summary.json", assessment.to_json())
 
+    def _name(self, agent: str | None) -> str:
+        """Of an agent: the first, if none is named."""
+        name = next(iter(self.agents)) if agent is None else agent
+        if name not in self.agents:
+            raise QfolioError(
+                f"The backtest has no agent {name!r}; there is {', '.join(self.agents)}."
+            )
+        return name
+
     # Training ------------------------------------------------------------------------------------
 
     def _task(self, name: str) -> Portfolio:
@@ -314,7 +320,7 @@ class Backtest:
         """The folds that are still to be trained, in groups that fill the devices."""
         missing = [job for job in self._jobs if not self._is_trained(name, job.name)]
         lockstep = jax.devices()[0].platform in devices.LOCKSTEP
-        size = max(len(jax.devices()), TOGETHER if lockstep else 1)
+        size = max(len(jax.devices()), FOLDS_AT_ONCE if lockstep else 1)
         return [missing[i : i + size] for i in range(0, len(missing), size)]
 
     def _train(self, name: str, group: list[Fold]) -> Iterator[float]:
@@ -442,9 +448,7 @@ def _check(config: dict[str, Any]) -> None:
         "lag": int, "cost": float, "cap": float, "seeds": int, "seed": int, "trials": int,
         "command": str, "agents": dict, "prices": dict,
     }  # fmt: skip
-    for name, kind in wanted.items():
-        if not isinstance(config.get(name), kind):
-            raise QfolioError(f"{name} is missing or of the wrong type.")
+    require_types(config, wanted)
     if not {"source", "rows", "first", "last", "digest"} <= config["prices"].keys():
         raise QfolioError("prices is not described.")
     if not 0 <= config["trials"] <= 10**9:

@@ -117,7 +117,7 @@ def backtest(
         chosen = {name: _preset(name, preset, episodes) for name in _split(agents)}
         chosen = _assign(chosen, settings.parse(assignments))
         folder = out or Path("runs") / f"backtest-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-        test_run = Backtest.create(
+        run = Backtest.create(
             table,
             chosen,
             train=train,
@@ -136,13 +136,13 @@ def backtest(
         defaults = inspect.signature(backtest).parameters
         if any(options[name] != p.default for name, p in defaults.items() if name != "resume"):
             raise QfolioError("--resume keeps what the backtest was started with; add nothing.")
-        test_run, folder = Backtest.open(resume), resume
-    console.say(console.describe_backtest(test_run))
-    console.run_backtest(test_run)
-    if test_run.interrupted:
+        run, folder = Backtest.open(resume), resume
+    console.say(console.describe_backtest(run))
+    console.run_backtest(run)
+    if run.interrupted:
         console.say(f"Stopped. Go on with: qfolio backtest --resume {folder}")
         sys.exit(INTERRUPTED)
-    _report(test_run, folder)
+    _report(run, folder)
 
 
 def allocate(
@@ -187,12 +187,12 @@ def allocate(
     from qfolio.backtest.run import Backtest
     from qfolio.markets.prices import load
 
-    test_run = Backtest.open(folder)
-    policy = test_run.policy(agent)
-    table = test_run.prices
+    run = Backtest.open(folder)
+    policy = run.policy(agent)
+    table = run.prices
     if prices is not None:
         # The policy looks at the last rows only; assets may start at any row before.
-        known = features or tuple(test_run.config["feature_names"])
+        known = features or tuple(run.config["feature_names"])
         options: dict[str, Any] = dict(missing=missing, features=known, date=date)
         table = policy.table(load(prices, late="join", **options))
     require_fresh(table, as_of)
@@ -205,7 +205,7 @@ def allocate(
     else:
         console.print_allocation(allocation)
     if update:
-        test_run.keep(agent, policy)
+        run.keep(agent, policy)
 
 
 def _split(text: str) -> list[str]:
@@ -257,15 +257,15 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
     return changed
 
 
-def _report(test_run: "Backtest", folder: Path) -> None:
+def _report(run: "Backtest", folder: Path) -> None:
     from qfolio import console
     from qfolio.report.backtest import write_backtest_report
     from qfolio.report.collect import backtest_data
 
     with console.console.status("Replaying all strategies, drawing histories, writing the report"):
-        entries, notes = test_run.entries()
-        assessment = test_run.assess(entries)
-        test_run.write_tables(entries, assessment)
-        write_backtest_report(folder, backtest_data(test_run, entries, assessment, notes))
+        entries, notes = run.entries()
+        assessment = run.assess(entries)
+        run.write_tables(entries, assessment)
+        write_backtest_report(folder, backtest_data(run, entries, assessment, notes))
     console.print_assessment(assessment)
     console.say(f"Report: {folder / 'report.html'}")
