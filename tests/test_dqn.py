@@ -3,11 +3,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.agents.dqn import DQN, bootstrap, huber_loss, td_target
+from qfolio.agents.dqn import DQN
 from qfolio.errors import QfolioError
 from qfolio.mdp import Transition
 from qfolio.optimizer import learning_rate
 from qfolio.presets import preset
+from qfolio.targets import bootstrap, huber_loss, td_target
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.training import Population
 

@@ -6,6 +6,7 @@ know only this file.
 """
 
 import abc
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -44,9 +45,10 @@ class Simplex(eqx.Module):
 
 
 class Box(eqx.Module):
-    """``n`` numbers without bounds."""
+    """``n`` numbers from −``bound`` to ``bound``; a task takes what lies beyond for the bound."""
 
     n: int = eqx.field(static=True)
+    bound: float = eqx.field(static=True, default=math.inf)
 
 
 Actions = Discrete | Simplex | Box
@@ -112,6 +114,11 @@ class Task(eqx.Module):
     @abc.abstractmethod
     def observe(self, state: PyTree) -> PyTree:
         """What the agent may see of a state; nothing later than now."""
+
+    @property
+    def states(self) -> int | None:
+        """How many observations there are where they are numbers from 0 on; else None."""
+        return None
 
     @property
     def observation_scale(self) -> tuple[float, ...] | float:

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.errors import QfolioError
-from qfolio.mdp import View
+from qfolio.mdp import Actions, Discrete, Simplex, Task, View
 
 
 class MLP(eqx.Module):
@@ -46,21 +46,32 @@ class MLP(eqx.Module):
 
 
 class Flat(eqx.Module):
-    """An MLP over everything that is observed, in one row of numbers."""
+    """An MLP over everything that is observed, in one row of numbers.
+
+    An observation that is one of ``states`` numbers becomes a row with a one at its place.
+    """
 
     mlp: MLP
+    states: int | None = eqx.field(static=True)
 
     def __init__(
         self, observation: PyTree, hidden: tuple[int, ...], outputs: int, key: PRNGKeyArray,
-        input_gain: Float[Array, "*inputs"] | float = 1.0,
+        input_gain: Float[Array, "*inputs"] | float = 1.0, states: int | None = None,
     ) -> None:  # fmt: skip
-        inputs = sum(leaf.size for leaf in jax.tree.leaves(observation))
+        self.states = states
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], observation)
+        inputs = jax.eval_shape(lambda: _rows(batch, states)).shape[1]
         self.mlp = MLP((inputs, *hidden, outputs), key, input_gain)
 
     def __call__(self, observation: PyTree) -> Float[Array, "batch outputs"]:
-        leaves = jax.tree.leaves(observation)
-        rows = [leaf.reshape(leaf.shape[0], -1) for leaf in leaves]
-        return self.mlp(jnp.concatenate(rows, axis=1))
+        return self.mlp(_rows(observation, self.states))
+
+
+def _rows(observation: PyTree, states: int | None) -> Float[Array, "batch inputs"]:
+    if states is not None:
+        observation = jax.nn.one_hot(observation, states)
+    leaves = jax.tree.leaves(observation)
+    return jnp.concatenate([leaf.reshape(leaf.shape[0], -1) for leaf in leaves], axis=1)
 
 
 class Reading(NamedTuple):
@@ -131,6 +142,20 @@ class Shared(eqx.Module):
         return output[..., : self.pooled].mean(-2), output[..., self.pooled :]
 
 
+class PerAsset(eqx.Module):
+    """A ``Shared`` network's outputs in one row: the market's, then every asset's first, ….
+
+    Of an action's values and of a policy's weights alike.
+    """
+
+    network: Shared
+
+    def __call__(self, view: View) -> Float[Array, "batch outputs"]:
+        market, each = self.network(view)
+        blocks = jnp.swapaxes(each, -1, -2)  # all assets' first choice, then their second, …
+        return jnp.concatenate([market, blocks.reshape(*market.shape[:-1], -1)], -1)
+
+
 class CNN(eqx.Module):
     """Two convolutions along time: the first over three rows, the second over all that is left."""
 
@@ -193,6 +218,60 @@ _ENCODERS: dict[str, Any] = {"mlp": _Window, "cnn": CNN, "rnn": RNN}
 
 SHARED = tuple(_ENCODERS)
 """Kinds of networks that assets share."""
+
+KINDS = ("flat", *SHARED)
+
+Network = Flat | PerAsset
+
+
+class Outputs(NamedTuple):
+    """How many numbers a network gives: of the whole, and of each asset in a market."""
+
+    pooled: int
+    each: int = 0
+
+
+def outputs_of(actions: Actions) -> Outputs:
+    """A number for each action, each weight or each coordinate."""
+    if isinstance(actions, Simplex):
+        return Outputs(1, 1)
+    if isinstance(actions, Discrete) and actions.each:
+        return Outputs(actions.pooled, actions.each)
+    return Outputs(actions.n)
+
+
+def build(
+    kind: str,
+    task: Task,
+    observation: PyTree,
+    hidden: tuple[int, ...],
+    outputs: Outputs,
+    key: PRNGKeyArray,
+    input_gain: Float[Array, ""] | float = 0.0,
+) -> Network:
+    """A network from batches of the task's observations to rows of numbers.
+
+    kind: ``flat``, or for markets one that assets share. observation: an example. input_gain: of
+    the first layer of ``flat``, with observations taken to ±1; 0 takes them as they are.
+    """
+    if kind == "flat":
+        # Small weights on a bounded observation make a function too smooth for some tasks.
+        scale = jnp.array(task.observation_scale)
+        gain = jnp.where(input_gain > 0, input_gain / scale, 1.0)
+        assets = observation.holding.shape[-1] if isinstance(observation, View) else 0
+        count = outputs.pooled + assets * outputs.each
+        return Flat(observation, hidden, count, key, gain, task.states)
+    if not isinstance(observation, View):
+        raise QfolioError(
+            f"network={kind} is shared by the assets of a market; for {type(task).__name__} take "
+            "network=flat."
+        )
+    if isinstance(task.actions, Discrete) and not task.actions.each:
+        raise QfolioError(
+            f"network={kind} is shared by assets and needs a menu with choices for each, such as "
+            "menu=tilts:0.1; otherwise take network=flat."
+        )
+    return PerAsset(Shared(kind, observation, hidden, outputs.pooled, outputs.each, key))
 
 
 def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], bound: float) -> Array:

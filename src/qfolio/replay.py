@@ -1,10 +1,35 @@
 """The replay buffer: a ring of the latest transitions (Lin 1992; Mnih et al. 2015)."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+
+from qfolio.mdp import Transition
+
+
+class Experience(NamedTuple):
+    """What the buffer keeps of a transition; nothing is bootstrapped behind ``terminal``."""
+
+    observation: PyTree
+    action: Array
+    reward: Float[Array, "*batch"]
+    next_observation: PyTree
+    terminal: Bool[Array, "*batch"]
+
+    @staticmethod
+    def of(rollout: Transition, *, time_limit_terminal: bool = False) -> "Experience":
+        """A rollout's experiences in one row, by time and then environment."""
+        step = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout)
+        terminal = step.terminated
+        if time_limit_terminal:
+            terminal = terminal | step.truncated
+        return Experience(
+            step.observation, step.action, step.reward, step.next_observation, terminal
+        )
 
 
 class Replay(eqx.Module):

@@ -17,10 +17,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio import optimizer
+from qfolio import networks, optimizer
 from qfolio.errors import QfolioError
+from qfolio.exploration import epsilon_greedy
 from qfolio.fields import number, require, require_sizes, sizes, static
 from qfolio.mdp import (
     Agent,
@@ -31,20 +32,10 @@ from qfolio.mdp import (
     Position,
     Task,
     Transition,
-    View,
 )
-from qfolio.networks import SHARED, Flat, Shared
-from qfolio.replay import Replay
-
-
-class Experience(NamedTuple):
-    """What the buffer keeps of a transition; nothing is bootstrapped behind ``terminal``."""
-
-    observation: PyTree
-    action: Int[Array, "*batch"]
-    reward: Float[Array, "*batch"]
-    next_observation: PyTree
-    terminal: Bool[Array, "*batch"]
+from qfolio.networks import KINDS, Network, outputs_of
+from qfolio.replay import Experience, Replay
+from qfolio.targets import bootstrap, follow, huber_loss, td_target
 
 
 class Move(NamedTuple):
@@ -52,20 +43,6 @@ class Move(NamedTuple):
 
     market: PyTree
     next_market: PyTree
-
-
-class SharedQ(eqx.Module):
-    """Q-values of a menu whose choices concern the whole market or one asset each."""
-
-    network: Shared
-
-    def __call__(self, view: View) -> Float[Array, "batch action"]:
-        market, each = self.network(view)
-        blocks = jnp.swapaxes(each, -1, -2)  # all assets' first choice, then their second, …
-        return jnp.concatenate([market, blocks.reshape(*market.shape[:-1], -1)], -1)
-
-
-Network = Flat | SharedQ
 
 
 class DQNState(eqx.Module):
@@ -77,9 +54,6 @@ class DQNState(eqx.Module):
     replay: Replay
     episodes: Int[Array, ""]  # finished; ε follows it
     steps: Int[Array, ""]  # of each environment; the target network follows them
-
-
-KINDS = ("flat", *SHARED)
 
 
 class DQN(Agent):
@@ -175,24 +149,14 @@ class DQN(Agent):
         )
 
     def _network(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Network:
-        actions = task.actions
-        if not isinstance(actions, Discrete):
+        if not isinstance(task.actions, Discrete):
             raise QfolioError(
                 f"dqn chooses among numbered actions, and those of {type(task).__name__} are "
                 "continuous; in a market, give it a menu of allocations (menu=grid:10)."
             )
-        if self.network == "flat":
-            # Small weights on a bounded observation make a Q-function too smooth for the task.
-            scale = jnp.array(task.observation_scale)
-            gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
-            return Flat(observation, self.hidden, actions.n, key, gain)
-        if not actions.each:
-            raise QfolioError(
-                f"network={self.network} is shared by assets and needs a menu with choices for "
-                "each, such as menu=tilts:0.1; otherwise take network=flat."
-            )
-        return SharedQ(
-            Shared(self.network, observation, self.hidden, actions.pooled, actions.each, key)
+        outputs = outputs_of(task.actions)
+        return networks.build(
+            self.network, task, observation, self.hidden, outputs, key, self.input_gain
         )
 
     def warm_up(self) -> int:
@@ -220,25 +184,16 @@ class DQN(Agent):
         return weights(observation).argmax(-1)
 
     def act(self, state: DQNState, observation: PyTree, key: PRNGKeyArray) -> Int[Array, " batch"]:
-        values = state.online(observation)
-        n, greedy = values.shape[-1], values.argmax(-1)
-        # One uniform decides both: below ε explore, and where below ε it fell picks the action.
-        uniform = jax.random.uniform(key, greedy.shape)
-        epsilon = self.epsilon_now(state)
-        explored = jnp.minimum(uniform / jnp.maximum(epsilon, 1e-30) * n, n - 1).astype(jnp.int32)
-        return jnp.where(uniform < epsilon, explored, greedy)
+        return epsilon_greedy(key, state.online(observation), self.epsilon_now(state))
 
     def observe(self, state: DQNState, rollout: Transition) -> DQNState:
-        step = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout)  # time × environments
-        terminal = step.terminated
-        if self.time_limit_terminal:
-            terminal = terminal | step.truncated
-        experience: Experience | Move = Experience(
-            step.observation, step.action, step.reward, step.next_observation, terminal
+        experience: Experience | Move = Experience.of(
+            rollout, time_limit_terminal=self.time_limit_terminal
         )
         if self.all_actions:
-            experience = Move(step.state.market, step.next_state.market)
-        finished = (step.terminated | step.truncated).sum(dtype=jnp.int32)
+            moves = Move(rollout.state.market, rollout.next_state.market)
+            experience = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), moves)
+        finished = (rollout.terminated | rollout.truncated).sum(dtype=jnp.int32)
         return eqx.tree_at(
             lambda s: (s.replay, s.episodes, s.steps),
             state,
@@ -268,9 +223,7 @@ class DQN(Agent):
 
         due = state.steps % self.target_period == 0
         rate = self.target_rate if self.target_period == 1 else jnp.where(due, self.target_rate, 0)
-        # This form is exact for rates of 0 and 1.
-        blend = lambda t, w: (1 - rate) * t + rate * w  # noqa: E731
-        target = jax.tree.map(blend, state.target, online)
+        target = follow(state.target, online, rate)
         state = DQNState(online, target, adam, state.replay, state.episodes, state.steps)
         return state, {"loss": loss.mean(), "max_q": max_q.mean()}
 
@@ -317,32 +270,3 @@ class DQN(Agent):
 
         goals = lax.stop_gradient(jax.vmap(goal)(reward, next_holdings)).T
         return huber_loss(goals - q, self.huber).mean(), q.max(1).mean() / self.reward_scale
-
-
-def bootstrap(
-    q_next: Float[Array, "batch action"], selector: Float[Array, "batch action"]
-) -> Float[Array, " batch"]:
-    """The next state's value: ``q_next`` at the action that ``selector`` finds best.
-
-    Double Q-learning (van Hasselt et al. 2016, eq. 4) lets the online network select and the target
-    network evaluate; with ``selector = q_next`` this is max_a Q'(s', a) (Mnih et al. 2015).
-    """
-    return jnp.take_along_axis(q_next, selector.argmax(1)[:, None], axis=1)[:, 0]
-
-
-def td_target(
-    reward: Float[Array, " batch"],
-    terminal: Bool[Array, " batch"],
-    following: Float[Array, " batch"],
-    discount: Float[Array, ""] | float,
-) -> Float[Array, " batch"]:
-    """Bellman target r + γ V(s'), where nothing follows a terminal transition."""
-    return reward + jnp.where(terminal, 0.0, discount * following)
-
-
-def huber_loss(
-    error: Float[Array, "*batch"], delta: Float[Array, ""] | float
-) -> Float[Array, "*batch"]:
-    """½e² up to |e| = δ and δ(|e| − ½δ) beyond (Huber 1964); δ = ∞ squares everything."""
-    clipped = jnp.clip(error, -delta, delta)
-    return clipped * (error - clipped / 2)

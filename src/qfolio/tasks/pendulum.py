@@ -5,15 +5,15 @@ and then held. The dynamics, the limits and the cost are those of Gymnasium's ``
 to which the tests hold this file step for step.
 """
 
+import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.errors import QfolioError
-from qfolio.mdp import Discrete, Step, Task
+from qfolio.fields import number, require, static
+from qfolio.mdp import Box, Discrete, Step, Task
 from qfolio.optimum.grid import GridOptimum
 
 
@@ -27,37 +27,43 @@ class PendulumState(NamedTuple):
 class Pendulum(Task):
     """Swing the pendulum up and hold it, by one of ``torques`` equally spaced torques.
 
+    With ``torques=0`` an action is the torque itself, a row of one number from −2 to 2 N m.
     Observation: (cos θ, sin θ, θ̇). Reward: −(θ² + 0.1 θ̇² + 0.001 u²) with θ wrapped to [−π, π).
     Start: θ uniform in [−π, π], θ̇ uniform in [−1, 1]. It never terminates; after ``horizon`` steps
     (Gymnasium: 200) an episode is truncated.
     """
 
-    torques: int = eqx.field(static=True, default=11)
-    horizon: int = eqx.field(static=True, default=200)
+    torques: int = static(11)  # 0: any torque
+    horizon: int = static(200)
+    gravity: float = number(10.0)  # m/s²
+    mass: float = number(1.0)  # kg
+    length: float = number(1.0)  # m
 
     max_torque = 2.0  # N m
     max_speed = 8.0  # rad/s
     dt = 0.05  # s
-    gravity = 10.0  # m/s²
-    mass = 1.0  # kg
-    length = 1.0  # m
 
     def __check_init__(self) -> None:
-        if not 2 <= self.torques <= 1001:
-            raise QfolioError(f"torques is {self.torques}; it must be from 2 to 1001.")
-        if not 1 <= self.horizon <= 5000:  # the exact optimum keeps a table for each step
-            raise QfolioError(f"horizon is {self.horizon}; it must be from 1 to 5000.")
+        require(self, "torques", lambda x: x == 0 or 2 <= x <= 1001, "0, or from 2 to 1001")
+        # The exact optimum keeps a table for each step.
+        require(self, "horizon", lambda x: 1 <= x <= 5000, "from 1 to 5000")
+        require(self, "gravity", lambda x: 0 <= x <= 100, "from 0 to 100")
+        require(self, "mass length", lambda x: 0.1 <= x <= 10, "from 0.1 to 10")
 
     @property
-    def actions(self) -> Discrete:
-        return Discrete(self.torques)
+    def actions(self) -> Discrete | Box:
+        return Discrete(self.torques) if self.torques else Box(1, self.max_torque)
 
     @property
     def observation_scale(self) -> tuple[float, ...]:
         return (1.0, 1.0, self.max_speed)
 
-    def torque(self, action: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
+    def torque(
+        self, action: Int[Array, "*batch"] | Float[Array, "*batch 1"]
+    ) -> Float[Array, "*batch"]:
         """The torque in N m that an action stands for."""
+        if not self.torques:
+            return jnp.clip(action[..., 0], -self.max_torque, self.max_torque)
         return self.max_torque * (2.0 * action / (self.torques - 1) - 1.0)
 
     def reset(self, key: PRNGKeyArray) -> PendulumState:
@@ -68,7 +74,7 @@ class Pendulum(Task):
         theta, theta_dot = state
         return jnp.stack([jnp.cos(theta), jnp.sin(theta), theta_dot], axis=-1)
 
-    def step(self, state: PendulumState, action: Int[Array, ""], key: PRNGKeyArray) -> Step:
+    def step(self, state: PendulumState, action: Array, key: PRNGKeyArray) -> Step:
         """One step of 0.05 s; deterministic, so that ``key`` is not used."""
         theta, theta_dot = state
         u = self.torque(action)
@@ -83,9 +89,12 @@ class Pendulum(Task):
         return Step(state, reward, jnp.zeros_like(reward, dtype=bool))
 
     def optimum(self) -> GridOptimum:
-        """Dynamic programming on a grid over one turn of θ and all speeds."""
+        """Dynamic programming on a grid over one turn of θ and all speeds, with equal torques.
+
+        Torques between the 11 gain less than the grid's error.
+        """
         return GridOptimum(
-            task=self,
+            task=self if self.torques else dataclasses.replace(self, torques=11),
             state=PendulumState,
             axes=(
                 jnp.linspace(-jnp.pi, jnp.pi, 400, endpoint=False),

@@ -1,0 +1,18 @@
+"""How agents that value actions explore."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+
+def epsilon_greedy(
+    key: PRNGKeyArray,
+    values: Float[Array, "batch action"],
+    epsilon: Float[Array, ""] | float,
+) -> Int[Array, " batch"]:
+    """The best action, or with probability ε any."""
+    n, greedy = values.shape[-1], values.argmax(-1)
+    # One uniform decides both: below ε explore, and where below ε it fell picks the action.
+    uniform = jax.random.uniform(key, greedy.shape)
+    explored = jnp.minimum(uniform / jnp.maximum(epsilon, 1e-30) * n, n - 1).astype(jnp.int32)
+    return jnp.where(uniform < epsilon, explored, greedy)
