@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from qfolio.backtest.performance import Strategy, assess
+from qfolio.backtest.assessment import Strategy, assess
 from qfolio.errors import QfolioError
 from qfolio.report.backtest import (
     AREAS,

@@ -7,23 +7,20 @@ import numpy as np
 import pytest
 
 from qfolio.backtest import performance
+from qfolio.backtest.assessment import Strategy, assess, luck, verdict
 from qfolio.backtest.performance import (
     MEASURES,
-    Strategy,
-    assess,
     block_length,
     bootstrap_measures,
     deflated_sharpe,
     drawdown,
     expected_maximum_sharpe,
-    luck,
     measures,
     minimum_track_record,
     monthly,
     percentile_interval,
     probabilistic_sharpe,
     stationary_bootstrap_indices,
-    verdict,
 )
 from qfolio.errors import QfolioError
 

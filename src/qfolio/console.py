@@ -15,7 +15,7 @@ from qfolio.training import episode_steps
 if TYPE_CHECKING:
     from qfolio.allocation import Allocation
     from qfolio.backtest import run as backtesting
-    from qfolio.backtest.performance import Assessment
+    from qfolio.backtest.assessment import Assessment
     from qfolio.backtest.run import Backtest
     from qfolio.markets.checks import Finding
     from qfolio.runs import Progress, Run

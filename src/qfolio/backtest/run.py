@@ -27,7 +27,7 @@ import numpy as np
 
 import qfolio
 from qfolio import devices, settings
-from qfolio.backtest import baselines, performance
+from qfolio.backtest import assessment, baselines
 from qfolio.backtest.folds import Fold, latest, spell, walk_forward
 from qfolio.backtest.simulation import Simulation, simulate
 from qfolio.errors import QfolioError
@@ -255,13 +255,13 @@ class Backtest:
         first, last = self.folds[0].decisions.start, self.folds[-1].decisions.stop
         return self.prices.dates[first + shift : last + shift]
 
-    def assess(self, entries: dict[str, Entry], since: str | None = None) -> performance.Assessment:
+    def assess(self, entries: dict[str, Entry], since: str | None = None) -> assessment.Assessment:
         """The statistics of all strategies, over all days of the test or those from a date on."""
         first = 0 if since is None else int(np.searchsorted(self.dates, np.datetime64(since)))
         days = slice(first, None)
-        return performance.assess(
+        return assessment.assess(
             {
-                name: performance.Strategy(
+                name: assessment.Strategy(
                     entry.kind,
                     entry.simulation.returns[:, days],
                     entry.simulation.turnover[:, days],
@@ -275,7 +275,7 @@ class Backtest:
             other_trials=self.config["trials"],
         )
 
-    def write_tables(self, entries: dict[str, Entry], assessment: performance.Assessment) -> None:
+    def write_tables(self, entries: dict[str, Entry], assessed: assessment.Assessment) -> None:
         """returns.csv (a column per strategy and seed), weights.csv (means) and summary.json."""
         assert self.folder is not None
         days = [spell(date, self.prices.dates) for date in self.dates]
@@ -293,7 +293,7 @@ class Backtest:
         )
         header = ["date", "strategy", "cash", *self.prices.assets]
         write_bytes(self.folder / "weights.csv", _csv(header, weights))
-        write_json(self.folder / "summary.json", assessment.to_json())
+        write_json(self.folder / "summary.json", assessed.to_json())
 
     def _name(self, agent: str | None) -> str:
         """Of an agent: the first, if none is named."""

@@ -20,7 +20,8 @@ from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from qfolio.backtest.performance import Assessment, Difference, drawdown, monthly
+from qfolio.backtest.assessment import Assessment, Difference
+from qfolio.backtest.performance import drawdown, monthly
 from qfolio.errors import QfolioError
 from qfolio.report import palette
 from qfolio.report.data import Floats

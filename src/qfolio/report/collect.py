@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from qfolio.backtest.performance import Assessment
+from qfolio.backtest.assessment import Assessment
 from qfolio.backtest.run import Backtest, Entry
 from qfolio.evaluation import greedy, play, start_keys
 from qfolio.mdp import Agent, Policy, Position
