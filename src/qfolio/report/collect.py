@@ -256,23 +256,23 @@ def responses(
     )
 
 
-def _maps(run: Run, task: Pendulum) -> Maps | None:
+def _maps(run: Run, task: Pendulum) -> Maps:
     theta = np.linspace(-np.pi, np.pi, 200, endpoint=False)
     theta_dot = np.linspace(-task.max_speed, task.max_speed, 201)
-    grid = PendulumState(*jnp.meshgrid(jnp.array(theta), jnp.array(theta_dot), indexing="ij"))
-    observation = task.observe(grid).reshape(-1, 3)
-    values = run.agent.action_values(run.first_weights(), observation)
-    if values is None:
-        return None
-    shape = (len(theta), len(theta_dot))
-    discount = float(run.agent.discount)
-    exact_value, exact_action = task.optimum().stationary(discount)
+    grid = np.meshgrid(theta.astype(np.float32), theta_dot.astype(np.float32), indexing="ij")
+    observation = task.observe(PendulumState(*(jnp.array(x.ravel()) for x in grid)))
+    agent, weights = run.agent, run.first_weights()
+    values = agent.action_values(weights, observation)
+    torque = task.torque(agent.policy(weights, observation))
+    discount = float(agent.discount)
+    optimum = task.optimum()
+    exact_value, exact_action = optimum.stationary(discount)
     return Maps(
         theta=theta,
         theta_dot=theta_dot,
-        value=np.asarray(values.max(-1)).reshape(shape),
-        policy=np.asarray(task.torque(values.argmax(-1))).reshape(shape),
+        value=None if values is None else np.asarray(values.max(-1)).reshape(grid[0].shape),
+        policy=np.asarray(torque).reshape(grid[0].shape),
         exact_value=exact_value[::2, ::2],  # the solver's grid is twice as fine
-        exact_policy=np.asarray(task.torque(jnp.array(exact_action)))[::2, ::2],
+        exact_policy=np.asarray(optimum.task.torque(jnp.array(exact_action)))[::2, ::2],
         discount=discount,
     )

@@ -43,7 +43,8 @@ class Maps:
     Attributes:
         theta: Angles in radians, 0 = upright, shape (n,).
         theta_dot: Angular speeds in rad/s, shape (m,).
-        value: Learned value, the largest action value, shape (n, m).
+        value: Learned value, the largest action value, shape (n, m), or None where the agent
+            estimates no action values.
         policy: Torque of the learned greedy policy in N m, shape (n, m).
         exact_value: Value of the exact optimum, shape (n, m).
         exact_policy: Torque of the exact optimum in N m, shape (n, m).
@@ -52,7 +53,7 @@ class Maps:
 
     theta: Floats
     theta_dot: Floats
-    value: Floats
+    value: Floats | None
     policy: Floats
     exact_value: Floats
     exact_policy: Floats

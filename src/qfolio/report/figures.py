@@ -112,7 +112,7 @@ def overestimation(target: Target, data: ReportData) -> None:
     save_png(target, draw_overestimation, data, WIDE)
 
 
-def inline_svg(draw: Draw, data: ReportData, width: float) -> str:
+def inline_svg(draw: Callable[[T, float], Figure], data: T, width: float) -> str:
     """Return a figure as an SVG element to be put into a page.
 
     Texts stay texts in the font of the page, colours refer to the variables of the page
@@ -180,16 +180,35 @@ def draw_learning_curve(data: ReportData, width: float) -> Figure:
 
 
 def draw_value(data: ReportData, width: float) -> Figure:
-    """Draw the learned and the exact value and policy over angle and angular speed."""
+    """Draw the learned and the exact policy, and value if there is one, over the states."""
     maps = data.maps
     if maps is None:
         raise ValueError("the value figure needs maps of the state space")
-    figure = new_figure(width, 0.98 * width if width > NARROW else 1.2 * width)
-    axes = figure.subplots(2, 2, sharex=True, sharey=True)
-    low = min(maps.value.min(), maps.exact_value.min())
-    high = max(maps.value.max(), maps.exact_value.max())
+    rows = 1 if maps.value is None else 2
+    figure = new_figure(width, (0.98 if width > NARROW else 1.2) * width * rows / 2)
+    axes = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
+    names = ["Learned policy", "Exact policy"]
+    if maps.value is not None:
+        _draw_values(axes[0], maps, maps.value)
+        names = ["Learned value", "Exact value", *names]
+    torques = _colours("torque", palette.TORQUE_MAP)
+    limit = max(2.0, np.abs(maps.policy).max(), np.abs(maps.exact_policy).max())
+    for panel, table in zip(axes[-1], (maps.policy, maps.exact_policy), strict=True):
+        image = _draw_map(panel, maps, table, torques, -limit, limit, "nearest")
+    _colour_bar(figure, image, axes[-1], "torque (N m)")
+    for panel, name in zip(axes.flat, names, strict=True):
+        panel.set_title(name, pad=6)
+    _map_ticks(axes, few=width <= NARROW)
+    if data.episode is not None:
+        _draw_path(axes[0, 0], data.episode)
+    return figure
+
+
+def _draw_values(axes: Panels, maps: Maps, learned: Floats) -> None:
+    low = min(learned.min(), maps.exact_value.min())
+    high = max(learned.max(), maps.exact_value.max())
     values = _colours("value", palette.VALUE_MAP)
-    for panel, table in zip(axes[0], (maps.value, maps.exact_value), strict=True):
+    for panel, table in zip(axes, (learned, maps.exact_value), strict=True):
         image = _draw_map(panel, maps, table, values, low, high, "bilinear")
         levels = np.linspace(low, high, 9)[1:-1]
         panel.contour(
@@ -202,19 +221,7 @@ def draw_value(data: ReportData, width: float) -> Figure:
             alpha=0.35,
             linestyles="solid",
         )
-    _colour_bar(figure, image, axes[0], "value")
-    torques = _colours("torque", palette.TORQUE_MAP)
-    limit = max(2.0, np.abs(maps.policy).max(), np.abs(maps.exact_policy).max())
-    for panel, table in zip(axes[1], (maps.policy, maps.exact_policy), strict=True):
-        image = _draw_map(panel, maps, table, torques, -limit, limit, "nearest")
-    _colour_bar(figure, image, axes[1], "torque (N m)")
-    names = ("Learned value", "Exact value", "Learned policy", "Exact policy")
-    for panel, name in zip(axes.flat, names, strict=True):
-        panel.set_title(name, pad=6)
-    _map_ticks(axes, few=width <= NARROW)
-    if data.episode is not None:
-        _draw_path(axes[0, 0], data.episode)
-    return figure
+    _colour_bar(axes[0].figure, image, axes, "value")
 
 
 def draw_policy(data: ReportData, width: float) -> Figure:
@@ -571,7 +578,7 @@ def _map_ticks(axes: Panels, *, few: bool) -> None:
     ticks = {-2: "−π", -1: "−π/2", 0: "0", 1: "π/2", 2: "π"}
     kept = {k: text for k, text in ticks.items() if not few or k % 2 == 0}
     axes[0, 0].set_xticks([k * np.pi / 2 for k in kept], list(kept.values()))
-    for panel in axes[1]:
+    for panel in axes[-1]:
         panel.set_xlabel("angle (rad)" if few else "angle θ (rad), upright = 0")
     for panel in axes[:, 0]:
         panel.set_ylabel("speed (rad/s)" if few else "angular speed (rad/s)")
