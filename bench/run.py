@@ -37,9 +37,10 @@ from jax import lax  # noqa: E402
 
 import replay  # noqa: E402
 from qfolio.presets import preset  # noqa: E402
+from qfolio.tasks.pendulum import Pendulum  # noqa: E402
 from qfolio.training import CHUNK, Population  # noqa: E402
 from race import Contestant, Rates, Ratio, process, race, ratio, timed  # noqa: E402
-from workload import EPISODES, layers, products, report  # noqa: E402
+from workload import EPISODES, families, layers, products, report  # noqa: E402
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -94,29 +95,56 @@ class Effort:
 Outcome = tuple[list[Figure], Rates]
 
 
+LIBRARIES = {"stable_baselines3": "stable-baselines3", "sbx": "sbx-rl", "rejax": "rejax"}
+
+
 def against_peers(effort: Effort) -> Outcome:
     """One agent with the report's settings, here and in other libraries."""
+    targets = {"stable_baselines3": 5.0, "sbx": 4.0, "rejax": 1.8}
+    return against("dqn", "one agent", agents(1), targets, effort)
+
+
+def against(
+    algorithm: str,
+    who: str,
+    own: Contestant,
+    targets: dict[str, float],
+    effort: Effort,
+) -> Outcome:
+    """An algorithm here and, with one thread and with two, in other libraries."""
     install_peers()
-    libraries = {
-        "stable_baselines3": ("stable-baselines3", 5.0),
-        "sbx": ("sbx-rl", 4.0),
-        "rejax": ("rejax", 1.8),
-    }
+    name = lambda library, threads: spelled(LIBRARIES[library], threads)  # noqa: E731
     with ExitStack() as stack:
-        contestants: dict[str, Contestant] = {"qfolio": agents(1)}
-        for library, (name, _) in libraries.items():
+        contestants: dict[str, Contestant] = {"qfolio": own}
+        for library in targets:
             for threads in THREADS:
                 command = [python(PEERS), "-W", "ignore", str(HERE / "peers.py"), library]
-                peer = process([*command, "--threads", str(threads)], ENVIRONMENT)
-                contestants[spelled(name, threads)] = stack.enter_context(peer)
+                command += ["--algorithm", algorithm, "--threads", str(threads)]
+                peer = process(command, ENVIRONMENT)
+                contestants[name(library, threads)] = stack.enter_context(peer)
         rates = race(contestants, effort.rounds, effort.seconds)
     figures = []
-    for name, target in libraries.values():
+    for library, target in targets.items():
         best = max(
-            (spelled(name, threads) for threads in THREADS),
+            (name(library, threads) for threads in THREADS),
             key=lambda name: statistics.median(rates[name]),
         )
-        figures.append(times(f"Speed of one agent ÷ {best}", ratio(rates, "qfolio", best), target))
+        figures.append(times(f"Speed of {who} ÷ {best}", ratio(rates, "qfolio", best), target))
+    return figures, rates
+
+
+def of_families(effort: Effort) -> Outcome:
+    """Policy gradients and actor–critics, here and in other libraries, which must be slower."""
+    figures, rates = [], {}
+    for algorithm, agent in families().items():
+        # rejax has no DDPG, and its TD3 stands for both.
+        without = {"ddpg": "rejax"}.get(algorithm)
+        targets = {library: 1.0 for library in LIBRARIES if library != without}
+        own = trained(Population(Pendulum(torques=0), agent, [0]))
+        name = algorithm.upper()
+        found, speeds = against(algorithm, name, own, targets, effort)
+        figures += found
+        rates |= {f"{name}: {who}": speed for who, speed in speeds.items()}
     return figures, rates
 
 
@@ -221,14 +249,19 @@ def spelled(library: str, threads: int) -> str:
 @cache
 def agents(count: int) -> Contestant:
     """That many agents with the report's settings, past all compiling."""
-    population = Population(*report(), range(count))
+    return trained(Population(*report(), range(count)))
+
+
+def trained(population: Population) -> Contestant:
+    """A population that goes on training, past all compiling."""
 
     def advance() -> int:
         before = population.steps
         population.advance(CHUNK)
-        return (population.steps - before) * count
+        steps = population.steps - before
+        return steps * population.agent.environments * len(population.seeds)
 
-    advance()  # observes only
+    advance()  # may observe only
     advance()
     return timed(advance)
 
@@ -422,6 +455,7 @@ PARTS: dict[str, Callable[[Effort], Outcome]] = {
     "c": on_all_cores,
     "d": of_one_run,
     "e": partial(of_preset, "fast"),
+    "families": of_families,
     "replay": of_replays,
     "best": partial(of_preset, "best"),
 }
@@ -430,7 +464,7 @@ PARTS: dict[str, Callable[[Effort], Outcome]] = {
 def main(
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART …")] = (
         *("a", "b", "c", "d", "e"),
-        "replay",
+        *("families", "replay"),
     ),
     best: bool = False,
     quick: bool = False,
@@ -439,7 +473,7 @@ def main(
 
     Args:
         only: Parts to run: a (peers), b (matrix products), c (cores), d (memory and start),
-            e (preset fast), replay (the backtest's engine).
+            e (preset fast), families (PPO, SAC, TD3 and DDPG), replay (the backtest's engine).
         best: Measure the preset best, too.
         quick: Short rounds and short runs, to see that all works; leaves the files as they are.
     """

@@ -6,7 +6,12 @@ each number.
 
 from itertools import pairwise
 
+from qfolio.agents.ddpg import DDPG
 from qfolio.agents.dqn import DQN
+from qfolio.agents.ppo import PPO
+from qfolio.agents.sac import SAC
+from qfolio.agents.td3 import TD3
+from qfolio.mdp import Agent
 from qfolio.presets import preset
 from qfolio.tasks.pendulum import Pendulum
 
@@ -18,6 +23,23 @@ PASSES = 12
 Both networks are read forward and the Q-network once more backward (3); the gradient is written and
 read again (2); Adam reads and writes the weights and both moments (6); the target is written (1).
 """
+
+
+def families() -> dict[str, Agent]:
+    """Other algorithms on the pendulum with continuous torques; peers.py has the same settings."""
+    off_policy = {
+        "hidden": (256, 256), "batch_size": 256, "replay_capacity": 50_000,
+        "learning_starts": 256, "learning_rate": 1e-3, "target_rate": 0.005, "discount": 0.99,
+    }  # fmt: skip
+    return {
+        "ppo": PPO(
+            environments=4, rollout=1024, epochs=10, batch_size=64, hidden=(64, 64),
+            discount=0.9, trace=0.95, learning_rate=1e-3, entropy_weight=0.0,
+        ),
+        "sac": SAC(**off_policy),
+        "td3": TD3(**off_policy),
+        "ddpg": DDPG(**off_policy),
+    }  # fmt: skip
 
 
 def report() -> tuple[Pendulum, DQN]:

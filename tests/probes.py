@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from qfolio.mdp import Discrete, Step, Task
+from qfolio.mdp import Box, Discrete, Simplex, Step, Task, View
 
 TERMINATED, GOES_ON = jnp.array(True), jnp.array(False)
 
@@ -84,3 +84,43 @@ class Explosive(Endless):
 
     def step(self, state, action, key):
         return Step(state + 1.0, jnp.where(state > 40, jnp.inf, 1.0), GOES_ON)
+
+
+class Aim(Task):
+    """Pays 1 − (a/2 − s)² in a state s = ±½, which ends after one step where s < 0.
+
+    Where s > 0 it goes on for ever, cut after every step: Q(s, a) is the reward, and where s > 0
+    γ / (1 − γ) more.
+    """
+
+    bound: float = eqx.field(static=True, default=2.0)
+    horizon: int = eqx.field(static=True, default=1)
+
+    @property
+    def actions(self):
+        return Box(1, self.bound)
+
+    def reset(self, key):
+        return 0.5 * jax.random.rademacher(key, (), jnp.float32)
+
+    def observe(self, state):
+        return state[None]
+
+    def step(self, state, action, key):
+        action = jnp.clip(action[0], -self.bound, self.bound)
+        return Step(state, 1.0 - (action / 2 - state) ** 2, state < 0)
+
+
+class AimWeights(Aim):
+    """One step that pays 1 − 10 |w − (0.2, 0.5, 0.3)|² for weights of cash and two assets."""
+
+    @property
+    def actions(self):
+        return Simplex(2)
+
+    def observe(self, state):
+        return View(jnp.full((2, 1, 1), state), jnp.zeros(2))
+
+    def step(self, state, action, key):
+        error = action - jnp.array([0.2, 0.5, 0.3])
+        return Step(state, 1.0 - 10 * (error**2).sum(), TERMINATED)

@@ -1,15 +1,21 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qfolio import heads
 from qfolio.agents.dqn import DQN
+from qfolio.distributional import Categorical, project, quantile_huber_loss
+from qfolio.encoders import MLP
 from qfolio.errors import QfolioError
 from qfolio.mdp import Transition
 from qfolio.optimizer import learning_rate
 from qfolio.presets import preset
-from qfolio.targets import bootstrap, huber_loss, td_target
+from qfolio.targets import bootstrap, chosen, huber_loss, td_target
 from qfolio.tasks.pendulum import Pendulum
+from qfolio.tasks.synthetic import Ar1, Merton
 from qfolio.training import Population
 
 
@@ -48,6 +54,21 @@ def test_huber_loss_by_hand():
     np.testing.assert_allclose(slopes(errors, jnp.inf), errors)
 
 
+def gradients(agent, state, target):
+    """Of the loss of a batch in the online and the target network."""
+    batch = agent.observe(state, rollout(agent)).replay.sample(jax.random.key(2), 8)
+
+    def loss(online, target):
+        losses = agent._losses(online, target, batch, agent.discount, jax.random.key(3))
+        return losses.each.mean()
+
+    return jax.grad(loss, argnums=(0, 1))(state.online, target)
+
+
+def largest(gradient):
+    return max(float(jnp.abs(g).max()) for g in jax.tree.leaves(gradient))
+
+
 def test_observing_learns_nothing(task, agent):
     state = agent.init(task, jax.random.key(0))
     after = agent.observe(state, rollout(agent))
@@ -69,11 +90,36 @@ def test_what_counts_as_the_end(task, terminated, truncated, wrong, expected):
 def test_the_gradient_reaches_the_online_network_only(task, agent):
     state = agent.init(task, jax.random.key(0))
     other = agent.init(task, jax.random.key(1)).online
+    assert largest(gradients(agent, state, other)[0]) > 0
+    assert largest(gradients(agent, state, other)[1]) == 0
+
+
+@pytest.mark.parametrize("values", ["expected", "categorical", "quantile"])
+def test_selecting_and_evaluating_have_no_gradient(task, agent, values):
+    """With γ = 0 what follows does not matter, and nor may its gradient with γ > 0."""
+    changes = {"values": values, "double": True, "dueling": True, "atoms": 7, "huber": 1.0}
+    changes |= {"v_min": -1000.0, "v_max": 1000.0}
+    agent = dataclasses.replace(agent, **changes, discount=0.9)
+    state = agent.init(task, jax.random.key(0))
+    other = agent.init(task, jax.random.key(1)).online
+    online, target = gradients(agent, state, other)
+    assert largest(online) > 0
+    assert largest(target) == 0
+    # Scaling what the goals are made of moves the goals, not the way that the gradient takes.
     batch = agent.observe(state, rollout(agent)).replay.sample(jax.random.key(2), 8)
-    loss = lambda online, target: agent._loss(online, target, batch)[0]  # noqa: E731
-    online, target = jax.grad(loss, argnums=(0, 1))(state.online, other)
-    assert max(float(jnp.abs(g).max()) for g in jax.tree.leaves(online)) > 0
-    assert max(float(jnp.abs(g).max()) for g in jax.tree.leaves(target)) == 0
+
+    def goals_moved_by_hand(online):
+        frozen = jax.tree.map(jax.lax.stop_gradient, state.online)
+        z = chosen(agent._read(online, batch.observation), batch.action)
+        kind = agent._values
+        selector = kind.mean(agent._read(frozen, batch.next_observation))
+        following = bootstrap(agent._read(other, batch.next_observation), selector)
+        goal = batch.reward[:, None] + 0.9 * kind.outcomes(following)
+        return kind.loss(z, goal, following)[0].mean()
+
+    expected = jax.grad(goals_moved_by_hand)(state.online)
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)  # noqa: E731
+    jax.tree.map(close, online, expected)
 
 
 def test_the_target_network_is_copied_every_period(task):
@@ -155,7 +201,8 @@ def test_adam_equals_its_formula(task):
     after, _ = agent.learn(Pendulum(), before, rollout(agent), jax.random.key(1))
     replay = agent.observe(before, rollout(agent)).replay
     batch = replay.sample(jax.random.key(1), 4)
-    gradient = jax.grad(lambda w: agent._loss(w, before.target, batch)[0])(before.online)
+    loss = lambda w: agent._losses(w, before.target, batch, 0.99, jax.random.key(0))  # noqa: E731
+    gradient = jax.grad(lambda w: loss(w).each.mean())(before.online)
     # At the first step Adam's direction is g / (|g| + ε).
     step = jax.tree.map(lambda g: 0.01 * g / (jnp.abs(g) + 1e-8), gradient)
     expected = jax.tree.map(lambda w, d: w - d, before.online, step)
@@ -168,8 +215,240 @@ def test_adam_equals_its_formula(task):
     [
         {"discount": 1.5}, {"learning_rate": 0.0}, {"batch_size": 0}, {"hidden": ()},
         {"epsilon": -0.1}, {"huber": 0.0}, {"learning_starts": 100, "replay_capacity": 50},
+        {"n_steps": 0}, {"n_steps": 30, "environments": 4, "replay_capacity": 100},
+        {"priority_exponent": 1.1}, {"values": "means"}, {"atoms": 1, "values": "categorical"},
+        {"v_max": -10.0, "values": "categorical"}, {"huber": float("inf"), "values": "quantile"},
+        {"noise_scale": -1.0},
     ],
 )  # fmt: skip
 def test_refuses_what_makes_no_sense(settings):
     with pytest.raises(QfolioError, match=next(iter(settings))):
         DQN(**settings)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"values": "quantile", "huber": 1.0}, {"n_steps": 2}, {"prioritised": True},
+                {"noisy": True}],
+)  # fmt: skip
+def test_all_actions_refuses_what_moves_do_not_give(changes):
+    with pytest.raises(QfolioError, match=f"take {next(iter(changes))}="):
+        DQN(all_actions=True, **changes)
+
+
+def projected_by_hand(outcomes, probabilities, support):
+    """Algorithm 1 of Bellemare et al. (2017), as it is printed."""
+    low, high, count = support[0], support[-1], len(support)
+    result = np.zeros((len(outcomes), count))
+    for row, (values, shares) in enumerate(zip(outcomes, probabilities, strict=True)):
+        for value, share in zip(values, shares, strict=True):
+            b = (np.clip(value, low, high) - low) / (high - low) * (count - 1)
+            lower, upper = int(np.floor(b)), int(np.ceil(b))
+            if lower == upper:
+                result[row, lower] += share
+            else:
+                result[row, lower] += share * (upper - b)
+                result[row, upper] += share * (b - lower)
+    return result
+
+
+def test_categorical_projection_by_hand():
+    support = jnp.array([0.0, 1.0, 2.0])
+    outcomes = jnp.array([[0.25, 1.0], [-5.0, 9.0], [2.0, 1.5]])
+    shares = jnp.array([[0.4, 0.6], [0.3, 0.7], [0.5, 0.5]])
+    expected = [[0.3, 0.7, 0.0], [0.3, 0.0, 0.7], [0.0, 0.25, 0.75]]
+    np.testing.assert_allclose(project(outcomes, shares, support), expected, atol=1e-6)
+
+
+def test_categorical_projection_equals_the_published_algorithm():
+    rng = np.random.default_rng(0)
+    support = np.linspace(-3.0, 5.0, 51)
+    outcomes = rng.normal(1.0, 3.0, (200, 51))
+    shares = rng.dirichlet(np.ones(51), 200)
+    with jax.enable_x64(True):
+        result = project(jnp.array(outcomes), jnp.array(shares), jnp.array(support))
+        np.testing.assert_allclose(result, projected_by_hand(outcomes, shares, support), atol=1e-12)
+
+
+def test_the_projection_keeps_means_within_the_support():
+    rng = np.random.default_rng(1)
+    support = jnp.linspace(-3.0, 5.0, 9)
+    outcomes = jnp.array(rng.uniform(-3, 5, (50, 7)))
+    shares = jnp.array(rng.dirichlet(np.ones(7), 50))
+    means = (project(outcomes, shares, support) * support).sum(1)
+    np.testing.assert_allclose(means, (outcomes * shares).sum(1), atol=1e-5)
+
+
+def test_the_categorical_priority_is_the_divergence():
+    kind = Categorical(5, -2.0, 2.0)
+    z = jax.random.normal(jax.random.key(0), (3, 5))
+    goal = kind.outcomes(z)
+    loss, off = kind.loss(z, goal, z)  # the goal is the estimate itself
+    np.testing.assert_allclose(off, 0.0, atol=1e-6)
+    assert (loss > 0.1).all()
+    assert (kind.loss(z, goal + 1, z)[1] > 0.01).all()
+
+
+def test_quantile_huber_loss_by_hand():
+    """Levels ¼ and ¾ of two quantiles, errors 1 and −1 of the one and 3 and 1 of the other."""
+    quantiles, outcomes = jnp.array([[2.0, 0.0]]), jnp.array([[3.0, 1.0]])
+    squared = (0.25 * 0.5 + 0.75 * 0.5) / 2 + (0.75 * 4.5 + 0.75 * 0.5) / 2
+    clipped = (0.25 * 0.5 + 0.75 * 0.5) / 2 + (0.75 * 2.5 + 0.75 * 0.5) / 2
+    np.testing.assert_allclose(quantile_huber_loss(quantiles, outcomes, 10.0), [squared])
+    np.testing.assert_allclose(quantile_huber_loss(quantiles, outcomes, 1.0), [clipped])
+
+
+def test_quantiles_that_minimise_the_loss_are_the_quantiles():
+    """Of 0, 1, …, 99 at the middles of four parts: 12, 37, 62, 87, each half way to the next."""
+    outcomes = jnp.arange(100.0)[None]
+    slope = jax.jit(jax.grad(lambda q: quantile_huber_loss(q, outcomes, 0.01).sum()))
+    quantiles = jnp.zeros((1, 4))
+    for _ in range(3000):
+        quantiles = quantiles - 100.0 * slope(quantiles)
+    np.testing.assert_allclose(quantiles[0], [12, 37, 62, 87], atol=1.0)
+
+
+def test_duelling_by_hand():
+    z = jnp.array([[[10.0], [1.0], [2.0], [6.0]]])
+    np.testing.assert_allclose(heads.duel(z)[0, :, 0], [8, 9, 13])
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("values", ["expected", "categorical"])
+def test_action_values_are_the_means_in_units_of_reward(task, noisy, values):
+    """And nothing of them, nor of the policy, depends on noise."""
+    agent = DQN(
+        hidden=(8, 8), dueling=True, noisy=noisy, values=values, atoms=5, v_min=0.0, v_max=4.0,
+        reward_scale=0.5,
+    )  # fmt: skip
+    online = agent.init(task, jax.random.key(0)).online
+    observation = jax.random.normal(jax.random.key(1), (6, 3))
+    outputs = online(observation).reshape(6, 12, -1)
+    z = outputs[:, :1] + outputs[:, 1:] - outputs[:, 1:].mean(1, keepdims=True)
+    means = jax.nn.softmax(z) @ jnp.arange(5.0) if values == "categorical" else z[..., 0]
+    np.testing.assert_allclose(agent.action_values(online, observation), 2 * means, rtol=1e-4)
+    np.testing.assert_array_equal(agent.policy(online, observation), means.argmax(1))
+
+
+def test_noise_is_factorised_and_of_the_size_that_it_starts_with():
+    """Fortunato et al. 2018, eq. 10, 11: f(x) f(y) on a weight, f(y) on a bias; E f² = √(2/π)."""
+    plain = MLP((64, 32), jax.random.key(0))
+    noisy = heads.NoisyMLP(plain, 0.5)
+    draws = jax.vmap(noisy.draw)(jax.random.split(jax.random.key(1), 500))
+    weight = np.asarray(draws.weights[0] - plain.weights[0]) / (0.5 / 8)
+    bias = np.asarray(draws.biases[0] - plain.biases[0]) / (0.5 / 8)
+    by_input = weight / bias[:, None, :]
+    np.testing.assert_allclose(by_input, by_input[:, :, :1] + 0 * by_input, rtol=2e-2, atol=1e-3)
+    moment = np.sqrt(2 / np.pi)
+    np.testing.assert_allclose((bias**2).mean(), moment, rtol=0.05)
+    np.testing.assert_allclose((weight**2).mean(), moment**2, rtol=0.05)
+    np.testing.assert_allclose(weight.mean(), 0, atol=0.02)
+
+
+def test_noise_is_drawn_anew_for_each_act_and_explores(task):
+    agent = DQN(hidden=(8, 8), noisy=True, epsilon=0.0, epsilon_end=0.0)
+    state = agent.init(task, jax.random.key(0))
+    observation = jnp.ones((1, 3))
+    act = lambda key: agent.act(state, observation, key)[0]  # noqa: E731
+    actions = jax.vmap(act)(jax.random.split(jax.random.key(1), 200))
+    assert len(set(actions.tolist())) > 1
+    quiet = dataclasses.replace(agent, noise_scale=0.0)
+    state = quiet.init(task, jax.random.key(0))
+    actions = jax.vmap(act)(jax.random.split(jax.random.key(1), 50))
+    assert set(actions.tolist()) == {int(quiet.policy(state.online, observation)[0])}
+
+
+def test_sizes_of_noise_are_learned(task, agent):
+    agent = dataclasses.replace(agent, noisy=True)
+    state = agent.init(task, jax.random.key(0))
+    gradient, _ = gradients(agent, state, state.online)
+    noisy = gradient.mlp.streams[0]
+    assert largest(noisy.weight_scales) > 0
+    assert largest(noisy.bias_scales) > 0
+
+
+def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):
+    """Written out: β = 0.4 at the first update, priorities (|error| + 10⁻⁶)^α afterwards."""
+    agent = DQN(
+        hidden=(8,),
+        environments=4,
+        batch_size=6,
+        prioritised=True,
+        replay_capacity=16,
+        learning_starts=8,
+    )
+    before = agent.init(task, jax.random.key(0))
+    for i in range(2):
+        before = agent.observe(before, rollout(agent, observation=float(i), reward=i - 0.5))
+    step = rollout(agent, observation=3.0)
+    after, metrics = agent.learn(task, before, step, jax.random.key(1))
+    replay = agent.observe(before, step).replay
+    index = replay.draw(jax.random.key(1), 6)
+    batch = replay.at(index)
+    losses = agent._losses(before.online, before.target, batch, 0.99, jax.random.key(0))
+    np.testing.assert_allclose(metrics["loss"], losses.each.mean(), rtol=1e-5)  # all alike so far
+    expected = np.ones(16)
+    expected[12:] = 0
+    expected[np.asarray(index)] = (np.asarray(losses.off) + 1e-6) ** 0.6
+    np.testing.assert_allclose(after.replay.priorities.of(jnp.arange(16)), expected, rtol=1e-4)
+    _, metrics = agent.learn(task, after, step, jax.random.key(2))
+    replay = agent.observe(after, step).replay
+    index = replay.draw(jax.random.key(2), 6)
+    losses = agent._losses(after.online, after.target, replay.at(index), 0.99, jax.random.key(0))
+    beta = 0.4 + 0.6 / agent.learning_rate_steps
+    weight = replay.priorities.importance(index, beta)
+    assert float(weight.min()) < 1
+    np.testing.assert_allclose(metrics["loss"], (weight * losses.each).mean(), rtol=1e-4)
+
+
+def test_learning_waits_for_the_steps_that_a_return_needs():
+    agent = DQN(environments=8, n_steps=5, learning_starts=8)
+    assert agent.warm_up() == 4
+
+
+def learned_abstractly(agent, task, state):
+    """Shapes after acting and learning; types are checked on the way."""
+
+    def step(state):
+        states = jax.vmap(task.reset)(jax.random.split(jax.random.key(0), agent.environments))
+        observation = jax.vmap(task.observe)(states)
+        action = agent.act(state, observation, jax.random.key(1))
+        no = jnp.zeros(agent.environments, bool)
+        step = (states, observation, action, jnp.zeros(len(no)), states, observation, no, no)
+        rollout = Transition(*jax.tree.map(lambda x: x[None], step))
+        return agent.learn(task, state, rollout, jax.random.key(2))[0]
+
+    return jax.eval_shape(step, state)
+
+
+@pytest.mark.parametrize("network", ["flat", "mlp"])
+def test_every_option_fits_a_market(network):
+    """Values of a menu with choices for each asset keep their order with several numbers each."""
+    market = Merton(menu="tilts:0.1")
+    agent = DQN(
+        network=network, hidden=(8, 8, 8), environments=4, batch_size=8, learning_starts=16,
+        replay_capacity=64, double=True, dueling=True, n_steps=2, prioritised=True, noisy=True,
+        values="quantile", atoms=3, huber=1.0,
+    )  # fmt: skip
+    state = agent.init(market, jax.random.key(0))
+    assert jax.tree.structure(learned_abstractly(agent, market, state)) == jax.tree.structure(state)
+    view = jax.vmap(market.observe)(jax.vmap(market.reset)(jax.random.split(jax.random.key(0), 5)))
+    values = agent.action_values(state.online, view)
+    assert values.shape == (5, market.actions.n)
+    if network == "mlp":
+        mirrored = jax.tree.map(lambda x: x[:, ::-1], view)
+        pooled, each = market.actions.pooled, market.actions.each
+        other = agent.action_values(state.online, mirrored)
+        np.testing.assert_allclose(other[:, :pooled], values[:, :pooled], atol=1e-5)
+        blocks, mirror = (v[:, pooled:].reshape(5, each, 3) for v in (values, other))
+        assert np.ptp(blocks, axis=2).min() > 1e-4
+        np.testing.assert_allclose(mirror, blocks[:, :, ::-1], atol=1e-5)
+
+
+def test_all_actions_can_duel():
+    market = Ar1(menu="grid:10")
+    agent = DQN(
+        hidden=(8, 8), environments=4, batch_size=8, learning_starts=16, replay_capacity=64,
+        dueling=True, double=True, all_actions=True, market_baseline=True,
+    )  # fmt: skip
+    state = agent.init(market, jax.random.key(0))
+    assert jax.tree.structure(learned_abstractly(agent, market, state)) == jax.tree.structure(state)

@@ -32,6 +32,65 @@ def environment(prices=None, **task):
     )
 
 
+# Torques are in N m, and positions have no bounds: advice that does not apply.
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space")
+@pytest.mark.filterwarnings("ignore:.*A Box action space")
+@pytest.mark.parametrize("name", gym.IDS)
+def test_every_task_is_an_environment(name):
+    env = gymnasium.make(gym.IDS[name])
+    check_env(env.unwrapped)
+    first, again = [env.reset(seed=3)[0] for _ in range(2)]
+    np.testing.assert_equal(first, again)
+
+
+def test_an_episode_ends_at_the_horizon_or_before():
+    env = gymnasium.make(gym.IDS["pendulum"], horizon=3, torques=0)
+    env.reset(seed=0)
+    ends = [env.step(np.ones(1, np.float32))[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+    with pytest.raises(QfolioError, match="reset"):
+        env.unwrapped.step(np.ones(1, np.float32))
+    cliff = gymnasium.make(gym.IDS["finite/cliff"])
+    cliff.reset(seed=0)
+    *_, end = [cliff.step(action) for action in (0, *[1] * 11, 2)]  # up, along the edge, down
+    assert end[2:4] == (True, False)
+
+
+def test_its_steps_are_those_of_the_task():
+    """Gymnasium's own pendulum is the oracle."""
+    env = gymnasium.make(gym.IDS["pendulum"], torques=0)
+    other = gymnasium.make("Pendulum-v1").unwrapped
+    seen, _ = env.reset(seed=5)
+    other.reset(seed=0)
+    other.state = np.array([np.arctan2(seen[1], seen[0]), seen[2]], float)
+    for torque in np.linspace(-2, 2, 40, dtype=np.float32):
+        seen, reward, *_ = env.step(torque[None])
+        expected, cost, *_ = other.step(torque[None])
+        np.testing.assert_allclose(seen, expected, atol=1e-3)
+        np.testing.assert_allclose(reward, cost, atol=1e-3)
+
+
+def test_scores_become_the_nearest_weights_of_a_market():
+    env = gymnasium.make(gym.IDS["market/kelly"])
+    for scores in ([0.7, 0.7], [-0.5, -0.5], [0.5, 0.5]):
+        env.reset(seed=1)
+        seen = env.step(np.array(scores, np.float32))[0]
+        holdings = seen["holding"]
+        assert 0.4 < holdings[0] < 0.6  # a half, drifted by one step
+
+
+def test_a_task_says_what_is_wrong():
+    env = gymnasium.make(gym.IDS["pendulum"])
+    env.reset(seed=0)
+    for action in (11, -1, 0.5):
+        with pytest.raises(QfolioError, match="must be in Discrete"):
+            env.unwrapped.step(action)
+    with pytest.raises(QfolioError, match="did you mean torques"):
+        gym.TaskEnv("pendulum", torqes=3)
+    with pytest.raises(QfolioError, match="render_mode"):
+        gym.TaskEnv("pendulum", render_mode="human")
+
+
 def play(env, **reset):
     """An episode of random actions: what was seen, earned and told."""
     rng = np.random.default_rng(0)

@@ -10,6 +10,22 @@ from probes import Endless, OneState, RewardDelay, TwoStates
 
 DISCOUNT = 0.9
 
+CATEGORICAL = {"values": "categorical", "atoms": 21, "v_min": -2.0, "v_max": 2.0}
+QUANTILE = {"values": "quantile", "atoms": 16, "huber": 1.0}
+RAINBOW = {
+    "double": True, "dueling": True, "n_steps": 3, "prioritised": True, "noisy": True,
+}  # fmt: skip
+OPTIONS = {
+    "dueling": {"dueling": True},
+    "n_steps": {"n_steps": 3},
+    "prioritised": {"prioritised": True},
+    "categorical": CATEGORICAL,
+    "quantile": QUANTILE,
+    "noisy": {"noisy": True},
+    "rainbow categorical": {**RAINBOW, **CATEGORICAL},
+    "rainbow quantile": {**RAINBOW, **QUANTILE},
+}
+
 
 def learned_values(task, observations, steps=1500, **changes):
     settings = {
@@ -32,15 +48,17 @@ def test_one_state(double):
     np.testing.assert_allclose(values, [[0.0, 1.0]], atol=0.02)
 
 
-@pytest.mark.parametrize("double", [True, False])
-def test_two_states(double):
-    values = learned_values(TwoStates(), [[1.0], [-1.0]], double=double)
+@pytest.mark.parametrize("changes", [{}, {"double": True}, *OPTIONS.values()],
+                         ids=["plain", "double", *OPTIONS])  # fmt: skip
+def test_two_states(changes):
+    values = learned_values(TwoStates(), [[1.0], [-1.0]], **changes)
     np.testing.assert_allclose(values, [[-1, 1], [1, -1]], atol=0.02)
 
 
-@pytest.mark.parametrize("double", [True, False])
-def test_reward_delay(double):
-    values = learned_values(RewardDelay(), [[1.0, 0.0], [0.0, 1.0]], double=double)
+@pytest.mark.parametrize("changes", [{}, {"double": True}, *OPTIONS.values()],
+                         ids=["plain", "double", *OPTIONS])  # fmt: skip
+def test_reward_delay(changes):
+    values = learned_values(RewardDelay(), [[1.0, 0.0], [0.0, 1.0]], **changes)
     np.testing.assert_allclose(values, [[DISCOUNT] * 2, [1, 1]], rtol=0.02)
 
 
@@ -52,16 +70,31 @@ def test_a_time_limit_is_not_the_end(changes):
     np.testing.assert_allclose(values, 1 / (1 - DISCOUNT), rtol=0.02)
 
 
+@pytest.mark.parametrize("name", ["n_steps", "rainbow categorical", "rainbow quantile"])
+@pytest.mark.parametrize("horizon", [1, 2])
+def test_returns_over_steps_bootstrap_through_a_time_limit(name, horizon):
+    """Where the episode is cut before the three steps are over, by the right power of γ."""
+    changes = {**OPTIONS[name], "target_rate": 0.2, "learning_rate_steps": 3000.0}
+    if "v_max" in changes:
+        changes |= {"v_min": 0.0, "v_max": 12.0}
+    values = learned_values(Endless(horizon), [[1.0]], steps=3000, **changes)
+    np.testing.assert_allclose(values, 1 / (1 - DISCOUNT), rtol=0.02)
+
+
 def test_a_time_limit_taken_for_the_end():
     values = learned_values(Endless(), [[1.0]], time_limit_terminal=True)
     np.testing.assert_allclose(values, 1.0, rtol=0.02)
 
 
-def test_scaled_rewards_and_huber_loss_leave_the_values_alone():
-    values = learned_values(RewardDelay(), [[1.0, 0.0]], reward_scale=0.5, huber=0.1)
+@pytest.mark.parametrize("changes", [{"huber": 0.1}, CATEGORICAL, {**QUANTILE, "huber": 0.1}])
+def test_scaled_rewards_leave_the_values_alone(changes):
+    values = learned_values(RewardDelay(), [[1.0, 0.0]], reward_scale=0.5, **changes)
     np.testing.assert_allclose(values, DISCOUNT, rtol=0.02)
 
 
-def test_several_updates_a_step():
-    values = learned_values(TwoStates(), [[1.0]], steps=500, updates=3)
+@pytest.mark.parametrize("prioritised", [False, True])
+def test_several_updates_a_step(prioritised):
+    values = learned_values(
+        TwoStates(), [[1.0]], steps=500, updates=3, prioritised=prioritised, n_steps=2
+    )
     np.testing.assert_allclose(values, [[-1, 1]], atol=0.02)

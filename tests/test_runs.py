@@ -53,6 +53,20 @@ def test_n_and_n_episodes_equal_2n(task, agent, tmp_path):
     assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
 
 
+def test_steps_say_how_far_as_episodes_do(task, agent, tmp_path):
+    create(task, agent, tmp_path / "straight", episodes=None, steps=300, seeds=2).train()
+    create(task, agent, tmp_path / "halves", episodes=None, steps=133, seeds=2).train()
+    again = Run.open(tmp_path / "halves")
+    assert (again.done("steps"), again.budget) == (134, {"steps": 133})
+    seen = []
+    again.train(steps=300, listener=seen.append)
+    assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
+    assert (seen[-1].done, seen[-1].total, seen[-1].unit) == (300, 300, "steps")
+    again.train(14)  # episodes of 25 steps
+    assert again.budget == {"episodes": 14}
+    assert again.done("steps") == 350
+
+
 IN_A_MARKET = {
     "pathwise": (Ar1(horizon=20), Pathwise(rollout=10, environments=3, hidden=(4, 4))),
     "dqn": (
@@ -319,7 +333,13 @@ def test_never_overwrites_a_folder(task, agent, tmp_path):
         create(task, agent, tmp_path)
 
 
-@pytest.mark.parametrize("options", [{"episodes": 0}, {"seeds": 0}, {"seed": -1}, {"seed": 2**32}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"episodes": 0}, {"seeds": 0}, {"seed": -1}, {"seed": 2**32},
+        {"steps": 9}, {"episodes": None}, {"episodes": None, "steps": 0},
+    ],
+)  # fmt: skip
 def test_refuses_counts_that_make_no_sense(task, agent, options):
     with pytest.raises(QfolioError, match=next(iter(options))):
         Run.create(task, agent, **{"episodes": 1, **options})

@@ -119,6 +119,15 @@ def test_steps_left_ends_with_whole_episodes(task, agent):
     assert (population.steps, population.episodes) == (50, 4)
 
 
+def test_steps_left_counts_those_of_all_environments(task, agent):
+    population = Population(task, agent, [0])
+    assert population.steps_left(steps=61) == 31
+    population.advance(population.steps_left(steps=61))  # the warm-up
+    assert population.steps_left(steps=61) == 31 - agent.warm_up()
+    population.advance(population.steps_left(steps=61))
+    assert (population.steps, population.steps_left(steps=61)) == (31, 0)
+
+
 def test_an_infinite_loss_stops_training():
     agent = DQN(hidden=(4,), environments=2, batch_size=8, learning_starts=4, episode_steps=0)
     population = Population(Explosive(), agent, [4, 5])

@@ -17,8 +17,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from qfolio.agents.a2c import A2C as A2C
+    from qfolio.agents.ddpg import DDPG as DDPG
     from qfolio.agents.dqn import DQN as DQN
     from qfolio.agents.pathwise import Pathwise as Pathwise
+    from qfolio.agents.ppo import PPO as PPO
+    from qfolio.agents.reinforce import REINFORCE as REINFORCE
+    from qfolio.agents.sac import SAC as SAC
+    from qfolio.agents.td3 import TD3 as TD3
     from qfolio.backtest.run import Backtest as Backtest
     from qfolio.errors import QfolioError as QfolioError
     from qfolio.markets.prices import load as load_prices  # noqa: F401
@@ -26,18 +32,26 @@ if TYPE_CHECKING:
     from qfolio.presets import preset as preset
     from qfolio.runs import Run as Run
     from qfolio.runs import train as train
+    from qfolio.tasks.finite import FiniteMDP as FiniteMDP
     from qfolio.tasks.pendulum import Pendulum as Pendulum
     from qfolio.tasks.portfolio import Portfolio as Portfolio
 
 _HOMES = {
+    "A2C": "qfolio.agents.a2c:A2C",
     "Backtest": "qfolio.backtest.run:Backtest",
+    "DDPG": "qfolio.agents.ddpg:DDPG",
     "DQN": "qfolio.agents.dqn:DQN",
+    "FiniteMDP": "qfolio.tasks.finite:FiniteMDP",
+    "PPO": "qfolio.agents.ppo:PPO",
     "Pathwise": "qfolio.agents.pathwise:Pathwise",
     "Pendulum": "qfolio.tasks.pendulum:Pendulum",
     "Policy": "qfolio.policy:Policy",
     "Portfolio": "qfolio.tasks.portfolio:Portfolio",
+    "REINFORCE": "qfolio.agents.reinforce:REINFORCE",
     "QfolioError": "qfolio.errors:QfolioError",
     "Run": "qfolio.runs:Run",
+    "SAC": "qfolio.agents.sac:SAC",
+    "TD3": "qfolio.agents.td3:TD3",
     "load_prices": "qfolio.markets.prices:load",
     "preset": "qfolio.presets:preset",
     "train": "qfolio.runs:train",

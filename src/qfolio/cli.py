@@ -7,8 +7,11 @@ from typing import Any, NoReturn
 import tyro
 
 from qfolio.commands.arguments import INTERRUPTED
+from qfolio.commands.comparison import compare
+from qfolio.commands.continual import continual
 from qfolio.commands.portfolio import allocate, backtest, prices
 from qfolio.commands.training import evaluate, train, watch
+from qfolio.commands.tuning import tune
 from qfolio.errors import QfolioError
 
 OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
@@ -18,7 +21,8 @@ def main() -> NoReturn:
     """The entry point: errors meant for people become one sentence and exit code 2."""
     commands: dict[str, Callable[..., Any]] = {
         "backtest": backtest, "allocate": allocate, "prices": prices,
-        "train": train, "evaluate": evaluate, "watch": watch,
+        "train": train, "compare": compare, "evaluate": evaluate, "watch": watch, "tune": tune,
+        "continual": continual,
     }  # fmt: skip
     try:
         tyro.extras.subcommand_cli_from_dict(

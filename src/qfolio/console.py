@@ -39,43 +39,43 @@ def describe(run: "Run") -> str:
 
 def train(
     run: "Run",
-    episodes: int | None,
+    budget: dict[str, int],
     optimum: float | None,
     show: Callable[["Run"], None] | None = None,
 ) -> None:
     """Trains with a line for each point of the curve and a bar between them.
 
-    episodes: those of the configuration where None. optimum: on the curve's start states.
+    budget: episodes or steps, as ``Run.train`` takes them. optimum: on the curve's start states.
     show: called with the run at each point of the curve.
     """
+    ((unit, total),) = budget.items()
     steps = episode_steps(run.task, run.agent)
     value = "return" if steps == run.task.horizon else f"return/{steps}"  # of shorter episodes
-    columns = ("episodes", value, "greedy", "optimum", "epsilon", "steps/s", "left")
+    columns = (unit, value, "greedy", "optimum", "epsilon", "steps/s", "left")
     say("".join(f"{name:>11}" for name in columns))
     bar_columns = (
         rich.progress.BarColumn(bar_width=24),
         rich.progress.TextColumn("{task.description}"),
     )
-    total = run.config["episodes"] if episodes is None else episodes
     with rich.progress.Progress(
         *bar_columns, console=console, transient=True, disable=not console.is_terminal
     ) as live:
-        bar = live.add_task("compiling", total=total, completed=run.episodes)
+        bar = live.add_task("compiling", total=total, completed=run.done(unit))
 
         def note(now: "Progress") -> None:
-            done, value = f"{now.episodes:,}", number(now.mean_return)
+            done, value = f"{now.done:,}", number(now.mean_return)
             rate = f"{now.steps_per_second:,.0f}"
             epsilon = "–" if math.isnan(now.epsilon) else f"{now.epsilon:.2f}"
             left = str(datetime.timedelta(seconds=round(now.seconds_left)))
-            status = f"{done} episodes  return {value}  ε {epsilon}  {rate} steps/s  {left} left"
-            live.update(bar, completed=min(now.episodes, total), description=status)
+            status = f"{done} {unit}  return {value}  ε {epsilon}  {rate} steps/s  {left} left"
+            live.update(bar, completed=min(now.done, total), description=status)
             if now.greedy_return is not None:
                 cells = (done, value, number(now.greedy_return), number(optimum))
                 say("".join(f"{cell:>11}" for cell in (*cells, epsilon, rate, left)))
                 if show is not None:
                     show(run)
 
-        run.train(episodes, note)
+        run.train(**budget, listener=note)
 
 
 def print_result(seeds: list[int], result: dict[str, Any]) -> None:
@@ -90,7 +90,8 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
         table.add_row(str(seed), *_cells(optimum, *values))
     table.add_section()
     means = (
-        sum(x or math.nan for x in column) / len(column) for column in (returns, regrets, over)
+        sum(math.nan if x is None else x for x in column) / len(column)
+        for column in (returns, regrets, over)
     )
     table.add_row("mean", *_cells(optimum, *means))
     console.print(table)
@@ -109,7 +110,8 @@ def number(value: float | None) -> str:
 
 
 def _cells(optimum: str, value: float, regret: float, over: float | None) -> tuple[str, ...]:
-    return number(value), optimum, f"{round(regret, 4) + 0.0:.2%}", number(over)
+    share = "–" if math.isnan(regret) else f"{round(regret, 4) + 0.0:.2%}"
+    return number(value), optimum, share, number(over)
 
 
 def print_rule(rule: dict[str, Any]) -> None:

@@ -117,18 +117,23 @@ Distribution = Categorical | Gaussian | LogisticNormal
 
 
 def policy_of(
-    actions: Actions, output: Float[Array, "*batch output"], log_std: Float[Array, "..."]
+    actions: Actions,
+    output: Float[Array, "*batch output"],
+    log_std: Float[Array, " coordinate"],
 ) -> Distribution:
     """The policy that a network's output stands for.
 
-    output: as many numbers as ``networks.outputs_of(actions)``. log_std: of each coordinate, or of
-    each asset, in units of the output.
+    output: as many numbers as ``networks.outputs_of(actions)``, in units of the bound where actions
+    have one. log_std: of each coordinate, or one for all, in the same units.
     """
     if isinstance(actions, Discrete):
         return Categorical(output)
     if isinstance(actions, Simplex):
-        return LogisticNormal(Gaussian(output[..., 1:] - output[..., :1], log_std))
-    return Gaussian(output, log_std)
+        y = output[..., 1:] - output[..., :1]
+        return LogisticNormal(Gaussian(y, jnp.broadcast_to(log_std, y.shape[-1:])))
+    unit = actions.bound if math.isfinite(actions.bound) else 1.0
+    log_std = jnp.broadcast_to(log_std + math.log(unit), output.shape[-1:])
+    return Gaussian(unit * output, log_std)
 
 
 def _with_cash(y: Float[Array, "*batch asset"]) -> Float[Array, "*batch entry"]:

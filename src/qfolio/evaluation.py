@@ -13,6 +13,9 @@ from qfolio.mdp import Agent, Policy, Task
 STARTS = 1024
 """Start states that results are graded on; those along the learning curve are the first of them."""
 
+CURVE_STARTS = 64
+"""Start states of the evaluations along the learning curve."""
+
 
 def start_keys(n: int = STARTS) -> Key[Array, " start"]:
     """Keys of the fixed start states; the first of many are the same as few."""

@@ -1,7 +1,10 @@
-"""The portfolio task as an environment of Gymnasium, for other libraries' agents.
+"""qfolio's tasks as environments of Gymnasium, for other libraries' agents.
 
 >>> import gymnasium, qfolio.gym
 >>> env = gymnasium.make("qfolio/Portfolio-v0", prices="prices.csv", cost=0.001, horizon=250)
+>>> env = gymnasium.make("qfolio/Pendulum-v0", torques=0)
+
+``IDS`` holds the others, one for each task that ``qfolio train`` knows by name.
 """
 
 from functools import cache, partial
@@ -14,6 +17,7 @@ from qfolio.backtest.simulation import simulate
 from qfolio.errors import QfolioError
 from qfolio.markets.costs import drift
 from qfolio.markets.prices import load
+from qfolio.registry import TASKS, find
 
 try:
     import gymnasium
@@ -22,6 +26,11 @@ except ImportError:
     raise QfolioError("qfolio.gym needs Gymnasium: pip install 'qfolio[gym]'.") from None
 
 ID = "qfolio/Portfolio-v0"
+
+IDS = {name: f"qfolio/{where.partition(':')[2]}-v0" for name, where in TASKS.items()}
+"""Of the tasks by name, such as qfolio/Pendulum-v0."""
+
+_LARGEST = float(np.finfo(np.float32).max)
 
 Observation = dict[str, np.ndarray]
 
@@ -86,11 +95,10 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         assets, channels = len(self.prices.assets), self.task.center.shape[0]
         self.first = int(self.task.first)
         self.last = int(self.task.last) - self.task.horizon + 1
-        largest = np.finfo(np.float32).max
         self.observation_space = spaces.Dict(
             {
                 "features": spaces.Box(
-                    -largest, largest, (assets, self.task.window, channels), np.float32
+                    -_LARGEST, _LARGEST, (assets, self.task.window, channels), np.float32
                 ),
                 "holding": spaces.Box(0.0, 1.0, (assets,), np.float32),
             }
@@ -230,5 +238,122 @@ class _Programs:
 
 _programs = cache(_Programs)
 
+
+class TaskEnv(gymnasium.Env[Any, Any]):
+    """A task of ``qfolio train`` by its name, compiled, one step at a time.
+
+    Observations are those of qfolio's agents: numbers (Box), one of a few numbers (Discrete) or in
+    markets a Dict of each asset's "features" and the "holding". Actions are numbered (Discrete),
+    or numbers (Box); where they are weights of a market, the nearest point of the simplex is taken.
+    Episodes are truncated after the task's ``horizon``. Raises QfolioError for settings and actions
+    that do not fit.
+
+    Args:
+        name: Of the task, such as "pendulum".
+        render_mode: None; there is nothing to be seen.
+        settings: Of the task, such as torques=0.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, name: str, *, render_mode: str | None = None, **chosen: Any) -> None:
+        import jax
+
+        from qfolio import devices
+        from qfolio.mdp import Discrete, Simplex, View
+
+        if render_mode is not None:
+            raise QfolioError(f"render_mode is {render_mode!r}; {name} has none.")
+        devices.configure()
+        task: Any = settings.build(find("task", TASKS, name), chosen)
+        self.task, self._steps = task, task.horizon  # over
+        self._there = jax.device_put(task)  # its arrays need not travel at each step
+        seen = jax.eval_shape(lambda key: task.observe(task.reset(key)), jax.random.key(0))
+        number = lambda x: spaces.Box(-_LARGEST, _LARGEST, x.shape, np.float32)  # noqa: E731
+        self._named = isinstance(seen, View)
+        self.observation_space: spaces.Space[Any]
+        if task.states is not None:
+            self.observation_space = spaces.Discrete(task.states)
+        elif self._named:
+            self.observation_space = spaces.Dict({k: number(x) for k, x in seen._asdict().items()})
+        else:
+            self.observation_space = number(seen)
+        actions = task.actions
+        self.action_space: spaces.Space[Any]
+        if isinstance(actions, Discrete):
+            self.action_space = spaces.Discrete(actions.n)
+        elif isinstance(actions, Simplex):
+            self.action_space = spaces.Box(-1.0, 1.0, (actions.assets + 1,), np.float32)
+        else:
+            bound = actions.bound
+            self.action_space = spaces.Box(-bound, bound, (actions.n,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """A start state, drawn anew."""
+        super().reset(seed=seed)
+        self._steps = 0
+        self._seed = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
+        self._state, observation = _stepping().reset(self._there, self._seed)
+        return self._told(observation), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self._steps >= self.task.horizon:
+            raise QfolioError("The episode is over; call reset() first.")
+        numbered = isinstance(self.action_space, spaces.Discrete)
+        given = np.asarray(action, None if numbered else np.float32)
+        if not self.action_space.contains(given) or not np.isfinite(given).all():
+            raise QfolioError(f"The action is {action!r}; it must be in {self.action_space}.")
+        after, observation = _stepping().step(
+            self._there, self._state, given, self._seed, np.int32(self._steps)
+        )
+        self._state, self._steps = after.state, self._steps + 1
+        terminated = bool(after.terminated)
+        truncated = self._steps >= self.task.horizon and not terminated
+        if terminated:
+            self._steps = self.task.horizon
+        return self._told(observation), float(after.reward), terminated, truncated, {}
+
+    def _told(self, observation: Any) -> Any:
+        if self._named:
+            return {name: np.array(x) for name, x in observation._asdict().items()}
+        if isinstance(self.observation_space, spaces.Discrete):
+            return np.int64(observation)
+        return np.array(observation, np.float32)
+
+
+class _Stepping:
+    """How a task is reset and stepped, compiled once for all environments of a kind."""
+
+    def __init__(self) -> None:
+        import jax
+
+        from qfolio import simplex
+        from qfolio.mdp import Discrete, Simplex
+
+        @jax.jit
+        def reset(task: Any, seed: Any) -> Any:
+            state = task.reset(jax.random.key(seed))
+            return state, task.observe(state)
+
+        @jax.jit
+        def step(task: Any, state: Any, action: Any, seed: Any, time: Any) -> Any:
+            if isinstance(task.actions, Discrete):
+                action = action.astype(jax.numpy.int32)
+            elif isinstance(task.actions, Simplex):
+                action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
+            key = jax.random.fold_in(jax.random.key(seed), time)
+            after = task.step(state, action, key)
+            return after, task.observe(after.state)
+
+        self.reset, self.step = reset, step
+
+
+_stepping = cache(_Stepping)
+
 if ID not in gymnasium.registry:
     gymnasium.register(ID, entry_point="qfolio.gym:PortfolioEnv")
+for _name, _id in IDS.items():
+    if _id not in gymnasium.registry:
+        gymnasium.register(_id, entry_point="qfolio.gym:TaskEnv", kwargs={"name": _name})

@@ -1,73 +1,48 @@
 """Networks as plain matrix products over batches."""
 
-from itertools import pairwise
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from qfolio.encoders import CNN, LSTM, MLP, RNN, Window, uniform
 from qfolio.errors import QfolioError
 from qfolio.mdp import Actions, Discrete, Simplex, Task, View
-
-
-class MLP(eqx.Module):
-    """Fully connected layers with ReLU between them and none after the last.
-
-    Weights and biases start uniform in ±1/√inputs (LeCun et al. 1998, section 4.6, up to √3); the
-    first layer's weights are multiplied by ``input_gain``, one factor for each input.
-    """
-
-    weights: list[Float[Array, "inputs outputs"]]
-    biases: list[Float[Array, " outputs"]]
-
-    def __init__(
-        self,
-        sizes: tuple[int, ...],
-        key: PRNGKeyArray,
-        input_gain: Float[Array, "*inputs"] | float = 1.0,
-    ) -> None:
-        self.weights, self.biases = [], []
-        for inputs, outputs in pairwise(sizes):
-            key, weight_key, bias_key = jax.random.split(key, 3)
-            bound = inputs**-0.5
-            self.weights.append(_uniform(weight_key, (inputs, outputs), bound))
-            self.biases.append(_uniform(bias_key, (outputs,), bound))
-        self.weights[0] = jnp.broadcast_to(input_gain, sizes[:1])[:, None] * self.weights[0]
-
-    def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
-        *hidden, last = zip(self.weights, self.biases, strict=True)
-        for weight, bias in hidden:
-            x = jax.nn.relu(x @ weight + bias)
-        weight, bias = last
-        return x @ weight + bias
 
 
 class Flat(eqx.Module):
     """An MLP over everything that is observed, in one row of numbers.
 
-    An observation that is one of ``states`` numbers becomes a row with a one at its place.
+    An observation that is one of ``states`` numbers becomes a row with a one at its place; windows
+    and images can be read by an ``encoder`` first.
     """
 
     mlp: MLP
+    encoder: CNN | RNN | LSTM | None
     states: int | None = eqx.field(static=True)
 
     def __init__(
         self, observation: PyTree, hidden: tuple[int, ...], outputs: int, key: PRNGKeyArray,
         input_gain: Float[Array, "*inputs"] | float = 1.0, states: int | None = None,
+        encoder: CNN | RNN | LSTM | None = None,
     ) -> None:  # fmt: skip
-        self.states = states
+        self.states, self.encoder = states, encoder
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], observation)
-        inputs = jax.eval_shape(lambda: _rows(batch, states)).shape[1]
+        inputs = jax.eval_shape(lambda: _rows(batch, states, encoder)).shape[1]
         self.mlp = MLP((inputs, *hidden, outputs), key, input_gain)
 
     def __call__(self, observation: PyTree) -> Float[Array, "batch outputs"]:
-        return self.mlp(_rows(observation, self.states))
+        return self.mlp(_rows(observation, self.states, self.encoder))
 
 
-def _rows(observation: PyTree, states: int | None) -> Float[Array, "batch inputs"]:
+def _rows(
+    observation: PyTree, states: int | None, encoder: CNN | RNN | LSTM | None
+) -> Float[Array, "batch inputs"]:
+    if encoder is not None:
+        observation = jax.nn.relu(encoder(observation))
     if states is not None:
         observation = jax.nn.one_hot(observation, states)
     leaves = jax.tree.leaves(observation)
@@ -91,7 +66,7 @@ class Shared(eqx.Module):
     Outputs of the whole market are means over the assets.
     """
 
-    encoder: "MLP | CNN | RNN"
+    encoder: Window | CNN | RNN | LSTM
     join: Float[Array, "inputs width"]
     head: MLP
     linear: Float[Array, "numbers outputs"]
@@ -107,15 +82,15 @@ class Shared(eqx.Module):
         key: PRNGKeyArray,
     ) -> None:
         """``pooled`` outputs for the market and ``each`` for every asset."""
-        time, channels = view.features.shape[-2:]
+        window = view.features.shape[-2:]
         keys = jax.random.split(key, 3)
         width, *rest = hidden
-        self.encoder = _ENCODERS[kind](time, channels, width, keys[0])
+        self.encoder = _ENCODERS[kind](window, width, keys[0])
         joined = rest[0] if rest else width
         inputs = 2 * width + 2
-        self.join = _uniform(keys[1], (inputs, joined), inputs**-0.5)
+        self.join = uniform(keys[1], (inputs, joined), inputs**-0.5)
         self.head = MLP((joined, *rest[1:], pooled + each), keys[2])
-        self.linear = jnp.zeros((time * channels + 1, pooled + each))
+        self.linear = jnp.zeros((math.prod(window) + 1, pooled + each))
         self.pooled = pooled
 
     def __call__(
@@ -145,81 +120,29 @@ class Shared(eqx.Module):
 class PerAsset(eqx.Module):
     """A ``Shared`` network's outputs in one row: the market's, then every asset's first, ….
 
-    Of an action's values and of a policy's weights alike.
+    Of an action's values and of a policy's weights alike; where an action has several numbers,
+    these stand together.
     """
 
     network: Shared
+    atoms: int = eqx.field(static=True, default=1)
 
     def __call__(self, view: View) -> Float[Array, "batch outputs"]:
         market, each = self.network(view)
-        blocks = jnp.swapaxes(each, -1, -2)  # all assets' first choice, then their second, …
+        choices = each.reshape(*each.shape[:-1], -1, self.atoms)
+        blocks = jnp.swapaxes(choices, -2, -3)  # all assets' first choice, then their second, …
         return jnp.concatenate([market, blocks.reshape(*market.shape[:-1], -1)], -1)
 
 
-class CNN(eqx.Module):
-    """Two convolutions along time: the first over three rows, the second over all that is left."""
-
-    first: MLP
-    second: MLP
-
-    ROWS = 3
-
-    def __init__(self, time: int, channels: int, width: int, key: PRNGKeyArray) -> None:
-        if time < self.ROWS:
-            raise QfolioError(f"A CNN needs windows of {self.ROWS} rows or more; here: {time}.")
-        first, second = jax.random.split(key)
-        narrow = max(2, width // 8)
-        self.first = MLP((self.ROWS * channels, narrow), first)
-        self.second = MLP(((time - self.ROWS + 1) * narrow, width), second)
-
-    def __call__(self, x: Float[Array, "*batch time channel"]) -> Float[Array, "*batch width"]:
-        count = x.shape[-2] - self.ROWS + 1
-        rows = jnp.concatenate([x[..., i : i + count, :] for i in range(self.ROWS)], axis=-1)
-        found = jax.nn.relu(self.first(rows))
-        return self.second(found.reshape(*found.shape[:-2], -1))
-
-
-class RNN(eqx.Module):
-    """A gated recurrent unit along time (Cho et al. 2014); its last state."""
-
-    inputs: MLP
-    state: Float[Array, "width gates"]
-
-    def __init__(self, time: int, channels: int, width: int, key: PRNGKeyArray) -> None:
-        inputs, state = jax.random.split(key)
-        self.inputs = MLP((channels, 3 * width), inputs)
-        self.state = _uniform(state, (width, 3 * width), width**-0.5)
-
-    def __call__(self, x: Float[Array, "*batch time channel"]) -> Float[Array, "*batch width"]:
-        gates = jnp.moveaxis(self.inputs(x), -2, 0)
-
-        def step(state: Array, gate: Array) -> tuple[Array, None]:
-            reset, update, new = jnp.split(gate, 3, axis=-1)
-            own_reset, own_update, own_new = jnp.split(state @ self.state, 3, axis=-1)
-            update = jax.nn.sigmoid(update + own_update)
-            candidate = jnp.tanh(new + jax.nn.sigmoid(reset + own_reset) * own_new)
-            return update * state + (1 - update) * candidate, None
-
-        start = jnp.zeros((*x.shape[:-2], self.state.shape[0]))
-        return lax.scan(step, start, gates)[0]
-
-
-class _Window(MLP):
-    """An MLP of one layer over a window's numbers."""
-
-    def __init__(self, time: int, channels: int, width: int, key: PRNGKeyArray) -> None:
-        super().__init__((time * channels, width), key)
-
-    def __call__(self, x: Float[Array, "*batch time channel"]) -> Float[Array, "*batch width"]:
-        return super().__call__(x.reshape(*x.shape[:-2], -1))
-
-
-_ENCODERS: dict[str, Any] = {"mlp": _Window, "cnn": CNN, "rnn": RNN}
+_ENCODERS: dict[str, Any] = {"mlp": Window, "cnn": CNN, "rnn": RNN, "lstm": LSTM}
 
 SHARED = tuple(_ENCODERS)
 """Kinds of networks that assets share."""
 
 KINDS = ("flat", *SHARED)
+
+_READS = {"cnn": (2, 3), "rnn": (2,), "lstm": (2,)}
+"""Dimensions of what an encoder reads: (time, channel), or (height, width, channel)."""
 
 Network = Flat | PerAsset
 
@@ -229,6 +152,7 @@ class Outputs(NamedTuple):
 
     pooled: int
     each: int = 0
+    atoms: int = 1  # how many of these numbers belong to one action
 
 
 def outputs_of(actions: Actions) -> Outputs:
@@ -251,28 +175,45 @@ def build(
 ) -> Network:
     """A network from batches of the task's observations to rows of numbers.
 
-    kind: ``flat``, or for markets one that assets share. observation: an example. input_gain: of
-    the first layer of ``flat``, with observations taken to ±1; 0 takes them as they are.
+    kind: ``flat``; or an encoder of windows or images, of ``hidden[0]`` outputs, with the remaining
+    layers behind it; or for markets one that assets share. observation: an example. input_gain: of
+    the first layer, with observations taken to ±1 (where no assets share it); 0 takes them as they
+    are. Raises QfolioError where the kind does not fit what is observed.
     """
+    # Small weights on a bounded observation make a function too smooth for some tasks.
+    gain = jnp.where(input_gain > 0, input_gain / jnp.array(task.observation_scale), 1.0)
     if kind == "flat":
-        # Small weights on a bounded observation make a function too smooth for some tasks.
-        scale = jnp.array(task.observation_scale)
-        gain = jnp.where(input_gain > 0, input_gain / scale, 1.0)
         assets = observation.holding.shape[-1] if isinstance(observation, View) else 0
         count = outputs.pooled + assets * outputs.each
         return Flat(observation, hidden, count, key, gain, task.states)
     if not isinstance(observation, View):
-        raise QfolioError(
-            f"network={kind} is shared by the assets of a market; for {type(task).__name__} take "
-            "network=flat."
-        )
+        shape = jnp.shape(observation) if isinstance(observation, Array) else ()
+        if kind not in _READS or len(shape) not in _READS[kind]:
+            raise QfolioError(_does_not_fit(kind, task, shape))
+        encoder_key, key = jax.random.split(key)
+        # One gain for each channel, whose range is the same at every time and place.
+        gain = jnp.broadcast_to(gain, (math.prod(shape),))[: shape[-1]]
+        width, *rest = hidden
+        encoder = _ENCODERS[kind](shape, width, encoder_key, gain)
+        return Flat(observation, tuple(rest), outputs.pooled, key, encoder=encoder)
     if isinstance(task.actions, Discrete) and not task.actions.each:
         raise QfolioError(
             f"network={kind} is shared by assets and needs a menu with choices for each, such as "
             "menu=tilts:0.1; otherwise take network=flat."
         )
-    return PerAsset(Shared(kind, observation, hidden, outputs.pooled, outputs.each, key))
+    shared = Shared(kind, observation, hidden, outputs.pooled, outputs.each, key)
+    return PerAsset(shared, outputs.atoms)
 
 
-def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], bound: float) -> Array:
-    return jax.random.uniform(key, shape, minval=-bound, maxval=bound)
+def _does_not_fit(kind: str, task: Task, shape: tuple[int, ...]) -> str:
+    name = type(task).__name__
+    if kind not in _READS:
+        return (
+            f"network={kind} is shared by the assets of a market, and {name} is none; take "
+            "network=flat."
+        )
+    images = " or images (height, width, channel)" if 3 in _READS[kind] else ""
+    return (
+        f"network={kind} reads windows (time, channel){images}; an observation of {name} is none, "
+        f"its shape is {shape}; take network=flat."
+    )

@@ -19,11 +19,16 @@ def begin(weights: Weights) -> Optimizer:
 
 
 def descend(
-    agent: Any, weights: Weights, gradient: Weights, optimizer: Optimizer
+    agent: Any,
+    weights: Weights,
+    gradient: Weights,
+    optimizer: Optimizer,
+    rate: Float[Array, ""] | None = None,
 ) -> tuple[Weights, Optimizer]:
-    """One step down the gradient, at the learning rate of ``agent``'s settings."""
+    """One step down the gradient, at ``rate`` or else the one that ``agent``'s settings tell."""
     direction, optimizer = optax.scale_by_adam().update(gradient, optimizer)
-    rate = learning_rate(agent, optimizer.count)
+    if rate is None:
+        rate = learning_rate(agent, optimizer.count)
     return jax.tree.map(lambda w, d: w - rate * d, weights, direction), optimizer
 
 

@@ -6,24 +6,33 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from qfolio import settings
 from qfolio.errors import QfolioError
-from qfolio.registry import AGENTS, find
+from qfolio.registry import AGENTS, GYM, find
 
 if TYPE_CHECKING:
     from qfolio.mdp import Agent
 
 
 class Preset(NamedTuple):
-    """An agent's settings, and how many episodes and seeds are trained unless told otherwise."""
+    """An agent's settings, and how far it is trained, with how many seeds, unless told otherwise.
+
+    That is a number of episodes, or of steps of an agent's environments where episodes end early.
+    """
 
     agent: str
     settings: dict[str, Any]
-    episodes: int
-    seeds: int
+    episodes: int = 0
+    seeds: int = 1
     task: Mapping[str, Any] = MappingProxyType({})  # of the task's settings, those it goes with
+    steps: int = 0
 
     def build(self, **changes: Any) -> "Agent":
         """The agent, with some settings changed."""
         return settings.build(find("agent", AGENTS, self.agent), {**self.settings, **changes})
+
+    @property
+    def budget(self) -> dict[str, int]:
+        """How far, as ``Run.create`` takes it."""
+        return {"steps": self.steps} if self.steps else {"episodes": self.episodes}
 
 
 _FAST = {
@@ -52,6 +61,77 @@ _BEST = {
     "replay_capacity": 262_144,
     "learning_rate": 2e-3,
     "learning_rate_steps": 30_000.0,
+}
+
+_RAINBOW = {
+    **_FAST,
+    "double": True,
+    "dueling": True,
+    "n_steps": 3,
+    "prioritised": True,
+    "values": "quantile",
+    "atoms": 32,
+    "noisy": True,
+    "epsilon": 0.0,
+    "epsilon_end": 0.0,
+}
+
+_HIDDEN = {**_FAST, "network": "rnn", "hidden": (64, 128), "input_gain": 12.0}
+
+_CATCH = {
+    "network": "cnn",
+    "hidden": (128,),
+    "environments": 32,
+    "batch_size": 64,
+    "replay_capacity": 32_768,
+    "learning_starts": 1024,
+    "target_period": 1,
+    "target_rate": 0.05,
+    "discount": 0.97,
+    "learning_rate": 1e-3,
+    "learning_rate_final": 0.0,
+    "learning_rate_steps": 12_000.0,
+    "epsilon_end": 0.1,
+    "epsilon_decay": 0.9995,
+}
+
+_ON_POLICY = {
+    "episode_steps": 64,
+    "input_gain": 6.0,
+    "reward_scale": 0.1,
+    "learning_rate_final": 0.0,
+}
+
+_PPO = {
+    **_ON_POLICY,
+    "environments": 64,
+    "rollout": 64,
+    "batch_size": 512,
+    "discount": 0.99,
+    "learning_rate": 3e-3,
+    "learning_rate_steps": 19_520.0,
+    "entropy_weight": 0.02,
+}
+
+_A2C = {
+    **_ON_POLICY,
+    "environments": 8,
+    "rollout": 8,
+    "trace": 0.95,
+    "discount": 0.98,
+    "learning_rate": 1e-3,
+    "learning_rate_steps": 15_616.0,
+    "entropy_weight": 0.01,
+}
+
+_REINFORCE = {
+    **_ON_POLICY,
+    "environments": 8,
+    "rollout": 200,
+    "episode_steps": 0,
+    "discount": 0.98,
+    "learning_rate": 3e-3,
+    "learning_rate_steps": 625.0,
 }
 
 _PORTFOLIO_TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
@@ -115,12 +195,36 @@ def _all_actions(episodes: int, **changes: Any) -> dict[str, Preset]:
     return {"fast": Preset("dqn", changes, episodes, seeds=5, task={"menu": "grid:10"})}
 
 
+def _gym(id: str, agent: str, steps: int, seeds: int = 4, **changes: Any) -> Preset:
+    return Preset(agent, changes, steps=steps, seeds=seeds, task={"id": id})
+
+
 PRESETS = {
     ("pendulum", "dqn"): {
         "fast": Preset("dqn", _FAST, episodes=8608, seeds=8),
         "best": Preset("dqn", _BEST, episodes=24_032, seeds=8),
+        "rainbow": Preset("dqn", _RAINBOW, episodes=8608, seeds=8),
         # Each hyperparameter of the report that qfolio grew out of; they are DQN's defaults.
         "report": Preset("dqn", {}, episodes=600, seeds=1),
+    },
+    ("pendulum/hidden", "dqn"): {"fast": Preset("dqn", _HIDDEN, episodes=8608, seeds=8)},
+    ("catch", "dqn"): {
+        "fast": Preset(
+            "dqn",
+            _CATCH,
+            episodes=38_400,
+            seeds=8,
+            task={"rows": 12, "columns": 11, "decoys": 3},
+        ),
+    },
+    ("pendulum", "ppo"): {
+        "fast": Preset("ppo", _PPO, episodes=15_616, seeds=8, task={"torques": 0}),
+    },
+    ("pendulum", "a2c"): {
+        "fast": Preset("a2c", _A2C, episodes=15_616, seeds=8, task={"torques": 0}),
+    },
+    ("pendulum", "reinforce"): {
+        "fast": Preset("reinforce", _REINFORCE, episodes=5000, seeds=8, task={"torques": 0}),
     },
     ("market/kelly", "pathwise"): _pathwise(
         307_200, environments=1024, rollout=5, learning_rate_steps=300.0, reward_scale=10.0
@@ -171,12 +275,21 @@ PRESETS = {
 
 def default_agent(task: str) -> str:
     """The first agent that has presets for a task, which may be none that there is."""
-    return next((agent for name, agent in PRESETS if name == task), "dqn")
+    default = "ppo" if task.startswith(GYM) else "dqn"
+    return next((agent for name, agent in PRESETS if name == task), default)
+
+
+def presets_of(task: str, agent: str) -> dict[str, Preset]:
+    """By name; for any environment of Gymnasium there are at least the agent's own defaults."""
+    known = PRESETS.get((task, agent), {})
+    if task.startswith(GYM) and not known:
+        return {"fast": _gym(task.removeprefix(GYM), agent, 100_000)}
+    return known
 
 
 def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
     """The preset of that name; raises QfolioError where there is none."""
-    presets = PRESETS.get((task, agent), {})
+    presets = presets_of(task, agent)
     if name not in presets:
         there = f"there is {', '.join(presets)}" if presets else "there is none at all"
         raise QfolioError(f"there is no preset {name!r} for {agent} on {task}; {there}.")

@@ -1,5 +1,6 @@
 """The replay buffer: a ring of the latest transitions (Lin 1992; Mnih et al. 2015)."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.mdp import Transition
+from qfolio.priorities import Priorities
+from qfolio.targets import n_step
 
 
 class Experience(NamedTuple):
@@ -19,17 +22,28 @@ class Experience(NamedTuple):
     reward: Float[Array, "*batch"]
     next_observation: PyTree
     terminal: Bool[Array, "*batch"]
+    last: Bool[Array, "*batch"] | None = None  # of its episode; returns over steps stop there
 
     @staticmethod
-    def of(rollout: Transition, *, time_limit_terminal: bool = False) -> "Experience":
+    def like(observation: PyTree, *, with_last: bool = False) -> "Experience":
+        """A row's shapes and types, where actions are numbered."""
+        no = jnp.array(False)
+        action, reward = jnp.array(0, jnp.int32), jnp.array(0.0)
+        return Experience(observation, action, reward, observation, no, no if with_last else None)
+
+    @staticmethod
+    def of(
+        rollout: Transition, *, time_limit_terminal: bool = False, with_last: bool = False
+    ) -> "Experience":
         """A rollout's experiences in one row, by time and then environment."""
         step = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout)
-        terminal = step.terminated
+        terminal, last = step.terminated, step.terminated | step.truncated
         if time_limit_terminal:
-            terminal = terminal | step.truncated
+            terminal = last
         return Experience(
-            step.observation, step.action, step.reward, step.next_observation, terminal
-        )
+            step.observation, step.action, step.reward, step.next_observation, terminal,
+            last if with_last else None,
+        )  # fmt: skip
 
 
 class Replay(eqx.Module):
@@ -44,37 +58,79 @@ class Replay(eqx.Module):
     rows: Float[Array, "capacity numbers"]
     position: Int[Array, ""]  # of the next write
     size: Int[Array, ""]  # rows that hold something
+    priorities: Priorities | None  # by which rows are drawn; None: all alike
     like: PyTree = eqx.field(static=True)  # shape and type of a row's leaves
+    width: int = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
 
     @staticmethod
-    def empty(row: PyTree, capacity: int, width: int) -> "Replay":
-        """Room for ``capacity`` rows shaped like ``row``."""
+    def empty(
+        row: PyTree, capacity: int, width: int, steps: int = 1, prioritised: bool = False
+    ) -> "Replay":
+        """Room for ``capacity`` rows shaped like ``row``, written ``width`` at a time.
+
+        steps: writes, its own included, that must be there before a row can be drawn.
+        """
         capacity = -(-capacity // width) * width
         like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), row)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(like))
         zero = jnp.array(0, jnp.int32)
-        return Replay(jnp.zeros((capacity, numbers)), zero, zero, like)
+        priorities = Priorities.empty(capacity) if prioritised else None
+        return Replay(jnp.zeros((capacity, numbers)), zero, zero, priorities, like, width, steps)
 
     def add(self, rows: PyTree) -> "Replay":
         """Appends ``width`` rows."""
-        leaves = jax.tree.leaves(rows)
-        width = leaves[0].shape[0]
         packed = jnp.concatenate(
-            [leaf.reshape(width, -1).astype(jnp.float32) for leaf in leaves], axis=1
+            [leaf.reshape(self.width, -1).astype(jnp.float32) for leaf in jax.tree.leaves(rows)],
+            axis=1,
         )
         capacity = self.rows.shape[0]
-        return Replay(
+        size = jnp.minimum(self.size + self.width, capacity)
+        return dataclasses.replace(
+            self,
             rows=lax.dynamic_update_slice_in_dim(self.rows, packed, self.position, axis=0),
-            position=(self.position + width) % capacity,
-            size=jnp.minimum(self.size + width, capacity),
-            like=self.like,
+            position=(self.position + self.width) % capacity,
+            size=size,
+            priorities=self._admit(size),
         )
 
+    def _admit(self, size: Int[Array, ""]) -> Priorities | None:
+        """Priorities once rows are written: the highest for those that can be drawn from now on."""
+        if self.priorities is None:
+            return None
+        row = jnp.arange(self.width)
+        ready = (self.position - (self.steps - 1) * self.width) % self.rows.shape[0] + row
+        value = jnp.where(size >= self.steps * self.width, self.priorities.highest, 0.0)
+        values = jnp.broadcast_to(value, ready.shape)
+        if self.steps > 1:  # what is written has to wait
+            ready = jnp.concatenate([ready, self.position + row])
+            values = jnp.concatenate([values, jnp.zeros(self.width)])
+        return self.priorities.set(ready, values)
+
     def sample(self, key: PRNGKeyArray, n: int) -> PyTree:
-        """``n`` rows drawn uniformly with replacement; the cost does not grow with capacity."""
+        """``n`` rows drawn with replacement; the cost does not grow with capacity."""
+        return self.at(self.draw(key, n))
+
+    def draw(self, key: PRNGKeyArray, n: int) -> Int[Array, " n"]:
+        """Where ``n`` rows stand, drawn by priority or else uniformly."""
+        if self.priorities is not None:
+            return self.priorities.draw(key, n)
         # One draw of uniforms instead of randint's two; float32 splits [0, 1) into 2²³ parts.
-        index = (jax.random.uniform(key, (n,)) * self.size).astype(jnp.int32)
+        uniform = jax.random.uniform(key, (n,))
+        if self.steps == 1:
+            return (uniform * self.size).astype(jnp.int32)
+        ready = self.size - (self.steps - 1) * self.width  # the oldest so many
+        drawn = (uniform * ready).astype(jnp.int32)
+        return (self.position - self.size + drawn) % self.rows.shape[0]
+
+    def at(self, index: Int[Array, " n"]) -> PyTree:
         return self.unpack(self.rows[index])
+
+    def ahead(self, index: Int[Array, " n"]) -> PyTree:
+        """Rows and those of the next writes at the same place; leading axes (``steps``, n)."""
+        offset = self.width * jnp.arange(self.steps)[:, None]
+        rows = self.at(((index + offset) % self.rows.shape[0]).reshape(-1))
+        return jax.tree.map(lambda x: x.reshape(self.steps, -1, *x.shape[1:]), rows)
 
     def unpack(self, packed: Float[Array, "n numbers"]) -> PyTree:
         """Rows as they were before they were added."""
@@ -88,3 +144,24 @@ class Replay(eqx.Module):
                 for part, leaf in zip(parts, leaves, strict=True)
             ],
         )
+
+
+def join(
+    replay: Replay, index: Int[Array, " n"], discount: Float[Array, ""] | float
+) -> tuple[Experience, Float[Array, "*#n"] | float]:
+    """Rows of experience over the buffer's ``steps``, and the discount of what follows them.
+
+    They end with the last of these steps or with the episode, and lead to the true next observation
+    of the step that they end with.
+    """
+    if replay.steps == 1:
+        return replay.at(index), discount
+    steps: Experience = replay.ahead(index)
+    assert steps.last is not None
+    reward, stop = n_step(steps.reward, steps.last, discount)
+    first = jax.tree.map(lambda x: x[0], steps)
+    end = jax.tree.map(lambda x: x[stop, jnp.arange(len(stop))], steps)
+    joined = first._replace(
+        reward=reward, next_observation=end.next_observation, terminal=end.terminal
+    )
+    return joined, discount ** (stop + 1)

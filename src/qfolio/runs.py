@@ -13,6 +13,7 @@ import io
 import math
 import platform
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ import numpy as np
 import qfolio
 from qfolio import devices, settings
 from qfolio.errors import QfolioError
-from qfolio.evaluation import STARTS, greedy, start_keys
+from qfolio.evaluation import greedy, start_keys
 from qfolio.files import (
     UNFINISHED,
     new_folder,
@@ -40,17 +41,15 @@ from qfolio.files import (
     write_json,
     write_tree,
 )
+from qfolio.host import population_of
 from qfolio.mdp import Agent, Optimum, Task
 from qfolio.optimum.followed import FollowedOptimum
 from qfolio.registry import AGENTS, TASKS, find, name_of
 from qfolio.statistics import mean_interval
 from qfolio.training import Episodes, Population
 
-FORMAT = 2
+FORMAT = 3
 """Of the run folder; raised whenever an older folder can no longer be read."""
-
-CURVE_STARTS = 64
-"""Start states of the evaluations along the learning curve."""
 
 EVALUATIONS = 20
 """Points on the learning curve, about."""
@@ -62,8 +61,10 @@ CHECKPOINT_SECONDS = 10.0
 class Progress:
     """Where a run is, after each chunk."""
 
-    episodes: int
-    total: int
+    episodes: int  # finished by the seed that has finished fewest
+    done: int  # of the total
+    total: int  # episodes, or environment steps, of each seed
+    unit: str  # which of the two
     mean_return: float  # of the training episodes finished in this chunk, all seeds; NaN if none
     epsilon: float
     steps_per_second: float  # environment steps of all seeds
@@ -79,7 +80,9 @@ class Run:
     ) -> None:
         self.task, self.agent, self.config, self.folder = task, agent, config, folder
         first = config["seed"]
-        self.population = Population(task, agent, range(first, first + config["seeds"]))
+        self.population: Population = population_of(
+            task, agent, range(first, first + config["seeds"])
+        )
         self.metrics: list[dict[str, float]] = []
         self.evaluations: list[dict[str, float]] = []
         self.seconds_train = 0.0
@@ -91,14 +94,19 @@ class Run:
         task: Task,
         agent: Agent,
         *,
-        episodes: int,
+        episodes: int | None = None,
+        steps: int | None = None,
         seeds: int = 1,
         seed: int = 0,
         preset: str | None = None,
         out: Path | str | None = None,
     ) -> "Run":
-        """A run before its first step; ``out`` must be a new or empty folder."""
-        check_counts(episodes, seeds, seed)
+        """A run before its first step.
+
+        episodes, steps: how far each seed is trained; one of the two. Steps are those of all its
+        environments. out: a new or empty folder.
+        """
+        check_counts(episodes, seeds, seed, steps=steps)
         folder = None if out is None else Path(out)
         if folder is not None:
             require_new(folder)
@@ -111,6 +119,7 @@ class Run:
             "preset": preset,
             "agent_settings": settings.describe(agent),
             "episodes": episodes,
+            "steps": steps,
             "seeds": seeds,
             "seed": seed,
             "device": devices.describe(),
@@ -149,27 +158,44 @@ class Run:
         """Finished by the seed that has finished fewest."""
         return self.population.episodes
 
+    @property
+    def budget(self) -> dict[str, int]:
+        """How far each seed is trained: ``{"episodes": n}`` or ``{"steps": n}``."""
+        given = {name: self.config[name] for name in ("episodes", "steps")}
+        return {name: amount for name, amount in given.items() if amount is not None}
+
+    def done(self, unit: str) -> int:
+        """Episodes or environment steps of each seed so far."""
+        if unit == "steps":
+            return self.population.steps * self.agent.environments
+        return self.episodes
+
     def train(
-        self, episodes: int | None = None, listener: Callable[[Progress], None] | None = None
+        self,
+        episodes: int | None = None,
+        listener: Callable[[Progress], None] | None = None,
+        *,
+        steps: int | None = None,
     ) -> None:
-        """Trains until each seed has finished ``episodes`` (those of the configuration).
+        """Trains until each seed has done ``episodes`` or ``steps`` (what was configured).
 
         A first Ctrl-C stops after the current chunk, sets ``interrupted`` and leaves a checkpoint.
         A loss that is not finite raises QfolioError; the last good checkpoint stays.
         """
-        total = self.config["episodes"] if episodes is None else episodes
-        check_counts(total, self.config["seeds"], self.config["seed"])
-        steps = self.population.steps_left(total)
-        if not steps:
+        if episodes is None and steps is None:
+            episodes, steps = self.config["episodes"], self.config["steps"]
+        check_counts(episodes, self.config["seeds"], self.config["seed"], steps=steps)
+        left = self.population.steps_left(episodes, steps=steps)
+        if not left:
             return
-        self.config["episodes"] = total
+        self.config |= {"episodes": episodes, "steps": steps}
         if self.folder is not None:
             write_json(self.folder / "config.json", self.config)
         if not self.population.steps:
             self.evaluations = []  # of a process that was killed before its first checkpoint
         self._tidy()
         # In steps since the very beginning, so that a resumed run has the same curve.
-        every = (self.population.steps + steps) / EVALUATIONS
+        every = (self.population.steps + left) / EVALUATIONS
         begun, saved = self.population.steps, perf_counter()
         start_seconds = self.seconds_train
         if not self.population.steps:
@@ -177,16 +203,16 @@ class Run:
         with interruptible() as stop:
             while True:
                 points = self.population.steps // every
-                records = self._advance(steps)
-                steps = self.population.steps_left(total)
+                records = self._advance(left)
+                left = self.population.steps_left(episodes, steps=steps)
                 greedy = None
-                if self.population.steps // every > points or not steps:
+                if self.population.steps // every > points or not left:
                     greedy = self._evaluate()
                 if listener is not None:
                     rate = (self.population.steps - begun) / (self.seconds_train - start_seconds)
-                    listener(self._progress(records, total, rate, steps, greedy))
-                self.interrupted = stop.is_set() and steps > 0
-                last = self.interrupted or not steps
+                    listener(self._progress(records, rate, left, greedy))
+                self.interrupted = stop.is_set() and left > 0
+                last = self.interrupted or not left
                 if last or perf_counter() - saved > CHECKPOINT_SECONDS:
                     self._write_checkpoint()
                     saved = perf_counter()
@@ -200,7 +226,7 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """Greedy returns on the fixed start states, the optimum on the same, and what it cost."""
         result = self.grade()
-        steps = self.population.steps * self.agent.environments
+        steps = self.done("steps")
         summary = {
             "task": self.config["task"],
             "agent": self.config["agent"],
@@ -219,9 +245,9 @@ class Run:
             write_json(self.folder / "summary.json", summary)
         return summary
 
-    def grade(self, starts: int = STARTS) -> dict[str, Any]:
+    def grade(self, starts: int | None = None) -> dict[str, Any]:
         """Returns, optimum and regret of each seed's policy on the first fixed start states."""
-        keys = start_keys(starts)
+        keys = start_keys(starts or self.population.starts)
         played = self.population.evaluate(keys)
         returns = played.returns.mean(1)
         solution = self.task.optimum()
@@ -268,12 +294,12 @@ class Run:
         return records
 
     def _evaluate(self) -> float:
-        greedy = self.population.evaluate(start_keys(CURVE_STARTS))
+        greedy = self.population.evaluate(start_keys(self.population.curve_starts))
         records = [
             {
                 "seed": seed,
                 "episode": episode,
-                "env_steps": self.population.steps * self.agent.environments,
+                "env_steps": self.done("steps"),
                 "return": float(returns.mean()),
                 "overestimation": float(overestimation),
             }
@@ -288,15 +314,17 @@ class Run:
     def _progress(
         self,
         records: list[dict[str, float]],
-        total: int,
         rate: float,
         steps_left: int,
         greedy: float | None,
     ) -> Progress:
+        ((unit, total),) = self.budget.items()
         returns = [record["return"] for record in records]
         return Progress(
             episodes=self.episodes,
+            done=self.done(unit),
             total=total,
+            unit=unit,
             mean_return=float(np.mean(returns)) if returns else math.nan,
             epsilon=records[-1].get("epsilon", math.nan) if records else math.nan,
             steps_per_second=rate * self.agent.environments * len(self.population.seeds),
@@ -335,7 +363,7 @@ class Run:
         if not path.exists():
             return []
         episodes = dict(zip(self.population.seeds, self.population.member_episodes, strict=True))
-        steps = self.population.steps * self.agent.environments
+        steps = self.done("steps")
         try:
             table = list(csv.DictReader(path.read_text(errors="replace").splitlines()))
         except csv.Error as error:
@@ -367,7 +395,8 @@ def train(
     task: Task,
     agent: Agent,
     *,
-    episodes: int,
+    episodes: int | None = None,
+    steps: int | None = None,
     seeds: int = 1,
     seed: int = 0,
     out: Path | str | None = None,
@@ -375,10 +404,11 @@ def train(
 ) -> Run:
     """Trains ``seeds`` agents side by side, from seeds ``seed``, ``seed + 1``, …
 
-    out: a new folder for the run; without it nothing is written. ``run.summary()`` grades it.
+    episodes, steps: how far, each of them; one of the two. out: a new folder for the run; without
+    it nothing is written. ``run.summary()`` grades it.
     """
     devices.configure()
-    run = Run.create(task, agent, episodes=episodes, seeds=seeds, seed=seed, out=out)
+    run = Run.create(task, agent, episodes=episodes, steps=steps, seeds=seeds, seed=seed, out=out)
     run.train(listener=listener)
     return run
 
@@ -403,7 +433,8 @@ def read_config(folder: Path) -> dict[str, Any]:
         "agent": str,
         "task_settings": dict,
         "agent_settings": dict,
-        "episodes": int,
+        "episodes": int | None,
+        "steps": int | None,
         "seeds": int,
         "seed": int,
         "device": str,
@@ -411,25 +442,36 @@ def read_config(folder: Path) -> dict[str, Any]:
     }
     try:
         require_types(config, wanted)
-        check_counts(config["episodes"], config["seeds"], config["seed"])
+        check_counts(config["episodes"], config["seeds"], config["seed"], steps=config["steps"])
     except QfolioError as error:
         raise QfolioError(f"{path} is damaged: {error}") from None
     return config
 
 
-def check_counts(episodes: int, seeds: int, seed: int) -> None:
-    """Raises QfolioError where a run cannot have that many episodes or these seeds."""
+def check_counts(episodes: int | None, seeds: int, seed: int, *, steps: int | None = None) -> None:
+    """Raises QfolioError where a run cannot have that many episodes or steps, or these seeds."""
+    if (episodes is None) == (steps is None):
+        raise QfolioError("give either episodes or steps, to say how far each agent is trained.")
+    unit, amount = ("episodes", episodes) if steps is None else ("steps", steps)
     bounds = {
-        "episodes": (episodes, 1, 2**31 - 1),
+        unit: (amount, 1, 2**31 - 1),
         "seeds": (seeds, 1, 2**20),
         "seed": (seed, 0, 2**32 - seeds),
     }
     for name, (value, low, high) in bounds.items():
+        assert value is not None
         if not low <= value <= high:
             raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")
 
 
 def configured_task(config: dict[str, Any]) -> Task:
+    """The task of a configuration; it imports no module that a stranger may have named there."""
+    module, _, id = str(config["task_settings"].get("id", "")).rpartition(":")
+    if module and module not in sys.modules:
+        raise QfolioError(
+            f"The run is on {id} of the module {module}, which only you may import: do so first, "
+            "in Python, and then open the run (qfolio.Run.open)."
+        )
     return settings.build(find("task", TASKS, config["task"]), config["task_settings"])
 
 

@@ -1,11 +1,15 @@
-"""Statistics for a handful of training runs: interquartile mean and bootstrap intervals.
+"""Statistics for a handful of training runs, of one agent or of several that are compared.
 
-Both follow R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
-Precipice" (2021): the interquartile mean ignores the best and the worst quarter of the runs, and
-resampling whole runs shows how much a result depends on which seeds happened to be drawn.
+They follow R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
+Precipice" (2021): the interquartile mean ignores the best and the worst quarter of the runs,
+resampling whole runs shows how much a result depends on which seeds happened to be drawn, and the
+probability of improvement says how often a run of one agent beats a run of another. Whether two
+agents can be told apart at all is left to an exact rank test, as a bootstrap of few runs claims
+more than it knows.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -91,3 +95,100 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> tuple[float, float]
     sample = np.asarray(values, dtype=float)
     margin = stdtrit(sample.size - 1, (1 + level) / 2) * sample.std(ddof=1) / np.sqrt(sample.size)
     return float(sample.mean() - margin), float(sample.mean() + margin)
+
+
+def stratified_interval(
+    strata: Sequence[ArrayLike],
+    statistic: Callable[..., Any] = interquartile_mean,
+    level: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """Return a percentile bootstrap interval of a statistic of groups, each drawn again by itself.
+
+    It is too narrow with few values: of three normal ones, a 95 % interval of the interquartile
+    mean holds the truth in about 75 % of all cases, of five in 90 % and of ten in 93 %.
+
+    Args:
+        strata: Groups of numbers, of shape (n,) each and n of its own: the seeds of an agent.
+        statistic: Called with the groups drawn again, each of shape (resamples, n), which are
+            averaged over the last axis.
+        level: Share of the resampled statistics inside the interval, between 0 and 1.
+        resamples: How many times the groups are drawn again.
+        seed: Seed of the drawing.
+
+    Returns:
+        The lower and the upper end.
+
+    Raises:
+        ValueError: A group has no values, or level or resamples is out of range.
+    """
+    groups = [np.asarray(group, dtype=float) for group in strata]
+    if not groups or not all(group.size for group in groups):
+        raise ValueError("a bootstrap interval needs at least one value in each group")
+    if not 0 < level < 1 or resamples < 1:
+        raise ValueError("level must lie between 0 and 1, and resamples must be positive")
+    rng = np.random.default_rng(seed)
+    drawn = [group[rng.integers(group.size, size=(resamples, group.size))] for group in groups]
+    tail = (1 - level) / 2
+    low, high = np.quantile(statistic(*drawn), [tail, 1 - tail])
+    return float(low), float(high)
+
+
+def probability_of_improvement(first: ArrayLike, second: ArrayLike) -> Floats:
+    """Return how often a value of the first group is larger than one of the second; ties count ½.
+
+    Args:
+        first: Numbers of shape (..., n).
+        second: Numbers of shape (..., m).
+
+    Returns:
+        An array of shape (...).
+    """
+    x, y = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    # A column at a time keeps memory small when there are many.
+    columns = (x[..., i, None] for i in range(x.shape[-1]))
+    wins = [(0.5 * (column > y) + 0.5 * (column >= y)).mean(-1) for column in columns]
+    return np.asarray(np.mean(wins, axis=0))
+
+
+def rank_test(first: ArrayLike, second: ArrayLike) -> float:
+    """Return the two-sided p-value of the test of Wilcoxon, Mann and Whitney, exact with ties.
+
+    If both groups come from one distribution, each choice of n of all n + m values is as likely to
+    be the first group; the p-value is the share of the choices whose ranks have a sum as far from
+    the middle as that observed. Beyond 100 values the sum is taken as normal.
+
+    Args:
+        first: Numbers of shape (n,).
+        second: Numbers of shape (m,).
+    """
+    x, y = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    pooled = np.concatenate([x, y])
+    # Twice the ranks, so that those shared by ties are whole numbers, too.
+    ranks = (pooled[:, None] > pooled).sum(1) + (pooled[:, None] >= pooled).sum(1) + 1
+    total, count = int(ranks.sum()), pooled.size
+    middle = x.size * total / count
+    distance = abs(int(ranks[: x.size].sum()) - middle)
+    if count > 100:
+        variance = x.size * y.size / count * ranks.var(ddof=1)
+        return math.erfc(distance / math.sqrt(2 * variance)) if variance else 1.0
+    # ways[k, s]: choices of k values whose ranks have the sum s.
+    ways = np.zeros((x.size + 1, total + 1))
+    ways[0, 0] = 1
+    for rank in ranks.tolist():
+        ways[1:, rank:] = ways[1:, rank:] + ways[:-1, :-rank]
+    sums = np.arange(total + 1)
+    return float(ways[-1, np.abs(sums - middle) >= distance - 1e-9].sum() / ways[-1].sum())
+
+
+def holm(p_values: ArrayLike) -> Floats:
+    """Return the p-values of tests made together, so that none errs more often than one would.
+
+    Source: S. Holm, "A Simple Sequentially Rejective Multiple Test Procedure" (1979).
+    """
+    p = np.asarray(p_values, dtype=float)
+    order = np.argsort(p, kind="stable")
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.maximum.accumulate(np.arange(p.size, 0, -1) * p[order])
+    return np.minimum(adjusted, 1.0)

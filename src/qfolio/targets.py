@@ -5,30 +5,53 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 Weights = TypeVar("Weights", bound=PyTree)
 
 
+def chosen(
+    values: Float[Array, "batch action *atom"], action: Int[Array, " batch"]
+) -> Float[Array, "batch *atom"]:
+    """What ``values`` says of one action of each row."""
+    index = action.reshape(-1, *[1] * (values.ndim - 1))
+    return jnp.take_along_axis(values, index, axis=1)[:, 0]
+
+
 def bootstrap(
-    q_next: Float[Array, "batch action"], selector: Float[Array, "batch action"]
-) -> Float[Array, " batch"]:
+    q_next: Float[Array, "batch action *atom"], selector: Float[Array, "batch action"]
+) -> Float[Array, "batch *atom"]:
     """The next state's value: ``q_next`` at the action that ``selector`` finds best.
 
     Double Q-learning (van Hasselt et al. 2016, eq. 4) lets the online network select and the target
     network evaluate; with ``selector = q_next`` this is max_a Q'(s', a) (Mnih et al. 2015).
     """
-    return jnp.take_along_axis(q_next, selector.argmax(1)[:, None], axis=1)[:, 0]
+    return chosen(q_next, selector.argmax(1))
 
 
 def td_target(
-    reward: Float[Array, " batch"],
-    terminal: Bool[Array, " batch"],
-    following: Float[Array, " batch"],
-    discount: Float[Array, ""] | float,
-) -> Float[Array, " batch"]:
+    reward: Float[Array, "*batch"],
+    terminal: Bool[Array, "*batch"],
+    following: Float[Array, "*batch"],
+    discount: Float[Array, "*#batch"] | float,
+) -> Float[Array, "*batch"]:
     """Bellman target r + γ V(s'), where nothing follows a terminal transition."""
     return reward + jnp.where(terminal, 0.0, discount * following)
+
+
+def n_step(
+    reward: Float[Array, "step batch"],
+    last: Bool[Array, "step batch"],
+    discount: Float[Array, ""] | float,
+) -> tuple[Float[Array, " batch"], Int[Array, " batch"]]:
+    """Σ γᵏ rₖ up to the first step that is its episode's last, and the number of that step.
+
+    Without such a step, up to the last one given (Sutton & Barto 2018, eq. 7.1, its sum alone).
+    """
+    before = jnp.concatenate([jnp.zeros_like(last[:1]), last[:-1]])
+    counts = jnp.cumprod(1.0 - before, axis=0)
+    power = discount ** jnp.arange(len(reward))[:, None]
+    return (counts * power * reward).sum(0), counts.sum(0).astype(jnp.int32) - 1
 
 
 def huber_loss(

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
 from qfolio.devices import Members, require_memory
 from qfolio.errors import QfolioError
-from qfolio.evaluation import Greedy, evaluate, tail_steps
+from qfolio.evaluation import CURVE_STARTS, STARTS, Greedy, evaluate, tail_steps
 from qfolio.mdp import Agent, Metrics, Task, Transition
 
 CHUNK = 400
@@ -73,7 +73,18 @@ def begin(task: Task, agent: Agent, seed: Int[Array, ""]) -> TrainingState:
         episodes=zero,
         healthy=jnp.array(True),
     )
-    _, _, metrics = jax.eval_shape(partial(_rollout, task, agent, learning=True), started)
+
+    def learned(state: TrainingState) -> Metrics:
+        """The metrics of a rollout of blanks, of which only the names count."""
+        observation = jax.vmap(task.observe)(state.task)
+        action = agent.act(state.agent, observation, task_key)
+        no = jnp.zeros(environments, bool)
+        step = Transition(state.task, observation, action, zeros, state.task, observation, no, no)
+        time = agent.rollout_steps
+        rollout = jax.tree.map(lambda x: jnp.broadcast_to(x, (time, *x.shape)), step)
+        return absorb(task, agent, state, rollout, learning=True)[2]
+
+    metrics = jax.eval_shape(learned, started)
     return eqx.tree_at(lambda s: s.tally.metrics, started, dict.fromkeys(metrics, zeros))
 
 
@@ -97,9 +108,13 @@ def advance(
         return state, jax.tree.map(put, episodes, record)
 
     state, episodes = lax.fori_loop(0, steps // length, body, (state, empty))
+    return eqx.tree_at(lambda s: s.healthy, state, healthy(agent, state)), episodes
+
+
+def healthy(agent: Agent, state: TrainingState) -> Bool[Array, ""]:
+    """Whether metrics and weights are still finite."""
     weights = jax.tree.leaves(agent.weights(state.agent))
-    finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in weights]).all()
-    return eqx.tree_at(lambda s: s.healthy, state, state.healthy & finite), episodes
+    return state.healthy & jnp.stack([jnp.isfinite(leaf).all() for leaf in weights]).all()
 
 
 def chunk_steps(task: Task, agent: Agent) -> int:
@@ -117,11 +132,10 @@ def _rollout(
     task: Task, agent: Agent, state: TrainingState, *, learning: bool
 ) -> tuple[TrainingState, Episodes, Metrics]:
     """One rollout, then learning from it; the records have a leading time axis."""
-    key = jax.random.wrap_key_data(state.key)
 
     def step(carry: tuple[PyTree, Array], time: Array) -> tuple[tuple[PyTree, Array], tuple]:
         states, length = carry
-        act_key, task_key, reset_key, _ = jax.random.split(jax.random.fold_in(key, time), 4)
+        act_key, task_key, reset_key, _ = step_keys(state.key, time)
         observation = jax.vmap(task.observe)(states)
         action = agent.act(state.agent, observation, act_key)
         after = jax.vmap(task.step)(states, action, jax.random.split(task_key, len(length)))
@@ -148,9 +162,23 @@ def _rollout(
 
     times = state.steps + jnp.arange(agent.rollout_steps)
     (states, _), rollout = _scan(step, (state.task, state.tally.steps), times)
+    return absorb(
+        task, agent, eqx.tree_at(lambda s: s.task, state, states), rollout, learning=learning
+    )
+
+
+def step_keys(key: UInt32[Array, "2"], time: Array) -> Key[Array, "4"]:
+    """A member's keys for a step: to act, to step the task, to reset it, and to learn."""
+    return jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key), time), 4)
+
+
+def absorb(
+    task: Task, agent: Agent, state: TrainingState, rollout: Transition, *, learning: bool
+) -> tuple[TrainingState, Episodes, Metrics]:
+    """Learns from a rollout, or only stores it, and counts it."""
     if learning:
-        learn_key = jax.random.split(jax.random.fold_in(key, times[-1]), 4)[3]
-        learner, metrics = agent.learn(task, state.agent, rollout, learn_key)
+        last = state.steps + agent.rollout_steps - 1
+        learner, metrics = agent.learn(task, state.agent, rollout, step_keys(state.key, last)[3])
     else:
         learner, metrics = agent.observe(state.agent, rollout), {}
     monitored = agent.monitor(state.agent)
@@ -170,7 +198,7 @@ def _rollout(
     finite = [jnp.isfinite(metric).all() for metric in metrics.values()]
     state = TrainingState(
         agent=learner,
-        task=states,
+        task=state.task,
         tally=tally,
         key=state.key,
         steps=state.steps + agent.rollout_steps,
@@ -195,62 +223,86 @@ def _select(mask: Bool[Array, " environment"], new: Array, old: Array) -> Array:
 class Population:
     """Members trained side by side, and the programs that do it.
 
-    tasks: one for all members, or one for each, which may differ in numbers and arrays.
+    tasks, agents: one for all members, or one for each, which may differ in numbers and arrays.
     state: the members' TrainingState, with a leading member axis.
+    starts, curve_starts: on how many starts policies are graded, and along the learning curve.
     """
 
-    def __init__(self, tasks: Task | Sequence[Task], agent: Agent, seeds: Sequence[int]) -> None:
-        self.agent, self.seeds = agent, list(seeds)
+    starts, curve_starts = STARTS, CURVE_STARTS
+
+    def __init__(
+        self, tasks: Task | Sequence[Task], agents: Agent | Sequence[Agent], seeds: Sequence[int]
+    ) -> None:
+        self.seeds = list(seeds)
         tasks = [tasks] * len(self.seeds) if isinstance(tasks, Task) else list(tasks)
-        self.task = tasks[0]
+        agents = [agents] * len(self.seeds) if isinstance(agents, Agent) else list(agents)
+        if len({jax.tree.structure(agent) for agent in agents}) > 1:
+            raise QfolioError(
+                "members of one population must share all settings that shape the program; train "
+                "agents that differ in them in populations of their own."
+            )
+        # What is asked of the first holds for all: it does not depend on numbers.
+        self.task, self.agent = task, agent = tasks[0], agents[0]
+        self._tail = max(tail_steps(agent.discount) for agent in agents)
+        self.seconds_compile = 0.0
+        first = jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))
+        require_memory(first, len(self.seeds))
+        own, self._shared, self._join, form = _split(list(zip(tasks, agents, strict=True)))
+        self._begin(own, form)
+
+    def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
+        """Members before their first step; ``own`` and ``form`` are those of ``_split``."""
         self._members = Members(len(self.seeds))
-        own, self._shared, self._join, form = _split([(task, agent) for task in tasks])
         self._own = self._members.place(own)
         # Nothing else may change what is compiled under a name.
-        rows = chunk_steps(self.task, agent)
-        self._programs = _programs((form, len(self.seeds), self._members.one_by_one, rows))
-        self.seconds_compile = 0.0
-        first = jax.eval_shape(lambda: begin(self.task, agent, jnp.array(0, jnp.uint32)))
-        require_memory(first, len(self.seeds))
+        rows = chunk_steps(self.task, self.agent)
+        self._programs = programs_of((form, len(self.seeds), self._members.one_by_one, rows))
+        seeds = self._members.place(np.array(self.seeds, np.uint32))
         self.state: TrainingState = self._run(
-            "begin",
-            lambda task, agent, seed: begin(task, agent, seed),
-            self._members.place(np.array(self.seeds, np.uint32)),
+            "begin", lambda task, agent, seed: begin(task, agent, seed), seeds
         )
 
     @property
     def steps(self) -> int:
         """Steps of each environment so far."""
-        return int(self._members.fetch(self.state.steps)[0])
+        return int(self._fetch(lambda state: state.steps)[0])
 
     @property
     def member_episodes(self) -> list[int]:
         """Finished episodes of each member."""
-        return self._members.fetch(self.state.episodes).tolist()
+        return self._fetch(lambda state: state.episodes).tolist()
 
     @property
     def episodes(self) -> int:
         """Finished episodes of the member that has finished fewest."""
         return min(self.member_episodes)
 
-    def steps_left(self, episodes: int) -> int:
-        """Steps until each member has finished ``episodes`` if no episode ends early; 0 if done."""
-        missing = episodes - self.episodes
+    @property
+    def healthy(self) -> list[bool]:
+        """Whether the losses and weights of each member have been finite so far."""
+        return self._fetch(lambda state: state.healthy).tolist()
+
+    def steps_left(self, episodes: int | None = None, *, steps: int | None = None) -> int:
+        """Steps of each environment until each member has done what is given; 0 if done.
+
+        episodes: finished by each member, if none ends early. steps: of all its environments.
+        """
+        if steps is not None:
+            return max(0, -(-steps // self.agent.environments) - self.steps)
+        missing = (episodes or 0) - self.episodes
         if missing <= 0:
             return 0
         rounds = -(-missing // self.agent.environments)
-        under_way = int(self._members.fetch(self.state.tally.steps).max())
+        under_way = int(self._fetch(lambda state: state.tally.steps).max())
         return max(1, rounds * episode_steps(self.task, self.agent) - under_way)
 
-    def advance(self, steps: int) -> Episodes:
+    def advance(self, steps: int, *, strict: bool = True) -> Episodes:
         """At most one chunk; returns the records as numpy arrays (member, time, environment).
 
-        Raises QfolioError, and leaves ``state`` undefined, if a loss is not finite.
+        Raises QfolioError, and leaves ``state`` undefined, if a loss is not finite; unless
+        ``strict``, the others go on, and ``healthy`` tells.
         """
-        length = self.agent.rollout_steps
-        warm_up = -(-self.agent.warm_up() // length) * length - self.steps
-        learning = warm_up <= 0
-        steps = min(steps, chunk_steps(self.task, self.agent), steps if learning else warm_up)
+        steps, learning = self._plan(steps, chunk_steps(self.task, self.agent))
 
         def program(
             task: Task, agent: Agent, state: TrainingState, steps: Array
@@ -258,22 +310,34 @@ class Population:
             return advance(task, agent, state, steps, learning=learning)
 
         name = "learn" if learning else "collect"
-        count = np.int32(-(-steps // length) * length)
-        self.state, episodes = self._run(name, program, self.state, count, donate=True)
-        healthy = self._members.fetch(self.state.healthy)
-        if not healthy.all():
+        self.state, episodes = self._run(name, program, self.state, np.int32(steps), donate=True)
+        if strict:
+            self._require_healthy()
+        return self._members.fetch(episodes)
+
+    def _plan(self, steps: int, most: int) -> tuple[int, bool]:
+        """How many steps to go now, in whole rollouts, and whether they learn."""
+        length = self.agent.rollout_steps
+        warm_up = -(-self.agent.warm_up() // length) * length - self.steps
+        steps = min(steps, most, warm_up if warm_up > 0 else most)
+        return -(-steps // length) * length, warm_up <= 0
+
+    def _require_healthy(self) -> None:
+        healthy = self.healthy
+        if not all(healthy):
             bad = {str(s): None for s, ok in zip(self.seeds, healthy, strict=True) if not ok}
             raise QfolioError(
                 f"The loss of seed {', '.join(bad)} is no longer finite after {self.steps} steps; "
                 "lower learning_rate, or bound the gradient (huber of dqn, gradient_norm of "
                 "pathwise)."
             )
-        return self._members.fetch(episodes)
 
-    def evaluate(self, keys: Key[Array, " start"]) -> Greedy:
-        """Greedy returns (member, start) and overestimation (member,) of the policies so far."""
+    def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
+        """Greedy returns (member, start) and overestimation (member,) of the policies so far.
 
-        tail = tail_steps(self.agent.discount)
+        tail: steps beyond the horizon that the overestimation counts; those that matter if None.
+        """
+        tail = self._tail if tail is None else tail
 
         def program(task: Task, agent: Agent, weights: PyTree, keys: Array) -> Greedy:
             return evaluate(task, agent, weights, keys, tail)
@@ -284,15 +348,19 @@ class Population:
 
     def weights(self) -> PyTree:
         """The members' learned weights as numpy arrays."""
-        return self._members.fetch(self.agent.weights(self.state.agent))
+        return self._fetch(lambda state: self.agent.weights(state.agent))
 
     def fetch(self) -> TrainingState:
         """The members' states as numpy arrays, with a leading member axis."""
-        return self._members.fetch(self.state)
+        return self._fetch(lambda state: state)
 
     def restore(self, state: TrainingState) -> None:
         """Goes on from what ``fetch`` gave."""
         self.state = self._members.place(state)
+
+    def _fetch(self, where: Callable[[TrainingState], PyTree]) -> PyTree:
+        """Parts of the members' states as numpy arrays, with a leading member axis."""
+        return self._members.fetch(where(self.state))
 
     def _run(
         self,
@@ -302,24 +370,41 @@ class Population:
         *args: Any,
         donate: bool = False,
     ) -> Any:
-        """Runs ``function(task, agent, member, *args)`` for all members as one program.
+        """Runs ``function(task, agent, member, *args)`` for all members as one program."""
+        start = partial(self._start, name, function, members, self._own)
+        return jax.block_until_ready(start(*args, donate=donate))
 
-        It is compiled at the first use of the name.
+    def _start(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        member: Any,
+        own: Any,
+        *args: Any,
+        donate: bool = False,
+    ) -> Any:
+        """The same without waiting for the result; compiled at the first use of the name.
+
+        own: the numbers of the member's agent and task.
         """
 
         def one(member: Any, own: Any, shared: Any, *args: Any) -> Any:
             return function(*self._join(own, shared), member, *args)
 
-        args = (members, self._own, self._shared, *args)
+        args = (member, own, self._shared, *args)
         if name not in self._programs:
             start = perf_counter()
-            self._programs[name] = self._members.compile(one, *args, split=2, donate=donate)
+            self._programs[name] = self._compile(one, *args, donate=donate)
             self.seconds_compile += perf_counter() - start
-        return jax.block_until_ready(self._programs[name](*args))
+        return self._programs[name](*args)
+
+    def _compile(self, one: Callable[..., Any], *args: Any, donate: bool) -> Any:
+        """A program from arguments shaped like these; the first one's memory may be reused."""
+        return self._members.compile(one, *args, split=2, donate=donate)
 
 
 @lru_cache(maxsize=8)
-def _programs(form: Hashable) -> dict[str, Any]:
+def programs_of(form: Hashable) -> dict[str, Any]:
     """Compiled programs by name, for all populations of one form: compiling takes long."""
     return {}
 

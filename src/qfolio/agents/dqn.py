@@ -1,11 +1,15 @@
-"""Deep Q-network (Mnih et al. 2015), with double Q-learning (van Hasselt et al. 2016).
+"""Deep Q-network (Mnih et al. 2015), and what was built on it, as options.
 
 A Q-network estimates the discounted return of each action. Collecting: actions are ε-greedy on it,
 and transitions go into a replay buffer. Training: it regresses, on batches from the buffer, towards
-r + γ max_a Q'(s', a), where Q' is a target network that follows it slowly. In an exogenous task one
-move of the market tells the outcome of all actions from any holding, and ``all_actions`` regresses
-them together. docs/dqn.md holds every formula, the place where it stands here, and each deviation
-from the paper.
+r + γ max_a Q'(s', a), where Q' is a target network that follows it slowly.
+
+Options, all of which together are Rainbow (Hessel et al. 2018): double Q-learning (van Hasselt et
+al. 2016), dueling networks (Wang et al. 2016), returns over n steps, prioritised replay (Schaul et
+al. 2016), noisy networks (Fortunato et al. 2018), and distributions of returns in place of their
+means (Bellemare et al. 2017; Dabney et al. 2018). In an exogenous task ``all_actions`` learns from
+one move of the market what every action would have led to. docs/dqn.md holds every formula, the
+place where it stands here, and each deviation from the papers.
 """
 
 import dataclasses
@@ -19,30 +23,18 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio import networks, optimizer
+from qfolio import distributional, heads, optimizer
+from qfolio.agents import hindsight
+from qfolio.agents.hindsight import Move
+from qfolio.distributional import Values
 from qfolio.errors import QfolioError
 from qfolio.exploration import epsilon_greedy
 from qfolio.fields import number, require, require_sizes, sizes, static
-from qfolio.mdp import (
-    Agent,
-    Contrast,
-    Discrete,
-    ExogenousTask,
-    Metrics,
-    Position,
-    Task,
-    Transition,
-)
-from qfolio.networks import KINDS, Network, outputs_of
-from qfolio.replay import Experience, Replay
-from qfolio.targets import bootstrap, follow, huber_loss, td_target
-
-
-class Move(NamedTuple):
-    """What the buffer keeps for all actions: how the market moved."""
-
-    market: PyTree
-    next_market: PyTree
+from qfolio.mdp import Agent, Contrast, Discrete, ExogenousTask, Metrics, Task, Transition
+from qfolio.networks import KINDS, Network
+from qfolio.priorities import Priorities
+from qfolio.replay import Experience, Replay, join
+from qfolio.targets import bootstrap, chosen, follow, huber_loss, td_target
 
 
 class DQNState(eqx.Module):
@@ -56,10 +48,21 @@ class DQNState(eqx.Module):
     steps: Int[Array, ""]  # of each environment; the target network follows them
 
 
+Learned = tuple[Network, optimizer.Optimizer, Priorities | None]
+
+
+class Losses(NamedTuple):
+    """Of a batch."""
+
+    each: Float[Array, "batch *action"]
+    off: Float[Array, " batch"] | None  # how far off the values were; priorities follow it
+    max_q: Float[Array, ""]  # mean of max_a Q(s, a), in units of reward
+
+
 class DQN(Agent):
     """A deep Q-network; the defaults are those of the report that qfolio grew out of."""
 
-    network: str = static("flat")  # over everything observed; or mlp, cnn, rnn, shared by assets
+    network: str = static("flat")  # over everything observed; or one of networks.KINDS
     hidden: tuple[int, ...] = sizes(256, 256)
     environments: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
@@ -68,6 +71,17 @@ class DQN(Agent):
     replay_capacity: int = static(50_000)  # transitions
     learning_starts: int = static(64)  # transitions stored before learning
     double: bool = static(False)
+    dueling: bool = static(False)  # a stream for the state's value and one for advantages
+    n_steps: int = static(1)  # whose rewards a target adds up
+    prioritised: bool = static(False)  # transitions are drawn by how far off their values were
+    priority_exponent: float = number(0.6)  # α
+    importance_exponent: float = number(0.4)  # β at the start; 1 after learning_rate_steps
+    values: str = static("expected")  # what is learned of a return: expected, categorical, quantile
+    atoms: int = static(51)  # numbers for each action, where values are a distribution
+    v_min: float = number(-10.0)  # ends of categorical's support, in units of scaled reward
+    v_max: float = number(10.0)
+    noisy: bool = static(False)  # explore by learned noise on weights, besides ε
+    noise_scale: float = number(0.5)  # σ₀
     all_actions: bool = static(False)  # learn every action at once, from re-drawn holdings
     market_baseline: bool = static(False)  # with all_actions: rewards above those of other holdings
     time_limit_terminal: bool = static(False)  # wrong, but often done
@@ -85,26 +99,33 @@ class DQN(Agent):
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
 
     def __check_init__(self) -> None:
-        counts = "environments batch_size updates target_period"
+        counts = "environments batch_size updates target_period n_steps"
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
-        require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "input_gain noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         optimizer.require_schedule(self)
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
         fractions = "discount target_rate epsilon epsilon_end epsilon_decay"
         require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
+        exponents = "priority_exponent importance_exponent"
+        require(self, exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
         require_sizes(self)
         require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+        distributional.require_values(self)
+        if self.all_actions:
+            hindsight.require_plain(self)
         if self.market_baseline and self.batch_size < 2:
             raise QfolioError(
                 "market_baseline compares holders; it needs a batch_size of 2 or more."
             )
-        if self.learning_starts > self.replay_capacity:
+        needed = max(self.learning_starts, self.n_steps * self.environments)
+        if needed > self.replay_capacity:
             raise QfolioError(
-                f"learning_starts is {self.learning_starts}, more than replay_capacity "
-                f"({self.replay_capacity}) can hold; lower the one or raise the other."
+                f"learning_starts is {self.learning_starts} and n_steps × environments is "
+                f"{self.n_steps * self.environments}, and replay_capacity "
+                f"({self.replay_capacity}) can hold fewer; lower the ones or raise the other."
             )
 
     def contrast(self) -> Contrast:
@@ -115,52 +136,39 @@ class DQN(Agent):
         other = dataclasses.replace(self, double=not self.double)
         return Contrast(names[self.double], names[not self.double], other)
 
-    def init(self, task: Task, key: PRNGKeyArray) -> DQNState:
-        state = task.reset(key)
-        observation = task.observe(state)
-        online = self._network(task, observation, key)
-        row: Experience | Move = Experience(
-            observation=observation,
-            action=jnp.array(0, jnp.int32),
-            reward=jnp.array(0.0),
-            next_observation=observation,
-            terminal=jnp.array(False),
-        )
-        if self.all_actions:
-            if not isinstance(task, ExogenousTask):
-                raise QfolioError(
-                    "all_actions needs a market, whose prices do not answer to actions; "
-                    f"{type(task).__name__} is none."
-                )
-            if getattr(task, "reward", "") == "differential-sharpe":
-                raise QfolioError(
-                    "all_actions draws holdings without a past, and differential-sharpe rewards "
-                    "what comes after one; take reward=crra, or all_actions=false."
-                )
-            row = Move(state.market, state.market)
-        zero = jnp.array(0, jnp.int32)
-        return DQNState(
-            online=online,
-            target=online,
-            optimizer=optimizer.begin(online),
-            replay=Replay.empty(row, self.replay_capacity, self.environments),
-            episodes=zero,
-            steps=zero,
-        )
+    @property
+    def _values(self) -> Values:
+        """What the network's numbers mean."""
+        return distributional.values_of(self)
 
-    def _network(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Network:
+    def init(self, task: Task, key: PRNGKeyArray) -> DQNState:
         if not isinstance(task.actions, Discrete):
             raise QfolioError(
                 f"dqn chooses among numbered actions, and those of {type(task).__name__} are "
                 "continuous; in a market, give it a menu of allocations (menu=grid:10)."
             )
-        outputs = outputs_of(task.actions)
-        return networks.build(
-            self.network, task, observation, self.hidden, outputs, key, self.input_gain
+        state = task.reset(key)
+        observation = task.observe(state)
+        online = heads.build(self, task, observation, self._values.atoms, key)
+        if self.all_actions:
+            hindsight.require_exogenous(task)
+            row: Experience | Move = Move(state.market, state.market)
+        else:
+            row = Experience.like(observation, with_last=self.n_steps > 1)
+        zero = jnp.array(0, jnp.int32)
+        return DQNState(
+            online=online,
+            target=online,
+            optimizer=optimizer.begin(online),
+            replay=Replay.empty(
+                row, self.replay_capacity, self.environments, self.n_steps, self.prioritised
+            ),
+            episodes=zero,
+            steps=zero,
         )
 
     def warm_up(self) -> int:
-        return max(0, math.ceil(self.learning_starts / self.environments) - 1)
+        return max(self.n_steps, math.ceil(self.learning_starts / self.environments)) - 1
 
     def epsilon_now(self, state: DQNState) -> Float[Array, ""]:
         return jnp.maximum(self.epsilon_end, self.epsilon * self.epsilon_decay**state.episodes)
@@ -178,95 +186,126 @@ class DQN(Agent):
         self, weights: Network, observation: PyTree
     ) -> Float[Array, "batch action"] | None:
         """Q(s, ·) in units of the task's reward; none where they are above a baseline."""
-        return None if self.market_baseline else weights(observation) / self.reward_scale
+        return None if self.market_baseline else self._q(weights, observation) / self.reward_scale
 
     def policy(self, weights: Network, observation: PyTree) -> Int[Array, " batch"]:
-        return weights(observation).argmax(-1)
+        return self._q(weights, observation).argmax(-1)
 
     def act(self, state: DQNState, observation: PyTree, key: PRNGKeyArray) -> Int[Array, " batch"]:
-        return epsilon_greedy(key, state.online(observation), self.epsilon_now(state))
+        online = state.online
+        if self.noisy:
+            key, noise_key = jax.random.split(key)
+            online = heads.draw_noise(online, noise_key)
+        return epsilon_greedy(key, self._q(online, observation), self.epsilon_now(state))
+
+    def _q(self, network: Network, observation: PyTree) -> Float[Array, "batch action"]:
+        return self._values.mean(self._read(network, observation))
+
+    def _read(self, network: Network, observation: PyTree) -> Float[Array, "batch action atom"]:
+        """What the network says of each action; ``_values`` knows what it means."""
+        outputs = network(observation)
+        z = outputs.reshape(outputs.shape[0], -1, self._values.atoms)
+        return heads.duel(z) if self.dueling else z
 
     def observe(self, state: DQNState, rollout: Transition) -> DQNState:
-        experience: Experience | Move = Experience.of(
-            rollout, time_limit_terminal=self.time_limit_terminal
-        )
-        if self.all_actions:
-            moves = Move(rollout.state.market, rollout.next_state.market)
-            experience = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), moves)
+        wrong, with_last = self.time_limit_terminal, self.n_steps > 1
+        row = Experience.of(rollout, time_limit_terminal=wrong, with_last=with_last)
+        stored = Move.of(rollout) if self.all_actions else row
         finished = (rollout.terminated | rollout.truncated).sum(dtype=jnp.int32)
         return eqx.tree_at(
             lambda s: (s.replay, s.episodes, s.steps),
             state,
-            (state.replay.add(experience), state.episodes + finished, state.steps + 1),
+            (state.replay.add(stored), state.episodes + finished, state.steps + 1),
         )
 
     def learn(
         self, task: Task, state: DQNState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[DQNState, Metrics]:
         state = self.observe(state, rollout)
-
-        def update(carry, key):  # type: ignore[no-untyped-def]
-            online, adam = carry
-            sample_key, holding_key = jax.random.split(key) if self.all_actions else (key, key)
-            batch = state.replay.sample(sample_key, self.batch_size)
-            every = partial(self._all_action_loss, task, holding_key)
-            loss_of = jax.value_and_grad(every if self.all_actions else self._loss, has_aux=True)
-            (loss, max_q), gradient = loss_of(online, state.target, batch)
-            return optimizer.descend(self, online, gradient, adam), (loss, max_q)
-
-        carry = (state.online, state.optimizer)
+        replay = state.replay
+        update = partial(self._update, task, replay, state.target)
+        carry = (state.online, state.optimizer, replay.priorities)
         if self.updates == 1:
-            (online, adam), (loss, max_q) = update(carry, key)
+            carry, (loss, max_q) = update(carry, key)
         else:
-            keys = jax.random.split(key, self.updates)
-            (online, adam), (loss, max_q) = lax.scan(update, carry, keys)
+            carry, (loss, max_q) = lax.scan(update, carry, jax.random.split(key, self.updates))
+        online, adam, priorities = carry
 
         due = state.steps % self.target_period == 0
         rate = self.target_rate if self.target_period == 1 else jnp.where(due, self.target_rate, 0)
         target = follow(state.target, online, rate)
-        state = DQNState(online, target, adam, state.replay, state.episodes, state.steps)
+        replay = dataclasses.replace(replay, priorities=priorities)
+        state = DQNState(online, target, adam, replay, state.episodes, state.steps)
         return state, {"loss": loss.mean(), "max_q": max_q.mean()}
 
-    def _loss(
-        self, online: Network, target: Network, batch: Experience
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Mean loss, and the batch's mean max_a Q(s, a) in units of reward."""
-        q = online(batch.observation)
-        taken = jnp.take_along_axis(q, batch.action[:, None], axis=1)[:, 0]
-        q_next = target(batch.next_observation)
-        selector = online(batch.next_observation) if self.double else q_next
-        following = bootstrap(q_next, selector)
-        goal = td_target(self.reward_scale * batch.reward, batch.terminal, following, self.discount)
-        error = lax.stop_gradient(goal) - taken
-        return huber_loss(error, self.huber).mean(), q.max(1).mean() / self.reward_scale
+    def _update(
+        self, task: Task, replay: Replay, target: Network, carry: Learned, key: PRNGKeyArray
+    ) -> tuple[Learned, tuple[Float[Array, ""], Float[Array, ""]]]:
+        """One gradient step, with its loss and the batch's mean max_a Q(s, a)."""
+        online, adam, priorities = carry
+        draw_key = key
+        if self.all_actions or self.noisy:
+            draw_key, key = jax.random.split(key)
+        index = dataclasses.replace(replay, priorities=priorities).draw(draw_key, self.batch_size)
+        weight: Array | float = 1.0
+        if priorities is not None:
+            weight = priorities.importance(index, self._importance_exponent(adam.count))
 
-    def _all_action_loss(
-        self, task: ExogenousTask, key: PRNGKeyArray, online: Network, target: Network, moves: Move
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The same, over every action from holdings drawn anew: what each would have led to."""
-        holdings = jax.vmap(task.draw_holding)(jax.random.split(key, self.batch_size))
-        q = online(jax.vmap(task.observe)(Position(moves.market, holdings)))
+        def objective(online: Network) -> tuple[Float[Array, ""], Losses]:
+            if self.all_actions:
+                losses = self._all_action_losses(task, online, target, replay.at(index), key)
+            else:
+                batch, discount = join(replay, index, self.discount)
+                losses = self._losses(online, target, batch, discount, key)
+            return (weight * losses.each).mean(), losses
 
-        def after(holdings: PyTree, action: Array) -> tuple[Array, PyTree]:
-            settle = jax.vmap(task.settle, (0, 0, 0, None))
-            return settle(moves.market, moves.next_market, holdings, action)
+        (loss, losses), gradient = jax.value_and_grad(objective, has_aux=True)(online)
+        if priorities is not None and losses.off is not None:
+            # A little more, so that nothing is never drawn again.
+            priorities = priorities.set(index, (losses.off + 1e-6) ** self.priority_exponent)
+        online, adam = optimizer.descend(self, online, gradient, adam)
+        return (online, adam, priorities), (loss, losses.max_q)
 
-        actions = jnp.arange(q.shape[-1])
-        reward, next_holdings = jax.vmap(partial(after, holdings))(actions)  # (action, batch)
-        if self.market_baseline:
-            # What the same move pays another holder, on average over his actions, depends on the
-            # market alone: taking it off leaves the best policy as it is, and takes off what all
-            # actions have in common of the market's noise (input-dependent baselines, Mao et al.
-            # 2019).
-            others = jax.tree.map(lambda x: jnp.roll(x, 1, 0), holdings)
-            reward = reward - jax.vmap(partial(after, others))(actions)[0].mean(0)
-        never = jnp.zeros(reward.shape[1:], bool)
+    def _importance_exponent(self, update: Int[Array, ""]) -> Float[Array, ""]:
+        """β: a line from its first value to 1, which is there when the cosine of the rate ends."""
+        done = jnp.minimum(update / self.learning_rate_steps, 1.0)
+        return self.importance_exponent + (1 - self.importance_exponent) * done
 
-        def goal(reward: Array, holding: PyTree) -> Array:
-            view = jax.vmap(task.observe)(Position(moves.next_market, holding))
-            q_next = target(view)
-            following = bootstrap(q_next, online(view) if self.double else q_next)
-            return td_target(self.reward_scale * reward, never, following, self.discount)
+    def _losses(
+        self,
+        online: Network,
+        target: Network,
+        batch: Experience,
+        discount: Float[Array, "*#batch"] | float,
+        key: PRNGKeyArray,
+    ) -> Losses:
+        """discount: of what follows the batch's rewards. key: of the noise."""
+        selecting = online
+        if self.noisy:
+            keys = jax.random.split(key, 3)
+            online, target, selecting = map(heads.draw_noise, (online, target, online), keys)
+        values = self._values
+        z = self._read(online, batch.observation)
+        z_next = self._read(target, batch.next_observation)
+        selector = self._read(selecting, batch.next_observation) if self.double else z_next
+        following = bootstrap(z_next, values.mean(selector))
 
-        goals = lax.stop_gradient(jax.vmap(goal)(reward, next_holdings)).T
-        return huber_loss(goals - q, self.huber).mean(), q.max(1).mean() / self.reward_scale
+        reward = self.reward_scale * batch.reward
+        goals = jax.vmap(td_target, (None, None, 1, None), 1)  # one for each outcome
+        goal = goals(reward, batch.terminal, values.outcomes(following), discount)
+        each, off = values.loss(
+            chosen(z, batch.action), lax.stop_gradient(goal), lax.stop_gradient(following)
+        )
+        return Losses(each, off, values.mean(z).max(1).mean() / self.reward_scale)
+
+    def _all_action_losses(
+        self, task: Task, online: Network, target: Network, moves: Move, key: PRNGKeyArray
+    ) -> Losses:
+        assert isinstance(task, ExogenousTask)
+        error, q = hindsight.errors(
+            task, moves, key, partial(self._q, online), partial(self._q, target),
+            discount=self.discount, reward_scale=self.reward_scale,
+            double=self.double, baseline=self.market_baseline,
+        )  # fmt: skip
+        each = huber_loss(error, self.huber)
+        return Losses(each, None, q.max(1).mean() / self.reward_scale)

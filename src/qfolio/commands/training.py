@@ -3,6 +3,8 @@
 import contextlib
 import datetime
 import json
+import re
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +26,7 @@ def train(
     agent: Name = None,
     preset: Name = None,
     episodes: Count = None,
+    steps: Count = None,
     seeds: Count = None,
     seed: Count = None,
     out: Folder = None,
@@ -36,18 +39,20 @@ def train(
 
     Args:
         task: What to learn: pendulum (the default), or a market with a known optimum: market/kelly,
-            market/merton, market/regime, market/ar1, market/no-trade, market/garleanu-pedersen.
+            market/merton, market/regime, market/ar1, market/no-trade, market/garleanu-pedersen;
+            or any environment of Gymnasium by its ID, such as gym:CartPole-v1.
         agent: Which algorithm: dqn, pathwise; the first that has presets for the task otherwise.
         preset: fast (the default); for the pendulum also best, and report (the run that qfolio grew
             out of).
         episodes: Training episodes of each agent; the preset says how many otherwise. Those of
             fast and best are short: 28 and 40 steps.
+        steps: Instead of episodes, steps of each agent's environments.
         seeds: How many agents are trained side by side; the preset says otherwise.
         seed: The first agent's seed, 0 unless given; the others' follow it.
         out: A new folder for the run; runs/… otherwise.
         assignments: Hyperparameters, for example --set discount=0.98 hidden=256,256 (the settings
             of a report and docs/dqn.md list them).
-        resume: Go on with the run in this folder, up to --episodes if given.
+        resume: Go on with the run in this folder, up to --episodes or --steps if given.
         compare: Train two more agents with one thing changed, for the report (DQN: double DQN; in
             markets, one action at a time instead of all at once).
         live: Show an episode in a window now and then, while training.
@@ -58,24 +63,29 @@ def train(
     from qfolio import console, presets
     from qfolio.runs import Run
 
+    budget = {"episodes": episodes, "steps": steps}
+    asked = {name: amount for name, amount in budget.items() if amount is not None}
+    if len(asked) > 1:
+        raise QfolioError("--episodes and --steps both say how far to train; give one of them.")
     if live and task not in (None, "pendulum"):
         raise QfolioError(f"--live shows the pendulum; there is nothing to see of {task}.")
     with _window(live) as show:
         if resume is None:
             task, preset = task or "pendulum", preset or "fast"
             agent = agent or presets.default_agent(task)
-            name = (
-                f"{task.replace('/', '-')}-{agent}-{preset}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-            )
+            now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
+            name = f"{re.sub('[/:]', '-', task)}-{agent}-{preset}-{now}"
             folder = out or Path("runs") / name
             chosen = settings.parse(assignments)
-            run = _new_run(task, agent, preset, episodes, seeds, seed or 0, folder, chosen)
+            run = _new_run(task, agent, preset, asked, seeds, seed or 0, folder, chosen)
         elif assignments or any(x is not None for x in (task, agent, preset, seeds, seed, out)):
-            raise QfolioError("--resume keeps what the run was started with; add only --episodes.")
+            raise QfolioError(
+                "--resume keeps what the run was started with; add only --episodes or --steps."
+            )
         else:
             run, folder = Run.open(resume), resume
         console.say(console.describe(run))
-        _train(run, episodes, show)
+        _train(run, asked or run.budget, show)
     contrast = None
     if compare and not run.interrupted:
         contrast = _contrast(run, folder)
@@ -89,17 +99,18 @@ def train(
 def evaluate(
     folder: Positional[Path],
     *,
-    episodes: int = 1024,
+    episodes: Count = None,
     as_json: Annotated[bool, arg(name="json")] = False,
 ) -> None:
     """Grade a run's greedy policies from fixed start states against the optimum.
 
     Args:
         folder: A run folder.
-        episodes: Start states, the same for every run and every agent.
+        episodes: Start states, the same for every run and every agent; 1,024 unless given, and 100
+            where Gymnasium steps the environment.
         as_json: Print JSON instead of a table.
     """
-    if episodes < 1:
+    if episodes is not None and episodes < 1:
         raise QfolioError(f"--episodes is {episodes}; it must be at least 1.")
     from qfolio import devices
 
@@ -107,6 +118,7 @@ def evaluate(
     from qfolio.runs import Run
 
     run = Run.open(folder)
+    episodes = episodes or run.population.starts
     result = run.grade(episodes)
     if as_json:
         print(json.dumps({"folder": str(folder), "starts": episodes, **result}, indent=2))
@@ -158,7 +170,7 @@ def _new_run(
     task_name: str,
     agent_name: str,
     preset_name: str,
-    episodes: int | None,
+    budget: dict[str, int],
     seeds: int | None,
     seed: int,
     folder: Path,
@@ -174,7 +186,7 @@ def _new_run(
     return Run.create(
         settings.build(task_class, {**preset.task, **task_settings}),
         preset.build(**chosen),
-        episodes=preset.episodes if episodes is None else episodes,
+        **budget or preset.budget,
         seeds=preset.seeds if seeds is None else seeds,
         seed=seed,
         preset=preset_name,
@@ -182,17 +194,17 @@ def _new_run(
     )
 
 
-def _train(run: "Run", episodes: int | None, show: Callable[["Run"], None] | None = None) -> None:
+def _train(run: "Run", budget: dict[str, int], show: Callable[["Run"], None] | None = None) -> None:
     """Trains with live progress, beside the optimum."""
     from qfolio import console
     from qfolio.evaluation import start_keys
-    from qfolio.runs import CURVE_STARTS
 
     solution, optimum = run.task.optimum(), None
     if solution is not None:
         with console.console.status("Solving for the exact optimum (once; then it is on disk)"):
-            optimum = float(solution.returns(start_keys())[:CURVE_STARTS].mean())
-    console.train(run, episodes, optimum, show)
+            on_curve = solution.returns(start_keys())[: run.population.curve_starts]
+            optimum = float(on_curve.mean())
+    console.train(run, budget, optimum, show)
 
 
 def _contrast(run: "Run", folder: Path) -> "Run | None":
@@ -211,15 +223,15 @@ def _contrast(run: "Run", folder: Path) -> "Run | None":
         contrast = Run.create(
             run.task,
             variant.variant,
-            episodes=config["episodes"],
+            **run.budget,
             seeds=min(2, config["seeds"]),
             seed=config["seed"],
             preset=config["preset"],
             out=place,
         )
-    if contrast.population.steps_left(run.config["episodes"]):
+    if contrast.population.steps_left(**run.budget):
         say(f"\nFor contrast, {variant.variant_name} ({contrast.config['seeds']} of the seeds):")
-        _train(contrast, run.config["episodes"])
+        _train(contrast, run.budget)
     return contrast
 
 
@@ -228,7 +240,8 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
     from qfolio.report.collect import report_data
     from qfolio.report.page import write_report
 
-    with console.status("Grading on 1,024 start states and writing the report"):
+    starts = run.population.starts
+    with console.status(f"Grading on {starts:,} start states and writing the report"):
         summary = run.summary()
         write_report(folder, report_data(run, summary, contrast, _command(run)))
     print_result(run.population.seeds, summary)
@@ -244,11 +257,11 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
 
 def _command(run: "Run") -> str:
     """The command line that repeats a run, and the one that goes on with it."""
-    from qfolio.presets import PRESETS, preset
+    from qfolio.presets import preset, presets_of
 
     config = run.config
     resume = f"qfolio train --resume {run.folder}"
-    known = PRESETS.get((config["task"], config["agent"]), {})
+    known = presets_of(config["task"], config["agent"])
     if not known:
         return resume
     name = config["preset"] if config["preset"] in known else next(iter(known))
@@ -261,8 +274,9 @@ def _command(run: "Run") -> str:
         if value != default[name]
     ]
     words = ["qfolio train", config["task"], "--agent", config["agent"], "--preset"]
-    words += [name, "--episodes", config["episodes"], "--seeds", config["seeds"]]
-    words += ["--seed", config["seed"], *(["--set", *changed] if changed else [])]
+    ((unit, amount),) = run.budget.items()
+    words += [name, f"--{unit}", amount, "--seeds", config["seeds"], "--seed", config["seed"]]
+    words += ["--set", *map(shlex.quote, changed)] if changed else []
     return f"{' '.join(map(str, words))}\n{resume}"
 
 

@@ -14,9 +14,10 @@ from qfolio.backtest.run import Backtest, Entry
 from qfolio.evaluation import greedy, play, start_keys
 from qfolio.mdp import Agent, Policy, Position
 from qfolio.optimum.followed import FollowedOptimum
+from qfolio.registry import GYM
 from qfolio.report.backtest import BacktestData, StrategySeries
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
-from qfolio.runs import CURVE_STARTS, Run
+from qfolio.runs import Run
 from qfolio.tasks.market import Market
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 from qfolio.tasks.synthetic import Ar1, NoTrade, OneAsset, Synthetic
@@ -99,7 +100,7 @@ def report_data(
     solution = run.task.optimum()
     optimum = np.nan
     if solution is not None:
-        optimum = float(solution.returns(start_keys())[:CURVE_STARTS].mean())
+        optimum = float(solution.returns(start_keys())[: run.population.curve_starts].mean())
     pendulum = run.task if isinstance(run.task, Pendulum) else None
     known = solution if isinstance(solution, FollowedOptimum) else None
     # In a market, training episodes have luck of their own: their returns do not compare.
@@ -108,7 +109,8 @@ def report_data(
     variant = run.agent.contrast()
     names = ("greedy return", "") if variant is None else (variant.name, variant.variant_name)
     agent, task = summary["agent"], summary["task"]
-    where = _TASKS.get(task, _Words(f"on the {task}")).where
+    name = task.removeprefix(GYM)
+    where = _TASKS.get(task, _Words(f"on {name}" if name != task else f"on the {task}")).where
     return ReportData(
         title=f"{_AGENTS.get(agent, agent)} {where}",
         command=command,

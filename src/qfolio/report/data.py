@@ -156,7 +156,8 @@ class ReportData:
         training_episodes: Number of each finished training episode of every seed, shape (R,).
         training_returns: Return of those episodes, shape (R,); none where they cannot be set
             beside the curve.
-        optimum: Mean return of the exact optimum on the evaluation starts of the curve.
+        optimum: Mean return of the exact optimum on the evaluation starts of the curve; NaN where
+            none is known, as summary's optimum and regrets are then None.
         maps: Solutions over the state space, or None for tasks without a 2-D state.
         episode: A greedy episode to be shown, or None.
         market: What there is to tell of a market, or None for other tasks.

@@ -350,6 +350,8 @@ def _draw_training(axes: Axes, data: ReportData) -> None:
 
 
 def _draw_optimum(axes: Axes, data: ReportData, *, label: bool) -> None:
+    if np.isnan(data.optimum):  # not known
+        return
     axes.axhline(data.optimum, color=palette.INK, linewidth=0.9, dashes=(4, 3))
     if label:
         text = f"exact optimum {number(data.optimum, decimals(data.optimum))}"
@@ -382,6 +384,8 @@ def _cut_beginning(axes: Axes, optimum: float) -> None:
 
 def _near_optimum(data: ReportData) -> tuple[float, float, float] | None:
     """Return the left, lower and upper ends of the close view, or None where none is needed."""
+    if np.isnan(data.optimum):
+        return None
     returns, episodes = data.curve.returns, data.curve.episodes
     late = returns[len(returns) // 2 :]
     # One failed seed must not decide the scale.

@@ -91,40 +91,54 @@ def verdict(summary: dict[str, Any], market: MarketData | None = None) -> str:
     """Return the result in one or two plain sentences."""
     count = len(summary["return_per_seed"])
     agents = counted(count, "agent")
-    digits = decimals(summary["optimum"])
-    mean, optimum = number(summary["return_mean"], digits), number(summary["optimum"], digits)
-    regret = _mean_regret(summary)
+    digits = _digits(summary)
     interval = ""
     if count > 1:
         low, high = (number(end, digits) for end in summary["return_ci95"])
         interval = f" (95{THIN_SPACE}% interval {low} to {high})"
-    side = "below" if regret >= 0 else "above"
-    share = percent(abs(regret))
-    distance = f"{share} {side} the exact optimum of {optimum}"
-    if share == percent(0):
-        distance = f"equal to the exact optimum of {optimum} within a tenth of a percent"
     measure = market.measure if market else "return"
     span = f" over {number(market.horizon, 0)} steps" if market else ""
-    sentence = f"{agents} reached a mean {measure} of {mean}{span}{interval}, {distance}."
+    mean = number(summary["return_mean"], digits)
+    sentence = f"{agents} reached a mean {measure} of {mean}{span}{interval}{_distance(summary)}."
     if count == 1:
         sentence += " A single seed says nothing about the spread, so no interval is given."
     return sentence
+
+
+def _distance(summary: dict[str, Any]) -> str:
+    """Return how far the result is from the optimum, where that is known."""
+    if summary["optimum"] is None:
+        return ""
+    optimum, regret = number(summary["optimum"], _digits(summary)), _mean_regret(summary)
+    share = percent(abs(regret))
+    if share == percent(0):
+        return f", equal to the exact optimum of {optimum} within a tenth of a percent"
+    return f", {share} {'below' if regret >= 0 else 'above'} the exact optimum of {optimum}"
+
+
+def _digits(summary: dict[str, Any]) -> int:
+    """Return with how many decimals to write a return."""
+    return decimals(summary["return_mean" if summary["optimum"] is None else "optimum"])
 
 
 def _facts(summary: dict[str, Any], market: MarketData | None) -> list[tuple[str, str, str]]:
     """Return the key figures: name, value and a remark."""
     several = len(summary["return_per_seed"]) > 1
     spread = "one seed, no interval"
-    digits = decimals(summary["optimum"])
+    digits = _digits(summary)
     if several:
         low, high = (number(end, digits) for end in summary["return_ci95"])
         spread = f"95{THIN_SPACE}%: {low} to {high}"
     together = "all seeds together" if several else "while training"
     speed = ("Steps per second", amount(summary["steps_per_second"]), together)
-    facts = [
-        ("Return", number(summary["return_mean"], digits), spread),
-        ("Exact optimum", number(summary["optimum"], digits), "on the same starts"),
-        ("Regret", percent(_mean_regret(summary), 2 if market else 1), "of the optimum"),
+    facts = [("Return", number(summary["return_mean"], digits), spread)]
+    if summary["optimum"] is not None:
+        regret = percent(_mean_regret(summary), 2 if market else 1)
+        facts += [
+            ("Exact optimum", number(summary["optimum"], digits), "on the same starts"),
+            ("Regret", regret, "of the optimum"),
+        ]
+    facts += [
         (
             "Training time",
             duration(summary["seconds_train"]),
@@ -152,10 +166,10 @@ def _facts(summary: dict[str, Any], market: MarketData | None) -> list[tuple[str
 def _agents(data: ReportData) -> list[tuple[str, list[str]]]:
     """Return a row for each agent, and one for their mean: return, regret and overestimation."""
     summary = data.summary
-    columns = [
-        (summary["return_per_seed"], lambda x: number(x, decimals(summary["optimum"]))),
-        (summary["regret_per_seed"], lambda x: percent(x, 2 if data.market else 1)),
-    ]
+    columns = [(summary["return_per_seed"], lambda x: number(x, _digits(summary)))]
+    if summary["regret_per_seed"] is not None:
+        regrets = summary["regret_per_seed"]
+        columns.append((regrets, lambda x: percent(x, 2 if data.market else 1)))
     excess = summary["overestimation_per_seed"]
     if None not in excess:
         columns.append((excess, lambda x: number(x, _bias_digits(data), sign=True)))

@@ -1,0 +1,31 @@
+"""Advantage actor-critic (Mnih et al. 2016, in its synchronous form, A2C).
+
+After a few steps of all environments, the policy takes one step along the gradient of its actions'
+log probabilities times their advantages, and the critic one towards the returns.
+docs/policy_gradients.md has the formulas and the deviations from the paper.
+"""
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from qfolio.agents.on_policy import ActorCriticState, Batch, OnPolicy
+from qfolio.fields import number, require, static
+from qfolio.mdp import Metrics, Task, Transition
+
+
+class A2C(OnPolicy):
+    """Advantage actor-critic."""
+
+    rollout: int = static(5)
+    trace: float = number(1.0)  # λ of the advantages: 0 trusts the critic, 1 the rewards
+    learning_rate: float = number(7e-4)
+
+    def __check_init__(self) -> None:
+        require(self, "trace", lambda x: 0 <= x <= 1, "between 0 and 1")
+
+    def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
+        return log_prob * batch.advantage
+
+    def learn(
+        self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[ActorCriticState, Metrics]:
+        return self.descend(state, self.judge(state.weights, rollout, self.trace))

@@ -1,0 +1,218 @@
+"""What DDPG, TD3 and SAC share: a policy and action values, learned from a replay buffer.
+
+The critics regress Q(s, a) towards a Bellman target at the action that the policy takes next; the
+actor climbs the critics' gradient in the action. Each algorithm's file says how it does the one and
+the other; here stand the networks, the buffer and the settings of all three. docs/actor_critic.md
+holds every formula and its place.
+"""
+
+import abc
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from qfolio import networks, optimizer
+from qfolio.errors import QfolioError
+from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.mdp import Actions, Agent, Box, Discrete, Metrics, Simplex, Task, Transition
+from qfolio.networks import KINDS, Flat, Network
+from qfolio.replay import Experience, Replay
+
+Weights = TypeVar("Weights", bound=PyTree)
+
+
+def unit_of(actions: Box | Simplex) -> float:
+    """What noise and critics measure an action by: its bound, or 1."""
+    return actions.bound if isinstance(actions, Box) and math.isfinite(actions.bound) else 1.0
+
+
+def uniform(actions: Actions, key: PRNGKeyArray, n: int) -> Array:
+    """``n`` actions drawn uniformly; from [−1, 1] where they have no bounds."""
+    if isinstance(actions, Discrete):
+        return jax.random.randint(key, (n,), 0, actions.n, jnp.int32)
+    if isinstance(actions, Simplex):
+        return jax.random.dirichlet(key, jnp.ones(actions.assets + 1), (n,))
+    unit = unit_of(actions)
+    return jax.random.uniform(key, (n, actions.n), minval=-unit, maxval=unit)
+
+
+class Critics(eqx.Module):
+    """Networks side by side, each with its own estimate of Q(s, a).
+
+    They read an observation and an action, or an observation alone where actions are numbered.
+    """
+
+    networks: Network  # with a leading critic axis
+
+    def __init__(self, make: Callable[[PRNGKeyArray], Network], n: int, key: PRNGKeyArray) -> None:
+        self.networks = jax.vmap(make)(jax.random.split(key, n))
+
+    def __call__(self, observation: PyTree, action: Array) -> Float[Array, "critic batch"]:
+        """Q(s, a) of each critic."""
+        if jnp.issubdtype(action.dtype, jnp.integer):
+            return jnp.take_along_axis(self.every(observation), action[None, :, None], -1)[..., 0]
+        return jax.vmap(lambda network: network((observation, action))[:, 0])(self.networks)
+
+    def every(self, observation: PyTree) -> Float[Array, "critic batch action"]:
+        """Q(s, ·) of each critic, where actions are numbered."""
+        return jax.vmap(lambda network: network(observation))(self.networks)
+
+
+def critic_loss(
+    critics: Critics, batch: Experience, goal: Float[Array, " batch"]
+) -> tuple[Float[Array, ""], Metrics]:
+    """Half the mean squared error to one goal, summed over the critics; and what to report."""
+    q = critics(batch.observation, batch.action)
+    loss = ((q - goal) ** 2).mean(1).sum() / 2
+    return loss, {"loss": loss, "q": q.mean()}
+
+
+class ActorCriticState(eqx.Module):
+    """All that an agent learns and remembers."""
+
+    learned: Any  # what gradient steps change; its actor explores
+    replay: Replay
+    steps: Int[Array, ""]  # of each environment
+
+
+class ActorCritic(Agent):
+    """Settings, buffer and gradient steps; an algorithm adds what it learns and how it explores."""
+
+    network: str = static("flat")  # the actor's: over everything observed; mlp, cnn, rnn: by asset
+    hidden: tuple[int, ...] = sizes(256, 256)  # of actor and critics
+    environments: int = static(1)  # stepped side by side
+    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
+    batch_size: int = static(256)
+    updates: int = static(1)  # gradient steps per step of all environments
+    replay_capacity: int = static(100_000)  # transitions
+    learning_starts: int = static(1000)  # transitions by random actions before learning
+    target_rate: float = number(0.005)  # how far targets go towards the online networks each time
+    discount: float = number(0.99)
+    learning_rate: float = number(1e-3)
+    learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
+    learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
+    actor_rate: float = number(0.3)  # the actor's learning rate, as a share of the critics'
+    reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
+    input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
+    action_gain: float = number(1.0)  # of the critics' first layer, actions taken to ±1
+
+    def __check_init__(self) -> None:
+        counts = "environments batch_size updates"
+        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
+        require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "input_gain action_gain actor_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        require(self, "discount target_rate", lambda x: 0 <= x <= 1, "between 0 and 1")
+        require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+        optimizer.require_schedule(self)
+        require_sizes(self)
+        if self.learning_starts > self.replay_capacity:
+            raise QfolioError(
+                f"learning_starts is {self.learning_starts}, more than replay_capacity "
+                f"({self.replay_capacity}) can hold; lower the one or raise the other."
+            )
+
+    @abc.abstractmethod
+    def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Any:
+        """What gradient steps will change; ``observation`` is an example."""
+
+    @abc.abstractmethod
+    def explore(self, learned: Any, observation: PyTree, key: PRNGKeyArray) -> Array:
+        """Actions for a batch of observations, with exploration."""
+
+    @abc.abstractmethod
+    def update(self, learned: Any, batch: Experience, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+        """One gradient step of all that learns."""
+
+    def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState:
+        observation = task.observe(task.reset(key))
+        row = Experience(
+            observation=observation,
+            action=uniform(task.actions, key, 1)[0],
+            reward=jnp.array(0.0),
+            next_observation=observation,
+            terminal=jnp.array(False),
+        )
+        learned = self.begin(task, observation, key)
+        replay = Replay.empty(row, self.replay_capacity, self.environments)
+        return ActorCriticState(learned, replay, jnp.array(0, jnp.int32))
+
+    def warm_up(self) -> int:
+        return max(0, math.ceil(self.learning_starts / self.environments) - 1)
+
+    def act(self, state: ActorCriticState, observation: PyTree, key: PRNGKeyArray) -> Array:
+        random_key, key = jax.random.split(key)
+        random = uniform(state.learned.actor.actions, random_key, self.environments)
+        action = self.explore(state.learned, observation, key)
+        return jnp.where(state.steps < self.warm_up(), random, action)
+
+    def observe(self, state: ActorCriticState, rollout: Transition) -> ActorCriticState:
+        replay = state.replay.add(Experience.of(rollout))
+        return ActorCriticState(state.learned, replay, state.steps + 1)
+
+    def learn(
+        self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[ActorCriticState, Metrics]:
+        state = self.observe(state, rollout)
+        learned, metrics = self.practise(state.learned, state.replay, key)
+        return ActorCriticState(learned, state.replay, state.steps), metrics
+
+    def practise(self, learned: Any, replay: Replay, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+        """``updates`` gradient steps on batches from a buffer."""
+
+        def update(learned: Any, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+            sample_key, key = jax.random.split(key)
+            return self.update(learned, replay.sample(sample_key, self.batch_size), key)
+
+        if self.updates == 1:
+            learned, metrics = update(learned, key)
+        else:
+            learned, metrics = lax.scan(update, learned, jax.random.split(key, self.updates))
+        means = {name: value.mean() for name, value in metrics.items()}
+        return learned, {**means, "q": means["q"] / self.reward_scale}
+
+    def carry_over(self, state: ActorCriticState, fresh: ActorCriticState) -> ActorCriticState:
+        return ActorCriticState(state.learned, fresh.replay, state.steps)
+
+    def weights(self, state: ActorCriticState) -> Any:
+        return state.learned.actor
+
+    def descend(
+        self,
+        loss: Callable[..., tuple[Float[Array, ""], Metrics]],
+        weights: Weights,
+        adam: optimizer.Optimizer,
+        rate: Float[Array, ""],
+        *others: Any,
+    ) -> tuple[Weights, optimizer.Optimizer, Metrics]:
+        """One step down the gradient in ``weights`` of ``loss(weights, *others)``."""
+        gradient, metrics = jax.grad(loss, has_aux=True)(weights, *others)
+        return *optimizer.descend(self, weights, gradient, adam, rate), metrics
+
+    def build(
+        self, task: Task, observation: PyTree, outputs: networks.Outputs, key: PRNGKeyArray
+    ) -> Network:
+        """A network over observations alone."""
+        return networks.build(
+            self.network, task, observation, self.hidden, outputs, key, self.input_gain
+        )
+
+    def build_critics(
+        self, task: Task, observation: PyTree, count: int, key: PRNGKeyArray
+    ) -> Critics:
+        """Critics over everything that is observed and an action."""
+        assert not isinstance(task.actions, Discrete)
+        action = uniform(task.actions, key, 1)[0]
+        seen = sum(jnp.size(leaf) for leaf in jax.tree.leaves(observation))
+        scale = jnp.broadcast_to(jnp.array(task.observation_scale), (seen,))
+        gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
+        gains = jnp.append(gain, jnp.full(action.shape, self.action_gain / unit_of(task.actions)))
+        make = lambda key: Flat((observation, action), self.hidden, 1, key, gains)  # noqa: E731
+        return Critics(make, count, key)

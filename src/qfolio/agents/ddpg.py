@@ -1,0 +1,141 @@
+"""Deep deterministic policy gradient (Lillicrap et al. 2016).
+
+The critic regresses Q(s, a) towards r + γ Q'(s', π'(s')), where Q' and π' are targets that follow
+slowly. The actor π climbs Q(s, π(s)) by the critic's gradient in the action (Silver et al. 2014,
+eq. 9). Exploration adds noise to the actor's action. docs/actor_critic.md lists formulas and
+deviations.
+"""
+
+import math
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from qfolio import optimizer, simplex
+from qfolio.agents.actor_critic import ActorCritic, Critics, critic_loss, unit_of
+from qfolio.errors import QfolioError
+from qfolio.fields import number, require
+from qfolio.mdp import Box, Discrete, Metrics, Simplex, Task
+from qfolio.networks import Network, outputs_of
+from qfolio.replay import Experience
+from qfolio.targets import follow, td_target
+
+
+class Actor(eqx.Module):
+    """A deterministic policy: a network whose outputs are brought among the actions.
+
+    By tanh between the bounds of a box, by softmax onto the simplex of weights.
+    """
+
+    network: Network
+    actions: Box | Simplex
+
+    def __call__(self, observation: PyTree) -> Float[Array, "batch entry"]:
+        output = self.network(observation)
+        if isinstance(self.actions, Simplex):
+            return jax.nn.softmax(output)
+        if math.isinf(self.actions.bound):
+            return output
+        return self.actions.bound * jnp.tanh(output)
+
+    def perturb(
+        self, action: Float[Array, "batch entry"], noise: Float[Array, "batch entry"]
+    ) -> Float[Array, "batch entry"]:
+        """The allowed action nearest to ``action`` plus noise, which is in units of the bound."""
+        if isinstance(self.actions, Simplex):
+            return simplex.project(action + noise)
+        bound = self.actions.bound
+        return jnp.clip(action + unit_of(self.actions) * noise, -bound, bound)
+
+
+class Learned(eqx.Module):
+    """What gradient steps change."""
+
+    actor: Actor
+    critics: Critics
+    target_actor: Actor
+    target_critics: Critics
+    actor_adam: optimizer.Optimizer
+    critic_adam: optimizer.Optimizer
+
+
+def actor_loss(
+    actor: Actor, critics: Critics, observation: PyTree
+) -> tuple[Float[Array, ""], Metrics]:
+    """Minus the mean of Q(s, π(s)) by the first critic."""
+    return -critics(observation, actor(observation))[0].mean(), {}
+
+
+class DDPG(ActorCritic):
+    """A deterministic actor and a critic, both with targets that follow them."""
+
+    exploration: float = number(0.1)  # standard deviation of the noise, in units of the bound
+
+    critics: ClassVar[int] = 1
+
+    def __check_init__(self) -> None:
+        require(self, "exploration", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+
+    def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
+        if isinstance(task.actions, Discrete):
+            raise QfolioError(
+                f"{type(self).__name__.lower()} needs continuous actions, and those of "
+                f"{type(task).__name__} are numbered; take dqn or sac, or make them continuous: "
+                "torques=0 of the pendulum, no menu in a market."
+            )
+        actor_key, critic_key = jax.random.split(key)
+        network = self.build(task, observation, outputs_of(task.actions), actor_key)
+        actor = Actor(network, task.actions)
+        critics = self.build_critics(task, observation, self.critics, critic_key)
+        return Learned(
+            actor, critics, actor, critics, optimizer.begin(actor), optimizer.begin(critics)
+        )
+
+    def policy(self, weights: Actor, observation: PyTree) -> Float[Array, "batch entry"]:
+        return weights(observation)
+
+    def explore(
+        self, learned: Learned, observation: PyTree, key: PRNGKeyArray
+    ) -> Float[Array, "batch entry"]:
+        action = learned.actor(observation)
+        noise = self.exploration * jax.random.normal(key, action.shape)
+        return learned.actor.perturb(action, noise)
+
+    def update(
+        self, learned: Learned, batch: Experience, key: PRNGKeyArray
+    ) -> tuple[Learned, Metrics]:
+        learned, metrics = self.evaluate(learned, batch, key)
+        return self.improve(learned, batch), metrics
+
+    def evaluate(
+        self, learned: Learned, batch: Experience, key: PRNGKeyArray
+    ) -> tuple[Learned, Metrics]:
+        """A step of the critics towards the Bellman target."""
+        reward = self.reward_scale * batch.reward
+        following = self.following(learned, batch.next_observation, key)
+        goal = td_target(reward, batch.terminal, following, self.discount)
+        rate = optimizer.learning_rate(self, learned.critic_adam.count)
+        critics, adam, metrics = self.descend(
+            critic_loss, learned.critics, learned.critic_adam, rate, batch, goal
+        )
+        learned = eqx.tree_at(lambda x: (x.critics, x.critic_adam), learned, (critics, adam))
+        return learned, metrics
+
+    def following(
+        self, learned: Learned, observation: PyTree, key: PRNGKeyArray
+    ) -> Float[Array, " batch"]:
+        """What the next observation is worth: Q'(s', π'(s'))."""
+        return learned.target_critics(observation, learned.target_actor(observation))[0]
+
+    def improve(self, learned: Learned, batch: Experience) -> Learned:
+        """A step of the actor up the first critic; then the targets follow."""
+        rate = self.actor_rate * optimizer.learning_rate(self, learned.critic_adam.count)
+        actor, adam, _ = self.descend(
+            actor_loss, learned.actor, learned.actor_adam, rate, learned.critics, batch.observation
+        )
+        targets = (learned.target_actor, learned.target_critics)
+        targets = follow(targets, (actor, learned.critics), self.target_rate)
+        return Learned(actor, learned.critics, *targets, adam, learned.critic_adam)

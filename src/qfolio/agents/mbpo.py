@@ -1,0 +1,196 @@
+"""Model-based policy optimization (Janner et al. 2019, algorithm 2): SAC on imagined steps.
+
+An ensemble of networks learns from all real transitions how an action changes the observation, what
+it pays, and whether anything follows. From real observations the policy then goes on in imagination
+for a few steps, each predicted by a member drawn at random, and soft actor-critic learns from these
+steps. Members differ by where they began and by their data: each counts a real transition 0, 1, 2,
+… times (on-line bootstrap, Oza & Russell 2001). docs/model_based.md lists formulas and deviations.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from qfolio import optimizer
+from qfolio.agents.actor_critic import ActorCriticState, uniform, unit_of
+from qfolio.agents.sac import SAC
+from qfolio.encoders import MLP
+from qfolio.errors import QfolioError
+from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.mdp import Actions, Discrete, Metrics, Task, Transition
+from qfolio.replay import Experience, Replay
+
+
+class Model(eqx.Module):
+    """An ensemble of networks; their weights have a leading axis.
+
+    They see observations and actions taken to ±1, and predict the change of the observation in
+    units of its range, the reward, and whether nothing follows (as a number, 0 or 1).
+    """
+
+    members: MLP
+    scale: Float[Array, " seen"]  # range of each component of an observation
+    actions: Actions
+
+    def __call__(
+        self, observation: Float[Array, "batch seen"], action: Array
+    ) -> Float[Array, "member batch seen+2"]:
+        """Every member's prediction."""
+        if isinstance(self.actions, Discrete):
+            action = jax.nn.one_hot(action, self.actions.n)
+        else:
+            action = action / unit_of(self.actions)
+        inputs = jnp.concatenate([observation / self.scale, action], -1)
+        return jax.vmap(lambda member: member(inputs))(self.members)
+
+    def truth(self, step: Experience) -> Float[Array, "batch seen+2"]:
+        """What would have been right to predict."""
+        change = (step.next_observation - step.observation) / self.scale
+        return jnp.column_stack([change, step.reward, step.terminal])
+
+    def imagine(
+        self, observation: Float[Array, "batch seen"], action: Array, key: PRNGKeyArray
+    ) -> Experience:
+        """A step of each row, as a member drawn at random expects it."""
+        expected = self(observation, action)
+        member = jax.random.randint(key, expected.shape[1:2], 0, len(expected))
+        drawn = expected[member, jnp.arange(len(member))]
+        change, reward, terminal = drawn[:, :-2], drawn[:, -2], drawn[:, -1] > 0.5
+        return Experience(observation, action, reward, observation + self.scale * change, terminal)
+
+
+def model_loss(
+    model: Model, step: Experience, counts: Float[Array, "batch member"]
+) -> tuple[Float[Array, ""], Metrics]:
+    """Squared errors relative to the batch's variance, each step counted as often as it is."""
+    truth = model.truth(step)
+    unit = jnp.maximum(truth.std(0), 1e-2).at[-1].set(1.0)
+    errors = ((model(step.observation, step.action) - truth) / unit) ** 2
+    loss = (counts.T * errors.mean(-1)).mean(1).sum()
+    return loss, {"model_loss": errors.mean()}
+
+
+class Remembered(NamedTuple):
+    """A real step, and how often each member counts it."""
+
+    step: Experience
+    counts: Float[Array, "*batch member"]
+
+
+class MBPOState(ActorCriticState):
+    """That of SAC, whose buffer holds real steps, with a model and its imagination."""
+
+    model: Model
+    model_adam: optimizer.Optimizer
+    imagined: Replay
+
+
+class MBPO(SAC):
+    """Soft actor-critic that learns from a learned model's steps alone."""
+
+    members: int = static(5)  # networks in the ensemble
+    model_hidden: tuple[int, ...] = sizes(128, 128)
+    model_updates: int = static(4)  # gradient steps of the model per step of all environments
+    model_rate: float = number(1.0)  # its learning rate, as a share of the critics'
+    imagined_rows: int = static(64)  # real observations that imagination starts from each time
+    imagined_steps: int = static(5)  # how far it goes
+    imagined_capacity: int = static(100_000)  # steps
+
+    def __check_init__(self) -> None:
+        counts = "members model_updates imagined_rows imagined_steps"
+        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "imagined_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
+        require(self, "model_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require_sizes(self, "model_hidden")
+
+    def init(self, task: Task, key: PRNGKeyArray) -> MBPOState:
+        model_key, key = jax.random.split(key)
+        observation = task.observe(task.reset(key))
+        if getattr(observation, "ndim", 0) != 1 or task.states is not None:
+            raise QfolioError(
+                "mbpo predicts observations that are one row of numbers; those of "
+                f"{type(task).__name__} are not. Take sac or dqn."
+            )
+        actions = task.actions
+        entries = actions.n if isinstance(actions, Discrete) else uniform(actions, key, 1).shape[1]
+        layers = (observation.size + entries, *self.model_hidden, observation.size + 2)
+        model = Model(
+            jax.vmap(lambda key: MLP(layers, key))(jax.random.split(model_key, self.members)),
+            jnp.broadcast_to(jnp.array(task.observation_scale), observation.shape),
+            actions,
+        )
+        start = super().init(task, key)
+        step = jax.tree.map(lambda x: x[0], start.replay.unpack(start.replay.rows[:1]))
+        rows = Remembered(step, jnp.ones(self.members))
+        width = self.imagined_rows * self.imagined_steps
+        return MBPOState(
+            learned=start.learned,
+            replay=Replay.empty(rows, self.replay_capacity, self.environments),
+            steps=start.steps,
+            model=model,
+            model_adam=optimizer.begin(model.members),
+            imagined=Replay.empty(step, self.imagined_capacity, width),
+        )
+
+    def observe(self, state: MBPOState, rollout: Transition) -> MBPOState:
+        step = Experience.of(rollout)
+        key = jax.random.fold_in(jax.random.key(0), state.steps)
+        counts = jax.random.poisson(key, 1.0, (len(step.reward), self.members))
+        replay = state.replay.add(Remembered(step, counts.astype(jnp.float32)))
+        return eqx.tree_at(lambda s: (s.replay, s.steps), state, (replay, state.steps + 1))
+
+    def learn(
+        self, task: Task, state: MBPOState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[MBPOState, Metrics]:
+        state = self.observe(state, rollout)
+        model_key, imagine_key, key = jax.random.split(key, 3)
+        model, model_adam, metrics = self._study(state, model_key)
+        imagined = self._imagine(model, state, imagine_key)
+        learned, more = self.practise(state.learned, imagined, key)
+        state = MBPOState(learned, state.replay, state.steps, model, model_adam, imagined)
+        return state, metrics | more
+
+    def _study(
+        self, state: MBPOState, key: PRNGKeyArray
+    ) -> tuple[Model, optimizer.Optimizer, Metrics]:
+        """Gradient steps of the model on real transitions."""
+        done = state.learned.critic_adam.count
+        rate = self.model_rate * optimizer.learning_rate(self, done)
+
+        def update(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, Metrics]:
+            members, adam = carry
+            batch = state.replay.sample(key, self.batch_size)
+            loss = lambda members: model_loss(  # noqa: E731
+                eqx.tree_at(lambda m: m.members, state.model, members), batch.step, batch.counts
+            )
+            members, adam, metrics = self.descend(loss, members, adam, rate)
+            return (members, adam), metrics
+
+        carry = (state.model.members, state.model_adam)
+        keys = jax.random.split(key, self.model_updates)
+        (members, adam), metrics = lax.scan(update, carry, keys)
+        model = eqx.tree_at(lambda m: m.members, state.model, members)
+        return model, adam, jax.tree.map(jnp.mean, metrics)
+
+    def _imagine(self, model: Model, state: MBPOState, key: PRNGKeyArray) -> Replay:
+        """The buffer of imagined steps, with those of the present policy and model."""
+        start_key, key = jax.random.split(key)
+        starts = state.replay.sample(start_key, self.imagined_rows).step.observation
+
+        def step(
+            observation: Float[Array, "batch seen"], key: PRNGKeyArray
+        ) -> tuple[Float[Array, "batch seen"], Experience]:
+            act_key, key = jax.random.split(key)
+            action = self.explore(state.learned, observation, act_key)
+            step = model.imagine(observation, action, key)
+            return jnp.where(step.terminal[:, None], starts, step.next_observation), step
+
+        _, steps = lax.scan(step, starts, jax.random.split(key, self.imagined_steps))
+        return state.imagined.add(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps))
+
+    def carry_over(self, state: MBPOState, fresh: MBPOState) -> MBPOState:
+        return eqx.tree_at(lambda s: (s.replay, s.imagined), state, (fresh.replay, fresh.imagined))

@@ -1,0 +1,189 @@
+"""What policy-gradient agents share: a stochastic policy beside an estimate of what it earns.
+
+They act by drawing from the policy, and learn from a rollout that this very policy has made: each
+action is compared with what the estimate had expected (an advantage), the policy moves towards
+actions that did better, and the estimate towards what came. ``reinforce.py``, ``a2c.py`` and
+``ppo.py`` differ in how. docs/policy_gradients.md has the formulas.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from qfolio import networks, optimizer
+from qfolio.distributions import Distribution, policy_of
+from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
+from qfolio.networks import KINDS, Flat, Network, Outputs, outputs_of
+from qfolio.targets import advantages
+
+
+class ActorCritic(eqx.Module):
+    """A policy (the actor) and the discounted return that it is expected to earn (the critic)."""
+
+    actor: Network
+    log_std: Float[Array, " coordinate"]  # the same in all states; one for all assets of a market
+    critic: Network
+    actions: Actions = eqx.field(static=True)
+
+    def policy(self, observation: PyTree) -> Distribution:
+        return policy_of(self.actions, self.actor(observation), self.log_std)
+
+    def value(self, observation: PyTree) -> Float[Array, " batch"]:
+        """V(s) in units of scaled rewards."""
+        return self.critic(observation)[:, 0]
+
+
+class ActorCriticState(eqx.Module):
+    weights: ActorCritic
+    optimizer: optimizer.Optimizer
+
+
+class Batch(NamedTuple):
+    """Steps of a rollout in one row, by time and then environment, with what came of them."""
+
+    observation: PyTree
+    action: Array
+    log_prob: Float[Array, " batch"]  # of the action, when it was drawn
+    advantage: Float[Array, " batch"]
+    goal: Float[Array, " batch"]  # of the critic
+
+
+class OnPolicy(Agent):
+    """Acting, the networks and the step of the optimiser; how to learn is left open."""
+
+    network: str = static("flat")  # over everything observed; or mlp, cnn, rnn, shared by assets
+    hidden: tuple[int, ...] = sizes(64, 64)  # of the actor, and of the critic
+    environments: int = static(8)  # stepped side by side
+    rollout: int = static(128)  # steps of each environment that are learned from at once
+    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
+    discount: float = number(0.99)
+    learning_rate: float = number(3e-4)
+    learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
+    learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
+    gradient_norm: float = number(0.5)  # longer gradients are cut to it
+    value_weight: float = number(0.5)  # of the critic's mean squared error in the loss
+    entropy_weight: float = number(0.0)  # of the policy's entropy, which the loss rewards
+    std: float = number(1.0)  # at the start, in units of the bound, or of the logits of weights
+    reward_scale: float = number(1.0)  # the critic learns values of scaled rewards
+    input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
+
+    def __check_init__(self) -> None:
+        require(self, "environments rollout", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "discount", lambda x: 0 <= x <= 1, "between 0 and 1")
+        require(self, "gradient_norm", lambda x: x > 0, "greater than 0")
+        require(self, "value_weight entropy_weight", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "std", lambda x: 1e-9 <= x <= 1e9, "from 10⁻⁹ to 10⁹")
+        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+        optimizer.require_schedule(self)
+        require_sizes(self)
+
+    @property
+    def rollout_steps(self) -> int:
+        return self.rollout
+
+    def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState:
+        actor_key, critic_key, start_key = jax.random.split(key, 3)
+        observation = task.observe(task.reset(start_key))
+
+        def build(outputs: Outputs, key: PRNGKeyArray) -> Network:
+            return networks.build(
+                self.network, task, observation, self.hidden, outputs, key, self.input_gain
+            )
+
+        weights = ActorCritic(
+            actor=_quiet(build(outputs_of(task.actions), actor_key)),
+            log_std=jnp.full(_coordinates(task.actions), jnp.log(self.std)),
+            critic=build(Outputs(1), critic_key),
+            actions=task.actions,
+        )
+        return ActorCriticState(weights, optimizer.begin(weights))
+
+    def warm_up(self) -> int:
+        return 0
+
+    def weights(self, state: ActorCriticState) -> ActorCritic:
+        return state.weights
+
+    def policy(self, weights: ActorCritic, observation: PyTree) -> Array:
+        return weights.policy(observation).mode()
+
+    def act(self, state: ActorCriticState, observation: PyTree, key: PRNGKeyArray) -> Array:
+        return state.weights.policy(observation).sample(key)
+
+    def observe(self, state: ActorCriticState, rollout: Transition) -> ActorCriticState:
+        return state
+
+    def judge(
+        self, weights: ActorCritic, rollout: Transition, trace: Float[Array, ""] | float
+    ) -> Batch:
+        """Compares a rollout that these weights made with what they expect.
+
+        trace: λ of the advantages, from 0, which trusts the critic, to 1, which trusts the rewards.
+        """
+        step = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout)
+        value = weights.value(step.observation)
+        by_time = lambda x: x.reshape(rollout.reward.shape)  # noqa: E731
+        advantage = advantages(
+            self.reward_scale * rollout.reward,
+            by_time(value),
+            by_time(weights.value(step.next_observation)),
+            rollout.terminated,
+            rollout.truncated,
+            self.discount,
+            trace,
+        ).reshape(-1)
+        return Batch(
+            observation=step.observation,
+            action=step.action,
+            log_prob=weights.policy(step.observation).log_prob(step.action),
+            advantage=advantage,
+            goal=advantage + value,
+        )
+
+    @abc.abstractmethod
+    def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
+        """What the policy raises, by the log density that it gives to the batch's actions."""
+
+    def loss(self, weights: ActorCritic, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
+        """Minus the objective, with the critic's error and the policy's entropy."""
+        policy = weights.policy(batch.observation)
+        loss = -self.objective(policy.log_prob(batch.action), batch).mean()
+        value_loss = ((batch.goal - weights.value(batch.observation)) ** 2).mean()
+        entropy = policy.entropy().mean()
+        total = loss + self.value_weight * value_loss - self.entropy_weight * entropy
+        return total, {"loss": loss, "value_loss": value_loss, "entropy": entropy}
+
+    def descend(self, state: ActorCriticState, batch: Batch) -> tuple[ActorCriticState, Metrics]:
+        """One gradient step."""
+        gradient, metrics = jax.grad(self.loss, has_aux=True)(state.weights, batch)
+        gradient = optimizer.clip(gradient, self.gradient_norm)
+        weights, adam = optimizer.descend(self, state.weights, gradient, state.optimizer)
+        return ActorCriticState(weights, adam), metrics
+
+
+def normalised(advantage: Float[Array, " batch"]) -> Float[Array, " batch"]:
+    """Advantages with mean 0 and standard deviation 1."""
+    return (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+
+
+def _coordinates(actions: Actions) -> int:
+    """How many standard deviations a policy has; a choice has none."""
+    return actions.n if isinstance(actions, Box) else int(isinstance(actions, Simplex))
+
+
+def _quiet(network: Network) -> Network:
+    """The network with an output layer of zeros: the first policy is the same everywhere."""
+
+    def last(network: Network) -> tuple[Array, Array]:
+        mlp = network.mlp if isinstance(network, Flat) else network.network.head
+        return mlp.weights[-1], mlp.biases[-1]
+
+    return eqx.tree_at(last, network, replace_fn=jnp.zeros_like)

@@ -1,0 +1,69 @@
+"""Proximal policy optimisation (Schulman et al. 2017).
+
+A rollout is used for several epochs of gradient steps on minibatches. What keeps the policy near
+the one that made the rollout is the objective: it rewards no change of an action's probability
+beyond 1 ± ``clip``. Advantages are generalised (Schulman et al. 2016). docs/policy_gradients.md has
+the formulas and the deviations from the paper.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from qfolio.agents.on_policy import ActorCriticState, Batch, OnPolicy, normalised
+from qfolio.errors import QfolioError
+from qfolio.fields import number, require, static
+from qfolio.mdp import Metrics, Task, Transition
+
+
+class PPO(OnPolicy):
+    """Proximal policy optimisation with the clipped objective."""
+
+    environments: int = static(1)
+    rollout: int = static(2048)
+    epochs: int = static(10)
+    batch_size: int = static(64)
+    trace: float = number(0.95)  # λ of the advantages: 0 trusts the critic, 1 the rewards
+    clip: float = number(0.2)  # how far the objective follows a change of probability
+
+    def __check_init__(self) -> None:
+        require(self, "epochs batch_size", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "trace", lambda x: 0 <= x <= 1, "between 0 and 1")
+        require(self, "clip", lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")
+        if self.environments * self.rollout % self.batch_size:
+            raise QfolioError(
+                f"batch_size is {self.batch_size}; it must divide the rollout of "
+                f"{self.environments} environments × {self.rollout} steps."
+            )
+
+    def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
+        return clipped(jnp.exp(log_prob - batch.log_prob), normalised(batch.advantage), self.clip)
+
+    def learn(
+        self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[ActorCriticState, Metrics]:
+        batch = self.judge(state.weights, rollout, self.trace)
+
+        def epoch(state: ActorCriticState, key: PRNGKeyArray) -> tuple[ActorCriticState, Metrics]:
+            descend = lambda state, batch: self.descend(state, batch)  # noqa: E731
+            return lax.scan(descend, state, minibatches(key, batch, self.batch_size))
+
+        state, metrics = lax.scan(epoch, state, jax.random.split(key, self.epochs))
+        return state, jax.tree.map(jnp.mean, metrics)
+
+
+def minibatches(key: PRNGKeyArray, batch: Batch, size: int) -> Batch:
+    """The batch's rows in random order, as (minibatch, row, ...)."""
+    order = jax.random.permutation(key, batch.goal.shape[0]).reshape(-1, size)
+    return jax.tree.map(lambda x: x[order], batch)
+
+
+def clipped(
+    ratio: Float[Array, " batch"], advantage: Float[Array, " batch"], clip: Float[Array, ""] | float
+) -> Float[Array, " batch"]:
+    """min(rA, clip(r, 1 − ε, 1 + ε)A) (Schulman et al. 2017, eq. 7).
+
+    ratio: the probability of an action over that when it was drawn.
+    """
+    return jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)

@@ -1,0 +1,37 @@
+"""REINFORCE with a learned baseline (Williams 1992).
+
+Whole episodes are played; then the policy takes one step along the gradient of its actions' log
+probabilities, each times the return that followed it less the baseline. No reward is replaced by an
+estimate, except that of what a time limit cuts off. docs/policy_gradients.md has the formulas and
+the deviations from the paper.
+"""
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from qfolio.agents.on_policy import ActorCriticState, Batch, OnPolicy, normalised
+from qfolio.errors import QfolioError
+from qfolio.fields import static
+from qfolio.mdp import Metrics, Task, Transition
+
+
+class REINFORCE(OnPolicy):
+    """REINFORCE with a learned baseline."""
+
+    rollout: int = static(200)  # whole episodes
+
+    def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState:
+        episode = min(self.episode_steps or task.horizon, task.horizon)
+        if self.rollout % episode:
+            raise QfolioError(
+                f"rollout is {self.rollout}; it must be a multiple of the {episode} steps of an "
+                "episode (episode_steps, or the task's horizon)."
+            )
+        return super().init(task, key)
+
+    def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
+        return log_prob * normalised(batch.advantage)
+
+    def learn(
+        self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[ActorCriticState, Metrics]:
+        return self.descend(state, self.judge(state.weights, rollout, trace=1.0))

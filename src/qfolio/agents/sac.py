@@ -1,0 +1,201 @@
+"""Soft actor-critic (Haarnoja et al. 2018, "Soft actor-critic algorithms and applications").
+
+The agent maximises reward plus α times the policy's entropy, so that it stays as random as the task
+lets it be. Two critics regress Q(s, a) towards r + γ V'(s') with the soft value
+V(s) = E[min Q(s, a) − α log π(a|s)]; the actor climbs V; the temperature α is tuned so that the
+entropy meets a target. Actions are squashed normal numbers, weights on a simplex, or numbered,
+where expectations are sums (Christodoulou 2019). docs/actor_critic.md lists formulas and
+deviations.
+"""
+
+import math
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from qfolio import optimizer
+from qfolio.agents.actor_critic import (
+    ActorCritic,
+    ActorCriticState,
+    Critics,
+    critic_loss,
+    unit_of,
+)
+from qfolio.distributions import Categorical, Gaussian, LogisticNormal, Squashed
+from qfolio.fields import number, require
+from qfolio.mdp import Actions, Discrete, Metrics, Simplex, Task
+from qfolio.networks import Network, Outputs, outputs_of
+from qfolio.replay import Experience
+from qfolio.targets import follow, td_target
+
+LOG_STD = (-10.0, 2.0)
+"""Where a normal number's log standard deviation is kept."""
+
+
+class Actor(eqx.Module):
+    """A stochastic policy over any kind of actions."""
+
+    network: Network
+    actions: Actions
+
+    def __call__(self, observation: PyTree) -> Categorical | Gaussian | Squashed | LogisticNormal:
+        output = self.network(observation)
+        if isinstance(self.actions, Discrete):
+            return Categorical(output)
+        if isinstance(self.actions, Simplex):
+            cash, assets, log_std = jnp.split(output, [1, 1 + self.actions.assets], axis=-1)
+            return LogisticNormal(Gaussian(assets - cash, jnp.clip(log_std, *LOG_STD)))
+        mean, log_std = jnp.split(output, 2, axis=-1)
+        normal = Gaussian(mean, jnp.clip(log_std, *LOG_STD))
+        bound = self.actions.bound
+        return normal if math.isinf(bound) else Squashed(normal, bound)
+
+
+class Learned(eqx.Module):
+    """What gradient steps change."""
+
+    actor: Actor
+    critics: Critics
+    target_critics: Critics
+    log_temperature: Float[Array, ""]
+    actor_adam: optimizer.Optimizer
+    critic_adam: optimizer.Optimizer
+    temperature_adam: optimizer.Optimizer
+
+
+def target_entropy(actions: Actions, spread: Float[Array, ""] | float) -> Float[Array, ""]:
+    """The entropy of a choice that is uniform over a share of each coordinate's range.
+
+    A coordinate without bounds counts as one from −1 to 1, weights have the simplex's volume, and
+    of n numbered actions 1 + ``spread`` (n − 1) are left.
+    """
+    if isinstance(actions, Discrete):
+        return jnp.log1p(spread * (actions.n - 1))
+    if isinstance(actions, Simplex):
+        return actions.assets * jnp.log(spread) - math.lgamma(actions.assets + 1)
+    return actions.n * jnp.log(2 * unit_of(actions) * spread)
+
+
+def expectations(
+    actor: Actor, critics: Critics, observation: PyTree, key: PRNGKeyArray
+) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
+    """E[min Q(s, a)] and the entropy of the policy, for each observation.
+
+    Exact for numbered actions, and from one draw otherwise; gradients flow through the draw.
+    """
+    policy = actor(observation)
+    if isinstance(policy, Categorical):
+        q = critics.every(observation).min(0)
+        return (jax.nn.softmax(policy.logits) * q).sum(-1), policy.entropy()
+    if isinstance(policy, Gaussian):
+        action = policy.sample(key)
+        log_prob = policy.log_prob(action)
+    else:
+        action, log_prob = policy.sample_and_log_prob(key)
+    return critics(observation, action).min(0), -log_prob
+
+
+def actor_loss(
+    actor: Actor,
+    critics: Critics,
+    temperature: Float[Array, ""],
+    observation: PyTree,
+    key: PRNGKeyArray,
+) -> tuple[Float[Array, ""], Metrics]:
+    """Minus the mean soft value (Haarnoja et al. 2018, eq. 9)."""
+    q, entropy = expectations(actor, critics, observation, key)
+    return -(q + temperature * entropy).mean(), {"entropy": entropy.mean()}
+
+
+def temperature_loss(
+    log_temperature: Float[Array, ""], excess: Float[Array, ""]
+) -> tuple[Float[Array, ""], Metrics]:
+    """Falls with the temperature where there is more entropy than wanted, and else rises."""
+    return log_temperature * excess, {"temperature": jnp.exp(log_temperature)}
+
+
+class Policy(NamedTuple):
+    """What acting needs, and the values of numbered actions."""
+
+    actor: Actor
+    critics: Critics | None
+
+
+class SAC(ActorCritic):
+    """A stochastic actor, two critics with targets, and a temperature."""
+
+    spread: float = number(0.184)  # target entropy, as share of the actions; Haarnoja's is e⁻¹/2
+    temperature: float = number(1.0)  # at the start
+
+    def __check_init__(self) -> None:
+        require(self, "spread temperature", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+
+    def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
+        actor_key, critic_key = jax.random.split(key)
+        outputs = outputs_of(task.actions)
+        if isinstance(task.actions, Discrete):
+            make = partial(self.build, task, observation, outputs)
+            critics = Critics(make, 2, critic_key)
+        else:
+            critics = self.build_critics(task, observation, 2, critic_key)
+            weights = isinstance(task.actions, Simplex)  # cash needs no standard deviation
+            outputs = Outputs(1, 2) if weights else Outputs(2 * outputs.pooled)
+        actor = Actor(self.build(task, observation, outputs, actor_key), task.actions)
+        log_temperature = jnp.log(self.temperature)
+        begin = optimizer.begin
+        return Learned(
+            actor, critics, critics, log_temperature,
+            begin(actor), begin(critics), begin(log_temperature),
+        )  # fmt: skip
+
+    def weights(self, state: ActorCriticState) -> Policy:
+        actor, critics = state.learned.actor, state.learned.critics
+        return Policy(actor, critics if isinstance(actor.actions, Discrete) else None)
+
+    def policy(self, weights: Policy, observation: PyTree) -> Array:
+        return weights.actor(observation).mode()
+
+    def action_values(
+        self, weights: Policy, observation: PyTree
+    ) -> Float[Array, "batch action"] | None:
+        """Q(s, ·) in units of reward, where actions are numbered; it counts later entropy, too."""
+        if weights.critics is None:
+            return None
+        return weights.critics.every(observation).min(0) / self.reward_scale
+
+    def explore(self, learned: Learned, observation: PyTree, key: PRNGKeyArray) -> Array:
+        return learned.actor(observation).sample(key)
+
+    def update(
+        self, learned: Learned, batch: Experience, key: PRNGKeyArray
+    ) -> tuple[Learned, Metrics]:
+        next_key, key = jax.random.split(key)
+        temperature = jnp.exp(learned.log_temperature)
+        rate = optimizer.learning_rate(self, learned.critic_adam.count)
+
+        following, entropy = expectations(
+            learned.actor, learned.target_critics, batch.next_observation, next_key
+        )
+        value = following + temperature * entropy
+        goal = td_target(self.reward_scale * batch.reward, batch.terminal, value, self.discount)
+        critics, critic_adam, metrics = self.descend(
+            critic_loss, learned.critics, learned.critic_adam, rate, batch, goal
+        )
+        actor, actor_adam, more = self.descend(
+            actor_loss, learned.actor, learned.actor_adam, self.actor_rate * rate,
+            critics, temperature, batch.observation, key,
+        )  # fmt: skip
+        excess = more["entropy"] - target_entropy(actor.actions, self.spread)
+        log_temperature, temperature_adam, last = self.descend(
+            temperature_loss, learned.log_temperature, learned.temperature_adam, rate, excess
+        )
+        target_critics = follow(learned.target_critics, critics, self.target_rate)
+        learned = Learned(
+            actor, critics, target_critics, log_temperature,
+            actor_adam, critic_adam, temperature_adam,
+        )  # fmt: skip
+        return learned, metrics | more | last

@@ -1,0 +1,239 @@
+"""Learning action values in a table, for tasks that show a number: Q-learning and its relatives.
+
+A step (s, a, r, s') moves one entry of the table towards a target, Q(s, a) ← Q(s, a) + α (r + γ
+v(s') − Q(s, a)); nothing follows where the task ended, and a time limit is no end. The agents
+differ in v(s'), what they think follows:
+
+- Q-learning (Watkins 1989): max_a Q(s', a).
+- SARSA (Rummery & Niranjan 1994): Q(s', a') of the action that is really taken next.
+- Expected SARSA (van Seijen et al. 2009): its mean over the ε-greedy policy.
+- Double Q-learning (van Hasselt 2010): two tables; one selects the best action, the other values
+  it, and a coin says which of them learns.
+
+docs/tabular.md holds every formula and each deviation from the papers.
+"""
+
+from typing import NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from qfolio.errors import QfolioError
+from qfolio.exploration import epsilon_greedy
+from qfolio.fields import number, require, static
+from qfolio.mdp import Agent, Discrete, Metrics, Task, Transition
+from qfolio.targets import bootstrap, td_target
+
+Values = Float[Array, "state action"]
+
+
+Tables = Float[Array, "table state action"]
+"""One table, or two for double Q-learning, whose mean acts."""
+
+
+class Move(NamedTuple):
+    """A step that is learned from, of each environment; states by number."""
+
+    state: Int[Array, " batch"]
+    action: Int[Array, " batch"]
+    reward: Float[Array, " batch"]
+    next_state: Int[Array, " batch"]
+    terminated: Bool[Array, " batch"]
+    truncated: Bool[Array, " batch"]
+
+    @classmethod
+    def of(cls, rollout: Transition) -> "Move":
+        """The only step of a rollout."""
+        step = (rollout.observation, rollout.action, rollout.reward, rollout.next_observation)
+        return cls(*(x[0] for x in (*step, rollout.terminated, rollout.truncated)))
+
+
+class TableState(eqx.Module):
+    """All that a tabular agent learns and remembers."""
+
+    # Value, and number of updates, which the step size follows. They are one array, and learning
+    # reports no errors, because XLA would else copy the tables at every step.
+    cells: Float[Array, "table state action 2"]
+    episodes: Int[Array, ""]  # finished; ε follows it
+
+    @property
+    def tables(self) -> Tables:
+        return self.cells[..., 0]
+
+
+State = TypeVar("State", bound=TableState)
+
+
+class Tabular(Agent):
+    """A table of action values and ε-greedy actions; the agents below say how it learns."""
+
+    environments: int = static(1)  # stepped side by side
+    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
+    discount: float = number(0.99)
+    learning_rate: float = number(0.1)  # α
+    learning_rate_decay: float = number(0.0)  # d: after n updates of an entry, α/(1 + d n)
+    initial_value: float = number(0.0)  # of every entry; above what can be true: optimism
+    epsilon: float = number(1.0)
+    epsilon_end: float = number(0.01)
+    epsilon_decay: float = number(0.995)  # factor per finished episode
+
+    count = 1  # of tables
+
+    def __check_init__(self) -> None:
+        require(self, "environments", lambda x: 1 <= x <= 4096, "from 1 to 4096")
+        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
+        fractions = "discount learning_rate epsilon epsilon_end epsilon_decay"
+        require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
+        require(self, "learning_rate_decay", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "initial_value", lambda x: abs(x) <= 1e30, "from −1e30 to 1e30")
+
+    def init(self, task: Task, key: PRNGKeyArray) -> TableState:
+        if task.states is None or not isinstance(task.actions, Discrete):
+            missing = "numbered states" if task.states is None else "numbered actions"
+            raise QfolioError(
+                f"A table needs {missing}, and {type(task).__name__} has none; take a task that "
+                "has, such as pendulum/grid, or another agent, such as dqn."
+            )
+        shape = (self.count, task.states, task.actions.n)
+        full = jnp.full(shape, jnp.asarray(self.initial_value, jnp.float32))
+        return TableState(jnp.stack([full, jnp.zeros(shape)], -1), jnp.array(0, jnp.int32))
+
+    def warm_up(self) -> int:
+        return 0
+
+    def epsilon_now(self, state: TableState) -> Float[Array, ""]:
+        return jnp.maximum(self.epsilon_end, self.epsilon * self.epsilon_decay**state.episodes)
+
+    def monitor(self, state: TableState) -> Metrics:
+        return {"epsilon": self.epsilon_now(state)}
+
+    def weights(self, state: TableState) -> Tables:
+        return state.tables
+
+    def action_values(
+        self, weights: Tables, observation: Int[Array, "*batch"]
+    ) -> Float[Array, "*batch action"]:
+        return weights[:, observation].mean(0)
+
+    def policy(self, weights: Tables, observation: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
+        return self.action_values(weights, observation).argmax(-1)
+
+    def act(
+        self, state: TableState, observation: Int[Array, " batch"], key: PRNGKeyArray
+    ) -> Int[Array, " batch"]:
+        values = self.action_values(state.tables, observation)
+        return epsilon_greedy(key, values, self.epsilon_now(state))
+
+    def observe(self, state: State, rollout: Transition) -> State:
+        finished = (rollout.terminated | rollout.truncated).sum(dtype=jnp.int32)
+        return eqx.tree_at(lambda s: s.episodes, state, state.episodes + finished)
+
+    def update(
+        self,
+        state: State,
+        move: Move,
+        following: Float[Array, " batch"],
+        table: Int[Array, " batch"] | int = 0,
+    ) -> State:
+        """Takes each move's entry of a table towards r + γ v(s'), with v(s') as ``following``."""
+        _, states, actions, _ = state.cells.shape
+        entry = (table * states + move.state) * actions + move.action
+        cells = state.cells.reshape(-1, 2)
+        value, visits = cells[entry].T
+        error = td_target(move.reward, move.terminated, following, self.discount) - value
+        rate = self.learning_rate / (1 + self.learning_rate_decay * visits)
+        step = jnp.stack([step_share(entry, rate) * error, jnp.ones_like(error)], 1)
+        if len(entry) == 1:  # one more that goes nowhere: XLA scatters two in place, but not one
+            entry, step = jnp.append(entry, len(cells)), jnp.concatenate([step, step])
+        cells = cells.at[entry].add(step).reshape(state.cells.shape)
+        return eqx.tree_at(lambda s: s.cells, state, cells)
+
+
+def step_share(entry: Int[Array, " batch"], rate: Float[Array, " batch"]) -> Float[Array, " batch"]:
+    """The part of each error that is added to its entry: α, where no other move has that entry.
+
+    n moves of one entry together go as far as n steps of α towards one goal: 1 − (1 − α)ⁿ towards
+    the mean of theirs.
+    """
+    if len(entry) == 1:
+        return rate
+    n = (entry[:, None] == entry).sum(1)
+    return jnp.where(n == 1, rate, (1 - (1 - rate) ** n) / n)
+
+
+class QLearning(Tabular):
+    """Q-learning: towards the best action's value, whichever is taken."""
+
+    def learn(
+        self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[TableState, Metrics]:
+        move = Move.of(rollout)
+        state = self.update(state, move, state.tables[0, move.next_state].max(-1))
+        return self.observe(state, rollout), {}
+
+
+class ExpectedSarsa(Tabular):
+    """Expected SARSA: towards the mean value of the ε-greedy policy's actions."""
+
+    def learn(
+        self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[TableState, Metrics]:
+        move, epsilon = Move.of(rollout), self.epsilon_now(state)
+        values = state.tables[0, move.next_state]
+        following = (1 - epsilon) * values.max(-1) + epsilon * values.mean(-1)
+        state = self.update(state, move, following)
+        return self.observe(state, rollout), {}
+
+
+class DoubleQ(Tabular):
+    """Double Q-learning: one table selects the best action, the other values it."""
+
+    count = 2
+
+    def learn(
+        self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[TableState, Metrics]:
+        move = Move.of(rollout)
+        batch = jnp.arange(self.environments)
+        learner = jax.random.bernoulli(key, shape=batch.shape).astype(jnp.int32)
+        values = state.tables[:, move.next_state]
+        following = bootstrap(values[1 - learner, batch], selector=values[learner, batch])
+        state = self.update(state, move, following, learner)
+        return self.observe(state, rollout), {}
+
+
+class SarsaState(TableState):
+    """What SARSA remembers beside its table."""
+
+    last: Move  # it waits for the next action
+
+
+class Sarsa(Tabular):
+    """SARSA: towards the value of the action that is taken next.
+
+    A step is learned from when the next one shows that action. After a truncation none is taken,
+    and one is drawn from the policy.
+    """
+
+    def init(self, task: Task, key: PRNGKeyArray) -> SarsaState:
+        state = super().init(task, key)
+        zeros = jnp.zeros(self.environments, jnp.int32)
+        never = zeros.astype(bool)
+        # At first none waits: what is learned of a state that does not exist goes nowhere.
+        nowhere = jnp.full_like(zeros, state.tables.shape[1])
+        last = Move(nowhere, zeros, zeros.astype(jnp.float32), zeros, never, never)
+        return SarsaState(state.cells, state.episodes, last)
+
+    def learn(
+        self, task: Task, state: SarsaState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[SarsaState, Metrics]:
+        move, last = Move.of(rollout), state.last
+        values = state.tables[0, last.next_state]
+        drawn = epsilon_greedy(key, values, self.epsilon_now(state))
+        action = jnp.where(last.truncated, drawn, move.action)
+        following = jnp.take_along_axis(values, action[:, None], axis=1)[:, 0]
+        state = self.update(state, last, following)
+        state = eqx.tree_at(lambda s: s.last, state, move)
+        return self.observe(state, rollout), {}

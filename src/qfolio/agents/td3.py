@@ -1,0 +1,51 @@
+"""Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, algorithm 1).
+
+DDPG with three changes against values that are too high: the Bellman target takes the smaller of
+two critics' estimates; noise on its action smooths the value over similar actions; and the actor
+and all targets wait for several steps of the critics. docs/actor_critic.md lists formulas and
+deviations.
+"""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from qfolio.agents.ddpg import DDPG, Learned
+from qfolio.fields import number, require, static
+from qfolio.mdp import Metrics
+from qfolio.replay import Experience
+
+
+class TD3(DDPG):
+    """DDPG with two critics, a smoothed target and a delayed actor."""
+
+    target_noise: float = number(0.2)  # of the target's action, in units of the bound
+    target_clip: float = number(0.5)  # the largest such noise
+    policy_delay: int = static(2)  # critics' steps for one of the actor and the targets
+
+    critics: ClassVar[int] = 2
+
+    def __check_init__(self) -> None:
+        require(self, "target_noise target_clip", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "policy_delay", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+
+    def update(
+        self, learned: Learned, batch: Experience, key: PRNGKeyArray
+    ) -> tuple[Learned, Metrics]:
+        learned, metrics = self.evaluate(learned, batch, key)
+        due = learned.critic_adam.count % self.policy_delay == 0
+        improve = lambda learned: self.improve(learned, batch)  # noqa: E731
+        return lax.cond(due, improve, lambda learned: learned, learned), metrics
+
+    def following(
+        self, learned: Learned, observation: PyTree, key: PRNGKeyArray
+    ) -> Float[Array, " batch"]:
+        """min Q'(s', a') at a' = π'(s') with clipped noise (eq. 14 and 15)."""
+        action = learned.target_actor(observation)
+        noise = self.target_noise * jax.random.normal(key, action.shape)
+        noise = jnp.clip(noise, -self.target_clip, self.target_clip)
+        action = learned.target_actor.perturb(action, noise)
+        return learned.target_critics(observation, action).min(0)

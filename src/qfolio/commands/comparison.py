@@ -1,0 +1,192 @@
+"""The command that trains several agents on one task and compares them."""
+
+import datetime
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from qfolio.commands.arguments import INTERRUPTED, Count, Folder, Name
+from qfolio.errors import QfolioError
+
+if TYPE_CHECKING:
+    from qfolio.comparison import Comparison, Entrant
+    from qfolio.runs import Progress
+
+
+def compare(
+    task: Positional[Name] = None,
+    *,
+    agents: Annotated[str | None, arg(metavar="NAME,NAME …", help_behavior_hint="")] = None,
+    preset: Name = None,
+    episodes: Count = None,
+    steps: Count = None,
+    seeds: Count = None,
+    seed: Count = None,
+    out: Folder = None,
+    resume: Folder = None,
+) -> None:
+    """Train several agents on one task, with the same seeds, and write a report that compares them.
+
+    Args:
+        task: What to learn; pendulum otherwise.
+        agents: Which, with commas between, each with a preset behind a colon if it is not
+            --preset: dqn,pathwise or dqn:fast,dqn:report.
+        preset: Of agents that name none: fast if there is one, or the first.
+        episodes: Training episodes of each agent's seeds; the presets say how many otherwise.
+        steps: Environment steps of each agent's seeds, instead of episodes.
+        seeds: How many of each agent, 10 unless given.
+        seed: The first one, 0 unless given.
+        out: A new folder; runs/… otherwise.
+        resume: Go on with the comparison in this folder.
+    """
+    given = (task, agents, preset, episodes, steps, seeds, seed, out)
+    if resume is not None and any(option is not None for option in given):
+        raise QfolioError("--resume keeps what the comparison was started with; add nothing.")
+    if episodes is not None and steps is not None:
+        raise QfolioError("--episodes and --steps both say how far to train; give one of them.")
+    from qfolio import devices
+
+    devices.configure()
+    from qfolio import console
+    from qfolio.comparison import Comparison
+
+    if resume is None:
+        task = task or "pendulum"
+        budget = {"episodes": episodes, "steps": steps}
+        asked = {unit: amount for unit, amount in budget.items() if amount is not None}
+        now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
+        name = f"{re.sub('[/:]', '-', task)}-comparison-{now}"
+        run = Comparison.create(
+            _entrants(task, agents or "", preset, asked),
+            seeds=10 if seeds is None else seeds,
+            seed=seed or 0,
+            command=shlex.join(["qfolio", *sys.argv[1:]]),
+            note=""
+            if not asked
+            else "How long to train was set by hand; learning rates that fall with time, and the "
+            "like, were tuned for the presets' own lengths.",
+            out=out or Path("runs") / name,
+        )
+    else:
+        run = Comparison.open(resume)
+    seeds = run.config["seeds"]
+    console.say(
+        f"{len(run.entrants)} agents on {run.config['task']} · {seeds} seed{'s' * (seeds > 1)} "
+        f"each · {run.config['device']}"
+    )
+    try:
+        _train(run)
+    except KeyboardInterrupt:  # while nothing trains: what is finished is on disk
+        run.interrupted = True
+    if run.interrupted:
+        console.say(f"Stopped. Go on with: qfolio compare --resume {run.folder}")
+        sys.exit(INTERRUPTED)
+    _finish(run)
+
+
+def _entrants(
+    task: str, agents: str, preset: str | None, budget: dict[str, int]
+) -> "dict[str, Entrant]":
+    """The agents that ``--agents`` names, by what it calls them."""
+    from qfolio import presets, registry, settings
+    from qfolio.comparison import Entrant
+
+    task_class = registry.find("task", registry.TASKS, task)
+    entrants: dict[str, Entrant] = {}
+    chosen: dict[tuple[str, str], str] = {}
+    for entry in filter(None, map(str.strip, agents.split(","))):
+        agent, colon, own = entry.partition(":")
+        registry.find("agent", registry.AGENTS, agent)
+        known = presets.presets_of(task, agent)
+        default = "fast" if "fast" in known else next(iter(known), "fast")
+        name = own if colon else preset or default
+        if twin := chosen.get((agent, name)):
+            raise QfolioError(
+                f"--agents names {agent} with the preset {name} twice: {twin}, {entry}."
+            )
+        chosen[agent, name] = entry
+        settled = presets.preset(name, task, agent)
+        entrants[entry] = Entrant(
+            settings.build(task_class, settled.task),
+            settled.build(),
+            name,
+            budget or settled.budget,
+        )
+    return entrants
+
+
+def _train(run: "Comparison") -> None:
+    """Trains with a bar, and a line for each agent that is finished."""
+    import rich.progress
+
+    from qfolio import console
+
+    count = len(run.entrants)
+    columns = (
+        rich.progress.BarColumn(bar_width=24),
+        rich.progress.TextColumn("{task.description}"),
+    )
+    with rich.progress.Progress(
+        *columns, console=console.console, transient=True, disable=not console.console.is_terminal
+    ) as live:
+        bar = live.add_task("", total=1.0)
+
+        def note(name: str, number: int, now: "Progress | None") -> None:
+            if now is None:
+                live.console.print(f"{number + 1} of {count}: {name}")
+                live.update(bar, completed=0.0, description="compiling")
+                return
+            left = datetime.timedelta(seconds=round(now.seconds_left))
+            speed = f"{now.steps_per_second:,.0f} steps/s"
+            status = f"{name} ({number + 1} of {count})  {speed}  {left} left"
+            live.update(bar, completed=min(now.done / now.total, 1.0), description=status)
+
+        run.run(note)
+
+
+def _finish(run: "Comparison") -> None:
+    from qfolio import console
+    from qfolio.report.comparison import write_comparison_report
+
+    content = run.finish()
+    write_comparison_report(run.folder, content)
+    print_ranking(content)
+    console.say(f"Report: {run.folder / 'report.html'}")
+
+
+def print_ranking(content: dict[str, Any]) -> None:
+    """A row for each agent, best first, and what follows from it in words."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from qfolio import console
+    from qfolio.ranking import HEADLINE, amount, share, span
+
+    ranking = content["ranking"]
+    write = share if ranking["measure"] == "regret" else amount
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    near = f"steps to {HEADLINE:.0%}".replace("%", " %")
+    table.add_column("agent", no_wrap=True)
+    for name in (ranking["measure"], "95 % interval", "worst", near, "s a seed", "parameters"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name in ranking["order"]:
+        measures, result = ranking["agents"][name], content["results"][name]
+        final = measures["final"]
+        ends = [write(end) for end in final["interval"] or ()]
+        within = next(x for x in measures["within"] if x["threshold"] == HEADLINE)
+        table.add_row(
+            Text(name),
+            write(final["iqm"]),
+            " … ".join([*(end.removesuffix(" %") for end in ends[:-1]), *ends[-1:]]) or "–",
+            write(final["worst"]),
+            "–" if within["steps"] is None else f"{within['steps']:,.0f}",
+            span(result["seconds_per_seed"]).removesuffix(" s"),
+            f"{result['parameters']:,}",
+        )
+    console.console.print(table)
+    for sentence in [*content["conclusion"], *content["notes"]]:
+        console.say(sentence)

@@ -1,0 +1,143 @@
+"""The command that changes a task after training, and compares ways to go on."""
+
+import datetime
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from qfolio import settings
+from qfolio.commands.arguments import Assignments, Count, Folder, Name
+from qfolio.errors import QfolioError
+
+if TYPE_CHECKING:
+    from qfolio.continual import Plan
+
+Changes = Annotated[tuple[str, ...], arg(metavar="NAME=VALUE …", help_behavior_hint="")]
+Share = Annotated[float | None, arg(metavar="X", help_behavior_hint="")]
+
+
+def continual(
+    task: Positional[Name] = None,
+    *,
+    change: Changes = (),
+    agent: Name = None,
+    preset: Name = None,
+    episodes: Count = None,
+    seeds: Count = None,
+    seed: Count = None,
+    rate: Share = None,
+    renewal: Share = None,
+    epsilon: Share = None,
+    assignments: Assignments = (),
+    out: Folder = None,
+) -> None:
+    """Change a task after training and compare ways to go on: how soon each recovers, at what cost.
+
+    Args:
+        task: What to learn: pendulum, the default.
+        change: What becomes of it, for example --change mass=1.5; numbers only.
+        agent: Which algorithm; the first that has presets for the task otherwise.
+        preset: Of the agent; fast otherwise.
+        episodes: Training episodes before the change, and after it; the preset says otherwise.
+        seeds: How many agents are trained side by side; the preset says otherwise.
+        seed: The first one's, 0 unless given.
+        rate: Share of its first learning rate that an agent goes on with, 0.1 otherwise.
+        renewal: Share of the first training that a renewed agent learns for, 0.25 otherwise.
+        epsilon: How much a renewed agent explores at first, 0.3 otherwise.
+        assignments: Hyperparameters, and the task's settings before the change.
+        out: A new folder for the report; runs/… otherwise.
+    """
+    from qfolio import devices
+
+    devices.configure()
+    import rich.progress
+
+    from qfolio import console, continual, presets
+    from qfolio.files import new_folder, require_new, write_json
+    from qfolio.report.continual import verdict, write_continual_report
+
+    task, preset = task or "pendulum", preset or "fast"
+    agent = agent or presets.default_agent(task)
+    shares = {"rate": rate, "renewal": renewal, "epsilon": epsilon}
+    options: dict[str, Any] = {k: x for k, x in shares.items() if x is not None}
+    options |= {} if seed is None else {"seed": seed}
+    plan = _plan(task, change, agent, preset, episodes, seeds, assignments, options)
+    name = f"{task.replace('/', '-')}-continual-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    folder = out or Path("runs") / name
+    require_new(folder)
+    columns = (
+        rich.progress.BarColumn(bar_width=24),
+        rich.progress.TextColumn("{task.description}"),
+    )
+    with rich.progress.Progress(
+        *columns, console=console.console, transient=True, disable=not console.console.is_terminal
+    ) as live:
+        bar = live.add_task("compiling", total=1.0)
+        content = continual.compare(
+            plan, lambda way, done: live.update(bar, completed=done, description=way)
+        )
+    content["command"] = shlex.join(["qfolio", *sys.argv[1:]])
+    with new_folder(folder) as place:
+        write_json(place / "continual.json", content)
+        write_continual_report(place, content)
+    _print(content)
+    console.say(verdict(content))
+    console.say(f"Report: {folder / 'report.html'}")
+
+
+def _plan(
+    task_name: str,
+    change: tuple[str, ...],
+    agent_name: str,
+    preset_name: str,
+    episodes: int | None,
+    seeds: int | None,
+    assignments: tuple[str, ...],
+    options: dict[str, Any],
+) -> "Plan":
+    from qfolio import presets, registry
+    from qfolio.continual import Plan
+
+    task_class = registry.find("task", registry.TASKS, task_name)
+    registry.find("agent", registry.AGENTS, agent_name)
+    preset = presets.preset(preset_name, task_name, agent_name)
+    if not change:
+        raise QfolioError("--change says what becomes of the task, for example --change mass=1.5.")
+    chosen = settings.parse(assignments)
+    before = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
+    before = {**preset.task, **before}
+    return Plan(
+        task=settings.build(task_class, before),
+        changed=settings.build(task_class, {**before, **settings.parse(change)}),
+        agent=preset.build(**chosen),
+        episodes=preset.episodes if episodes is None else episodes,
+        seeds=preset.seeds if seeds is None else seeds,
+        **options,
+    )
+
+
+def _print(content: dict[str, Any]) -> None:
+    """A row for each way."""
+    from rich.table import Table
+
+    from qfolio.console import console
+    from qfolio.statistics import interquartile_mean
+
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("way")
+    for name in ("regret", "worst seed", "steps to recover", "recovered", "steps", "old world"):
+        table.add_column(name, justify="right")
+    for way, course in content["courses"].items():
+        recovery = content["recovery"][way]
+        reached = sum(step is not None for step in recovery["per_seed"])
+        final, other = (interquartile_mean(course[name]) for name in ("final", "other"))
+        middle = recovery["middle"]
+        table.add_row(
+            way, f"{final:.1%}", f"{max(course['final']):.1%}",
+            "–" if middle is None else f"{middle:,.0f}", f"{reached} of {content['seeds']}",
+            f"{course['steps'][-1]:,}", f"{other:.1%}",
+        )  # fmt: skip
+    console.print(table)

@@ -1,0 +1,152 @@
+"""Action values as one number or as a distribution of returns: how each is read and learned.
+
+A network gives ``atoms`` numbers z for each action. Each kind of value says what they mean: their
+``mean`` is the action value, ``outcomes`` are the returns that may follow, each of which makes a
+goal, and ``loss`` is the distance of z from the goals, with how far off the value was, to set
+priorities by.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from qfolio.fields import require
+from qfolio.targets import huber_loss
+
+Losses = tuple[Float[Array, " batch"], Float[Array, " batch"]]
+
+
+class Expected(NamedTuple):
+    """The expected return alone (Mnih et al. 2015)."""
+
+    huber: Float[Array, ""] | float
+
+    @property
+    def atoms(self) -> int:
+        return 1
+
+    def mean(self, z: Float[Array, "*batch 1"]) -> Float[Array, "*batch"]:
+        return z[..., 0]
+
+    def outcomes(self, z: Float[Array, "batch 1"]) -> Float[Array, "batch 1"]:
+        return z
+
+    def loss(
+        self,
+        z: Float[Array, "batch 1"],
+        goal: Float[Array, "batch 1"],
+        following: Float[Array, "batch 1"],
+    ) -> Losses:
+        error = (goal - z)[:, 0]
+        return huber_loss(error, self.huber), jnp.abs(error)
+
+
+class Categorical(NamedTuple):
+    """Probabilities, as logits, of returns equally spaced (C51; Bellemare et al. 2017)."""
+
+    atoms: int
+    low: Float[Array, ""] | float
+    high: Float[Array, ""] | float
+
+    @property
+    def support(self) -> Float[Array, " atom"]:
+        return self.low + (self.high - self.low) * jnp.linspace(0.0, 1.0, self.atoms)
+
+    def mean(self, z: Float[Array, "*batch atom"]) -> Float[Array, "*batch"]:
+        return (jax.nn.softmax(z) * self.support).sum(-1)
+
+    def outcomes(self, z: Float[Array, "batch atom"]) -> Float[Array, "batch atom"]:
+        return jnp.broadcast_to(self.support, z.shape)
+
+    def loss(
+        self,
+        z: Float[Array, "batch atom"],
+        goal: Float[Array, "batch atom"],
+        following: Float[Array, "batch atom"],
+    ) -> Losses:
+        """Cross-entropy; its distance from the least possible is the divergence of the two."""
+        wanted = project(goal, jax.nn.softmax(following), self.support)
+        loss = -(wanted * jax.nn.log_softmax(z)).sum(-1)
+        return loss, jnp.maximum(loss - jax.scipy.special.entr(wanted).sum(-1), 0.0)
+
+
+class Quantile(NamedTuple):
+    """The return's quantiles at the middles of equal parts (Dabney et al. 2018)."""
+
+    atoms: int
+    huber: Float[Array, ""] | float
+
+    def mean(self, z: Float[Array, "*batch atom"]) -> Float[Array, "*batch"]:
+        return z.mean(-1)
+
+    def outcomes(self, z: Float[Array, "batch atom"]) -> Float[Array, "batch atom"]:
+        return z
+
+    def loss(
+        self,
+        z: Float[Array, "batch atom"],
+        goal: Float[Array, "batch atom"],
+        following: Float[Array, "batch atom"],
+    ) -> Losses:
+        off = jnp.abs(goal.mean(-1) - z.mean(-1))
+        return quantile_huber_loss(z, goal, self.huber), off
+
+
+Values = Expected | Categorical | Quantile
+
+KINDS = ("expected", "categorical", "quantile")
+
+
+def values_of(agent: Any) -> Values:
+    """What the settings of an agent ask for."""
+    if agent.values == "categorical":
+        return Categorical(agent.atoms, agent.v_min, agent.v_max)
+    if agent.values == "quantile":
+        return Quantile(agent.atoms, agent.huber)
+    return Expected(agent.huber)
+
+
+def require_values(agent: Any) -> None:
+    """Raises QfolioError where the settings of an agent's values make no sense."""
+    require(agent, "values", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+    require(agent, "atoms", lambda x: 2 <= x <= 1001, "from 2 to 1001")
+    require(agent, "v_min v_max", lambda x: -1e30 <= x <= 1e30, "from -1e30 to 1e30")
+    if agent.values == "categorical":
+        require(agent, "v_max", lambda x: x > agent.v_min, f"above v_min ({agent.v_min})")
+    if agent.values == "quantile":
+        require(agent, "huber", math.isfinite, "finite for quantiles, such as 1")
+
+
+def project(
+    outcomes: Float[Array, "batch outcome"],
+    probabilities: Float[Array, "batch outcome"],
+    support: Float[Array, " atom"],
+) -> Float[Array, "batch atom"]:
+    """Probabilities of outcomes, brought to equal spacing (Bellemare et al. 2017, eq. 7).
+
+    Each outcome's probability goes to its two neighbours, the nearer the more, so that the mean
+    stays; what lies beyond the support goes to its ends.
+    """
+    spacing = support[1] - support[0]
+    clipped = jnp.clip(outcomes, support[0], support[-1])
+    distance = jnp.abs(clipped[:, None, :] - support[:, None]) / spacing
+    return jnp.einsum("bao,bo->ba", jnp.maximum(1 - distance, 0.0), probabilities)
+
+
+def quantile_huber_loss(
+    quantiles: Float[Array, "batch quantile"],
+    outcomes: Float[Array, "batch outcome"],
+    delta: Float[Array, ""] | float,
+) -> Float[Array, " batch"]:
+    """Sum over quantiles of the mean over outcomes (Dabney et al. 2018, eq. 10 and algorithm 1).
+
+    Errors below a quantile's level count by 1 − level, those above by the level.
+    """
+    n = quantiles.shape[-1]
+    error = outcomes[:, None, :] - quantiles[:, :, None]
+    level = ((jnp.arange(n) + 0.5) / n)[:, None]
+    weight = jnp.where(error < 0, 1 - level, level)
+    return (weight * huber_loss(error, delta)).mean(-1).sum(-1)

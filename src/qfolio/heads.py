@@ -1,0 +1,120 @@
+"""The last layers of a network where plain ones will not do: streams, and noise on the weights."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from qfolio import networks
+from qfolio.encoders import MLP
+from qfolio.mdp import Task
+
+
+class NoisyMLP(MLP):
+    """Layers whose weights carry noise of a learned size (Fortunato et al. 2018, section 3).
+
+    The noise of a weight is the product of one number for its input and one for its output. As it
+    is, the network has the mean weights; ``draw`` gives it with noise.
+    """
+
+    weight_scales: list[Float[Array, "inputs outputs"]]
+    bias_scales: list[Float[Array, " outputs"]]
+
+    def __init__(self, mlp: MLP, scale: Float[Array, ""] | float) -> None:
+        """Noise starts at ``scale``/√inputs."""
+        self.weights, self.biases = mlp.weights, mlp.biases
+        starts = [scale / math.sqrt(len(weight)) for weight in mlp.weights]
+        fill = lambda x, start: jnp.full_like(x, start)  # noqa: E731
+        self.weight_scales = list(map(fill, mlp.weights, starts))
+        self.bias_scales = list(map(fill, mlp.biases, starts))
+
+    def draw(self, key: PRNGKeyArray) -> "NoisyMLP":
+        """The same layers with noise on their weights."""
+        weights, biases = [], []
+        for i, (weight, scale) in enumerate(zip(self.weights, self.weight_scales, strict=True)):
+            inputs, outputs = weight.shape
+            normal = jax.random.normal(jax.random.fold_in(key, i), (inputs + outputs,))
+            noise = jnp.sign(normal) * jnp.sqrt(jnp.abs(normal))
+            weights.append(weight + scale * noise[:inputs, None] * noise[inputs:])
+            biases.append(self.biases[i] + self.bias_scales[i] * noise[inputs:])
+        return eqx.tree_at(lambda m: (m.weights, m.biases), self, (weights, biases))
+
+
+class Streams(eqx.Module):
+    """Layers that begin together and part into streams; the streams' outputs stand in one row.
+
+    Dueling networks have one stream for a state's value and one for its actions' advantages (Wang
+    et al. 2016, figure 1).
+    """
+
+    trunk: MLP | None
+    streams: list[MLP]
+
+    def __init__(
+        self, mlp: MLP, first: int, noise: Float[Array, ""] | float | None, key: PRNGKeyArray
+    ) -> None:
+        """Parts the last two layers of ``mlp``, or its last one where there are not three.
+
+        first: outputs of the first stream; 0 for a single stream of all. noise: the size that the
+        noise of the streams' weights starts with, or None.
+        """
+        shared = max(len(mlp.weights) - 2, min(len(mlp.weights) - 1, 1))
+        layers = lambda m: (m.weights, m.biases)  # noqa: E731
+        cut = (mlp.weights[:shared], mlp.biases[:shared])
+        self.trunk = eqx.tree_at(layers, mlp, cut) if shared else None
+        *hidden, total = [weight.shape[1] for weight in mlp.weights[shared:]]
+        inputs = mlp.weights[shared].shape[0]
+        self.streams = []
+        for outputs in (first, total - first) if first else (total,):
+            key, stream_key = jax.random.split(key)
+            sizes = (inputs, *hidden, outputs)
+            plain = MLP(sizes, stream_key)
+            self.streams.append(plain if noise is None else NoisyMLP(plain, noise))
+
+    def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
+        if self.trunk is not None:
+            x = jax.nn.relu(self.trunk(x))
+        return jnp.concatenate([stream(x) for stream in self.streams], axis=-1)
+
+
+def build(
+    agent: Any, task: Task, observation: PyTree, atoms: int, key: PRNGKeyArray
+) -> networks.Network:
+    """The network that an agent's settings ask for: ``atoms`` numbers for each action in a row.
+
+    Where it is dueling, those of the state's value stand before them.
+    """
+    pooled, each, _ = networks.outputs_of(task.actions)
+    outputs = networks.Outputs((pooled + agent.dueling) * atoms, each * atoms, atoms)
+    network = networks.build(
+        agent.network, task, observation, agent.hidden, outputs, key, agent.input_gain
+    )
+    if not (agent.dueling or agent.noisy):
+        return network
+    shared = isinstance(network, networks.PerAsset)
+    last = (lambda n: n.network.head) if shared else (lambda n: n.mlp)
+    first, noise = atoms * agent.dueling, agent.noise_scale if agent.noisy else None
+    return eqx.tree_at(last, network, Streams(last(network), first, noise, key))
+
+
+def draw_noise(network: PyTree, key: PRNGKeyArray) -> PyTree:
+    """The network with one draw of noise on all its noisy layers."""
+    is_noisy = lambda x: isinstance(x, NoisyMLP)  # noqa: E731
+    leaves, structure = jax.tree.flatten(network, is_leaf=is_noisy)
+    drawn = [
+        leaf.draw(jax.random.fold_in(key, i)) if is_noisy(leaf) else leaf
+        for i, leaf in enumerate(leaves)
+    ]
+    return jax.tree.unflatten(structure, drawn)
+
+
+def duel(z: Float[Array, "batch outputs atom"]) -> Float[Array, "batch action atom"]:
+    """Action values from a state's value, which stands first, and its actions' advantages.
+
+    Advantages count from their mean over the actions (Wang et al. 2016, eq. 9).
+    """
+    value, advantage = z[:, :1], z[:, 1:]
+    return value + advantage - advantage.mean(1, keepdims=True)

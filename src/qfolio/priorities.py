@@ -1,0 +1,76 @@
+"""Priorities of the rows of a replay buffer (Schaul et al. 2016): a tree of sums in arrays."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+FAN = 16
+"""Children of a node."""
+
+
+class Priorities(eqx.Module):
+    """A number for each row, drawn in proportion to it; setting and drawing cost O(log rows).
+
+    The last level holds the rows' numbers, FAN to a node, and each level above the sums of the
+    nodes below it. A wide tree is shallow: few dependent steps, each over many numbers at once.
+    Sums are taken anew from their children, so that rounding does not pile up.
+    """
+
+    levels: list[Float[Array, "_ 16"]]  # from the root's children to the rows
+    highest: Float[Array, ""]  # that any row has had; new rows get it
+
+    @staticmethod
+    def empty(capacity: int) -> "Priorities":
+        """No row can be drawn yet."""
+        levels: list[Array] = []
+        nodes = capacity
+        while not levels or nodes > 1:
+            nodes = -(-nodes // FAN)
+            levels.insert(0, jnp.zeros((nodes, FAN)))
+        return Priorities(levels, jnp.array(1.0))
+
+    @property
+    def total(self) -> Float[Array, ""]:
+        return self.levels[0].sum()
+
+    def of(self, index: Int[Array, " n"]) -> Float[Array, " n"]:
+        return self.levels[-1][index // FAN, index % FAN]
+
+    def set(self, index: Int[Array, " n"], values: Float[Array, " n"]) -> "Priorities":
+        """Rows set to ``values``; one that comes twice has to come with the same."""
+        highest = jnp.maximum(self.highest, values.max())
+        levels = []
+        for level in reversed(self.levels):
+            index, child = index // FAN, index % FAN
+            level = level.at[index, child].set(values)
+            values = level[index].sum(-1)
+            levels.append(level)
+        return Priorities(levels[::-1], highest)
+
+    def draw(self, key: PRNGKeyArray, n: int) -> Int[Array, " n"]:
+        """``n`` rows, one from each of ``n`` equal parts of the sum (stratified)."""
+        strata = (jnp.arange(n) + jax.random.uniform(key, (n,))) / n
+        return self.find(strata * self.total)
+
+    def find(self, mass: Float[Array, " n"]) -> Int[Array, " n"]:
+        """The rows at which the running sum of all rows' numbers first exceeds ``mass``."""
+        node = jnp.zeros(mass.shape, jnp.int32)
+        for level in self.levels:
+            children = level[node]
+            sums = children.cumsum(-1)
+            # Whatever rounding does, a child of zero is never taken.
+            reached = jnp.where(children > 0, sums, -1.0)
+            bound = jnp.minimum(mass, 0.9999999 * reached.max(-1))[:, None]
+            child = jnp.argmax(reached > bound, axis=-1).astype(jnp.int32)
+            before = jnp.take_along_axis(sums - children, child[:, None], axis=-1)[:, 0]
+            mass = jnp.maximum(mass - before, 0.0)
+            node = node * FAN + child
+        return node
+
+    def importance(
+        self, index: Int[Array, " n"], exponent: Float[Array, ""] | float
+    ) -> Float[Array, " n"]:
+        """Weights (N P(i))^−exponent of rows drawn, the largest of them 1 (section 3.4)."""
+        drawn = self.of(index)
+        return (drawn.min() / drawn) ** exponent

@@ -1,0 +1,161 @@
+"""Writing the report of a change in the world: one self-contained page and its figure.
+
+Everything shown is in continual.json, so that a report can be written anew from it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from markupsafe import Markup
+
+from qfolio.continual import WAYS
+from qfolio.report import palette
+from qfolio.report.comparison import _log_axis, _short, _themed
+from qfolio.report.figures import LEAD, NARROW, inline_svg, new_figure, save_png
+from qfolio.report.rendering import amount, duration, number, percent, render, setting_groups
+from qfolio.statistics import bootstrap_interval, interquartile_mean
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Content = dict[str, Any]
+"""Of continual.json."""
+
+COLOURS = dict(zip(WAYS, ("muted", "agent-3", "agent-1", "agent-2"), strict=True))
+"""Of each way, as keys of palette.LIGHT and palette.DARK."""
+
+FLOOR = 1e-3
+"""The smallest regret that is drawn, as the scale is logarithmic."""
+
+
+def write_continual_report(folder: Path, content: Content) -> None:
+    """Write report.html and recovery.png into a folder, which is made if missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    save_png(folder / "recovery.png", draw_recovery, content, LEAD)
+    (folder / "report.html").write_text(render_page(content), encoding="utf-8")
+
+
+def render_page(content: Content) -> str:
+    """Return the text of the page."""
+    keys = ("agent", "episodes", "seeds", "seed", "rate", "renewal", "epsilon", "version")
+    general = {key: content[key] for key in (*keys, "device", "started")}
+    groups = {"task": content["task_settings"], "agent": content["agent_settings"]}
+    return render(
+        "continual.html",
+        content=content,
+        data={"command": content["command"]},
+        change=change(content),
+        verdict=verdict(content),
+        facts=_facts(content),
+        rows=[(way, WAYS[way], COLOURS[way], _row(content, way)) for way in WAYS],
+        within=percent(content["within"], 0),
+        rate=percent(content["rate"], 0),
+        renewal=percent(content["renewal"], 0),
+        recovery={
+            kind: Markup(_themed(inline_svg(draw_recovery, content, width)))
+            for kind, width in (("wide", LEAD), ("narrow", NARROW))
+        },
+        settings=setting_groups({**general, **groups}),
+    )
+
+
+def change(content: Content) -> str:
+    """What changes, as text."""
+    changes = content["changes"].items()
+    return ", ".join(f"{name} from {old:g} to {new:g}" for name, (old, new) in changes)
+
+
+def verdict(content: Content) -> str:
+    """Return the result in a few plain sentences."""
+    worse = percent(_middle(content, "frozen"))
+    before = percent(float(interquartile_mean(content["training"]["final"])))
+    found = [f"Where it was trained, the policy has a regret of {before}; after the change, as it "
+             f"is, of {worse}."]  # fmt: skip
+    for way in ("renewed", "going on", "fresh"):
+        steps = content["recovery"][way]["middle"]
+        name = {"going on": "Going on", "renewed": "Renewed learning", "fresh": "A new agent"}[way]
+        goal = f"within {percent(content['within'], 0)} of the new optimum"
+        if steps is None:
+            found.append(f"{name} does not come to stay {goal} in {_learned(content, way)} steps.")
+        else:
+            found.append(f"{name} stays {goal} from {amount(round(steps))} steps on.")
+    return " ".join(found)
+
+
+def _facts(content: Content) -> list[tuple[str, str, str]]:
+    optimum = content["optimum"]
+    training = content["training"]
+    return [
+        ("Optimum before", number(optimum["old"]), "exact"),
+        ("Optimum after", number(optimum["new"]), "exact"),
+        ("Regret before", percent(float(interquartile_mean(training["final"]))), "after training"),
+        ("Regret at once", percent(_middle(content, "frozen")), "after the change"),
+        ("First training", amount(training["steps"][-1]), "steps of a seed"),
+        ("Seeds", str(content["seeds"]), f"from {content['seed']} on"),
+    ]
+
+
+def _row(content: Content, way: str) -> list[tuple[str, str]]:
+    """What became of a way, each with a remark."""
+    course, recovery = content["courses"][way], content["recovery"][way]
+    reached = sum(step is not None for step in recovery["per_seed"])
+    middle = recovery["middle"]
+    seconds = course["seconds"] / content["seeds"]
+    return [
+        (percent(_middle(content, way)), f"worst {percent(max(course['final']))}"),
+        ("–" if middle is None else amount(round(middle)), f"{reached} of {content['seeds']}"),
+        (_learned(content, way), duration(seconds) if seconds else ""),
+        (percent(float(interquartile_mean(course["other"]))), ""),
+    ]
+
+
+def _learned(content: Content, way: str) -> str:
+    """Environment steps of a seed after the change."""
+    return amount(content["courses"][way]["steps"][-1])
+
+
+def _middle(content: Content, way: str) -> float:
+    return float(interquartile_mean(content["courses"][way]["final"]))
+
+
+def draw_recovery(content: Content, width: float) -> Figure:
+    """Draw the regret in the changed world over the steps since the change."""
+    figure = new_figure(width, 4.2 if width > NARROW else 3.9)
+    axes = figure.subplots()
+    axes.grid(axis="y")
+    axes.set_xlabel("environment steps of a seed since the change")
+    last = max(course["steps"][-1] for course in content["courses"].values())
+    for way in reversed(WAYS):
+        _draw_course(axes, content, way, last)
+    axes.set_yscale("log")
+    axes.set_xlim(0, last)
+    axes.xaxis.set_major_formatter(lambda tick, _: _short(tick))
+    axes.locator_params(axis="x", nbins=6 if width > NARROW else 4)
+    _log_axis(axes.yaxis)
+    axes.axhline(content["within"], color=palette.INK, linewidth=0.9, dashes=(4, 3), zorder=1.5)
+    axes.set_title("Regret in the changed world")
+    handles, labels = axes.get_legend_handles_labels()
+    columns = len(WAYS) if width > NARROW else 2
+    figure.legend(
+        handles[::-1], labels[::-1], loc="outside upper left", ncols=columns,
+        labelcolor=palette.INK, handlelength=2.2, columnspacing=1.6, borderpad=0.3,
+    )  # fmt: skip
+    return figure
+
+
+def _draw_course(axes: Axes, content: Content, way: str, last: int) -> None:
+    """Draw the interquartile mean over seeds and its band; what does not learn is a line."""
+    course = content["courses"][way]
+    steps, curve = np.array(course["steps"]), np.array(course["curve"])
+    if len(steps) == 1:
+        steps, curve = np.array([0, last]), np.repeat(curve, 2, axis=0)
+    colour = palette.MUTED if COLOURS[way] == "muted" else palette.LIGHT[COLOURS[way]]
+    low, high, middle = (
+        np.maximum(line, FLOOR) for line in (*bootstrap_interval(curve), interquartile_mean(curve))
+    )
+    axes.fill_between(steps, low, high, color=colour, alpha=0.16, linewidth=0)
+    axes.plot(steps, middle, color=colour, linewidth=1.8, label=way, clip_on=False)

@@ -1,0 +1,201 @@
+"""Any environment of Gymnasium as a task: what agents must know of it, and how it is translated.
+
+``qfolio train gym:CartPole-v1`` makes one. The environment itself cannot be compiled: ``host.py``
+steps it. This file holds the shapes that agents ask a task for, and takes observations and actions
+from one side to the other.
+"""
+
+import copy
+import difflib
+import json
+import math
+from functools import cache
+from importlib import import_module
+from typing import Any, NamedTuple, NoReturn
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+from qfolio.errors import QfolioError
+from qfolio.fields import require, static
+from qfolio.mdp import Box, Discrete, Step, Task
+
+UNLIMITED = 1000
+"""Steps after which an episode is cut where the environment itself has no time limit."""
+
+
+class GymnasiumTask(Task):
+    """An environment by its ID in Gymnasium's registry, such as ``CartPole-v1``.
+
+    Observations are numbers (a Box, of any shape) or one of ``states`` numbers (Discrete). Actions
+    are numbered (Discrete), or coordinates from −1 to 1 that stand for the space's bounds (Box).
+    Raises QfolioError for other spaces, for an unknown ID and for what is not installed.
+    """
+
+    id: str = static("CartPole-v1")  # with a module to import first: my_module:MyEnv-v0
+    kwargs: str = static("")  # what it is made with, as JSON: {"continuous": true}
+    horizon: int = static(0)  # episodes are truncated here; 0: at the environment's own limit
+
+    def __post_init__(self) -> None:
+        if not self.horizon:
+            self.horizon = self.facts.limit
+
+    def __check_init__(self) -> None:
+        require(self, "horizon", lambda x: 1 <= x < 2**31, "at least 0")
+
+    @property
+    def facts(self) -> "Facts":
+        return _facts(self.id, self.kwargs)
+
+    @property
+    def actions(self) -> Discrete | Box:
+        return self.facts.actions
+
+    @property
+    def states(self) -> int | None:
+        return self.facts.states
+
+    @property
+    def observation_scale(self) -> tuple[float, ...] | float:
+        """The bounds of an observation's numbers, and 1 where there are none."""
+        return self.facts.scale
+
+    @property
+    def observation(self) -> tuple[tuple[int, ...], type]:
+        """Shape and type of an observation."""
+        return self.facts.shape, np.float32 if self.states is None else np.int32
+
+    def reset(self, key: PRNGKeyArray) -> Array:
+        """A state, of which nothing is known here."""
+        return jnp.zeros(())
+
+    def observe(self, state: Array) -> Array:
+        """An observation of zeros, for its shape."""
+        return jnp.zeros(*self.observation)
+
+    def step(self, state: Array, action: Array, key: PRNGKeyArray) -> Step:
+        raise QfolioError(f"{self.id} cannot be compiled; qfolio.train steps it from Python.")
+
+    def make(self, **options: Any) -> Any:
+        """The environment, without the time limit and the checks that ``host.py`` sees to."""
+        return _make(self.id, self.kwargs, **options)
+
+
+class Facts(NamedTuple):
+    """What is fixed of an environment, and how observations and actions are translated."""
+
+    limit: int  # of an episode, in steps
+    shape: tuple[int, ...]  # of an observation
+    states: int | None
+    first_state: int
+    scale: tuple[float, ...] | float
+    actions: Discrete | Box
+    first_action: int
+    low: np.ndarray  # bounds of a Box of actions
+    high: np.ndarray
+
+    def given(self, actions: np.ndarray) -> list[Any]:
+        """A batch of agents' actions, each as the environment takes it."""
+        if isinstance(self.actions, Discrete):
+            return (actions.ravel() + self.first_action).tolist()
+        share = (np.clip(actions, -1.0, 1.0) + 1) / 2
+        return list(self.low + share.reshape(-1, *self.low.shape) * (self.high - self.low))
+
+    def seen(self, observation: Any) -> Any:
+        """An environment's observation as agents get it."""
+        return observation if self.states is None else observation - self.first_state
+
+
+@cache
+def _facts(id: str, kwargs: str) -> Facts:
+    spaces = _gymnasium().spaces
+    env = _make(id, kwargs)
+    seen, done = env.observation_space, env.action_space
+    env.close()
+    if isinstance(seen, spaces.Box):
+        bounds = np.maximum(np.abs(seen.low), np.abs(seen.high)).astype(float).ravel()
+        known = (bounds > 0) & (bounds < 1e6)
+        scale = tuple(np.where(known, bounds, 1.0).tolist())
+    elif not isinstance(seen, spaces.Discrete):
+        _refuse(id, "observations", seen, "Discrete or a Box", "FlattenObservation")
+    numbered = isinstance(done, spaces.Discrete)
+    if not numbered and not (isinstance(done, spaces.Box) and done.is_bounded()):
+        _refuse(id, "actions", done, "Discrete or a Box with bounds", "TransformAction")
+    discrete = isinstance(seen, spaces.Discrete)
+    return Facts(
+        limit=_spec(id).max_episode_steps or UNLIMITED,
+        shape=() if discrete else seen.shape,
+        states=int(seen.n) if discrete else None,
+        first_state=int(seen.start) if discrete else 0,
+        scale=1.0 if discrete else scale,
+        actions=Discrete(int(done.n)) if numbered else Box(math.prod(done.shape), 1.0),
+        first_action=int(done.start) if numbered else 0,
+        low=np.zeros(0) if numbered else done.low,
+        high=np.zeros(0) if numbered else done.high,
+    )
+
+
+def _refuse(id: str, what: str, space: Any, wanted: str, wrapper: str) -> NoReturn:
+    raise QfolioError(
+        f"The {what} of {id} are {space}, and agents here need {wanted}; register it in a wrapper "
+        f"that makes them so, such as gymnasium.wrappers.{wrapper}."
+    )
+
+
+def _make(id: str, kwargs: str, **options: Any) -> Any:
+    error = _gymnasium().error
+    spec = copy.deepcopy(_spec(id))
+    spec.order_enforce, spec.disable_env_checker = False, True  # they cost a third of a step
+    try:
+        return _gymnasium().make(spec, max_episode_steps=-1, **_arguments(kwargs), **options)
+    except (error.DependencyNotInstalled, ImportError) as reason:
+        box2d = "pip install 'qfolio[box2d]'." if "ox2" in str(reason) else _sentence(reason)
+        raise QfolioError(f"{id} needs more than Gymnasium: {box2d}") from None
+    except TypeError as reason:
+        raise QfolioError(f"{id} cannot be made with kwargs={kwargs} ({reason}).") from None
+    except error.Error as reason:
+        raise QfolioError(f"{id} cannot be made: {_sentence(reason)}") from None
+
+
+def _spec(id: str) -> Any:
+    """What Gymnasium's registry holds of an ID."""
+    gymnasium = _gymnasium()
+    module, _, name = id.rpartition(":")
+    try:
+        if module or name.startswith("qfolio/"):
+            import_module(module or "qfolio.gym")
+        return gymnasium.spec(name)
+    except ImportError as reason:
+        raise QfolioError(f"{module} cannot be imported for {id} ({reason}).") from None
+    except gymnasium.error.Error as reason:
+        space = name.rpartition("/")[0]
+        there = [other for other in gymnasium.registry if other.rpartition("/")[0] == space]
+        close = difflib.get_close_matches(name, there, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else _sentence(reason)
+        raise QfolioError(f"Gymnasium has no environment {name!r}; {hint}") from None
+
+
+def _arguments(kwargs: str) -> dict[str, Any]:
+    try:
+        arguments = json.loads(kwargs or "{}")
+        if isinstance(arguments, dict):
+            return arguments
+    except ValueError:
+        pass
+    raise QfolioError(
+        f"kwargs is {kwargs}; it must be a JSON object, for example "
+        """'kwargs={"continuous": true}'."""
+    )
+
+
+def _sentence(reason: Exception) -> str:
+    return " ".join(str(reason).split()).rstrip(".") + "."
+
+
+def _gymnasium() -> Any:
+    try:
+        import gymnasium
+    except ImportError:
+        raise QfolioError("gym: needs Gymnasium: pip install 'qfolio[gym]'.") from None
+    return gymnasium

@@ -1,0 +1,150 @@
+import dataclasses
+import json
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from qfolio import continual
+from qfolio.agents.dqn import DQN
+from qfolio.cli import main
+from qfolio.continual import Course, Plan, compare, recovery, renew
+from qfolio.errors import QfolioError
+from qfolio.evaluation import start_keys
+from qfolio.report.continual import render_page, verdict
+from qfolio.tasks.catch import Catch
+from qfolio.tasks.pendulum import Pendulum
+from qfolio.training import Population
+
+OLD, NEW = Pendulum(horizon=20), Pendulum(horizon=20, mass=1.5)
+AGENT = DQN(
+    hidden=(8,), environments=2, batch_size=8, replay_capacity=100, learning_starts=10,
+    learning_rate_final=0.0, learning_rate_steps=150.0,
+)  # fmt: skip
+EPISODES = 16
+
+
+def trained(task, agent, episodes=EPISODES):
+    population = Population(task, agent, [3, 4])
+    while left := population.steps_left(episodes):
+        population.advance(left)
+    return population
+
+
+@pytest.fixture(scope="module")
+def content():
+    return compare(Plan(OLD, NEW, AGENT, EPISODES, seeds=2, seed=3))
+
+
+def regrets(task, population):
+    best = task.optimum().returns(start_keys()).mean()
+    return (best - population.evaluate(start_keys(), tail=0).returns.mean(1)) / abs(best)
+
+
+def test_frozen_is_the_trained_policy_in_both_worlds(content):
+    course = content["courses"]["frozen"]
+    assert course["steps"] == [0]
+    first = trained(OLD, AGENT)
+    np.testing.assert_allclose(course["other"], regrets(OLD, first), rtol=1e-5)
+    there = Population(NEW, AGENT, [3, 4])
+    there.restore(first.fetch())
+    np.testing.assert_allclose(course["final"], regrets(NEW, there), rtol=1e-5)
+
+
+def test_fresh_is_a_training_in_the_changed_world(content):
+    course = content["courses"]["fresh"]
+    np.testing.assert_allclose(course["final"], regrets(NEW, trained(NEW, AGENT)), rtol=1e-5)
+    assert course["steps"][-1] == EPISODES * 20
+
+
+def test_every_way_begins_with_what_it_knows(content):
+    courses = content["courses"]
+    assert courses["going on"]["curve"][0] == courses["frozen"]["curve"][0]
+    assert courses["renewed"]["curve"][0] == courses["frozen"]["curve"][0]
+    assert courses["fresh"]["curve"][0] != courses["frozen"]["curve"][0]
+    assert courses["going on"]["steps"][-1] == EPISODES * 20
+    assert courses["renewed"]["steps"][-1] == EPISODES // 4 * 20
+
+
+def test_going_on_needs_a_learning_rate():
+    """That of the preset has fallen to zero: as it is, an agent would learn nothing."""
+    plan = Plan(OLD, NEW, AGENT, EPISODES)
+    assert plan.going_on == dataclasses.replace(AGENT, learning_rate_final=0.1)
+    first = trained(OLD, dataclasses.replace(AGENT, learning_rate_steps=100.0), 32)
+    moved = {}
+    for final in (0.0, 0.1):
+        agent = dataclasses.replace(AGENT, learning_rate_steps=100.0, learning_rate_final=final)
+        population = Population(NEW, agent, [3, 4])
+        population.restore(first.fetch())
+        population.advance(20)
+        pairs = zip(*(jax.tree.leaves(p.weights()) for p in (population, first)), strict=True)
+        moved[final] = max(np.abs(a - b).max() for a, b in pairs)
+    assert moved[0.0] == 0
+    assert moved[0.1] > 1e-4
+
+
+def test_renewed_learning_knows_everything_and_remembers_nothing():
+    plan = Plan(OLD, NEW, AGENT, EPISODES)
+    assert plan.renewed == dataclasses.replace(AGENT, learning_rate_steps=37.5, epsilon=0.3)
+    learned, fresh = trained(OLD, AGENT).fetch(), Population(NEW, AGENT, [3, 4]).fetch()
+    state = renew(AGENT, learned, fresh)
+    for name in ("online", "target"):
+        for new, old in zip(*(jax.tree.leaves(getattr(x.agent, name)) for x in (state, learned)),
+                            strict=True):  # fmt: skip
+            np.testing.assert_array_equal(new, old)
+    assert np.any(learned.agent.replay.rows)
+    assert not np.any(state.agent.replay.rows)
+    counters = (state.agent.replay.size, state.agent.episodes, state.agent.steps, state.steps,
+                *jax.tree.leaves(state.agent.optimizer))  # fmt: skip
+    assert not any(np.any(x) for x in counters)
+    assert np.any(learned.agent.episodes)
+
+
+def test_recovery_is_staying_near_the_optimum():
+    curve = [[0.5, 0.04, 0.9], [0.04, 0.06, 0.8], [0.03, 0.02, 0.7], [0.01, 0.05, 0.6]]
+    found = recovery(Course([0, 10, 20, 30], curve, [], [], 0.0))
+    assert found["per_seed"] == [10, 20, None]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (Pendulum(horizon=20, torques=5), "only numbers"),
+        (Pendulum(horizon=20), "nothing changes"),
+    ],
+)
+def test_refuses_changes_that_make_no_sense(changed, message):
+    with pytest.raises(QfolioError, match=message):
+        Plan(OLD, changed, AGENT, EPISODES)
+
+
+def test_a_task_without_numbers_cannot_change():
+    with pytest.raises(QfolioError, match="only numbers"):
+        Plan(Catch(), Catch(rows=12), AGENT, EPISODES)
+
+
+def test_the_report_says_what_happened(content, tmp_path):
+    page = render_page({**content, "command": "qfolio continual <b>"})
+    assert "&lt;b&gt;" in page
+    assert "mass from 1 to 1.5" in page
+    for way in continual.WAYS:
+        assert way in page
+    assert "does not come to stay" in verdict(content)
+
+
+def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
+    folder = tmp_path / "there"
+    words = ["qfolio", "continual", "pendulum", "--change", "mass=1.5", "--episodes", "8",
+             "--seeds", "2", "--out", str(folder), "--set", "hidden=8", "environments=2",
+             "batch_size=8", "learning_starts=16", "episode_steps=0", "horizon=20"]  # fmt: skip
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as exit:
+        main()
+    assert exit.value.code == 0
+    assert {path.name for path in folder.iterdir()} == {
+        "continual.json", "report.html", "recovery.png",
+    }  # fmt: skip
+    content = json.loads((folder / "continual.json").read_text())
+    assert content["changes"] == {"mass": [1.0, 1.5]}
+    assert "frozen" in capsys.readouterr().out

@@ -1,0 +1,135 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from qfolio import networks
+from qfolio.agents.dqn import DQN
+from qfolio.encoders import CNN, LSTM, RNN
+from qfolio.errors import QfolioError
+from qfolio.mdp import View
+from qfolio.networks import SHARED, Outputs, Shared
+from qfolio.tasks.catch import Catch
+from qfolio.tasks.hidden_pendulum import HiddenPendulum
+from qfolio.tasks.pendulum import Pendulum
+
+KEY = jax.random.key(3)
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-x))
+
+
+def normal(*shape):
+    return jax.random.normal(KEY, shape)
+
+
+def test_an_image_is_convolved_as_xla_does_it():
+    x, cnn = normal(5, 6, 7, 2), CNN((6, 7, 2), 24, KEY)
+    # Our neighbourhoods run by column, then row, then channel.
+    kernel = cnn.first.weights[0].reshape(3, 3, 2, 3).transpose(1, 0, 2, 3)
+    found = lax.conv_general_dilated(
+        x, kernel, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+    found = np.maximum(found + cnn.first.biases[0], 0).reshape(5, -1)
+    expected = found @ cnn.second.weights[0] + cnn.second.biases[0]
+    np.testing.assert_allclose(cnn(x), expected, atol=1e-5)
+
+
+def test_a_window_is_convolved_as_xla_does_it():
+    x, cnn = normal(4, 9, 2), CNN((9, 2), 16, KEY)
+    kernel = cnn.first.weights[0].reshape(3, 2, 2)
+    found = lax.conv_general_dilated(
+        x, kernel, (1,), "VALID", dimension_numbers=("NWC", "WIO", "NWC")
+    )
+    found = np.maximum(found + cnn.first.biases[0], 0).reshape(4, -1)
+    expected = found @ cnn.second.weights[0] + cnn.second.biases[0]
+    np.testing.assert_allclose(cnn(x), expected, atol=1e-5)
+
+
+def test_a_gated_recurrent_unit_by_hand():
+    x, rnn = normal(4, 6, 2), RNN((6, 2), 3, KEY)
+    w, b, u = rnn.inputs.weights[0], rnn.inputs.biases[0], rnn.state
+    state = np.zeros((4, 3))
+    for row in np.moveaxis(x, 1, 0):
+        reset = sigmoid(row @ w[:, :3] + b[:3] + state @ u[:, :3])
+        update = sigmoid(row @ w[:, 3:6] + b[3:6] + state @ u[:, 3:6])
+        candidate = np.tanh(row @ w[:, 6:] + b[6:] + reset * (state @ u[:, 6:]))
+        state = update * state + (1 - update) * candidate
+    np.testing.assert_allclose(rnn(x), state, atol=1e-5)
+
+
+def test_long_short_term_memory_by_hand():
+    x, lstm = normal(4, 6, 2), LSTM((6, 2), 3, KEY)
+    w, b, u = lstm.inputs.weights[0], lstm.inputs.biases[0], lstm.state
+    output = cell = np.zeros((4, 3))
+    for row in np.moveaxis(x, 1, 0):
+        write, keep, show, new = np.split(row @ w + b + output @ u, 4, axis=1)
+        cell = sigmoid(keep) * cell + sigmoid(write) * np.tanh(new)
+        output = sigmoid(show) * np.tanh(cell)
+    np.testing.assert_allclose(lstm(x), output, atol=1e-5)
+    assert float(b[3:6].min()) > 1 - 2**-0.5  # the forget gate starts open
+
+
+@pytest.mark.parametrize(
+    ("kind", "task"),
+    [
+        ("flat", Catch()), ("cnn", Catch()), ("flat", HiddenPendulum()), ("cnn", HiddenPendulum()),
+        ("rnn", HiddenPendulum()), ("lstm", HiddenPendulum()),
+    ],
+)  # fmt: skip
+def test_every_network_fits_what_is_observed(kind, task):
+    observation = jax.vmap(lambda key: task.observe(task.reset(key)))(jax.random.split(KEY, 6))
+    network = networks.build(kind, task, observation[0], (16, 8), Outputs(3), KEY)
+    assert network(observation).shape == (6, 3)
+    gradient = jax.grad(lambda n: (n(observation) ** 2).sum())(network)
+    for leaf in jax.tree.leaves(gradient):  # every part takes part
+        assert jnp.abs(leaf).max() > 0
+
+
+@pytest.mark.parametrize("kind", ["cnn", "rnn", "lstm"])
+def test_the_input_gain_is_of_each_channel(kind):
+    class Scaled(HiddenPendulum):
+        @property
+        def observation_scale(self):
+            return (1.0, 4.0) * self.window
+
+    task = Scaled()
+    observation = task.observe(task.reset(KEY))
+    plain, gained = (
+        networks.build(kind, task, observation, (16,), Outputs(3), KEY, gain).encoder
+        for gain in (0.0, 2.0)
+    )
+    first = lambda e: (e.first if kind == "cnn" else e.inputs).weights[0]  # noqa: E731
+    ratio = first(gained) / first(plain)
+    np.testing.assert_allclose(ratio[::2], 2.0, rtol=1e-6)
+    np.testing.assert_allclose(ratio[1::2], 0.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", SHARED)
+def test_assets_share_a_network_whatever_their_order(kind):
+    view = View(normal(2, 4, 5, 3), normal(2, 4))
+    one = jax.tree.map(lambda x: x[0], view)
+    network = Shared(kind, one, (16, 8), pooled=2, each=3, key=KEY)
+    order = jnp.array([2, 0, 3, 1])
+    market, each = network(view)
+    market_again, each_again = network(View(view.features[:, order], view.holding[:, order]))
+    np.testing.assert_allclose(market_again, market, atol=1e-5)
+    np.testing.assert_allclose(each_again, each[:, order], atol=1e-5)
+    assert jnp.abs(each_again - each).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("kind", "task", "message"),
+    [
+        ("rnn", Catch(), "windows"),
+        ("lstm", Pendulum(), "windows"),
+        ("cnn", Pendulum(), "images"),
+        ("mlp", Catch(), "network=flat"),
+        ("cnn", HiddenPendulum(window=2), "3 rows"),
+    ],
+)
+def test_a_network_says_what_it_cannot_read(kind, task, message):
+    with pytest.raises(QfolioError, match=message):
+        DQN(network=kind, hidden=(16,)).init(task, KEY)
