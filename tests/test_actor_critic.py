@@ -15,7 +15,9 @@ from qfolio.agents.td3 import TD3
 from qfolio.distributions import Gaussian, LogisticNormal, Squashed
 from qfolio.errors import QfolioError
 from qfolio.mdp import Box, Discrete, Simplex
+from qfolio.presets import preset
 from qfolio.replay import Experience
+from qfolio.runs import train
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.tasks.synthetic import GarleanuPedersen, Merton
 from qfolio.training import Population
@@ -391,7 +393,8 @@ def test_fits_markets(kind, network, task):
         return state.learned, agent.update(state.learned, batch, key)[0]
 
     before, after = jax.eval_shape(step)
-    assert eqx.tree_equal(before, after)
+    same = eqx.tree_equal(before, after)
+    assert same, "the program's state changes its shape or type"
 
 
 @pytest.mark.parametrize(
@@ -406,3 +409,14 @@ def test_fits_markets(kind, network, task):
 def test_refuses_what_makes_no_sense(kind, settings):
     with pytest.raises(QfolioError, match=next(iter(settings))):
         kind(**settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
+def test_fast_presets_come_within_5_percent_of_the_pendulums_optimum(agent):
+    fast = preset("fast", "pendulum", agent)
+    task = Pendulum(**fast.task)
+    run = train(task, fast.build(), episodes=fast.episodes, seeds=2, seed=100)
+    regrets = run.grade()["regret_per_seed"]
+    assert max(regrets) <= 0.05, regrets
+    assert min(regrets) > -0.005, "nothing beats the optimum"

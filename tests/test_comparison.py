@@ -153,8 +153,12 @@ def test_few_seeds_tell_nothing_apart():
     # Of three against three, two of twenty ways to choose are as extreme: 10 %.
     assert [fewest_seeds(pairs) for pairs in (1, 3, 45)] == [4, 5, 7]
     said = conclusion(rank({"a": result(GOOD[:3]), "b": result(BAD[:3])}))
-    assert said[1] == "With 3 seeds each it cannot be told apart from b (39 %)."
-    assert said[2].endswith("whatever they reach; from 4 on they can.")
+    assert said[1] == (
+        "With 3 seeds each two agents cannot be told apart, whatever they reach; it takes 4 seeds "
+        "or more."
+    )
+    said = conclusion(rank({name: result(GOOD[:4]) for name in "abc"}))
+    assert said[1].startswith("With 4 seeds each no two of 3 agents can be told apart, whatever")
 
 
 def test_one_seed_has_no_intervals():
@@ -340,7 +344,7 @@ def test_the_command(presets, monkeypatch, capsys, tmp_path):
     assert qfolio(monkeypatch, *arguments, "--episodes", 4) == 0
     printed = capsys.readouterr().out
     assert "1 of 2: dqn\n2 of 2: dqn:bold\n" in printed
-    assert "cannot be told apart" in printed
+    assert "two agents cannot be told apart" in printed.replace("\n", " ")
     assert f"Report: {folder / 'report.html'}" in printed.replace("\n", "").replace("R", "\nR")
     assert {path.name for path in folder.iterdir()} == {
         "comparison.json", "agents", "report.html", "learning_curves.png",

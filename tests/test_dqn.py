@@ -10,6 +10,7 @@ from qfolio.agents.dqn import DQN
 from qfolio.distributional import Categorical, project, quantile_huber_loss
 from qfolio.encoders import MLP
 from qfolio.errors import QfolioError
+from qfolio.files import read_tree, write_tree
 from qfolio.mdp import Transition
 from qfolio.optimizer import learning_rate
 from qfolio.presets import preset
@@ -452,3 +453,13 @@ def test_all_actions_can_duel():
     )  # fmt: skip
     state = agent.init(market, jax.random.key(0))
     assert jax.tree.structure(learned_abstractly(agent, market, state)) == jax.tree.structure(state)
+
+
+def test_priorities_are_part_of_what_is_saved(task, agent, tmp_path):
+    agent = dataclasses.replace(agent, prioritised=True)
+    fresh = agent.init(task, jax.random.key(0))
+    state = jax.tree.map(np.asarray, agent.observe(fresh, rollout(agent)))
+    write_tree(tmp_path / "state", state)
+    again = read_tree(tmp_path / "state", fresh)
+    assert again.replay.priorities.levels[-1].sum() == agent.environments
+    jax.tree.map(np.testing.assert_array_equal, again, state)

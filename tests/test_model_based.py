@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from qfolio.agents.mbpo import MBPO, Model, model_loss
+from qfolio.encoders import MLP
 from qfolio.errors import QfolioError
 from qfolio.mdp import Box, Discrete, Transition
 from qfolio.replay import Experience
@@ -89,10 +90,9 @@ def test_numbered_actions_are_told_apart():
 
 def test_the_models_gradient_against_differences():
     with jax.enable_x64(True):
-        agent = MBPO(hidden=(8,), model_hidden=(8,), members=2)
-        model = jax.jit(lambda: agent.init(Pendulum(), jax.random.key(0)).model)()
-        model = jax.tree.map(lambda x: x.astype(jnp.float64), model)
         keys = jax.random.split(jax.random.key(1), 4)
+        members = jax.vmap(lambda key: MLP((3 + 11, 8, 3 + 2), key))(keys[:2])
+        model = Model(members, jnp.array([1.0, 1, 8]), Discrete(11))
         step = Experience(
             observation=jax.random.normal(keys[0], (5, 3)),
             action=jnp.array([0, 3, 10, 5, 5]),
@@ -128,8 +128,9 @@ def test_each_member_counts_real_steps_as_often_as_chance_says():
         reward=jnp.ones(shape), next_state=None, next_observation=jnp.ones((*shape, 3)),
         terminated=jnp.zeros(shape, bool), truncated=jnp.zeros(shape, bool),
     )  # fmt: skip
+    observe = jax.jit(agent.observe)
     for _ in range(4):
-        state = agent.observe(state, rollout)
+        state = observe(state, rollout)
     counts = np.asarray(state.replay.unpack(state.replay.rows).counts)
     for member in counts.T:
         share = np.bincount(member.astype(int), minlength=4)[:4] / 2000

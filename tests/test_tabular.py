@@ -8,9 +8,14 @@ from qfolio.agents.dyna_q import Counts, DynaQ
 from qfolio.agents.tabular import DoubleQ, ExpectedSarsa, Move, QLearning, Sarsa, step_share
 from qfolio.errors import QfolioError
 from qfolio.mdp import Transition
+from qfolio.presets import preset
+from qfolio.runs import train
 from qfolio.tasks.finite import Cliff, FiniteMDP, FrozenLake, Garnet
+from qfolio.tasks.grid_pendulum import GridPendulum
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.training import Population
+
+from test_cli import qfolio
 
 KINDS = [QLearning, Sarsa, ExpectedSarsa, DoubleQ, DynaQ]
 DISCOUNT = 0.9
@@ -169,9 +174,11 @@ def test_environments_that_visit_the_same_entry():
 
 def test_the_model_of_dyna_q():
     model = Counts.empty(entries=4, outcomes=2)
-    for outcome, reward in [(7, 1.0), (7, 2.0), (9, 5.0)]:
-        model = model.add(jnp.array(2), jnp.array(outcome), jnp.array(reward))
-    model = model.add(jnp.array(1), jnp.array(10), jnp.array(4.0))  # 10 states: it ended
+    add = lambda *steps: model.add(*(jnp.array(x) for x in zip(*steps, strict=True)))  # noqa: E731
+    for step in [(2, 7, 1.0), (2, 7, 2.0), (2, 9, 5.0)]:
+        model = add(step)
+    # 10 states: 10 is the end. Of two steps of one entry the last counts.
+    model = add((1, 3, 9.0), (1, 10, 4.0))
     assert int(model.entries) == 2
     assert model.seen[:2].tolist() == [2, 1]
     moves = model.imagine(6000, (10, 2), jax.random.key(0))
@@ -184,10 +191,8 @@ def test_the_model_of_dyna_q():
     assert set(pay[others == 7]) == {1.5}
     assert set(pay[others == 9]) == {5.0}
     # No room for a third outcome: the rarest gives way.
-    model = model.add(jnp.array(2), jnp.array(3), jnp.array(0.5))
-    assert model.outcomes[2].tolist() == [7, 3]
-    assert model.counts[2].tolist() == [2, 1]
-    assert model.rewards[2].tolist() == [3, 0.5]
+    model = add((2, 3, 0.5))
+    assert model.table[2].tolist() == [[7, 2, 3], [3, 1, 0.5]]
 
 
 @pytest.mark.parametrize(
@@ -208,10 +213,75 @@ def test_values_of_a_process_without_chance_are_exact(kind, environments):
     np.testing.assert_allclose(values[0], exact, rtol=0.02 if kind is Sarsa else 1e-4)
 
 
-LEARNED = [
-    (QLearning, "cliff", 3e4, {}), (Sarsa, "cliff", 6e6, {"learning_rate_decay": 0.2}),
-    (ExpectedSarsa, "cliff", 1e5, {}), (DoubleQ, "cliff", 1e5, {}), (DynaQ, "cliff", 2e4, {}),
-]  # fmt: skip
+def process(kind, **changes):
+    """An agent for values of stochastic processes; ε is 0.5 where it is part of what is learned."""
+    epsilon = 0.5 if kind in (Sarsa, ExpectedSarsa) else 1.0
+    settings = {"environments": 32, "discount": DISCOUNT, "learning_rate": 1.0}
+    return kind(**{**settings, "epsilon": epsilon, "epsilon_end": epsilon, **changes})
+
+
+@pytest.mark.parametrize(
+    ("task", "kind", "steps", "decay"),
+    [
+        (Cliff(), ExpectedSarsa, 1.5e6, 0.3),
+        (Cliff(), DynaQ, 1e6, 0.3),
+        (Garnet(), QLearning, 2e6, 0.1),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [
+                (Garnet(), Sarsa, 20e6, 0.1),
+                (FrozenLake(), QLearning, 10e6, 0.1),
+                (FrozenLake(), Sarsa, 12e6, 0.2),
+                (FrozenLake(), DoubleQ, 10e6, 0.1),
+            ]
+        ),
+    ],
+)
+def test_values_within_a_hundredth(task, kind, steps, decay):
+    agent = process(kind, learning_rate_decay=decay)
+    values = trained(anywhere(task), agent, int(steps) // 32)
+    exact = task.optimum().action_values(DISCOUNT, 0.5 if agent.epsilon < 1 else 0.0)
+    assert error(task, values, exact).max() < 0.01
+
+
+def test_planning_saves_real_steps():
+    task = Garnet()
+    exact = task.optimum().action_values(DISCOUNT)
+
+    def worst(kind, steps):
+        agent = process(kind, environments=1, learning_rate_decay=0.1)
+        return error(task, trained(anywhere(task), agent, steps, (100, 101)), exact).max()
+
+    assert worst(DynaQ, 5000) < worst(QLearning, 15_000)
+
+
+@pytest.mark.parametrize(("kind", "path"), [(QLearning, 13), (Sarsa, 17)])
+def test_along_the_cliff_or_around_it(kind, path):
+    """Who learns what exploring costs keeps away from the cliff (Sutton & Barto, example 6.6)."""
+    run = train(Cliff(), kind(epsilon_end=0.1), episodes=1000, seeds=1, seed=100)
+    result = run.grade(4)
+    assert result["return_mean"] == -path
+    assert result["regret_per_seed"] == pytest.approx([path / 13 - 1])
+
+
+@pytest.mark.parametrize(
+    ("task", "chosen"),
+    [("finite/frozen-lake", ["horizon=9"]), ("pendulum/grid", ["angles=9", "speeds=9"])],
+)
+def test_the_command_trains_and_reports(task, chosen, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "run"
+    arguments = ["train", task, "--agent", "sarsa", "--episodes", 64, "--seeds", 2, "--out", folder]
+    assert qfolio(monkeypatch, *arguments, "--set", *chosen) == 0
+    assert "optimum" in capsys.readouterr().out
+    assert (folder / "report.html").stat().st_size > 10_000
+    assert len((folder / "metrics.csv").read_text().splitlines()) > 2 * 64
+
+
+@pytest.mark.slow
+def test_the_pendulum_in_a_table():
+    chosen = preset("fast", "pendulum/grid", "q-learning")
+    run = train(GridPendulum(), chosen.build(), episodes=chosen.episodes, seeds=2, seed=100)
+    assert max(run.grade()["regret_per_seed"]) < 0.04
 
 
 def test_double_q_learning_against_the_bias_of_a_maximum():
@@ -225,7 +295,7 @@ def test_double_q_learning_against_the_bias_of_a_maximum():
     pay[1, :, 2], pay[1, :, 3] = 0.9, -1.1
     task = FiniteMDP(moves, pay, start=[1, 0, 0, 0, 0], terminal=[2, 3, 4], horizon=3)
     settings = {"discount": 1.0, "learning_rate": 0.1, "epsilon": 1.0, "epsilon_end": 1.0}
-    worth = lambda kind: trained(task, kind(**settings), 4000, range(100, 108))[:, 0, ::2].mean()  # noqa: E731
+    worth = lambda kind: trained(task, kind(**settings), 4000, (100, 101))[:, 0, ::2].mean()  # noqa: E731
     assert worth(QLearning) > 0.1  # it is −0.1
     assert worth(DoubleQ) < 0.0
 

@@ -108,6 +108,7 @@ _PPO = {
     "rollout": 64,
     "batch_size": 512,
     "discount": 0.99,
+    "trace": 0.9,
     "learning_rate": 3e-3,
     "learning_rate_steps": 19_520.0,
     "entropy_weight": 0.02,
@@ -132,6 +133,22 @@ _REINFORCE = {
     "discount": 0.98,
     "learning_rate": 3e-3,
     "learning_rate_steps": 625.0,
+}
+
+_TORQUE = {
+    "hidden": (128, 128),
+    "input_gain": 6.0,
+    "environments": 12,
+    "episode_steps": 28,
+    "batch_size": 256,
+    "replay_capacity": 131_072,
+    "learning_starts": 1024,
+    "target_rate": 0.03,
+    "discount": 0.995,
+    "learning_rate": 3e-3,
+    "learning_rate_final": 0.0,
+    "learning_rate_steps": 8000.0,
+    "reward_scale": 0.3,
 }
 
 _PORTFOLIO_TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
@@ -195,8 +212,95 @@ def _all_actions(episodes: int, **changes: Any) -> dict[str, Preset]:
     return {"fast": Preset("dqn", changes, episodes, seeds=5, task={"menu": "grid:10"})}
 
 
-def _gym(id: str, agent: str, steps: int, seeds: int = 4, **changes: Any) -> Preset:
-    return Preset(agent, changes, steps=steps, seeds=seeds, task={"id": id})
+# Small inputs count (input_gain), and the few bad ends travel back fast (n_steps).
+_GYM_DQN = {
+    "hidden": (128, 128),
+    "input_gain": 3.0,
+    "dueling": True,
+    "double": True,
+    "n_steps": 4,
+    "environments": 8,
+    "batch_size": 256,
+    "replay_capacity": 65_536,
+    "learning_starts": 1000,
+    "target_period": 1,
+    "target_rate": 0.03,
+    "learning_rate": 2e-3,
+    "learning_rate_final": 0.0,
+    "epsilon_decay": 0.99,
+    "epsilon_end": 0.02,
+    "huber": 1.0,
+    "reward_scale": 0.1,
+}
+
+_GYM_PPO: dict[str, Any] = {
+    "environments": 8,
+    "rollout": 32,
+    "batch_size": 256,
+    "epochs": 20,
+    "discount": 0.98,
+    "trace": 0.8,
+    "learning_rate": 1e-3,
+    "learning_rate_final": 0.0,
+    "learning_rate_steps": 7800.0,
+}
+
+
+def _gym(
+    id: str, agent: str, steps: int, *, task: Mapping[str, Any] | None = None, **changes: Any
+) -> Preset:
+    return Preset(agent, changes, steps=steps, seeds=4, task={"id": id, **(task or {})})
+
+
+def _gym_dqn(id: str, steps: int, *, task: Mapping[str, Any] | None = None, **changes: Any) -> Any:
+    """DQN whose learning rate has fallen to zero at the end."""
+    settings = {**_GYM_DQN, **changes}
+    settings["learning_rate_steps"] = float(steps // settings["environments"])
+    return {"fast": _gym(id, "dqn", steps, task=task, **settings)}
+
+
+def _torque(agent: str, **changes: Any) -> dict[str, Preset]:
+    """The pendulum with any torque."""
+    return {"fast": Preset(agent, {**_TORQUE, **changes}, 3468, seeds=8, task={"torques": 0})}
+
+
+_CLIFF = {"epsilon_end": 0.1}
+
+_LAKE = {
+    "environments": 8,
+    "learning_rate": 0.5,
+    "learning_rate_decay": 0.02,
+    "initial_value": 1.0,
+    "epsilon_end": 0.1,
+    "epsilon_decay": 0.9998,
+}
+
+_RANDOM = {
+    "environments": 8,
+    "discount": 0.95,
+    "learning_rate": 0.5,
+    "learning_rate_decay": 0.02,
+    "epsilon_end": 0.1,
+    "epsilon_decay": 0.998,
+}
+
+_GRID_PENDULUM = {
+    "environments": 16,
+    "episode_steps": 40,
+    "discount": 0.995,
+    "learning_rate": 0.5,
+    "learning_rate_decay": 0.01,
+    "epsilon": 0.2,
+    "epsilon_end": 0.2,
+}
+
+_ON_POLICY = {"epsilon": 0.05, "epsilon_end": 0.05}  # what SARSA learns counts its exploration
+
+
+def _tables(task: str, settings: dict[str, Any], episodes: int) -> dict[tuple[str, str], Any]:
+    """Presets of the tabular agents that differ in nothing but their algorithm."""
+    names = ("q-learning", "sarsa", "expected-sarsa", "double-q", "dyna-q")
+    return {(task, name): {"fast": Preset(name, settings, episodes, seeds=8)} for name in names}
 
 
 PRESETS = {
@@ -226,6 +330,9 @@ PRESETS = {
     ("pendulum", "reinforce"): {
         "fast": Preset("reinforce", _REINFORCE, episodes=5000, seeds=8, task={"torques": 0}),
     },
+    ("pendulum", "ddpg"): _torque("ddpg"),
+    ("pendulum", "td3"): _torque("td3", actor_rate=0.4, target_noise=0.05, target_rate=0.06),
+    ("pendulum", "sac"): _torque("sac", spread=0.05),
     ("market/kelly", "pathwise"): _pathwise(
         307_200, environments=1024, rollout=5, learning_rate_steps=300.0, reward_scale=10.0
     ),
@@ -257,6 +364,27 @@ PRESETS = {
         reward_scale=10.0,
         gradient_norm=0.3,
     ),
+    ("gym:CartPole-v1", "dqn"): _gym_dqn("CartPole-v1", 80_000),
+    ("gym:CartPole-v1", "ppo"): {"fast": _gym("CartPole-v1", "ppo", 100_000, **_GYM_PPO)},
+    ("gym:Acrobot-v1", "dqn"): _gym_dqn("Acrobot-v1", 60_000),
+    # In 200 steps the goal is hardly ever found by chance; longer episodes find it.
+    ("gym:MountainCar-v0", "dqn"): _gym_dqn(
+        "MountainCar-v0",
+        160_000,
+        task={"horizon": 1000},
+        environments=16,
+        replay_capacity=262_144,
+        epsilon_decay=0.98,
+    ),
+    ("gym:LunarLander-v3", "dqn"): _gym_dqn(
+        "LunarLander-v3",
+        400_000,
+        environments=16,
+        replay_capacity=262_144,
+        input_gain=1.0,
+        learning_rate=1e-3,
+        reward_scale=0.03,
+    ),
     ("portfolio", "dqn"): {
         "fast": Preset(
             "dqn",
@@ -268,6 +396,19 @@ PRESETS = {
     },
     ("portfolio", "pathwise"): {
         "fast": Preset("pathwise", _PORTFOLIO_PATHWISE, episodes=800, seeds=5, task=_PORTFOLIO_TASK)
+    },
+    **_tables("finite/cliff", _CLIFF, episodes=1000),
+    **_tables("finite/frozen-lake", _LAKE, episodes=20_000),
+    **_tables("finite/random", _RANDOM, episodes=8000),
+    **_tables("pendulum/grid", _GRID_PENDULUM, episodes=100_000),
+    ("pendulum/grid", "sarsa"): {
+        "fast": Preset("sarsa", {**_GRID_PENDULUM, **_ON_POLICY}, episodes=100_000, seeds=8)
+    },
+    ("pendulum/grid", "expected-sarsa"): {
+        "fast": Preset("expected-sarsa", {**_GRID_PENDULUM, **_ON_POLICY}, 100_000, seeds=8)
+    },
+    ("pendulum/grid", "dyna-q"): {
+        "fast": Preset("dyna-q", {**_GRID_PENDULUM, "planning": 16}, episodes=25_024, seeds=8)
     },
 }
 """By task and agent."""

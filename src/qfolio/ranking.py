@@ -166,21 +166,18 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
         if ranking["measure"] == "regret"
         else f"{first} ends with the highest return:"
     )
-    sentences = [f"{best} {figure(ranking, first, interval=True)}."]
+    sentence = f"{each.capitalize()} it can be told apart from {listed(worse)}." if worse else ""
     if tied:
-        apart = f"{each.capitalize()} it cannot be told apart from {listed(tied, 'or')}"
-        sentences.append(f"{apart}; {listed(worse)} do{'es' * (len(worse) == 1)} worse."
-                         if worse else f"{apart}.")  # fmt: skip
-    else:
-        sentences.append(f"{each.capitalize()} it can be told apart from {listed(worse)}.")
-    needed = ranking["seeds_needed"]
-    if seeds < needed:
-        those = f"any two of {len(beaten) + 1} agents" if len(beaten) > 1 else "two agents"
-        sentences.append(
-            f"So few seeds cannot tell {those} apart, whatever they reach; from {needed} on they "
-            "can."
+        sentence = f"{each.capitalize()} it cannot be told apart from {listed(tied, 'or')}"
+        sentence += f"; {listed(worse)} do{'es' * (len(worse) == 1)} worse." if worse else "."
+    if seeds < ranking["seeds_needed"]:
+        count = len(ranking["order"])
+        none = f"no two of {count} agents can" if count > 2 else "two agents cannot"
+        sentence = (
+            f"{each.capitalize()} {none} be told apart, whatever they reach; it takes "
+            f"{ranking['seeds_needed']} seeds or more."
         )
-    return [*sentences, _quickest(ranking)]
+    return [f"{best} {figure(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
 
 
 def figure(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:

@@ -9,10 +9,10 @@ in the same way. Every real step is so used many times, which saves real steps a
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.agents.tabular import Move, TableState, Tabular
+from qfolio.errors import QfolioError
 from qfolio.fields import require, static
 from qfolio.mdp import Metrics, Task, Transition
 
@@ -23,31 +23,48 @@ class Counts(eqx.Module):
     An outcome is the next state's number, or the number of states where the task ended.
     """
 
-    outcomes: Int[Array, "entry outcome"]  # −1: none yet
-    counts: Float[Array, "entry outcome"]
-    rewards: Float[Array, "entry outcome"]  # summed
+    # Outcome (−1: none), how often it was seen, and its rewards summed; one array, because XLA
+    # would copy three at every step.
+    table: Float[Array, "entry outcome 3"]
     seen: Int[Array, " entry"]  # the entries in the order of their first visit
     entries: Int[Array, ""]  # how many were seen
 
     @classmethod
     def empty(cls, entries: int, outcomes: int) -> "Counts":
-        zeros = jnp.zeros((entries, outcomes))
-        none = jnp.full(zeros.shape, -1, jnp.int32)
-        return cls(none, zeros, zeros, jnp.zeros(entries, jnp.int32), jnp.array(0, jnp.int32))
+        table = jnp.zeros((entries, outcomes, 3)).at[..., 0].set(-1.0)
+        return cls(table, jnp.zeros(entries, jnp.int32), jnp.array(0, jnp.int32))
 
-    def add(self, entry: Int[Array, ""], outcome: Int[Array, ""], reward: Array) -> "Counts":
-        """With one more step; where there is no room, its outcome replaces the rarest."""
-        counts = self.counts[entry]
-        same = self.outcomes[entry] == outcome
-        slot = jnp.where(same.any(), same.argmax(), counts.argmin())
-        place, kept = (entry, slot), same[slot]
-        first = counts.sum() == 0
+    def add(
+        self,
+        entry: Int[Array, " batch"],
+        outcome: Int[Array, " batch"],
+        reward: Float[Array, " batch"],
+    ) -> "Counts":
+        """With one more step of each entry; of several steps of one entry, the last counts.
+
+        Where there is no room for an outcome, it replaces the rarest.
+        """
+        if len(entry) == 1:  # XLA scatters two in place, but not one
+            entry, outcome, reward = (jnp.tile(x, 2) for x in (entry, outcome, reward))
+        rows = self.table[entry]
+        outcomes, counts, rewards = (rows[..., i] for i in range(3))
+        same = outcomes == outcome[:, None]
+        slot = jnp.where(same.any(1), same.argmax(1), counts.argmin(1))
+        now = [
+            jnp.broadcast_to(outcome[:, None], same.shape),
+            same * counts + 1.0,
+            same * rewards + reward[:, None],
+        ]
+        here = jnp.arange(same.shape[1]) == slot[:, None]
+        rows = jnp.where(here[..., None], jnp.stack(now, -1), rows)
+        last = ~jnp.triu(entry[:, None] == entry, 1).any(1)
+        fresh = last & (counts.sum(1) == 0)
+        nowhere = len(self.seen)
+        place = jnp.where(fresh, self.entries + fresh.cumsum() - 1, nowhere)
         return Counts(
-            outcomes=self.outcomes.at[place].set(outcome),
-            counts=self.counts.at[place].set(kept * counts[slot] + 1.0),
-            rewards=self.rewards.at[place].set(kept * self.rewards[place] + reward),
-            seen=self.seen.at[self.entries].set(entry),  # overwritten, if it is not the first
-            entries=self.entries + first.astype(jnp.int32),
+            table=self.table.at[jnp.where(last, entry, nowhere)].set(rows),
+            seen=self.seen.at[place].set(entry),
+            entries=self.entries + fresh.sum(dtype=jnp.int32),
         )
 
     def imagine(self, n: int, shape: tuple[int, int], key: PRNGKeyArray) -> Move:
@@ -55,16 +72,18 @@ class Counts(eqx.Module):
         states, actions = shape
         entry_key, outcome_key = jax.random.split(key)
         entry = self.seen[jax.random.randint(entry_key, (n,), 0, self.entries)]
-        total = jnp.cumsum(self.counts[entry], axis=1)
+        rows = self.table[entry]
+        total = jnp.cumsum(rows[..., 1], axis=1)
         drawn = jax.random.uniform(outcome_key, (n, 1)) * total[:, -1:]
-        place = (entry, (total > drawn).argmax(1))
-        outcome = self.outcomes[place]
+        slot = (total > drawn).argmax(1)
+        outcome, count, reward = jnp.take_along_axis(rows, slot[:, None, None], 1)[:, 0].T
+        next_state = outcome.astype(jnp.int32)
         return Move(
             state=entry // actions,
             action=entry % actions,
-            reward=self.rewards[place] / self.counts[place],
-            next_state=jnp.minimum(outcome, states - 1),
-            terminated=outcome == states,
+            reward=reward / count,
+            next_state=jnp.minimum(next_state, states - 1),
+            terminated=next_state == states,
             truncated=jnp.zeros(n, bool),
         )
 
@@ -87,8 +106,11 @@ class DynaQ(Tabular):
 
     def init(self, task: Task, key: PRNGKeyArray) -> DynaState:
         state = super().init(task, key)
-        outcomes = min(self.outcomes, state.tables.shape[1] + 1)  # every state, and the end
-        model = Counts.empty(state.tables.size, outcomes)
+        _, states, actions = state.tables.shape
+        if states >= 2**24:
+            raise QfolioError(f"dyna-q counts fewer than 2²⁴ states; here are {states}.")
+        outcomes = min(self.outcomes, states + 1)  # every state, and the end
+        model = Counts.empty(states * actions, outcomes)
         return DynaState(state.cells, state.episodes, model)
 
     def learn(
@@ -99,12 +121,7 @@ class DynaQ(Tabular):
         state = self._update(state, move)
         entry = move.state * shape[1] + move.action
         outcome = jnp.where(move.terminated, shape[0], move.next_state)
-        model = state.model
-        if self.environments == 1:
-            model = model.add(entry[0], outcome[0], move.reward[0])
-        else:
-            add = lambda model, step: (model.add(*step), None)  # noqa: E731
-            model, _ = lax.scan(add, model, (entry, outcome, move.reward))
+        model = state.model.add(entry, outcome, move.reward)
         state = eqx.tree_at(lambda s: s.model, state, model)
         state = self._update(state, model.imagine(self.planning, (shape[0], shape[1]), key))
         return self.observe(state, rollout), {}

@@ -145,7 +145,7 @@ class SAC(ActorCritic):
             weights = isinstance(task.actions, Simplex)  # cash needs no standard deviation
             outputs = Outputs(1, 2) if weights else Outputs(2 * outputs.pooled)
         actor = Actor(self.build(task, observation, outputs, actor_key), task.actions)
-        log_temperature = jnp.log(self.temperature)
+        log_temperature = jnp.log(jnp.asarray(self.temperature, float))
         begin = optimizer.begin
         return Learned(
             actor, critics, critics, log_temperature,

@@ -115,7 +115,7 @@ class Tabular(Agent):
     def action_values(
         self, weights: Tables, observation: Int[Array, "*batch"]
     ) -> Float[Array, "*batch action"]:
-        return weights[:, observation].mean(0)
+        return jnp.asarray(weights)[:, observation].mean(0)
 
     def policy(self, weights: Tables, observation: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
         return self.action_values(weights, observation).argmax(-1)
