@@ -64,13 +64,13 @@ def test_every_way_begins_with_what_it_knows(content):
     assert courses["renewed"]["curve"][0] == courses["frozen"]["curve"][0]
     assert courses["fresh"]["curve"][0] != courses["frozen"]["curve"][0]
     assert courses["going on"]["steps"][-1] == EPISODES * 20
-    assert courses["renewed"]["steps"][-1] == EPISODES // 4 * 20
+    assert courses["renewed"]["steps"][-1] == EPISODES // 2 * 20
 
 
 def test_going_on_needs_a_learning_rate():
     """That of the preset has fallen to zero: as it is, an agent would learn nothing."""
     plan = Plan(OLD, NEW, AGENT, EPISODES)
-    assert plan.going_on == dataclasses.replace(AGENT, learning_rate_final=0.1)
+    assert plan.going_on == dataclasses.replace(AGENT, learning_rate_final=0.3)
     first = trained(OLD, dataclasses.replace(AGENT, learning_rate_steps=100.0), 32)
     moved = {}
     for final in (0.0, 0.1):
@@ -86,7 +86,7 @@ def test_going_on_needs_a_learning_rate():
 
 def test_renewed_learning_knows_everything_and_remembers_nothing():
     plan = Plan(OLD, NEW, AGENT, EPISODES)
-    assert plan.renewed == dataclasses.replace(AGENT, learning_rate_steps=37.5, epsilon=0.3)
+    assert plan.renewed == dataclasses.replace(AGENT, learning_rate_steps=75.0, epsilon=0.3)
     learned, fresh = trained(OLD, AGENT).fetch(), Population(NEW, AGENT, [3, 4]).fetch()
     state = renew(AGENT, learned, fresh)
     for name in ("online", "target"):
@@ -102,7 +102,7 @@ def test_renewed_learning_knows_everything_and_remembers_nothing():
 
 
 def test_recovery_is_staying_near_the_optimum():
-    curve = [[0.5, 0.04, 0.9], [0.04, 0.06, 0.8], [0.03, 0.02, 0.7], [0.01, 0.05, 0.6]]
+    curve = [[0.5, 0.09, 0.9], [0.09, 0.11, 0.8], [0.03, 0.02, 0.7], [0.01, 0.1, 0.6]]
     found = recovery(Course([0, 10, 20, 30], curve, [], [], 0.0))
     assert found["per_seed"] == [10, 20, None]
 

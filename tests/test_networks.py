@@ -4,15 +4,19 @@ import numpy as np
 import pytest
 from jax import lax
 
-from qfolio import networks
+from qfolio import networks, presets, settings
 from qfolio.agents.dqn import DQN
 from qfolio.encoders import CNN, LSTM, RNN
 from qfolio.errors import QfolioError
-from qfolio.mdp import View
+from qfolio.evaluation import start_keys
+from qfolio.mdp import Step, View
 from qfolio.networks import SHARED, Outputs, Shared
 from qfolio.tasks.catch import Catch
 from qfolio.tasks.hidden_pendulum import HiddenPendulum
 from qfolio.tasks.pendulum import Pendulum
+from qfolio.training import Population
+
+from probes import TERMINATED, TwoStates
 
 KEY = jax.random.key(3)
 
@@ -133,3 +137,57 @@ def test_assets_share_a_network_whatever_their_order(kind):
 def test_a_network_says_what_it_cannot_read(kind, task, message):
     with pytest.raises(QfolioError, match=message):
         DQN(network=kind, hidden=(16,)).init(task, KEY)
+
+
+class Recall(TwoStates):
+    """One step; the action must match the first row of three: Q(s, a) = s · (2a − 1)."""
+
+    def observe(self, state):
+        return jnp.stack([state, 0.0 * state, 0.0 * state])[:, None]
+
+    def step(self, state, action, key):
+        return Step(state, state * (2.0 * action - 1.0), TERMINATED)
+
+
+LEARNER = {
+    "environments": 4, "batch_size": 32, "replay_capacity": 1000, "learning_starts": 100,
+    "target_period": 1, "target_rate": 0.05, "learning_rate": 3e-3, "learning_rate_steps": 800.0,
+    "learning_rate_final": 0.0, "epsilon_end": 0.2,
+}  # fmt: skip
+
+
+def train(population, steps):
+    while population.steps < steps:
+        population.advance(steps - population.steps)
+    return population
+
+
+@pytest.mark.parametrize("kind", ["cnn", "rnn", "lstm"])
+def test_an_agent_recalls_what_it_saw_first(kind):
+    agent = DQN(**{**LEARNER, "network": kind, "hidden": (16,)})
+    population = train(Population(Recall(), agent, [100]), 800)
+    weights = jax.tree.map(lambda x: jnp.array(x[0]), population.weights())
+    seen = jax.vmap(Recall().observe)(jnp.array([1.0, -1.0]))
+    np.testing.assert_allclose(agent.action_values(weights, seen), [[-1, 1], [1, -1]], atol=0.02)
+
+
+def test_an_agent_learns_to_catch_what_it_sees():
+    agent = DQN(
+        **{**LEARNER, "network": "cnn", "hidden": (64,), "environments": 32, "batch_size": 64,
+           "replay_capacity": 16_384, "learning_starts": 1024, "discount": 0.97,
+           "learning_rate": 1e-3, "learning_rate_steps": 1500.0, "epsilon_decay": 0.999},
+    )  # fmt: skip
+    population = train(Population(Catch(), agent, [100, 101]), 1500)
+    np.testing.assert_array_equal(population.evaluate(start_keys(256), tail=0).returns, 1.0)
+
+
+@pytest.mark.slow
+def test_the_hidden_pendulum_is_swung_up_and_held():
+    preset = presets.preset("fast", "pendulum/hidden", "dqn")
+    task = settings.build(HiddenPendulum, preset.task)
+    population = Population(task, preset.build(), [100, 101])
+    while left := population.steps_left(preset.episodes):
+        population.advance(left)
+    best = task.optimum().returns(start_keys()).mean()
+    returns = population.evaluate(start_keys(), tail=0).returns.mean(1)
+    assert ((best - returns) / abs(best) < 0.1).all()

@@ -337,7 +337,7 @@ def test_never_overwrites_a_folder(task, agent, tmp_path):
     "options",
     [
         {"episodes": 0}, {"seeds": 0}, {"seed": -1}, {"seed": 2**32},
-        {"steps": 9}, {"episodes": None}, {"episodes": None, "steps": 0},
+        {"steps": 9}, {"episodes": None}, {"steps": 0, "episodes": None},
     ],
 )  # fmt: skip
 def test_refuses_counts_that_make_no_sense(task, agent, options):

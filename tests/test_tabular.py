@@ -266,7 +266,10 @@ def test_along_the_cliff_or_around_it(kind, path):
 
 @pytest.mark.parametrize(
     ("task", "chosen"),
-    [("finite/frozen-lake", ["horizon=9"]), ("pendulum/grid", ["angles=9", "speeds=9"])],
+    [
+        ("finite/frozen-lake", ["horizon=9"]),
+        ("pendulum/grid", ["angles=9", "speeds=9", "horizon=20"]),
+    ],
 )
 def test_the_command_trains_and_reports(task, chosen, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "run"

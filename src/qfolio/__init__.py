@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from qfolio.agents.a2c import A2C as A2C
     from qfolio.agents.ddpg import DDPG as DDPG
     from qfolio.agents.dqn import DQN as DQN
+    from qfolio.agents.mbpo import MBPO as MBPO
     from qfolio.agents.pathwise import Pathwise as Pathwise
     from qfolio.agents.ppo import PPO as PPO
     from qfolio.agents.reinforce import REINFORCE as REINFORCE
@@ -43,6 +44,7 @@ _HOMES = {
     "DQN": "qfolio.agents.dqn:DQN",
     "FiniteMDP": "qfolio.tasks.finite:FiniteMDP",
     "PPO": "qfolio.agents.ppo:PPO",
+    "MBPO": "qfolio.agents.mbpo:MBPO",
     "Pathwise": "qfolio.agents.pathwise:Pathwise",
     "Pendulum": "qfolio.tasks.pendulum:Pendulum",
     "Policy": "qfolio.policy:Policy",

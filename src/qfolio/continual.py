@@ -33,7 +33,7 @@ from qfolio.training import Population, TrainingState
 POINTS = 24
 """Of a learning curve after the change, about; renewed learning has as many on its shorter way."""
 
-WITHIN = 0.05
+WITHIN = 0.1
 """A seed has recovered when its regret in the changed world stays below."""
 
 
@@ -52,8 +52,8 @@ class Plan:
     episodes: int
     seeds: int = 8
     seed: int = 0
-    rate: float = 0.1
-    renewal: float = 0.25
+    rate: float = 0.3
+    renewal: float = 0.5
     epsilon: float = 0.3
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class Plan:
                 f"of {type(self.task).__name__} these are {', '.join(_numbers(self.task))}."
             )
         if not self.changes:
-            raise QfolioError("nothing changes; name one of the task's numbers, as in mass=1.5.")
+            raise QfolioError("nothing changes; name one of the task's numbers, as in mass=2.")
         if any(task.optimum() is None for task in (self.task, self.changed)):
             raise QfolioError(
                 f"recovery is measured against an exact optimum, and {type(self.task).__name__} "

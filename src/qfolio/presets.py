@@ -76,7 +76,7 @@ _RAINBOW = {
     "epsilon_end": 0.0,
 }
 
-_HIDDEN = {**_FAST, "network": "rnn", "hidden": (64, 128), "input_gain": 12.0}
+_HIDDEN = {**_FAST, "network": "lstm", "hidden": (64, 128), "input_gain": 12.0}
 
 _CATCH = {
     "network": "cnn",
@@ -311,7 +311,9 @@ PRESETS = {
         # Each hyperparameter of the report that qfolio grew out of; they are DQN's defaults.
         "report": Preset("dqn", {}, episodes=600, seeds=1),
     },
-    ("pendulum/hidden", "dqn"): {"fast": Preset("dqn", _HIDDEN, episodes=8608, seeds=8)},
+    ("pendulum/hidden", "dqn"): {
+        "fast": Preset("dqn", _HIDDEN, episodes=8608, seeds=8, task={"window": 2}),
+    },
     ("catch", "dqn"): {
         "fast": Preset(
             "dqn",
@@ -332,7 +334,7 @@ PRESETS = {
     },
     ("pendulum", "ddpg"): _torque("ddpg"),
     ("pendulum", "td3"): _torque("td3", actor_rate=0.4, target_noise=0.05, target_rate=0.06),
-    ("pendulum", "sac"): _torque("sac", spread=0.05),
+    ("pendulum", "sac"): _torque("sac", spread=0.05, actor_rate=0.6),
     ("market/kelly", "pathwise"): _pathwise(
         307_200, environments=1024, rollout=5, learning_rate_steps=300.0, reward_scale=10.0
     ),

@@ -31,6 +31,7 @@ AGENTS = {
     "ddpg": "qfolio.agents.ddpg:DDPG",
     "td3": "qfolio.agents.td3:TD3",
     "sac": "qfolio.agents.sac:SAC",
+    "mbpo": "qfolio.agents.mbpo:MBPO",
     "reinforce": "qfolio.agents.reinforce:REINFORCE",
     "a2c": "qfolio.agents.a2c:A2C",
     "ppo": "qfolio.agents.ppo:PPO",

@@ -38,14 +38,14 @@ def continual(
 
     Args:
         task: What to learn: pendulum, the default.
-        change: What becomes of it, for example --change mass=1.5; numbers only.
+        change: What becomes of it, for example --change mass=2; numbers only.
         agent: Which algorithm; the first that has presets for the task otherwise.
         preset: Of the agent; fast otherwise.
         episodes: Training episodes before the change, and after it; the preset says otherwise.
         seeds: How many agents are trained side by side; the preset says otherwise.
         seed: The first one's, 0 unless given.
-        rate: Share of its first learning rate that an agent goes on with, 0.1 otherwise.
-        renewal: Share of the first training that a renewed agent learns for, 0.25 otherwise.
+        rate: Share of its first learning rate that an agent goes on with, 0.3 otherwise.
+        renewal: Share of the first training that a renewed agent learns for, 0.5 otherwise.
         epsilon: How much a renewed agent explores at first, 0.3 otherwise.
         assignments: Hyperparameters, and the task's settings before the change.
         out: A new folder for the report; runs/… otherwise.
@@ -105,7 +105,7 @@ def _plan(
     registry.find("agent", registry.AGENTS, agent_name)
     preset = presets.preset(preset_name, task_name, agent_name)
     if not change:
-        raise QfolioError("--change says what becomes of the task, for example --change mass=1.5.")
+        raise QfolioError("--change says what becomes of the task, for example --change mass=2.")
     chosen = settings.parse(assignments)
     before = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
     before = {**preset.task, **before}
