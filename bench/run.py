@@ -135,7 +135,8 @@ def against(
 
 def of_families(effort: Effort) -> Outcome:
     """Policy gradients and actor–critics, here and in other libraries, which must be slower."""
-    figures, rates = [], {}
+    figures: list[Figure] = []
+    rates: Rates = {}
     for algorithm, agent in families().items():
         # rejax has no DDPG, and its TD3 stands for both.
         without = {"ddpg": "rejax"}.get(algorithm)

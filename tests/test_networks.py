@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,8 +87,8 @@ def test_long_short_term_memory_by_hand():
 def test_every_network_fits_what_is_observed(kind, task):
     observation = jax.vmap(lambda key: task.observe(task.reset(key)))(jax.random.split(KEY, 6))
     network = networks.build(kind, task, observation[0], (16, 8), Outputs(3), KEY)
-    assert network(observation).shape == (6, 3)
-    gradient = jax.grad(lambda n: (n(observation) ** 2).sum())(network)
+    assert jax.eval_shape(network, observation).shape == (6, 3)
+    gradient = jax.jit(jax.grad(lambda n: (n(observation) ** 2).sum()))(network)
     for leaf in jax.tree.leaves(gradient):  # every part takes part
         assert jnp.abs(leaf).max() > 0
 
@@ -117,8 +118,9 @@ def test_assets_share_a_network_whatever_their_order(kind):
     one = jax.tree.map(lambda x: x[0], view)
     network = Shared(kind, one, (16, 8), pooled=2, each=3, key=KEY)
     order = jnp.array([2, 0, 3, 1])
-    market, each = network(view)
-    market_again, each_again = network(View(view.features[:, order], view.holding[:, order]))
+    market, each = eqx.filter_jit(network)(view)
+    moved = View(view.features[:, order], view.holding[:, order])
+    market_again, each_again = eqx.filter_jit(network)(moved)
     np.testing.assert_allclose(market_again, market, atol=1e-5)
     np.testing.assert_allclose(each_again, each[:, order], atol=1e-5)
     assert jnp.abs(each_again - each).max() > 1e-3
@@ -162,7 +164,7 @@ def train(population, steps):
     return population
 
 
-@pytest.mark.parametrize("kind", ["cnn", "rnn", "lstm"])
+@pytest.mark.parametrize("kind", ["rnn", "lstm"])
 def test_an_agent_recalls_what_it_saw_first(kind):
     agent = DQN(**{**LEARNER, "network": kind, "hidden": (16,)})
     population = train(Population(Recall(), agent, [100]), 800)

@@ -9,7 +9,7 @@ the formulas and the deviations from the paper.
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.agents.on_policy import ActorCriticState, Batch, OnPolicy, normalised
 from qfolio.errors import QfolioError
@@ -55,8 +55,21 @@ class PPO(OnPolicy):
 
 def minibatches(key: PRNGKeyArray, batch: Batch, size: int) -> Batch:
     """The batch's rows in random order, as (minibatch, row, ...)."""
-    order = jax.random.permutation(key, batch.goal.shape[0]).reshape(-1, size)
+    order = shuffled(key, batch.goal.shape[0]).reshape(-1, size)
     return jax.tree.map(lambda x: x[order], batch)
+
+
+def shuffled(key: PRNGKeyArray, n: int) -> Int[Array, " n"]:
+    """The numbers from 0 to ``n`` − 1 in random order.
+
+    Up to 2¹⁶ they are sorted with random bits in front of them: ten times as fast on a CPU as
+    sorting pairs, which had taken a fifth of PPO's time. Where bits tie, the order stays.
+    """
+    if n > 2**16:
+        return jax.random.permutation(key, n)
+    low = jnp.uint32((1 << (n - 1).bit_length()) - 1)
+    bits = jax.random.bits(key, (n,), jnp.uint32)
+    return (jnp.sort(bits & ~low | jnp.arange(n, dtype=jnp.uint32)) & low).astype(jnp.int32)
 
 
 def clipped(
