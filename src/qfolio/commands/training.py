@@ -38,12 +38,16 @@ def train(
     """Train agents on a task, grade them against the exact optimum and write a report.
 
     Args:
-        task: What to learn: pendulum (the default), or a market with a known optimum: market/kelly,
-            market/merton, market/regime, market/ar1, market/no-trade, market/garleanu-pedersen;
-            or any environment of Gymnasium by its ID, such as gym:CartPole-v1.
-        agent: Which algorithm: dqn, pathwise; the first that has presets for the task otherwise.
-        preset: fast (the default); for the pendulum also best, and report (the run that qfolio grew
-            out of).
+        task: What to learn: pendulum (the default), pendulum/grid, pendulum/hidden, catch; a finite
+            process: finite/cliff, finite/frozen-lake, finite/random; a market with a known optimum:
+            market/kelly, market/merton, market/regime, market/ar1, market/no-trade,
+            market/garleanu-pedersen; or any environment of Gymnasium by its ID, such as
+            gym:CartPole-v1.
+        agent: Which algorithm: dqn, reinforce, a2c, ppo, ddpg, td3, sac, mbpo; where states are
+            numbered, q-learning, sarsa, expected-sarsa, double-q, dyna-q; in markets pathwise.
+            Without, the first that has presets for the task.
+        preset: fast (the default); of dqn on the pendulum also best, rainbow, and report (the run
+            that qfolio grew out of).
         episodes: Training episodes of each agent; the preset says how many otherwise. Those of
             fast and best are short: 28 and 40 steps.
         steps: Instead of episodes, steps of each agent's environments.

@@ -104,7 +104,7 @@ class GridOptimum:
     def _interpolate(self, values: Array, x: Array, y: Array) -> Array:
         """Bilinear interpolation of ``values`` at coordinates (x, y)."""
         (i, i_next, u), (j, j_next, v) = (
-            _cell(axis, periodic, at)
+            cell(axis, periodic, at)
             for axis, periodic, at in zip(self.axes, self.periodic, (x, y), strict=True)
         )
         low = (1 - u) * values[i, j] + u * values[i_next, j]
@@ -127,7 +127,7 @@ class GridOptimum:
             return solution
 
 
-def _cell(axis: Array, periodic: bool, at: Array) -> tuple[Array, Array, Array]:
+def cell(axis: Array, periodic: bool, at: Array) -> tuple[Array, Array, Array]:
     """The two grid indices around a coordinate and how far it lies between them, in [0, 1]."""
     n = len(axis)
     position = (at - axis[0]) / (axis[1] - axis[0])

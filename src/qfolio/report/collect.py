@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,74 +17,12 @@ from qfolio.optimum.followed import FollowedOptimum
 from qfolio.registry import GYM
 from qfolio.report.backtest import BacktestData, StrategySeries
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
+from qfolio.report.words import AGENTS, TASKS, Words
 from qfolio.runs import Run
 from qfolio.tasks.market import Market
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 from qfolio.tasks.synthetic import Ar1, NoTrade, OneAsset, Synthetic
 from qfolio.training import episode_steps
-
-
-class _Words(NamedTuple):
-    where: str  # an agent was trained, for the title
-    about: str = ""
-    meaning: str = ""  # of a return, where it is more than the sum of rewards
-    rule: str = ""  # what the numbers of its rule are
-    scene: str = "{}"  # what the name of a scene stands for
-
-
-_WEIGHT_WANTED = "Each number is the weight that is wanted, from a weight that is held."
-
-_TASKS = {
-    "pendulum": _Words("on the pendulum"),
-    "market/kelly": _Words(
-        "on Kelly’s bet",
-        "A bet on good odds, repeated. The best policy stakes one fraction of the wealth, whatever "
-        "is at stake already (Kelly, 1956).",
-        rule="The fraction is the share of the wealth at stake.",
-    ),
-    "market/merton": _Words(
-        "in Merton’s market",
-        "Three assets and cash with the same chances at every step. The best weights therefore "
-        "never change (Merton, 1969), and here one of the assets is not worth holding.",
-        rule="What the three weights leave is held in cash.",
-    ),
-    "market/regime": _Words(
-        "in a market of good and bad times",
-        "One asset rises in good times and falls in bad ones, and trading costs. The best policy "
-        "is all in or all out, and changes over only where that earns more than it costs.",
-        rule=_WEIGHT_WANTED,
-        scene="{} times",
-    ),
-    "market/ar1": _Words(
-        "in a market with a signal",
-        "A slowly fading signal foretells the return of one asset, and trading costs. The best "
-        "policy, computed for weights in tenths, moves only where the signal is worth the cost, "
-        "and else keeps what it holds.",
-        rule=f"{_WEIGHT_WANTED} Signals are in standard deviations.",
-        scene="signal {}",
-    ),
-    "market/no-trade": _Words(
-        "in a market with a no-trade region",
-        "One asset grows faster than cash, and trading costs. The best policy does nothing inside "
-        "a region of weights; outside of it, it trades just to the nearest edge.",
-        "Each step counts with its expected growth, so that the luck of its price does not.",
-        rule="Low and high are the edges of the region: where a holder of too little stops buying, "
-        "and a holder of too much stops selling.",
-    ),
-    "market/garleanu-pedersen": _Words(
-        "in the market of Gârleanu and Pedersen",
-        "A fading signal foretells the return of one asset, and costs grow with the square of a "
-        "trade. The best policy therefore goes only part of the way to where it aims (Gârleanu "
-        "and Pedersen, 2013).",
-        "It counts what a position earns, less its risk and the costs of trading, each step "
-        "discounted.",
-        rule="What is wanted is a sum of two parts. The coefficient of the position held is one "
-        "less the trading rate; the other is that of the factor, the signal.",
-    ),
-}
-"""What the report says of a task, by name."""
-
-_AGENTS = {"dqn": "DQN", "pathwise": "Pathwise gradients"}
 
 _HELD = 201
 """At how many weights or positions a policy is drawn."""
@@ -110,9 +48,9 @@ def report_data(
     names = ("greedy return", "") if variant is None else (variant.name, variant.variant_name)
     agent, task = summary["agent"], summary["task"]
     name = task.removeprefix(GYM)
-    where = _TASKS.get(task, _Words(f"on {name}" if name != task else f"on the {task}")).where
+    where = TASKS.get(task, Words(f"on {name}" if name != task else f"on the {task}")).where
     return ReportData(
-        title=f"{_AGENTS.get(agent, agent)} {where}",
+        title=f"{AGENTS.get(agent, agent)} {where}",
         command=command,
         summary=summary,
         config=run.config,
@@ -192,7 +130,7 @@ def _curve(run: Run, label: str) -> Curve:
 
 def _market(run: Run, summary: dict[str, Any], solution: FollowedOptimum) -> MarketData:
     task = run.task
-    words = _TASKS.get(summary["task"], _Words(""))
+    words = TASKS.get(summary["task"], Words(""))
     growth = isinstance(task, Market) and task.reward == "log"
     years = task.horizon * task.dt if isinstance(task, NoTrade) else None
     return MarketData(

@@ -18,7 +18,6 @@ from qfolio.ranking import HEADLINE, THRESHOLDS, Result, amount, curve, share, s
 from qfolio.registry import GYM
 from qfolio.report import palette, rendering
 from qfolio.report.backtest import _MARKER_PATHS, _MARKERS
-from qfolio.report.collect import _TASKS, _Words
 from qfolio.report.data import Floats
 from qfolio.report.figures import LEAD, NARROW, WIDE, inline_svg, new_figure, save_png
 from qfolio.report.rendering import (
@@ -30,6 +29,7 @@ from qfolio.report.rendering import (
     render,
     setting_groups,
 )
+from qfolio.report.words import TASKS, Words
 from qfolio.statistics import bootstrap_interval, interquartile_mean
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def render_comparison(data: ComparisonData) -> str:
     """Return the text of the page; see ``write_comparison_report``."""
     content, ranking = data.content, data.ranking
     task = content["task"]
-    where = _TASKS.get(task, _Words(f"on {task.removeprefix(GYM)}")).where
+    where = TASKS.get(task, Words(f"on {task.removeprefix(GYM)}")).where
     return render(
         "comparison.html",
         content=content,

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from qfolio.fields import require, static
-from qfolio.optimum.grid import GridOptimum, _cell
+from qfolio.optimum.grid import GridOptimum, cell
 from qfolio.tasks.finite import FiniteMDP
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 
@@ -64,7 +64,7 @@ def interpolated(grid: GridOptimum, horizon: int = 200) -> FiniteMDP:
         step = jax.vmap(grid.task.step, (0, None, None))
         after = step(points, action, jax.random.key(0))  # deterministic: the key is not used
         (i, i_next, u), (j, j_next, v) = (
-            _cell(axis, periodic, at)
+            cell(axis, periodic, at)
             for axis, periodic, at in zip(grid.axes, grid.periodic, after.state, strict=True)
         )
         corners = [i * m + j, i_next * m + j, i * m + j_next, i_next * m + j_next]
