@@ -67,13 +67,16 @@ _RAINBOW = {
     **_FAST,
     "double": True,
     "dueling": True,
-    "n_steps": 3,
+    "n_steps": 2,
     "prioritised": True,
     "values": "quantile",
-    "atoms": 32,
+    "atoms": 16,
     "noisy": True,
+    "noise_scale": 0.1,
     "epsilon": 0.0,
     "epsilon_end": 0.0,
+    "updates": 2,
+    "learning_rate_steps": 15_000.0,
 }
 
 _HIDDEN = {**_FAST, "network": "lstm", "hidden": (64, 128), "input_gain": 12.0}
@@ -366,7 +369,7 @@ PRESETS = {
         reward_scale=10.0,
         gradient_norm=0.3,
     ),
-    ("gym:CartPole-v1", "dqn"): _gym_dqn("CartPole-v1", 80_000),
+    ("gym:CartPole-v1", "dqn"): _gym_dqn("CartPole-v1", 120_000),
     ("gym:CartPole-v1", "ppo"): {"fast": _gym("CartPole-v1", "ppo", 100_000, **_GYM_PPO)},
     ("gym:Acrobot-v1", "dqn"): _gym_dqn("Acrobot-v1", 60_000),
     # In 200 steps the goal is hardly ever found by chance; longer episodes find it.
