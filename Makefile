@@ -13,11 +13,12 @@ demo: .venv/installed
 	@echo "  runs/demo-$(NOW)/pendulum/report.html"
 	@echo "  runs/demo-$(NOW)/portfolio/report.html"
 
+# Two processes, each with whole files: most of a test's time is compiling, which keeps one core busy.
 test: .venv/installed-dev
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
 test-fast: .venv/installed-dev
-	$(BIN)/pytest -m "not slow"
+	$(BIN)/pytest -n 2 --dist loadfile -m "not slow"
 
 check: .venv/installed-dev
 	$(BIN)/ruff format --check

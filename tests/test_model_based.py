@@ -154,7 +154,7 @@ def test_learns_values_from_imagined_steps():
     np.testing.assert_allclose(reward, [[1], [1]], atol=0.05)
     np.testing.assert_allclose(terminal, [[0], [1]], atol=0.05)
     values = state.learned.critics(states, best).mean(0)
-    np.testing.assert_allclose(values, [5, 1], rtol=0.02)  # hardly any entropy is wanted
+    np.testing.assert_allclose(values, [5, 1], rtol=0.05)  # hardly any entropy is wanted
     imagined = state.imagined.unpack(state.imagined.rows)
     np.testing.assert_allclose(jnp.abs(imagined.observation), 0.5, atol=0.05)
 

@@ -154,6 +154,19 @@ _TORQUE = {
     "reward_scale": 0.3,
 }
 
+_MODEL = {  # 2,000 real steps, with 4 gradient steps of SAC for each behind the first 200
+    **_TORQUE,
+    "environments": 1,
+    "episode_steps": 40,
+    "replay_capacity": 2048,
+    "learning_starts": 200,
+    "learning_rate_steps": 7200.0,
+    "updates": 4,
+    "model_updates": 2,
+    "members": 3,
+    "spread": 0.05,
+}
+
 _PORTFOLIO_TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
 
 _PORTFOLIO_DQN = {
@@ -263,8 +276,10 @@ def _gym_dqn(id: str, steps: int, *, task: Mapping[str, Any] | None = None, **ch
 
 
 def _torque(agent: str, **changes: Any) -> dict[str, Preset]:
-    """The pendulum with any torque."""
-    return {"fast": Preset(agent, {**_TORQUE, **changes}, 3468, seeds=8, task={"torques": 0})}
+    """The pendulum with any torque; 8,000 gradient steps."""
+    changes = {**_TORQUE, **changes}
+    episodes = 289 * changes["environments"]
+    return {"fast": Preset(agent, changes, episodes, seeds=8, task={"torques": 0})}
 
 
 _CLIFF = {"epsilon_end": 0.1}
@@ -335,9 +350,10 @@ PRESETS = {
     ("pendulum", "reinforce"): {
         "fast": Preset("reinforce", _REINFORCE, episodes=5000, seeds=8, task={"torques": 0}),
     },
-    ("pendulum", "ddpg"): _torque("ddpg"),
+    ("pendulum", "ddpg"): _torque("ddpg", environments=32, replay_capacity=262_144),
     ("pendulum", "td3"): _torque("td3", actor_rate=0.4, target_noise=0.05, target_rate=0.06),
     ("pendulum", "sac"): _torque("sac", spread=0.05, actor_rate=0.6),
+    ("pendulum", "mbpo"): {"fast": Preset("mbpo", _MODEL, 50, seeds=8, task={"torques": 0})},
     ("market/kelly", "pathwise"): _pathwise(
         307_200, environments=1024, rollout=5, learning_rate_steps=300.0, reward_scale=10.0
     ),
@@ -383,9 +399,8 @@ PRESETS = {
     ),
     ("gym:LunarLander-v3", "dqn"): _gym_dqn(
         "LunarLander-v3",
-        400_000,
-        environments=16,
-        replay_capacity=262_144,
+        200_000,
+        replay_capacity=131_072,
         input_gain=1.0,
         learning_rate=1e-3,
         reward_scale=0.03,

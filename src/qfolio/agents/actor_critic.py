@@ -100,14 +100,13 @@ class ActorCritic(Agent):
     actor_rate: float = number(0.3)  # the actor's learning rate, as a share of the critics'
     reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
-    action_gain: float = number(1.0)  # of the critics' first layer, actions taken to ±1
 
     def __check_init__(self) -> None:
         counts = "environments batch_size updates"
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
-        require(self, "input_gain action_gain actor_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "input_gain actor_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "discount target_rate", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
@@ -213,6 +212,6 @@ class ActorCritic(Agent):
         seen = sum(jnp.size(leaf) for leaf in jax.tree.leaves(observation))
         scale = jnp.broadcast_to(jnp.array(task.observation_scale), (seen,))
         gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
-        gains = jnp.append(gain, jnp.full(action.shape, self.action_gain / unit_of(task.actions)))
+        gains = jnp.append(gain, jnp.full(action.shape, 1 / unit_of(task.actions)))
         make = lambda key: Flat((observation, action), self.hidden, 1, key, gains)  # noqa: E731
         return Critics(make, count, key)
