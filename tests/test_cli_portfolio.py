@@ -143,7 +143,7 @@ def test_the_check_of_prices(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["nothing.csv"], "nothing.csv"), (["--agents", "ppo"], "no agent"),
+        (["nothing.csv"], "nothing.csv"), (["--agents", "dqm"], "no agent"),
         (["--agents", "dqn,dqn"], "twice"), (["--agents", ""], "at least one agent"),
         (["--preset", "quick"], "no preset"), (["--set", "lag=2"], "options of their own"),
         (["--set", "dqn.windw=2"], "has this setting"), (["--train", "90y"], "nothing to test"),

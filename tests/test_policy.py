@@ -203,7 +203,7 @@ def test_programs_that_are_used_again_learn_the_same():
     used = [learned("pathwise"), learned("pathwise", agent=fast), learned("pathwise")]
     assert same(used[0].learner, used[2].learner)
     assert not same(used[0].learner, used[1].learner)
-    training._programs.cache_clear()
+    training.programs_of.cache_clear()
     assert same(learned("pathwise", agent=fast).learner, used[1].learner)
 
 
