@@ -44,15 +44,6 @@ _DASHES = ("6 3", "2 2", "7 2 2 2", "9 3", "2 4", "7 2 2 2 2 2", "4 4")
 _Year = tuple[int, list[tuple[str, str]]]
 
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "pentagon")
-_MARKERS = ("o", "s", "D", "^", "v", "p")  # the same in matplotlib
-_MARKER_PATHS = (  # and as SVG
-    "M11,5a4,4 0 1,0 8,0a4,4 0 1,0 -8,0",
-    "M11.5,1.5h7v7h-7z",
-    "M15,0l5,5l-5,5l-5,-5z",
-    "M15,.5l4.5,8h-9z",
-    "M15,9.5l4.5,-8h-9z",
-    "M15,.5l4.6,3.4l-1.8,5.4h-5.6l-1.8,-5.4z",
-)
 _PERCENT = ("growth", "volatility", "drawdown", "cost_drag")
 _HEADINGS = {
     "growth": "Growth",
@@ -162,7 +153,7 @@ def render_backtest(data: BacktestData) -> str:
         hashes=[_hash(script) for script in scripts],
         payload=htmlsafe_json_dumps(payload, separators=(",", ":"), allow_nan=False),
         strategies=[(name, data.strategies[name].kind, looks[name]) for name in names],
-        markers=_MARKER_PATHS,
+        markers=palette.MARKER_PATHS,
         verdicts=_verdicts(names, data),
         facts=_facts(data),
         latest={
@@ -208,7 +199,7 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
         if look.symbol is not None:
             start = (0.03 + 0.05 * look.symbol) % 0.14
             marker: dict[str, Any] = {
-                "marker": _MARKERS[look.symbol],
+                "marker": palette.MARKERS[look.symbol],
                 "markersize": 5.5,
                 "markeredgecolor": palette.PAPER,
                 "markevery": (round(start * len(days)), max(1, len(days) // 7)),

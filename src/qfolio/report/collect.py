@@ -14,10 +14,9 @@ from qfolio.backtest.run import Backtest, Entry
 from qfolio.evaluation import greedy, play, start_keys
 from qfolio.mdp import Agent, Policy, Position
 from qfolio.optimum.followed import FollowedOptimum
-from qfolio.registry import GYM
 from qfolio.report.backtest import BacktestData, StrategySeries
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
-from qfolio.report.words import AGENTS, TASKS, Words
+from qfolio.report.words import AGENTS, words_of
 from qfolio.runs import Run
 from qfolio.tasks.market import Market
 from qfolio.tasks.pendulum import Pendulum, PendulumState
@@ -47,10 +46,8 @@ def report_data(
     variant = run.agent.contrast()
     names = ("greedy return", "") if variant is None else (variant.name, variant.variant_name)
     agent, task = summary["agent"], summary["task"]
-    name = task.removeprefix(GYM)
-    where = TASKS.get(task, Words(f"on {name}" if name != task else f"on the {task}")).where
     return ReportData(
-        title=f"{AGENTS.get(agent, agent)} {where}",
+        title=f"{AGENTS.get(agent, agent)} {words_of(task).where}",
         command=command,
         summary=summary,
         config=run.config,
@@ -130,7 +127,7 @@ def _curve(run: Run, label: str) -> Curve:
 
 def _market(run: Run, summary: dict[str, Any], solution: FollowedOptimum) -> MarketData:
     task = run.task
-    words = TASKS.get(summary["task"], Words(""))
+    words = words_of(summary["task"])
     growth = isinstance(task, Market) and task.reward == "log"
     years = task.horizon * task.dt if isinstance(task, NoTrade) else None
     return MarketData(

@@ -12,14 +12,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from markupsafe import Markup
 
 from qfolio.ranking import HEADLINE, THRESHOLDS, Result, amount, curve, share, span
-from qfolio.registry import GYM
 from qfolio.report import palette, rendering
-from qfolio.report.backtest import _MARKER_PATHS, _MARKERS
 from qfolio.report.data import Floats
-from qfolio.report.figures import LEAD, NARROW, WIDE, inline_svg, new_figure, save_png
+from qfolio.report.figures import (
+    LEAD,
+    NARROW,
+    WIDE,
+    new_figure,
+    percent_axis,
+    percent_tick,
+    save_png,
+    short_tick,
+    svgs,
+)
 from qfolio.report.rendering import (
     THIN_SPACE,
     counted,
@@ -29,7 +36,7 @@ from qfolio.report.rendering import (
     render,
     setting_groups,
 )
-from qfolio.report.words import TASKS, Words
+from qfolio.report.words import words_of
 from qfolio.statistics import bootstrap_interval, interquartile_mean
 
 if TYPE_CHECKING:
@@ -85,7 +92,7 @@ def comparison_data(content: dict[str, Any]) -> ComparisonData:
         name: Look(
             f"agent-{place % palette.AGENTS + 1}",
             ("", "7 3", "2 3")[place // palette.AGENTS % 3],
-            place % len(_MARKERS),
+            place % len(palette.MARKERS),
         )
         for place, name in enumerate(order)
     }
@@ -113,8 +120,6 @@ def write_comparison_report(folder: Path, content: dict[str, Any]) -> None:
 def render_comparison(data: ComparisonData) -> str:
     """Return the text of the page; see ``write_comparison_report``."""
     content, ranking = data.content, data.ranking
-    task = content["task"]
-    where = TASKS.get(task, Words(f"on {task.removeprefix(GYM)}")).where
     return render(
         "comparison.html",
         content=content,
@@ -122,11 +127,11 @@ def render_comparison(data: ComparisonData) -> str:
         graded=data.graded,
         starts=data.starts,
         curve_starts=next(iter(data.results.values())).curve_starts,
-        title=f"{counted(len(data.results), 'agent')} {where}",
+        title=f"{counted(len(data.results), 'agent')} {words_of(content['task']).where}",
         lede=[tidy(sentence) for sentence in content["conclusion"]],
         notes=[tidy(sentence) for sentence in content["notes"]],
         looks=data.looks,
-        markers=_MARKER_PATHS,
+        markers=palette.MARKER_PATHS,
         facts=_facts(data),
         reached=[(name, _reached(data, name)) for name in data.results],
         took=[(name, _took(result)) for name, result in data.results.items()],
@@ -134,10 +139,10 @@ def render_comparison(data: ComparisonData) -> str:
         near=percent(HEADLINE, 0),
         within=[(name, _within(data, name)) for name in data.results],
         better=_better(data),
-        curves=_svgs(draw_curves, data, LEAD),
-        finals=_svgs(draw_finals, data, WIDE),
+        curves=svgs(draw_curves, data, LEAD),
+        finals=svgs(draw_finals, data, WIDE),
         common=rendering.amount(ranking["common_steps"]),
-        floor=_percent_tick(_floor(data)) if _logarithmic(data) else None,
+        floor=percent_tick(_floor(data)) if _logarithmic(data) else None,
         runs=[(name, *_settings(data, name)) for name in data.results],
     )
 
@@ -173,7 +178,7 @@ def draw_curves(data: ComparisonData, width: float) -> Figure:
         else:
             panel.set_xlim(left=0)
             panel.locator_params(axis="x", nbins=5)
-        panel.xaxis.set_major_formatter(lambda tick, _: _short(tick))
+        panel.xaxis.set_major_formatter(lambda tick, _: short_tick(tick))
         panel.margins(x=0.02 if log else 0)
         _goal_line(panel, data)
     axes[0, 0].set_title("Regret of the greedy policy" if data.graded else "Greedy return")
@@ -209,7 +214,7 @@ def draw_finals(data: ComparisonData, width: float) -> Figure:
             axes.plot(
                 limit(final["interval"]), [row - 0.1] * 2, color=colour, linewidth=4, alpha=0.4
             )
-        symbol = _MARKERS[data.looks[name].symbol]
+        symbol = palette.MARKERS[data.looks[name].symbol]
         axes.plot(limit([final["iqm"]]), [row - 0.1], symbol, color=colour, markersize=7)
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(axis="y", labelcolor=palette.INK)
@@ -217,7 +222,7 @@ def draw_finals(data: ComparisonData, width: float) -> Figure:
     axes.grid(axis="x")
     if log:
         axes.set_xscale("log")
-        _log_axis(axes.xaxis)
+        percent_axis(axes.xaxis)
     else:
         axes.xaxis.set_major_formatter(lambda tick, _: data.write(tick))
         axes.locator_params(axis="x", nbins=5 if width > NARROW else 4)
@@ -242,7 +247,7 @@ def _draw_curve(axes: Axes, data: ComparisonData, name: str, pace: float, log: b
         "linestyle": (0, tuple(float(part) / 1.8 for part in look.dash.split()))
         if look.dash
         else "solid",
-        "marker": _MARKERS[look.symbol],
+        "marker": palette.MARKERS[look.symbol],
         "markevery": (look.symbol % 4, 4) if len(x) > 6 else 1,
         "markersize": 5,
         "clip_on": False,
@@ -255,34 +260,12 @@ def _goal_line(axes: Axes, data: ComparisonData) -> None:
     if _logarithmic(data):
         axes.set_yscale("log")
         axes.set_ylim(bottom=_floor(data))
-        _log_axis(axes.yaxis)
+        percent_axis(axes.yaxis)
     elif data.graded:
         axes.yaxis.set_major_formatter(lambda tick, _: data.write(tick))
     goal = data.ranking["goal"]
     height = HEADLINE if data.graded else goal - HEADLINE * abs(goal)
     axes.axhline(height, color=palette.INK, linewidth=0.9, dashes=(4, 3), zorder=1.5)
-
-
-def _log_axis(axis: Any) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 50 * low else (1,), numticks=8))
-    axis.set_major_formatter(lambda tick, _: _percent_tick(tick))
-    axis.set_minor_formatter(NullFormatter())
-    axis.set_tick_params(which="minor", length=0)
-
-
-def _percent_tick(tick: float) -> str:
-    return percent(tick, max(0, -math.floor(math.log10(tick) + 2 + 1e-9)))
-
-
-def _short(tick: float) -> str:
-    """A number as the label of a tick: 200k, 5M."""
-    for size, letter in ((1e6, "M"), (1e3, "k")):
-        if abs(tick) >= size:
-            return f"{tick / size:g}{letter}"
-    return f"{tick:g}"
 
 
 def _logarithmic(data: ComparisonData) -> bool:
@@ -301,20 +284,6 @@ def _middles(data: ComparisonData) -> Floats:
     """All points of all curves that are drawn as lines."""
     measure = data.ranking["measure"]
     return np.concatenate([interquartile_mean(curve(x, measure)) for x in data.results.values()])
-
-
-def _svgs(draw: Any, data: ComparisonData, width: float) -> dict[str, Markup]:
-    return {
-        kind: Markup(_themed(inline_svg(draw, data, size)))
-        for kind, size in (("wide", width), ("narrow", NARROW))
-    }
-
-
-def _themed(svg: str) -> str:
-    """A figure whose agents have the colours of the page's light or dark scheme."""
-    for place in range(1, palette.AGENTS + 1):
-        svg = svg.replace(palette.LIGHT[f"agent-{place}"], f"var(--agent-{place})")
-    return svg
 
 
 # What is said --------------------------------------------------------------------------------

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from markupsafe import Markup
 
 from qfolio.continual import WAYS
 from qfolio.report import palette
-from qfolio.report.comparison import _log_axis, _short, _themed
-from qfolio.report.figures import LEAD, NARROW, inline_svg, new_figure, save_png
+from qfolio.report.figures import LEAD, NARROW, new_figure, percent_axis, save_png, short_tick, svgs
 from qfolio.report.rendering import amount, duration, number, percent, render, setting_groups
 from qfolio.statistics import bootstrap_interval, interquartile_mean
 
@@ -55,10 +53,7 @@ def render_page(content: Content) -> str:
         within=percent(content["within"], 0),
         rate=percent(content["rate"], 0),
         renewal=percent(content["renewal"], 0),
-        recovery={
-            kind: Markup(_themed(inline_svg(draw_recovery, content, width)))
-            for kind, width in (("wide", LEAD), ("narrow", NARROW))
-        },
+        recovery=svgs(draw_recovery, content, LEAD),
         settings=setting_groups({**general, **groups}),
     )
 
@@ -133,9 +128,9 @@ def draw_recovery(content: Content, width: float) -> Figure:
         _draw_course(axes, content, way, last)
     axes.set_yscale("log")
     axes.set_xlim(0, last)
-    axes.xaxis.set_major_formatter(lambda tick, _: _short(tick))
+    axes.xaxis.set_major_formatter(lambda tick, _: short_tick(tick))
     axes.locator_params(axis="x", nbins=6 if width > NARROW else 4)
-    _log_axis(axes.yaxis)
+    percent_axis(axes.yaxis)
     axes.axhline(content["within"], color=palette.INK, linewidth=0.9, dashes=(4, 3), zorder=1.5)
     axes.set_title("Regret in the changed world")
     handles, labels = axes.get_legend_handles_labels()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import threading
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from qfolio.report import palette
@@ -24,7 +26,7 @@ from qfolio.report.data import (
     Weights,
     decimals,
 )
-from qfolio.report.rendering import number
+from qfolio.report.rendering import number, percent
 from qfolio.statistics import bootstrap_interval, interquartile_mean
 
 if TYPE_CHECKING:
@@ -138,6 +140,12 @@ def inline_svg(draw: Callable[[T, float], Figure], data: T, width: float) -> str
     for colour, variable in palette.CSS_VARIABLES.items():
         body = body.replace(colour, f"var({variable})")
     return f'<svg {box.group()} aria-hidden="true">{body}'
+
+
+def svgs(draw: Callable[[T, float], Figure], data: T, width: float) -> dict[str, Markup]:
+    """Return a figure for wide pages and for phones, as ``parts.html`` takes it."""
+    sizes = {"wide": width, "narrow": NARROW}
+    return {kind: Markup(inline_svg(draw, data, size)) for kind, size in sizes.items()}
 
 
 def draw_learning_curve(data: ReportData, width: float) -> Figure:
@@ -547,6 +555,30 @@ def _colours(name: str, colours: list[str]) -> Colormap:
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list(name, colours)
+
+
+def percent_axis(axis: Any) -> None:
+    """Give a logarithmic axis of fractions a few ticks, in percent."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 50 * low else (1,), numticks=8))
+    axis.set_major_formatter(lambda tick, _: percent_tick(tick))
+    axis.set_minor_formatter(NullFormatter())
+    axis.set_tick_params(which="minor", length=0)
+
+
+def percent_tick(tick: float) -> str:
+    """A fraction as the label of a tick: 0.1 %, 5 %."""
+    return percent(tick, max(0, -math.floor(math.log10(tick) + 2 + 1e-9)))
+
+
+def short_tick(tick: float) -> str:
+    """A number as the label of a tick: 200k, 5M."""
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(tick) >= size:
+            return f"{tick / size:g}{letter}"
+    return f"{tick:g}"
 
 
 def _draw_map(

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from PIL import Image
 
 from qfolio.report import figures
@@ -80,10 +79,12 @@ def render_page(data: ReportData, gif: bytes | None = None) -> str:
         settings=setting_groups(data.config),
         gif=None if gif is None else _data_uri("image/gif", gif),
         still=None if gif is None else _data_uri("image/png", _first_frame(gif)),
-        learning=_svgs(figures.draw_learning_curve, data, figures.LEAD),
-        value=None if data.maps is None else _svgs(figures.draw_value, data, figures.WIDE),
-        policy=_svgs(figures.draw_policy, data, figures.WIDE) if _has_policy(data) else None,
-        overestimation=_svgs(figures.draw_overestimation, data, figures.WIDE) if biases else None,
+        learning=figures.svgs(figures.draw_learning_curve, data, figures.LEAD),
+        value=None if data.maps is None else figures.svgs(figures.draw_value, data, figures.WIDE),
+        policy=figures.svgs(figures.draw_policy, data, figures.WIDE) if _has_policy(data) else None,
+        overestimation=figures.svgs(figures.draw_overestimation, data, figures.WIDE)
+        if biases
+        else None,
     )
 
 
@@ -216,13 +217,6 @@ def _bias_digits(data: ReportData) -> int:
     if data.market is None:
         return 2
     return decimals(max((abs(bias) for _, bias in _biases(data)), default=1.0), 2, least=2)
-
-
-def _svgs(draw: figures.Draw, data: ReportData, width: float) -> dict[str, Markup]:
-    return {
-        "wide": Markup(figures.inline_svg(draw, data, width)),
-        "narrow": Markup(figures.inline_svg(draw, data, figures.NARROW)),
-    }
 
 
 def _first_frame(gif: bytes) -> bytes:

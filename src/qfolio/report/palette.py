@@ -1,4 +1,4 @@
-"""The colours shared by figures, animation and page.
+"""The colours and marks shared by figures, animation and page.
 
 Blue and orange stay apart for every common form of colour blindness. The page renames these
 colours to its own variables, which is how the figures follow its light or dark scheme.
@@ -10,15 +10,6 @@ MUTED = "#66707c"
 HAIRLINE = "#dfe3e8"
 ACCENT = "#0b63a5"
 SECOND = "#c4570a"
-
-CSS_VARIABLES = {
-    PAPER: "--paper",
-    INK: "--ink",
-    MUTED: "--muted",
-    HAIRLINE: "--hairline",
-    ACCENT: "--accent",
-    SECOND: "--second",
-}
 
 PATH = "#f28c3c"
 VALUE_MAP = ["#0a1a2f", "#0c3d6b", "#1f72b0", "#7db8d8", "#f7f1e1"]
@@ -58,6 +49,17 @@ DARK = {
 }
 """The page's variables in its light and its dark scheme."""
 
+CSS_VARIABLES = {
+    PAPER: "--paper",
+    INK: "--ink",
+    MUTED: "--muted",
+    HAIRLINE: "--hairline",
+    ACCENT: "--accent",
+    SECOND: "--second",
+    **{LIGHT[f"agent-{n}"]: f"--agent-{n}" for n in (3, 4, 5, 6)},
+}
+"""The page's variable for each colour of a figure."""
+
 AGENTS = 6
 """How many colours there are for agents; further agents begin again with a dashed line."""
 
@@ -67,3 +69,16 @@ ASSETS = (
     *("#dba79b", "#b9c48d", "#5a7391", "#a0703f"),
 )
 """Calm colours for stacked areas, the same in both schemes."""
+
+MARKERS = ("o", "s", "D", "^", "v", "p")
+"""Marks of agents, in matplotlib's words."""
+
+MARKER_PATHS = (
+    "M11,5a4,4 0 1,0 8,0a4,4 0 1,0 -8,0",
+    "M11.5,1.5h7v7h-7z",
+    "M15,0l5,5l-5,5l-5,-5z",
+    "M15,.5l4.5,8h-9z",
+    "M15,9.5l4.5,-8h-9z",
+    "M15,.5l4.6,3.4l-1.8,5.4h-5.6l-1.8,-5.4z",
+)
+"""The same as paths of SVG, 30 wide and 10 high."""

@@ -16,8 +16,9 @@ from qfolio import search
 from qfolio.journal import Trial, best_of
 from qfolio.report import palette
 from qfolio.report.data import decimals
-from qfolio.report.figures import LEAD, NARROW, WIDE, inline_svg, new_figure, save_png
+from qfolio.report.figures import LEAD, NARROW, WIDE, new_figure, save_png, svgs
 from qfolio.report.rendering import THIN_SPACE, counted, number, percent, render, setting_groups
+from qfolio.report.words import AGENTS, words_of
 from qfolio.search import Dimension, Value
 from qfolio.sensitivity import Effect, Sensitivity, sensitivity, short, verdicts
 from qfolio.statistics import mean_interval
@@ -60,7 +61,8 @@ class Sweep:
 
     @property
     def title(self) -> str:
-        return f"Hyperparameters of {self.config['agent']} on {self.config['task']}"
+        agent, task = self.config["agent"], self.config["task"]
+        return f"Hyperparameters of {AGENTS.get(agent, agent)} {words_of(task).where}"
 
     @property
     def verdicts(self) -> list[str]:
@@ -420,10 +422,7 @@ def _top(data: Sweep) -> list[tuple[str, str, list[str]]]:
 
 
 def _svgs(draw: Callable[[Sweep, float], Figure], data: Sweep, width: float) -> dict[str, Markup]:
-    return {
-        "wide": Markup(_shaded(inline_svg(draw, data, width))),
-        "narrow": Markup(_shaded(inline_svg(draw, data, NARROW))),
-    }
+    return {kind: Markup(_shaded(svg)) for kind, svg in svgs(draw, data, width).items()}
 
 
 def _shaded(svg: str) -> str:

@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+from qfolio.registry import GYM
+
 
 class Words(NamedTuple):
     where: str  # an agent was trained, for the title
@@ -86,3 +88,9 @@ AGENTS = {
     "mbpo": "MBPO",
 }
 """What the report calls an agent, by name."""
+
+
+def words_of(task: str) -> Words:
+    """What the report says of a task; of one that is not registered, its name alone."""
+    name = task.removeprefix(GYM)
+    return TASKS.get(task, Words(f"on {name}" if name != task else f"on the {task}"))
