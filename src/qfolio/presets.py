@@ -130,12 +130,11 @@ _A2C = {
 
 _REINFORCE = {
     **_ON_POLICY,
-    "environments": 8,
-    "rollout": 200,
-    "episode_steps": 0,
+    "environments": 16,
+    "rollout": 64,
     "discount": 0.98,
-    "learning_rate": 3e-3,
-    "learning_rate_steps": 625.0,
+    "learning_rate": 1e-3,
+    "learning_rate_steps": 3906.0,
 }
 
 _TORQUE = {
@@ -312,7 +311,7 @@ _GRID_PENDULUM = {
     "epsilon_end": 0.2,
 }
 
-_ON_POLICY = {"epsilon": 0.05, "epsilon_end": 0.05}  # what SARSA learns counts its exploration
+_SARSA = {"epsilon": 0.05, "epsilon_end": 0.05}  # what SARSA learns counts its exploration
 
 
 def _tables(task: str, settings: dict[str, Any], episodes: int) -> dict[tuple[str, str], Any]:
@@ -348,7 +347,7 @@ PRESETS = {
         "fast": Preset("a2c", _A2C, episodes=15_616, seeds=8, task={"torques": 0}),
     },
     ("pendulum", "reinforce"): {
-        "fast": Preset("reinforce", _REINFORCE, episodes=5000, seeds=8, task={"torques": 0}),
+        "fast": Preset("reinforce", _REINFORCE, episodes=62_496, seeds=8, task={"torques": 0}),
     },
     ("pendulum", "ddpg"): _torque("ddpg", environments=32, replay_capacity=262_144),
     ("pendulum", "td3"): _torque("td3", actor_rate=0.4, target_noise=0.05, target_rate=0.06),
@@ -422,10 +421,10 @@ PRESETS = {
     **_tables("finite/random", _RANDOM, episodes=8000),
     **_tables("pendulum/grid", _GRID_PENDULUM, episodes=100_000),
     ("pendulum/grid", "sarsa"): {
-        "fast": Preset("sarsa", {**_GRID_PENDULUM, **_ON_POLICY}, episodes=100_000, seeds=8)
+        "fast": Preset("sarsa", {**_GRID_PENDULUM, **_SARSA}, episodes=100_000, seeds=8)
     },
     ("pendulum/grid", "expected-sarsa"): {
-        "fast": Preset("expected-sarsa", {**_GRID_PENDULUM, **_ON_POLICY}, 100_000, seeds=8)
+        "fast": Preset("expected-sarsa", {**_GRID_PENDULUM, **_SARSA}, 100_000, seeds=8)
     },
     ("pendulum/grid", "dyna-q"): {
         "fast": Preset("dyna-q", {**_GRID_PENDULUM, "planning": 16}, episodes=25_024, seeds=8)

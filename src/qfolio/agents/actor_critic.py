@@ -23,6 +23,7 @@ from qfolio.fields import number, require, require_sizes, sizes, static
 from qfolio.mdp import Actions, Agent, Box, Discrete, Metrics, Simplex, Task, Transition
 from qfolio.networks import KINDS, Flat, Network
 from qfolio.replay import Experience, Replay
+from qfolio.targets import huber_loss
 
 Weights = TypeVar("Weights", bound=PyTree)
 
@@ -65,11 +66,14 @@ class Critics(eqx.Module):
 
 
 def critic_loss(
-    critics: Critics, batch: Experience, goal: Float[Array, " batch"]
+    critics: Critics,
+    batch: Experience,
+    goal: Float[Array, " batch"],
+    huber: Float[Array, ""] | float,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Half the mean squared error to one goal, summed over the critics; and what to report."""
+    """The mean loss of the errors to one goal, summed over the critics; and what to report."""
     q = critics(batch.observation, batch.action)
-    loss = ((q - goal) ** 2).mean(1).sum() / 2
+    loss = huber_loss(q - goal, huber).mean(1).sum()
     return loss, {"loss": loss, "q": q.mean()}
 
 
@@ -100,6 +104,7 @@ class ActorCritic(Agent):
     actor_rate: float = number(0.3)  # the actor's learning rate, as a share of the critics'
     reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
+    huber: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
 
     def __check_init__(self) -> None:
         counts = "environments batch_size updates"
@@ -107,6 +112,7 @@ class ActorCritic(Agent):
         require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "input_gain actor_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "discount target_rate", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")

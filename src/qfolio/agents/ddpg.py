@@ -119,7 +119,7 @@ class DDPG(ActorCritic):
         goal = td_target(reward, batch.terminal, following, self.discount)
         rate = optimizer.learning_rate(self, learned.critic_adam.count)
         critics, adam, metrics = self.descend(
-            critic_loss, learned.critics, learned.critic_adam, rate, batch, goal
+            critic_loss, learned.critics, learned.critic_adam, rate, batch, goal, self.huber
         )
         learned = eqx.tree_at(lambda x: (x.critics, x.critic_adam), learned, (critics, adam))
         return learned, metrics

@@ -183,7 +183,7 @@ class SAC(ActorCritic):
         value = following + temperature * entropy
         goal = td_target(self.reward_scale * batch.reward, batch.terminal, value, self.discount)
         critics, critic_adam, metrics = self.descend(
-            critic_loss, learned.critics, learned.critic_adam, rate, batch, goal
+            critic_loss, learned.critics, learned.critic_adam, rate, batch, goal, self.huber
         )
         actor, actor_adam, more = self.descend(
             actor_loss, learned.actor, learned.actor_adam, self.actor_rate * rate,
