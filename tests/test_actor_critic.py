@@ -199,7 +199,9 @@ def test_nothing_follows_what_is_terminal():
     start, batch = begun(agent), batch_of()
     q_next = start.critics(batch.next_observation, start.actor(batch.next_observation))[0]
     goal = 0.5 * batch.reward + jnp.array([0, 0.9, 0.9, 0, 0.9, 0.9]) * q_next
-    expected = adams_first_step(lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01)
+    expected = adams_first_step(
+        lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01
+    )
     assert_close(updated(agent, start, batch).critics, expected, 1e-5)
 
 
@@ -240,7 +242,10 @@ def test_gradients_against_differences():
 
         cases = {
             "critic": (lambda c: critic_loss(c, batch, goal, jnp.inf)[0], soft.critics),
-            "critic of numbers": (lambda c: critic_loss(c, numbers, goal, jnp.inf)[0], numbered.critics),
+            "critic of numbers": (
+                lambda c: critic_loss(c, numbers, goal, jnp.inf)[0],
+                numbered.critics,
+            ),
             "deterministic actor": (
                 lambda a: ddpg.actor_loss(a, deterministic.critics, batch.observation)[0],
                 deterministic.actor,
@@ -288,7 +293,9 @@ def test_the_soft_goal_counts_the_next_steps_entropy():
         start.actor, start.critics, batch.next_observation, jax.random.key(0)
     )
     goal = batch.reward + 0.9 * (q + 0.7 * entropy) * ~batch.terminal
-    expected = adams_first_step(lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01)
+    expected = adams_first_step(
+        lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01
+    )
     assert_close(updated(agent, start, batch).critics, expected, 1e-5)
 
 
