@@ -36,11 +36,13 @@ import tyro  # noqa: E402
 from jax import lax  # noqa: E402
 
 import replay  # noqa: E402
+from qfolio.host import HostPopulation  # noqa: E402
 from qfolio.presets import preset  # noqa: E402
+from qfolio.tasks.gymnasium import GymnasiumTask  # noqa: E402
 from qfolio.tasks.pendulum import Pendulum  # noqa: E402
 from qfolio.training import CHUNK, Population  # noqa: E402
 from race import Contestant, Rates, Ratio, process, race, ratio, timed  # noqa: E402
-from workload import EPISODES, families, layers, products, report  # noqa: E402
+from workload import EPISODES, families, hosted, layers, products, report  # noqa: E402
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -144,6 +146,20 @@ def of_families(effort: Effort) -> Outcome:
         own = trained(Population(Pendulum(torques=0), agent, [0]))
         name = algorithm.upper()
         found, speeds = against(algorithm, name, own, targets, effort)
+        figures += found
+        rates |= {f"{name}: {who}": speed for who, speed in speeds.items()}
+    return figures, rates
+
+
+def of_host_loop(effort: Effort) -> Outcome:
+    """Agents in an environment of Gymnasium, here and in stable-baselines3."""
+    figures: list[Figure] = []
+    rates: Rates = {}
+    for algorithm, agent in hosted().items():
+        own = trained(HostPopulation(GymnasiumTask("CartPole-v1"), agent, [0]))
+        name = f"{algorithm.upper()} on CartPole-v1"
+        targets = {"stable_baselines3": 2.0}
+        found, speeds = against(f"{algorithm}-cartpole", name, own, targets, effort)
         figures += found
         rates |= {f"{name}: {who}": speed for who, speed in speeds.items()}
     return figures, rates
@@ -457,6 +473,7 @@ PARTS: dict[str, Callable[[Effort], Outcome]] = {
     "d": of_one_run,
     "e": partial(of_preset, "fast"),
     "families": of_families,
+    "host": of_host_loop,
     "replay": of_replays,
     "best": partial(of_preset, "best"),
 }
@@ -465,7 +482,7 @@ PARTS: dict[str, Callable[[Effort], Outcome]] = {
 def main(
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART …")] = (
         *("a", "b", "c", "d", "e"),
-        *("families", "replay"),
+        *("families", "host", "replay"),
     ),
     best: bool = False,
     quick: bool = False,
@@ -474,7 +491,8 @@ def main(
 
     Args:
         only: Parts to run: a (peers), b (matrix products), c (cores), d (memory and start),
-            e (preset fast), families (PPO, SAC, TD3 and DDPG), replay (the backtest's engine).
+            e (preset fast), families (PPO, SAC, TD3 and DDPG), host (environments of Gymnasium),
+            replay (the backtest's engine).
         best: Measure the preset best, too.
         quick: Short rounds and short runs, to see that all works; leaves the files as they are.
     """

@@ -42,6 +42,20 @@ def families() -> dict[str, Agent]:
     }  # fmt: skip
 
 
+def hosted() -> dict[str, Agent]:
+    """Algorithms on CartPole-v1; peers.py has the same settings."""
+    return {
+        "dqn": DQN(
+            hidden=(64, 64), batch_size=64, replay_capacity=50_000, learning_starts=1000,
+            target_period=200, learning_rate=1e-3, discount=0.99,
+        ),
+        "ppo": PPO(
+            environments=8, rollout=128, epochs=10, batch_size=64, hidden=(64, 64),
+            discount=0.99, trace=0.95, learning_rate=1e-3, entropy_weight=0.0,
+        ),
+    }  # fmt: skip
+
+
 def report() -> tuple[Pendulum, DQN]:
     agent = preset("report").build()
     assert isinstance(agent, DQN)
