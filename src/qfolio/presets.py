@@ -76,6 +76,7 @@ _RAINBOW = {
     "epsilon": 0.0,
     "epsilon_end": 0.0,
     "updates": 2,
+    "huber": 1.0,
     "learning_rate_steps": 15_000.0,
 }
 
@@ -384,7 +385,7 @@ PRESETS = {
         reward_scale=10.0,
         gradient_norm=0.3,
     ),
-    ("gym:CartPole-v1", "dqn"): _gym_dqn("CartPole-v1", 120_000),
+    ("gym:CartPole-v1", "dqn"): _gym_dqn("CartPole-v1", 120_000, discount=0.98, epsilon_end=0.05),
     ("gym:CartPole-v1", "ppo"): {"fast": _gym("CartPole-v1", "ppo", 100_000, **_GYM_PPO)},
     ("gym:Acrobot-v1", "dqn"): _gym_dqn("Acrobot-v1", 60_000),
     # In 200 steps the goal is hardly ever found by chance; longer episodes find it.
