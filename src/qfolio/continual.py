@@ -26,12 +26,12 @@ import numpy as np
 
 import qfolio
 from qfolio import devices, settings
+from qfolio.comparison.ranking import middle_steps, regret, steps_within
 from qfolio.errors import QfolioError
 from qfolio.evaluation import start_keys
 from qfolio.files import new_folder, read_json, read_tree, require_types, write_json, write_tree
+from qfolio.learning.optimizer import Optimizer
 from qfolio.mdp import Agent, Task
-from qfolio.optimizer import Optimizer
-from qfolio.ranking import middle_steps, regret, steps_within
 from qfolio.registry import AGENTS, TASKS, name_of
 from qfolio.runs import check_counts, configured_agent, configured_task
 from qfolio.training import Population, TrainingState

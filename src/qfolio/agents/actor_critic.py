@@ -17,13 +17,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio import networks, optimizer
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.learning import networks, optimizer
+from qfolio.learning.networks import KINDS, Flat, Network
+from qfolio.learning.replay import Experience, Replay
+from qfolio.learning.targets import huber_loss
 from qfolio.mdp import Actions, Agent, Box, Discrete, Metrics, Simplex, Task, Transition
-from qfolio.networks import KINDS, Flat, Network
-from qfolio.replay import Experience, Replay
-from qfolio.targets import huber_loss
 
 Weights = TypeVar("Weights", bound=PyTree)
 

@@ -23,18 +23,18 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio import distributional, heads, optimizer
 from qfolio.agents import hindsight
 from qfolio.agents.hindsight import Move
-from qfolio.distributional import Values
 from qfolio.errors import QfolioError
-from qfolio.exploration import epsilon_greedy
 from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.learning import distributional, heads, optimizer
+from qfolio.learning.distributional import Values
+from qfolio.learning.exploration import epsilon_greedy
+from qfolio.learning.networks import KINDS, Network
+from qfolio.learning.priorities import Priorities
+from qfolio.learning.replay import Experience, Replay, join
+from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
 from qfolio.mdp import Agent, Contrast, Discrete, ExogenousTask, Metrics, Task, Transition
-from qfolio.networks import KINDS, Network
-from qfolio.priorities import Priorities
-from qfolio.replay import Experience, Replay, join
-from qfolio.targets import bootstrap, chosen, follow, huber_loss, td_target
 
 
 class DQNState(eqx.Module):

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio import networks, optimizer
-from qfolio.distributions import Distribution, policy_of
 from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.learning import networks, optimizer
+from qfolio.learning.distributions import Distribution, policy_of
+from qfolio.learning.networks import KINDS, Flat, Network, Outputs, outputs_of
+from qfolio.learning.targets import advantages
 from qfolio.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
-from qfolio.networks import KINDS, Flat, Network, Outputs, outputs_of
-from qfolio.targets import advantages
 
 
 class ActorCritic(eqx.Module):

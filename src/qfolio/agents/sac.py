@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio import optimizer
 from qfolio.agents.actor_critic import (
     ActorCritic,
     ActorCriticState,
@@ -25,12 +24,13 @@ from qfolio.agents.actor_critic import (
     critic_loss,
     unit_of,
 )
-from qfolio.distributions import Categorical, Gaussian, LogisticNormal, Squashed
 from qfolio.fields import number, require
+from qfolio.learning import optimizer
+from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed
+from qfolio.learning.networks import Network, Outputs, outputs_of
+from qfolio.learning.replay import Experience
+from qfolio.learning.targets import follow, td_target
 from qfolio.mdp import Actions, Discrete, Metrics, Simplex, Task
-from qfolio.networks import Network, Outputs, outputs_of
-from qfolio.replay import Experience
-from qfolio.targets import follow, td_target
 
 LOG_STD = (-10.0, 2.0)
 """Where a normal number's log standard deviation is kept."""

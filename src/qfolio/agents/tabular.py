@@ -21,10 +21,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from qfolio.errors import QfolioError
-from qfolio.exploration import epsilon_greedy
 from qfolio.fields import number, require, static
+from qfolio.learning.exploration import epsilon_greedy
+from qfolio.learning.targets import bootstrap, td_target
 from qfolio.mdp import Agent, Discrete, Metrics, Task, Transition
-from qfolio.targets import bootstrap, td_target
 
 Values = Float[Array, "state action"]
 

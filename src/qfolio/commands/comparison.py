@@ -13,7 +13,7 @@ from qfolio.commands.arguments import INTERRUPTED, Count, Folder, Name
 from qfolio.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.comparison import Comparison, Entrant
+    from qfolio.comparison.run import Comparison, Entrant
     from qfolio.runs import Progress
 
 
@@ -52,7 +52,7 @@ def compare(
 
     devices.configure()
     from qfolio import console
-    from qfolio.comparison import Comparison
+    from qfolio.comparison.run import Comparison
 
     if resume is None:
         task = task or "pendulum"
@@ -93,7 +93,7 @@ def _entrants(
 ) -> "dict[str, Entrant]":
     """The agents that ``--agents`` names, by what it calls them."""
     from qfolio import presets, registry, settings
-    from qfolio.comparison import Entrant
+    from qfolio.comparison.run import Entrant
 
     task_class = registry.find("task", registry.TASKS, task)
     entrants: dict[str, Entrant] = {}
@@ -164,7 +164,7 @@ def print_ranking(content: dict[str, Any]) -> None:
     from rich.text import Text
 
     from qfolio import console
-    from qfolio.ranking import HEADLINE, amount, share, span
+    from qfolio.comparison.ranking import HEADLINE, amount, share, span
 
     ranking = content["ranking"]
     write = share if ranking["measure"] == "regret" else amount

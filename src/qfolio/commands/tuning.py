@@ -15,7 +15,7 @@ from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, N
 from qfolio.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.tuning import Progress, Tuning
+    from qfolio.tuning.run import Progress, Tuning
 
 Ranges = Annotated[tuple[str, ...], arg(metavar="NAME=RANGE …", help_behavior_hint="")]
 
@@ -92,14 +92,14 @@ def tune(
 
 def _tuning() -> Any:
     try:
-        import qfolio.tuning
+        import qfolio.tuning.run
     except ModuleNotFoundError as error:
         if error.name != "optuna":
             raise
         raise QfolioError(
             "qfolio tune chooses configurations with Optuna; pip install 'qfolio[tune]'."
         ) from None
-    return qfolio.tuning
+    return qfolio.tuning.run
 
 
 def _new(
@@ -114,9 +114,10 @@ def _new(
     assignments: tuple[str, ...],
     out: Path | None,
 ) -> "Tuning":
-    from qfolio import presets, registry, search
+    from qfolio import presets, registry
     from qfolio.runs import check_counts
-    from qfolio.tuning import Tuning
+    from qfolio.tuning import search
+    from qfolio.tuning.run import Tuning
 
     task_class = registry.find("task", registry.TASKS, task_name)
     agent_class = registry.find("agent", registry.AGENTS, agent_name)
@@ -218,7 +219,7 @@ def _conclude(work: "Tuning") -> None:
 def command(work: "Tuning", values: dict[str, Any]) -> str:
     """The command line that trains a configuration, and the one that goes on with the search."""
     from qfolio.presets import preset
-    from qfolio.search import written
+    from qfolio.tuning.search import written
 
     config = work.config
     base = preset(config["preset"], config["task"], config["agent"])

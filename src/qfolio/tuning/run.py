@@ -22,17 +22,18 @@ import optuna
 from jaxtyping import Array, Float, Key
 
 import qfolio
-from qfolio import devices, search, settings
+from qfolio import devices, settings
 from qfolio.errors import QfolioError
 from qfolio.evaluation import start_keys
 from qfolio.files import new_folder, read_json, require_types, write_json
 from qfolio.host import population_of
-from qfolio.journal import Asked, Journal, Trial, best_of
 from qfolio.mdp import Agent, Task
 from qfolio.registry import AGENTS, TASKS, name_of
 from qfolio.runs import check_counts, configured_agent, configured_task, interruptible
-from qfolio.search import Value
 from qfolio.training import begin
+from qfolio.tuning import search
+from qfolio.tuning.journal import Asked, Journal, Trial, best_of
+from qfolio.tuning.search import Value
 
 FORMAT = 1
 """Of the study folder; raised whenever an older folder can no longer be read."""
