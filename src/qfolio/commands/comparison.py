@@ -121,29 +121,20 @@ def _entrants(
 
 def _train(run: "Comparison") -> None:
     """Trains with a bar, and a line for each agent that is finished."""
-    import rich.progress
-
     from qfolio import console
 
     count = len(run.entrants)
-    columns = (
-        rich.progress.BarColumn(bar_width=24),
-        rich.progress.TextColumn("{task.description}"),
-    )
-    with rich.progress.Progress(
-        *columns, console=console.console, transient=True, disable=not console.console.is_terminal
-    ) as live:
-        bar = live.add_task("", total=1.0)
+    with console.bar("") as update:
 
         def note(name: str, number: int, now: "Progress | None") -> None:
             if now is None:
-                live.console.print(f"{number + 1} of {count}: {name}")
-                live.update(bar, completed=0.0, description="compiling")
+                console.console.print(f"{number + 1} of {count}: {name}")
+                update(completed=0.0, description="compiling")
                 return
             left = datetime.timedelta(seconds=round(now.seconds_left))
             speed = f"{now.steps_per_second:,.0f} steps/s"
             status = f"{name} ({number + 1} of {count})  {speed}  {left} left"
-            live.update(bar, completed=min(now.done / now.total, 1.0), description=status)
+            update(completed=min(now.done / now.total, 1.0), description=status)
 
         run.run(note)
 

@@ -60,8 +60,6 @@ def continual(
     from qfolio import devices
 
     devices.configure()
-    import rich.progress
-
     from qfolio import console, continual, presets
     from qfolio.report.continual import verdict, write_continual_report
 
@@ -77,20 +75,10 @@ def continual(
         continual.create(plan, folder, shlex.join(["qfolio", *sys.argv[1:]]))
     else:
         folder = resume
-    columns = (
-        rich.progress.BarColumn(bar_width=24),
-        rich.progress.TextColumn("{task.description}"),
-    )
     try:
-        with rich.progress.Progress(
-            *columns,
-            console=console.console,
-            transient=True,
-            disable=not console.console.is_terminal,
-        ) as live:
-            bar = live.add_task("compiling", total=1.0)
+        with console.bar("compiling") as update:
             content = continual.compare(
-                folder, lambda way, done: live.update(bar, completed=done, description=way)
+                folder, lambda way, done: update(completed=done, description=way)
             )
     except KeyboardInterrupt:  # what is finished is on disk
         console.say(f"Stopped. Go on with: qfolio continual --resume {folder}")

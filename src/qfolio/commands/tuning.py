@@ -170,19 +170,10 @@ def far(work: "Tuning") -> str:
 
 def _run(work: "Tuning") -> None:
     """Trains with a line for each batch and a bar within it."""
-    import rich.progress
-
-    from qfolio.console import console, number, say
+    from qfolio.console import bar, number, say
 
     say("".join(f"{name:>11}" for name in ("trials", "diverged", "best", "preset", "an hour")))
-    columns = (
-        rich.progress.BarColumn(bar_width=24),
-        rich.progress.TextColumn("{task.description}"),
-    )
-    with rich.progress.Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as live:
-        bar = live.add_task("training a batch", total=1.0)
+    with bar("training a batch") as update:
 
         def note(now: "Progress") -> None:
             best, own = (number(x and x.value) for x in (now.best, now.preset))
@@ -190,7 +181,7 @@ def _run(work: "Tuning") -> None:
             cells = (f"{now.done}/{now.total}", str(now.diverged), best, own, rate)
             say("".join(f"{cell:>11}" for cell in cells))
 
-        work.run(note, lambda done: live.update(bar, completed=done))
+        work.run(note, lambda done: update(completed=done))
 
 
 def _conclude(work: "Tuning") -> None:
