@@ -556,6 +556,7 @@ def test_wrong_commands(arguments, says, monkeypatch, capsys, tmp_path):
 
 def test_without_optuna(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    monkeypatch.delitem(sys.modules, "qfolio.tuning.run", raising=False)
+    for name in ("qfolio.tuning.run", "qfolio.tuning.journal"):
+        monkeypatch.delitem(sys.modules, name)
     assert qfolio(monkeypatch, "tune") == 2
     assert "qfolio[tune]" in capsys.readouterr().err

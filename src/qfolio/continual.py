@@ -11,7 +11,6 @@ has gone on from it) and, at the end, the report.
 """
 
 import dataclasses
-import datetime
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -178,8 +177,7 @@ def create(plan: Plan, folder: Path, command: str = "") -> None:
         "agent": name_of(AGENTS, plan.agent),
         "agent_settings": settings.describe(plan.agent),
         **{name: getattr(plan, name) for name in NUMBERS},
-        "device": devices.describe(),
-        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        **devices.circumstances(),
         "starts": Population.starts,
         "curve_starts": Population.curve_starts,
         "within": WITHIN,

@@ -7,7 +7,6 @@ on from the last checkpoint of the agent that was training.
 """
 
 import dataclasses
-import datetime
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -123,8 +122,7 @@ class Comparison:
                 }
                 for name, entrant in entrants.items()
             },
-            "device": devices.describe(),
-            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            **devices.circumstances(),
         }
         with new_folder(Path(out)) as folder:
             write_json(folder / FILE, {**config, "results": {}})

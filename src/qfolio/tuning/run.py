@@ -6,7 +6,6 @@ and, at the end, summary.json. Any number of processes may work on one folder at
 starts later, or again, goes on from what the journal says.
 """
 
-import datetime
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -18,7 +17,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optuna
 from jaxtyping import Array, Float, Key
 
 import qfolio
@@ -130,9 +128,7 @@ class Tuning:
             "steps": steps,
             "batch": batch,
             "fresh_seeds": fresh_seeds,
-            "device": devices.describe(),
-            "versions": {"jax": jax.__version__, "optuna": optuna.__version__},
-            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            **devices.circumstances("jax", "optuna"),
         }
         folder = Path(out)
         with new_folder(folder) as unfinished:
