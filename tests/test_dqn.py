@@ -169,7 +169,7 @@ def test_epsilon_decays_with_finished_episodes(task):
     state = agent.init(task, jax.random.key(0))
     values = []
     for _ in range(8):
-        values.append(float(agent.epsilon_now(state)))
+        values.append(float(agent.monitor(state)["epsilon"]))
         state = agent.observe(state, rollout(agent, truncated=True))
     expected = [max(0.5, 0.9**i) for i in range(8)]
     np.testing.assert_allclose(values, expected, rtol=1e-5)
