@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio import simplex
-from qfolio.agents.actor_critic import ActorCritic, Critics, critic_loss, unit_of
+from qfolio.agents.actor_critic import ActorCritic, Critics, critic_loss
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require
 from qfolio.learning import optimizer
@@ -49,7 +49,7 @@ class Actor(eqx.Module):
         if isinstance(self.actions, Simplex):
             return simplex.project(action + noise)
         bound = self.actions.bound
-        return jnp.clip(action + unit_of(self.actions) * noise, -bound, bound)
+        return jnp.clip(action + self.actions.unit * noise, -bound, bound)
 
 
 class Learned(eqx.Module):

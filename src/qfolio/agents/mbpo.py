@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from qfolio.agents.actor_critic import ActorCriticState, uniform, unit_of
+from qfolio.agents.actor_critic import ActorCriticState, uniform
 from qfolio.agents.sac import SAC
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
@@ -43,7 +43,7 @@ class Model(eqx.Module):
         if isinstance(self.actions, Discrete):
             action = jax.nn.one_hot(action, self.actions.n)
         else:
-            action = action / unit_of(self.actions)
+            action = action / self.actions.unit
         inputs = jnp.concatenate([observation / self.scale, action], -1)
         return jax.vmap(lambda member: member(inputs))(self.members)
 

@@ -22,7 +22,6 @@ from qfolio.agents.actor_critic import (
     ActorCriticState,
     Critics,
     critic_loss,
-    unit_of,
 )
 from qfolio.fields import number, require
 from qfolio.learning import optimizer
@@ -77,7 +76,7 @@ def target_entropy(actions: Actions, spread: Float[Array, ""] | float) -> Float[
         return jnp.log1p(spread * (actions.n - 1))
     if isinstance(actions, Simplex):
         return actions.assets * jnp.log(spread) - math.lgamma(actions.assets + 1)
-    return actions.n * jnp.log(2 * unit_of(actions) * spread)
+    return actions.n * jnp.log(2 * actions.unit * spread)
 
 
 def expectations(
