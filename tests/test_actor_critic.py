@@ -12,11 +12,11 @@ from qfolio.agents.actor_critic import Critics, critic_loss, uniform
 from qfolio.agents.ddpg import DDPG
 from qfolio.agents.sac import SAC
 from qfolio.agents.td3 import TD3
-from qfolio.distributions import Gaussian, LogisticNormal, Squashed
 from qfolio.errors import QfolioError
+from qfolio.learning.distributions import Gaussian, LogisticNormal, Squashed
+from qfolio.learning.replay import Experience
 from qfolio.mdp import Box, Discrete, Simplex
 from qfolio.presets import preset
-from qfolio.replay import Experience
 from qfolio.runs import train
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.tasks.synthetic import GarleanuPedersen, Merton

@@ -8,13 +8,10 @@ import jax
 import numpy as np
 import pytest
 
-from qfolio import comparison as comparing
 from qfolio.agents.dqn import DQN
-from qfolio.comparison import Comparison, Entrant
-from qfolio.errors import QfolioError
-from qfolio.operations import operations_per_step
-from qfolio.presets import PRESETS, Preset
-from qfolio.ranking import (
+from qfolio.comparison import run as comparing
+from qfolio.comparison.operations import operations_per_step
+from qfolio.comparison.ranking import (
     Result,
     area,
     conclusion,
@@ -24,6 +21,9 @@ from qfolio.ranking import (
     share,
     steps_within,
 )
+from qfolio.comparison.run import Comparison, Entrant
+from qfolio.errors import QfolioError
+from qfolio.presets import PRESETS, Preset
 from qfolio.report.comparison import comparison_data, render_comparison, tidy
 from qfolio.runs import Run
 from qfolio.tasks.pendulum import Pendulum

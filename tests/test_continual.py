@@ -1,6 +1,5 @@
 import dataclasses
 import json
-import sys
 
 import jax
 import numpy as np
@@ -8,14 +7,15 @@ import pytest
 
 from qfolio import continual
 from qfolio.agents.dqn import DQN
-from qfolio.cli import main
-from qfolio.continual import Course, Plan, compare, recovery, renew
+from qfolio.continual import Course, Plan, compare, create, recovery, renew
 from qfolio.errors import QfolioError
 from qfolio.evaluation import start_keys
 from qfolio.report.continual import render_page, verdict
 from qfolio.tasks.catch import Catch
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.training import Population
+
+from test_cli import TINY, qfolio
 
 OLD, NEW = Pendulum(horizon=20), Pendulum(horizon=20, mass=1.5)
 AGENT = DQN(
@@ -32,9 +32,26 @@ def trained(task, agent, episodes=EPISODES):
     return population
 
 
+PLAN = Plan(OLD, NEW, AGENT, EPISODES, seeds=2, seed=3)
+
+
 @pytest.fixture(scope="module")
-def content():
-    return compare(Plan(OLD, NEW, AGENT, EPISODES, seeds=2, seed=3))
+def content(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("continual") / "whole"
+    create(PLAN, folder, "qfolio continual <b>")
+    return compare(folder)
+
+
+def stop_at(way, stopping):
+    """Ctrl-C while a way, or the first training, is under way."""
+    learn = continual._learn
+
+    def interrupted(*args):
+        if args[-1].args == (way,):
+            raise KeyboardInterrupt
+        return learn(*args)
+
+    stopping.setattr(continual, "_learn", interrupted)
 
 
 def regrets(task, population):
@@ -107,6 +124,27 @@ def test_recovery_is_staying_near_the_optimum():
     assert found["per_seed"] == [10, 20, None]
 
 
+@pytest.mark.parametrize("way", ["first training", "frozen", "renewed"])
+def test_an_interrupted_comparison_goes_on_as_if_it_never_was(content, way, tmp_path):
+    create(PLAN, tmp_path / "stopped", "qfolio continual <b>")
+    with pytest.MonkeyPatch.context() as stopping:
+        stop_at(way, stopping)
+        with pytest.raises(KeyboardInterrupt):
+            compare(tmp_path / "stopped")
+    done = []
+    found = compare(tmp_path / "stopped", lambda name, share: done.append(name))
+    ways = ["first training", *continual.WAYS]
+    assert set(done) == set(ways[ways.index(way) :]) - {"frozen"}  # which does not learn
+
+    def lasting(content):
+        courses = {"training": content["training"], **content["courses"]}
+        return {**content, "started": "", "training": "", "courses": {
+            name: {**course, "seconds": 0.0} for name, course in courses.items()}}  # fmt: skip
+
+    assert lasting(found) == lasting(content)
+    assert [path.name for path in (tmp_path / "stopped").iterdir()] == ["continual.json"]
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
@@ -124,8 +162,8 @@ def test_a_task_without_numbers_cannot_change():
         Plan(Catch(), Catch(rows=12), AGENT, EPISODES)
 
 
-def test_the_report_says_what_happened(content, tmp_path):
-    page = render_page({**content, "command": "qfolio continual <b>"})
+def test_the_report_says_what_happened(content):
+    page = render_page(content)
     assert "&lt;b&gt;" in page
     assert "mass from 1 to 1.5" in page
     for way in continual.WAYS:
@@ -135,16 +173,32 @@ def test_the_report_says_what_happened(content, tmp_path):
 
 def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
     folder = tmp_path / "there"
-    words = ["qfolio", "continual", "pendulum", "--change", "mass=1.5", "--episodes", "8",
-             "--seeds", "2", "--out", str(folder), "--set", "hidden=8", "environments=2",
-             "batch_size=8", "learning_starts=16", "episode_steps=0", "horizon=20"]  # fmt: skip
-    monkeypatch.setattr(sys, "argv", words)
-    with pytest.raises(SystemExit) as exit:
-        main()
-    assert exit.value.code == 0
+    words = ["continual", "pendulum", "--change", "mass=1.5", "--episodes", 8, "--seeds", 2]
+    with monkeypatch.context() as stopping:
+        stop_at("fresh", stopping)
+        assert qfolio(monkeypatch, *words, "--out", folder, *TINY) == 130
+    said = f"Go on with: qfolio continual --resume {folder}"
+    assert capsys.readouterr().out.splitlines()[-1].endswith(said)
+    assert qfolio(monkeypatch, *words, "--out", folder, *TINY) == 2
+    assert f"go on with --resume {folder}" in capsys.readouterr().err
+    assert qfolio(monkeypatch, "continual", "--resume", folder) == 0
     assert {path.name for path in folder.iterdir()} == {
         "continual.json", "report.html", "recovery.png",
     }  # fmt: skip
     content = json.loads((folder / "continual.json").read_text())
     assert content["changes"] == {"mass": [1.0, 1.5]}
+    assert "--change mass=1.5" in content["command"]
     assert "frozen" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--resume", "nowhere"], "no change of a task"),
+        (["--resume", ".", "--change", "mass=2"], "add nothing"),
+        (["--resume", ".", "--rate", 0.5], "add nothing"),
+    ],
+)
+def test_resume_refuses_what_it_would_ignore(monkeypatch, capsys, options, message):
+    assert qfolio(monkeypatch, "continual", *options) == 2
+    assert message in capsys.readouterr().err

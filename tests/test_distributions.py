@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from qfolio.distributions import Categorical, Gaussian, LogisticNormal, Squashed, policy_of
+from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed, policy_of
 from qfolio.mdp import Box, Discrete, Simplex
 
 KEY = jax.random.key(0)

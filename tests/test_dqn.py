@@ -5,16 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio import heads
 from qfolio.agents.dqn import DQN
-from qfolio.distributional import Categorical, project, quantile_huber_loss
-from qfolio.encoders import MLP
 from qfolio.errors import QfolioError
 from qfolio.files import read_tree, write_tree
+from qfolio.learning import heads
+from qfolio.learning.distributional import Categorical, project, quantile_huber_loss
+from qfolio.learning.encoders import MLP
+from qfolio.learning.optimizer import learning_rate
+from qfolio.learning.targets import bootstrap, chosen, huber_loss, td_target
 from qfolio.mdp import Transition
-from qfolio.optimizer import learning_rate
 from qfolio.presets import preset
-from qfolio.targets import bootstrap, chosen, huber_loss, td_target
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.tasks.synthetic import Ar1, Merton
 from qfolio.training import Population
@@ -169,7 +169,7 @@ def test_epsilon_decays_with_finished_episodes(task):
     state = agent.init(task, jax.random.key(0))
     values = []
     for _ in range(8):
-        values.append(float(agent.epsilon_now(state)))
+        values.append(float(agent.monitor(state)["epsilon"]))
         state = agent.observe(state, rollout(agent, truncated=True))
     expected = [max(0.5, 0.9**i) for i in range(8)]
     np.testing.assert_allclose(values, expected, rtol=1e-5)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from qfolio.agents.mbpo import MBPO, Model, model_loss
-from qfolio.encoders import MLP
 from qfolio.errors import QfolioError
+from qfolio.learning.encoders import MLP
+from qfolio.learning.replay import Experience
 from qfolio.mdp import Box, Discrete, Transition
-from qfolio.replay import Experience
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.tasks.synthetic import Merton
 from qfolio.training import Population

@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 from jax import lax
 
-from qfolio import networks, presets, settings
+from qfolio import presets, settings
 from qfolio.agents.dqn import DQN
-from qfolio.encoders import CNN, LSTM, RNN
 from qfolio.errors import QfolioError
 from qfolio.evaluation import start_keys
+from qfolio.learning import networks
+from qfolio.learning.encoders import CNN, LSTM, RNN
+from qfolio.learning.networks import SHARED, Outputs, Shared
 from qfolio.mdp import Step, View
-from qfolio.networks import SHARED, Outputs, Shared
 from qfolio.tasks.catch import Catch
 from qfolio.tasks.hidden_pendulum import HiddenPendulum
 from qfolio.tasks.pendulum import Pendulum

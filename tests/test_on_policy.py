@@ -13,10 +13,10 @@ from qfolio.agents.on_policy import Batch, normalised
 from qfolio.agents.ppo import PPO, clipped, minibatches, shuffled
 from qfolio.agents.reinforce import REINFORCE
 from qfolio.errors import QfolioError
+from qfolio.learning.targets import advantages
 from qfolio.mdp import Transition
 from qfolio.presets import preset
 from qfolio.runs import train
-from qfolio.targets import advantages
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.tasks.synthetic import Ar1, Merton
 from qfolio.training import Population

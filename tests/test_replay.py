@@ -3,10 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qfolio.learning.priorities import FAN, Priorities
+from qfolio.learning.replay import Experience, Replay, join
+from qfolio.learning.targets import n_step
 from qfolio.mdp import Transition
-from qfolio.priorities import FAN, Priorities
-from qfolio.replay import Experience, Replay, join
-from qfolio.targets import n_step
 
 
 def filled(capacity, writes, width=2, **options):

@@ -10,19 +10,20 @@ import jax
 import numpy as np
 import pytest
 
-from qfolio import search, settings
+from qfolio import settings
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.errors import QfolioError
 from qfolio.evaluation import start_keys
-from qfolio.journal import Trial, best_of, locked
 from qfolio.presets import preset
 from qfolio.report.tuning import Sweep, render_page, write_tuning_report
 from qfolio.runs import Run
-from qfolio.search import dimension
-from qfolio.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
 from qfolio.training import Population
-from qfolio.tuning import Tuning, tuning_keys
+from qfolio.tuning import search
+from qfolio.tuning.journal import Trial, best_of, locked
+from qfolio.tuning.run import Tuning, tuning_keys
+from qfolio.tuning.search import dimension
+from qfolio.tuning.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
 
 from test_cli import TINY, qfolio
 
@@ -555,6 +556,7 @@ def test_wrong_commands(arguments, says, monkeypatch, capsys, tmp_path):
 
 def test_without_optuna(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    monkeypatch.delitem(sys.modules, "qfolio.tuning", raising=False)
+    for name in ("qfolio.tuning.run", "qfolio.tuning.journal"):
+        monkeypatch.delitem(sys.modules, name)
     assert qfolio(monkeypatch, "tune") == 2
     assert "qfolio[tune]" in capsys.readouterr().err

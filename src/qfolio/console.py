@@ -1,8 +1,10 @@
 """What the commands print: live progress and tables."""
 
+import contextlib
 import datetime
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import rich.progress
@@ -25,6 +27,22 @@ console = Console(highlight=False)
 
 def say(text: str) -> None:
     print(text, flush=True)
+
+
+@contextlib.contextmanager
+def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., None]]:
+    """A bar with text beside it, on terminals only and gone at the end.
+
+    Yields what moves it: ``update(completed=…)``, with ``description=…`` where the text changes.
+    """
+    columns = (
+        rich.progress.BarColumn(bar_width=24),
+        rich.progress.TextColumn("{task.description}"),
+    )
+    with rich.progress.Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as live:
+        yield partial(live.update, live.add_task(text, total=total, completed=done))
 
 
 def describe(run: "Run") -> str:
@@ -53,14 +71,7 @@ def train(
     value = "return" if steps == run.task.horizon else f"return/{steps}"  # of shorter episodes
     columns = (unit, value, "greedy", "optimum", "epsilon", "steps/s", "left")
     say("".join(f"{name:>11}" for name in columns))
-    bar_columns = (
-        rich.progress.BarColumn(bar_width=24),
-        rich.progress.TextColumn("{task.description}"),
-    )
-    with rich.progress.Progress(
-        *bar_columns, console=console, transient=True, disable=not console.is_terminal
-    ) as live:
-        bar = live.add_task("compiling", total=total, completed=run.done(unit))
+    with bar("compiling", total, run.done(unit)) as update:
 
         def note(now: "Progress") -> None:
             done, value = f"{now.done:,}", number(now.mean_return)
@@ -68,7 +79,7 @@ def train(
             epsilon = "–" if math.isnan(now.epsilon) else f"{now.epsilon:.2f}"
             left = str(datetime.timedelta(seconds=round(now.seconds_left)))
             status = f"{done} {unit}  return {value}  ε {epsilon}  {rate} steps/s  {left} left"
-            live.update(bar, completed=min(now.done, total), description=status)
+            update(completed=min(now.done, total), description=status)
             if now.greedy_return is not None:
                 cells = (done, value, number(now.greedy_return), number(optimum))
                 say("".join(f"{cell:>11}" for cell in (*cells, epsilon, rate, left)))
@@ -163,21 +174,14 @@ def describe_backtest(backtest: "Backtest") -> str:
 
 def run_backtest(backtest: "Backtest") -> None:
     """Trains with a bar and the time left."""
-    with rich.progress.Progress(
-        rich.progress.BarColumn(bar_width=24),
-        rich.progress.TextColumn("{task.description}"),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    ) as live:
-        bar = live.add_task("compiling", total=1.0)
-        last = ""
+    last = ""
+    with bar("compiling") as update:
 
         def note(now: "backtesting.Progress") -> None:
             nonlocal last
             left = datetime.timedelta(seconds=round(now.seconds_left))
             description = f"training {now.agent}  {now.done:.0%}  {left} left"
-            live.update(bar, completed=now.done, description=description)
+            update(completed=now.done, description=description)
             if not console.is_terminal and f"{now.done:.1f}" != last:  # a line for each tenth
                 last = f"{now.done:.1f}"
                 say(description)

@@ -4,13 +4,17 @@ A task's numbers (the mass of a pendulum) change when training is over. Four way
 compared in the changed world, against its own exact optimum: the policy as it is; learning on from
 the same memory; renewed learning, which keeps what was learned, forgets what was stored and starts
 its schedules again; and a fresh agent. What each has forgotten is measured in the old world.
+
+The folder holds continual.json (settings, written at the start; the first training and each way,
+added as soon as it is finished), learned.safetensors (what the first training left, until every way
+has gone on from it) and, at the end, the report.
 """
 
 import dataclasses
-import datetime
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -21,14 +25,23 @@ import numpy as np
 
 import qfolio
 from qfolio import devices, settings
+from qfolio.comparison.ranking import middle_steps, regret, steps_within
 from qfolio.errors import QfolioError
 from qfolio.evaluation import start_keys
+from qfolio.files import new_folder, read_json, read_tree, require_types, write_json, write_tree
+from qfolio.learning.optimizer import Optimizer
 from qfolio.mdp import Agent, Task
-from qfolio.optimizer import Optimizer
-from qfolio.ranking import middle_steps, regret, steps_within
 from qfolio.registry import AGENTS, TASKS, name_of
-from qfolio.runs import check_counts
+from qfolio.runs import check_counts, configured_agent, configured_task
 from qfolio.training import Population, TrainingState
+
+FORMAT = 1
+"""Of continual.json."""
+
+FILE, LEARNED = "continual.json", "learned.safetensors"
+
+NUMBERS = ("episodes", "seeds", "seed", "rate", "renewal", "epsilon")
+"""Of a plan, as continual.json holds them."""
 
 POINTS = 24
 """Of a learning curve after the change, about; renewed learning has as many on its shorter way."""
@@ -73,6 +86,18 @@ class Plan:
                 f"recovery is measured against an exact optimum, and {type(self.task).__name__} "
                 "has none; take the pendulum."
             )
+
+    @classmethod
+    def of(cls, content: dict[str, Any]) -> "Plan":
+        """The plan that a continual.json tells."""
+        after = {name: new for name, (_, new) in content["changes"].items()}
+        changed = {**content, "task_settings": content["task_settings"] | after}
+        return cls(
+            configured_task(content),
+            configured_task(changed),
+            configured_agent(content),
+            **{name: content[name] for name in NUMBERS},
+        )
 
     @property
     def changes(self) -> dict[str, tuple[Any, Any]]:
@@ -138,19 +163,52 @@ Listener = Callable[[str, float], None]
 """Called with what is under way and how much of it is done."""
 
 
-def compare(plan: Plan, listener: Listener = lambda name, share: None) -> dict[str, Any]:
+def create(plan: Plan, folder: Path, command: str = "") -> None:
+    """Makes the new or empty folder that ``compare`` works in.
+
+    command: what was typed to start it, for the report.
+    """
+    content = {
+        "format": FORMAT,
+        "version": qfolio.__version__,
+        "task": name_of(TASKS, plan.task),
+        "task_settings": settings.describe(plan.task),
+        "changes": plan.changes,
+        "agent": name_of(AGENTS, plan.agent),
+        "agent_settings": settings.describe(plan.agent),
+        **{name: getattr(plan, name) for name in NUMBERS},
+        **devices.circumstances(),
+        "starts": Population.starts,
+        "curve_starts": Population.curve_starts,
+        "within": WITHIN,
+        "command": command,
+        "courses": {},
+        "recovery": {},
+    }
+    with new_folder(folder) as place:
+        write_json(place / FILE, content)
+
+
+def compare(folder: Path, listener: Listener = lambda name, share: None) -> dict[str, Any]:
     """Trains, changes the world and goes on in every way; all that a report shows, as JSON values.
 
-    Raises QfolioError where a loss is not finite.
+    What the folder already holds is not done again. Raises QfolioError where a loss is not finite.
     """
-    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    content = _read(folder)
+    plan, courses = Plan.of(content), content["courses"]
     seeds = range(plan.seed, plan.seed + plan.seeds)
     grades = Grades(plan.task), Grades(plan.changed)
     first = Population(plan.task, plan.agent, seeds)
-    training = _learn(first, plan.episodes, 1, grades, partial(listener, "first training"))
-    learned = first.fetch()
-    courses = {}
+    if "training" not in content:
+        training = _learn(first, plan.episodes, 1, grades, partial(listener, "first training"))
+        write_tree(folder / LEARNED, first.fetch())
+        content["optimum"] = {"old": grades[0].optimum, "new": grades[1].optimum}
+        content["training"] = training._asdict()
+        write_json(folder / FILE, content)
     for way in WAYS:
+        if way in courses:
+            continue
+        learned = read_tree(folder / LEARNED, first.fetch())
         agent = {"going on": plan.going_on, "renewed": plan.renewed}.get(way, plan.agent)
         population = Population(plan.changed, agent, seeds)
         if way == "renewed":
@@ -159,27 +217,30 @@ def compare(plan: Plan, listener: Listener = lambda name, share: None) -> dict[s
             population.restore(learned)
         share = {"frozen": 0.0, "renewed": plan.renewal}.get(way, 1.0)
         episodes = round(share * plan.episodes)
-        courses[way] = _learn(population, episodes, POINTS, grades[::-1], partial(listener, way))
-    return {
-        "version": qfolio.__version__,
-        "task": name_of(TASKS, plan.task),
-        "task_settings": settings.describe(plan.task),
-        "changes": plan.changes,
-        "agent": name_of(AGENTS, plan.agent),
-        "agent_settings": settings.describe(plan.agent),
-        **{
-            k: getattr(plan, k) for k in ("episodes", "seeds", "seed", "rate", "renewal", "epsilon")
-        },
-        "device": devices.describe(),
-        "started": started,
-        "starts": Population.starts,
-        "curve_starts": Population.curve_starts,
-        "optimum": {"old": grades[0].optimum, "new": grades[1].optimum},
-        "within": WITHIN,
-        "training": training._asdict(),
-        "courses": {way: course._asdict() for way, course in courses.items()},
-        "recovery": {way: recovery(course) for way, course in courses.items()},
-    }
+        course = _learn(population, episodes, POINTS, grades[::-1], partial(listener, way))
+        courses[way], content["recovery"][way] = course._asdict(), recovery(course)
+        write_json(folder / FILE, content)
+    (folder / LEARNED).unlink(missing_ok=True)
+    return content
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    """What continual.json says, or QfolioError where ``folder`` has none of this version."""
+    path = folder / FILE
+    if not path.is_file():
+        raise QfolioError(f"{folder} is no change of a task: it has no {FILE}.")
+    content = read_json(path)
+    if content.get("format") != FORMAT:
+        raise QfolioError(f"{path} was written in another format; start anew.")
+    wanted: dict[str, Any] = {"task": str, "task_settings": dict, "changes": dict, "agent": str,
+              "agent_settings": dict, "episodes": int, "seeds": int, "seed": int,
+              "courses": dict, "recovery": dict}  # fmt: skip
+    wanted |= dict.fromkeys(("rate", "renewal", "epsilon"), float | int)
+    try:
+        require_types(content, wanted)
+    except QfolioError as error:
+        raise QfolioError(f"{path} is damaged: {error}") from None
+    return content
 
 
 def recovery(course: Course) -> dict[str, Any]:

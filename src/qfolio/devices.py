@@ -7,9 +7,12 @@ weights then stay in its cache, its matrix products keep their shape, and a memb
 not depend on how many others there are, to the last bit.
 """
 
+import datetime
 import os
 from collections.abc import Callable
 from functools import partial
+from importlib.metadata import version
+from platform import python_version
 from typing import Any
 
 import jax
@@ -48,6 +51,19 @@ def configure() -> None:
 def describe() -> str:
     device = jax.devices()[0]
     return f"{len(jax.devices())} × {device.device_kind} ({device.platform})"
+
+
+def circumstances(*programs: str) -> dict[str, str | dict[str, str]]:
+    """When and on what something begins, as its file on disk tells.
+
+    programs: Python, or libraries, whose versions it tells, too.
+    """
+    versions = {name: python_version() if name == "python" else version(name) for name in programs}
+    return {
+        "device": describe(),
+        **({"versions": versions} if programs else {}),
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
 
 
 def require_memory(tree: Any, count: int) -> None:

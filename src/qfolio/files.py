@@ -127,7 +127,7 @@ def read_tree(path: Path, template: Any) -> Any:
     )
     if not fits:
         raise QfolioError(
-            f"{path} does not belong to the settings in config.json beside it; "
+            f"{path} does not belong to the settings beside it; "
             "restore the two together, or train anew."
         )
     return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])

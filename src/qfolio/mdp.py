@@ -38,6 +38,8 @@ class Simplex(eqx.Module):
     assets: int = eqx.field(static=True)
     cap: float = eqx.field(static=True, default=1.0)
 
+    unit = 1.0  # what noise and critics measure an action by
+
     @property
     def caps(self) -> np.ndarray:
         """The largest weight of each entry."""
@@ -49,6 +51,11 @@ class Box(eqx.Module):
 
     n: int = eqx.field(static=True)
     bound: float = eqx.field(static=True, default=math.inf)
+
+    @property
+    def unit(self) -> float:
+        """What noise and critics measure an action by: its bound, or 1."""
+        return self.bound if math.isfinite(self.bound) else 1.0
 
 
 Actions = Discrete | Simplex | Box

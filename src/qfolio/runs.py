@@ -8,17 +8,14 @@ when a run is resumed, and then come again, the same to the last digit.
 
 import contextlib
 import csv
-import datetime
 import io
 import math
-import platform
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version as version_of
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -122,12 +119,7 @@ class Run:
             "steps": steps,
             "seeds": seeds,
             "seed": seed,
-            "device": devices.describe(),
-            "versions": {
-                "python": platform.python_version(),
-                **{name: version_of(name) for name in ("jax", "equinox", "optax", "numpy")},
-            },
-            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            **devices.circumstances("python", "jax", "equinox", "optax", "numpy"),
         }
         run = cls(task, agent, config, None)
         if folder is not None:

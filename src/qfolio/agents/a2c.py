@@ -7,7 +7,7 @@ docs/policy_gradients.md has the formulas and the deviations from the paper.
 
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from qfolio.agents.on_policy import ActorCriticState, Batch, OnPolicy
+from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState
 from qfolio.fields import number, require, static
 from qfolio.mdp import Metrics, Task, Transition
 
@@ -26,6 +26,6 @@ class A2C(OnPolicy):
         return log_prob * batch.advantage
 
     def learn(
-        self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[ActorCriticState, Metrics]:
+        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[OnPolicyState, Metrics]:
         return self.descend(state, self.judge(state.weights, rollout, self.trace))

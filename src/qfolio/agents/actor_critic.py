@@ -17,20 +17,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio import networks, optimizer
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
-from qfolio.mdp import Actions, Agent, Box, Discrete, Metrics, Simplex, Task, Transition
-from qfolio.networks import KINDS, Flat, Network
-from qfolio.replay import Experience, Replay
-from qfolio.targets import huber_loss
+from qfolio.learning import networks, optimizer
+from qfolio.learning.networks import KINDS, Flat, Network
+from qfolio.learning.replay import Experience, Replay
+from qfolio.learning.targets import huber_loss
+from qfolio.mdp import Actions, Agent, Discrete, Metrics, Simplex, Task, Transition
 
 Weights = TypeVar("Weights", bound=PyTree)
-
-
-def unit_of(actions: Box | Simplex) -> float:
-    """What noise and critics measure an action by: its bound, or 1."""
-    return actions.bound if isinstance(actions, Box) and math.isfinite(actions.bound) else 1.0
 
 
 def uniform(actions: Actions, key: PRNGKeyArray, n: int) -> Array:
@@ -39,8 +34,7 @@ def uniform(actions: Actions, key: PRNGKeyArray, n: int) -> Array:
         return jax.random.randint(key, (n,), 0, actions.n, jnp.int32)
     if isinstance(actions, Simplex):
         return jax.random.dirichlet(key, jnp.ones(actions.assets + 1), (n,))
-    unit = unit_of(actions)
-    return jax.random.uniform(key, (n, actions.n), minval=-unit, maxval=unit)
+    return jax.random.uniform(key, (n, actions.n), minval=-actions.unit, maxval=actions.unit)
 
 
 class Critics(eqx.Module):
@@ -218,6 +212,6 @@ class ActorCritic(Agent):
         seen = sum(jnp.size(leaf) for leaf in jax.tree.leaves(observation))
         scale = jnp.broadcast_to(jnp.array(task.observation_scale), (seen,))
         gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
-        gains = jnp.append(gain, jnp.full(action.shape, 1 / unit_of(task.actions)))
+        gains = jnp.append(gain, jnp.full(action.shape, 1 / task.actions.unit))
         make = lambda key: Flat((observation, action), self.hidden, 1, key, gains)  # noqa: E731
         return Critics(make, count, key)

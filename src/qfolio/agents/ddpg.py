@@ -14,14 +14,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio import optimizer, simplex
-from qfolio.agents.actor_critic import ActorCritic, Critics, critic_loss, unit_of
+from qfolio import simplex
+from qfolio.agents.actor_critic import ActorCritic, Critics, critic_loss
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require
+from qfolio.learning import optimizer
+from qfolio.learning.networks import Network, outputs_of
+from qfolio.learning.replay import Experience
+from qfolio.learning.targets import follow, td_target
 from qfolio.mdp import Box, Discrete, Metrics, Simplex, Task
-from qfolio.networks import Network, outputs_of
-from qfolio.replay import Experience
-from qfolio.targets import follow, td_target
 
 
 class Actor(eqx.Module):
@@ -48,7 +49,7 @@ class Actor(eqx.Module):
         if isinstance(self.actions, Simplex):
             return simplex.project(action + noise)
         bound = self.actions.bound
-        return jnp.clip(action + unit_of(self.actions) * noise, -bound, bound)
+        return jnp.clip(action + self.actions.unit * noise, -bound, bound)
 
 
 class Learned(eqx.Module):

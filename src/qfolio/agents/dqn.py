@@ -23,18 +23,18 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio import distributional, heads, optimizer
 from qfolio.agents import hindsight
 from qfolio.agents.hindsight import Move
-from qfolio.distributional import Values
 from qfolio.errors import QfolioError
-from qfolio.exploration import epsilon_greedy
 from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.learning import distributional, heads, optimizer
+from qfolio.learning.distributional import Values
+from qfolio.learning.exploration import epsilon_greedy, epsilon_now
+from qfolio.learning.networks import KINDS, Network
+from qfolio.learning.priorities import Priorities
+from qfolio.learning.replay import Experience, Replay, join
+from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
 from qfolio.mdp import Agent, Contrast, Discrete, ExogenousTask, Metrics, Task, Transition
-from qfolio.networks import KINDS, Network
-from qfolio.priorities import Priorities
-from qfolio.replay import Experience, Replay, join
-from qfolio.targets import bootstrap, chosen, follow, huber_loss, td_target
 
 
 class DQNState(eqx.Module):
@@ -170,11 +170,8 @@ class DQN(Agent):
     def warm_up(self) -> int:
         return max(self.n_steps, math.ceil(self.learning_starts / self.environments)) - 1
 
-    def epsilon_now(self, state: DQNState) -> Float[Array, ""]:
-        return jnp.maximum(self.epsilon_end, self.epsilon * self.epsilon_decay**state.episodes)
-
     def monitor(self, state: DQNState) -> Metrics:
-        return {"epsilon": self.epsilon_now(state)}
+        return {"epsilon": epsilon_now(self, state.episodes)}
 
     def carry_over(self, state: DQNState, fresh: DQNState) -> DQNState:
         return eqx.tree_at(lambda s: s.replay, state, fresh.replay)
@@ -196,7 +193,7 @@ class DQN(Agent):
         if self.noisy:
             key, noise_key = jax.random.split(key)
             online = heads.draw_noise(online, noise_key)
-        return epsilon_greedy(key, self._q(online, observation), self.epsilon_now(state))
+        return epsilon_greedy(key, self._q(online, observation), epsilon_now(self, state.episodes))
 
     def _q(self, network: Network, observation: PyTree) -> Float[Array, "batch action"]:
         return self._values.mean(self._read(network, observation))

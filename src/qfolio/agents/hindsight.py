@@ -15,8 +15,8 @@ from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.errors import QfolioError
+from qfolio.learning.targets import bootstrap, td_target
 from qfolio.mdp import ExogenousTask, Position, Task, Transition
-from qfolio.targets import bootstrap, td_target
 
 Q = Callable[[PyTree], Float[Array, "batch action"]]
 """From observations to action values."""

@@ -15,14 +15,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from qfolio import optimizer
-from qfolio.agents.actor_critic import ActorCriticState, uniform, unit_of
+from qfolio.agents.actor_critic import ActorCriticState, uniform
 from qfolio.agents.sac import SAC
-from qfolio.encoders import MLP
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.learning import optimizer
+from qfolio.learning.encoders import MLP
+from qfolio.learning.replay import Experience, Replay
 from qfolio.mdp import Actions, Discrete, Metrics, Task, Transition
-from qfolio.replay import Experience, Replay
 
 
 class Model(eqx.Module):
@@ -43,7 +43,7 @@ class Model(eqx.Module):
         if isinstance(self.actions, Discrete):
             action = jax.nn.one_hot(action, self.actions.n)
         else:
-            action = action / unit_of(self.actions)
+            action = action / self.actions.unit
         inputs = jnp.concatenate([observation / self.scale, action], -1)
         return jax.vmap(lambda member: member(inputs))(self.members)
 

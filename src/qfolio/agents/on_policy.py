@@ -14,15 +14,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio import networks, optimizer
-from qfolio.distributions import Distribution, policy_of
 from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.learning import networks, optimizer
+from qfolio.learning.distributions import Distribution, policy_of
+from qfolio.learning.networks import KINDS, Flat, Network, Outputs, outputs_of
+from qfolio.learning.targets import advantages
 from qfolio.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
-from qfolio.networks import KINDS, Flat, Network, Outputs, outputs_of
-from qfolio.targets import advantages
 
 
-class ActorCritic(eqx.Module):
+class PolicyAndValue(eqx.Module):
     """A policy (the actor) and the discounted return that it is expected to earn (the critic)."""
 
     actor: Network
@@ -38,8 +38,8 @@ class ActorCritic(eqx.Module):
         return self.critic(observation)[:, 0]
 
 
-class ActorCriticState(eqx.Module):
-    weights: ActorCritic
+class OnPolicyState(eqx.Module):
+    weights: PolicyAndValue
     optimizer: optimizer.Optimizer
 
 
@@ -89,7 +89,7 @@ class OnPolicy(Agent):
     def rollout_steps(self) -> int:
         return self.rollout
 
-    def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState:
+    def init(self, task: Task, key: PRNGKeyArray) -> OnPolicyState:
         actor_key, critic_key, start_key = jax.random.split(key, 3)
         observation = task.observe(task.reset(start_key))
 
@@ -98,31 +98,31 @@ class OnPolicy(Agent):
                 self.network, task, observation, self.hidden, outputs, key, self.input_gain
             )
 
-        weights = ActorCritic(
+        weights = PolicyAndValue(
             actor=_quiet(build(outputs_of(task.actions), actor_key)),
             log_std=jnp.full(_coordinates(task.actions), jnp.log(self.std)),
             critic=build(Outputs(1), critic_key),
             actions=task.actions,
         )
-        return ActorCriticState(weights, optimizer.begin(weights))
+        return OnPolicyState(weights, optimizer.begin(weights))
 
     def warm_up(self) -> int:
         return 0
 
-    def weights(self, state: ActorCriticState) -> ActorCritic:
+    def weights(self, state: OnPolicyState) -> PolicyAndValue:
         return state.weights
 
-    def policy(self, weights: ActorCritic, observation: PyTree) -> Array:
+    def policy(self, weights: PolicyAndValue, observation: PyTree) -> Array:
         return weights.policy(observation).mode()
 
-    def act(self, state: ActorCriticState, observation: PyTree, key: PRNGKeyArray) -> Array:
+    def act(self, state: OnPolicyState, observation: PyTree, key: PRNGKeyArray) -> Array:
         return state.weights.policy(observation).sample(key)
 
-    def observe(self, state: ActorCriticState, rollout: Transition) -> ActorCriticState:
+    def observe(self, state: OnPolicyState, rollout: Transition) -> OnPolicyState:
         return state
 
     def judge(
-        self, weights: ActorCritic, rollout: Transition, trace: Float[Array, ""] | float
+        self, weights: PolicyAndValue, rollout: Transition, trace: Float[Array, ""] | float
     ) -> Batch:
         """Compares a rollout that these weights made with what they expect.
 
@@ -152,7 +152,7 @@ class OnPolicy(Agent):
     def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
         """What the policy raises, by the log density that it gives to the batch's actions."""
 
-    def loss(self, weights: ActorCritic, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
+    def loss(self, weights: PolicyAndValue, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
         """Minus the objective, with the critic's error and the policy's entropy."""
         policy = weights.policy(batch.observation)
         loss = -self.objective(policy.log_prob(batch.action), batch).mean()
@@ -161,12 +161,12 @@ class OnPolicy(Agent):
         total = loss + self.value_weight * value_loss - self.entropy_weight * entropy
         return total, {"loss": loss, "value_loss": value_loss, "entropy": entropy}
 
-    def descend(self, state: ActorCriticState, batch: Batch) -> tuple[ActorCriticState, Metrics]:
+    def descend(self, state: OnPolicyState, batch: Batch) -> tuple[OnPolicyState, Metrics]:
         """One gradient step."""
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.weights, batch)
         gradient = optimizer.clip(gradient, self.gradient_norm)
         weights, adam = optimizer.descend(self, state.weights, gradient, state.optimizer)
-        return ActorCriticState(weights, adam), metrics
+        return OnPolicyState(weights, adam), metrics
 
 
 def normalised(advantage: Float[Array, " batch"]) -> Float[Array, " batch"]:

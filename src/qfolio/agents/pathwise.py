@@ -16,9 +16,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio import optimizer, simplex
+from qfolio import simplex
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.learning import optimizer
+from qfolio.learning.networks import SHARED, Reading, Shared
 from qfolio.mdp import (
     Agent,
     Box,
@@ -31,7 +33,6 @@ from qfolio.mdp import (
     Transition,
     View,
 )
-from qfolio.networks import SHARED, Reading, Shared
 
 
 class Band(eqx.Module):

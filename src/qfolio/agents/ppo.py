@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.agents.on_policy import ActorCriticState, Batch, OnPolicy, normalised
+from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, normalised
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, static
 from qfolio.mdp import Metrics, Task, Transition
@@ -41,11 +41,11 @@ class PPO(OnPolicy):
         return clipped(jnp.exp(log_prob - batch.log_prob), normalised(batch.advantage), self.clip)
 
     def learn(
-        self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[ActorCriticState, Metrics]:
+        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[OnPolicyState, Metrics]:
         batch = self.judge(state.weights, rollout, self.trace)
 
-        def epoch(state: ActorCriticState, key: PRNGKeyArray) -> tuple[ActorCriticState, Metrics]:
+        def epoch(state: OnPolicyState, key: PRNGKeyArray) -> tuple[OnPolicyState, Metrics]:
             descend = lambda state, batch: self.descend(state, batch)  # noqa: E731
             return lax.scan(descend, state, minibatches(key, batch, self.batch_size))
 

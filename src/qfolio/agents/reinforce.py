@@ -8,7 +8,7 @@ the deviations from the paper.
 
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from qfolio.agents.on_policy import ActorCriticState, Batch, OnPolicy, normalised
+from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, normalised
 from qfolio.errors import QfolioError
 from qfolio.fields import static
 from qfolio.mdp import Metrics, Task, Transition
@@ -19,7 +19,7 @@ class REINFORCE(OnPolicy):
 
     rollout: int = static(200)  # whole episodes
 
-    def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState:
+    def init(self, task: Task, key: PRNGKeyArray) -> OnPolicyState:
         episode = min(self.episode_steps or task.horizon, task.horizon)
         if self.rollout % episode:
             raise QfolioError(
@@ -32,6 +32,6 @@ class REINFORCE(OnPolicy):
         return log_prob * normalised(batch.advantage)
 
     def learn(
-        self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[ActorCriticState, Metrics]:
+        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[OnPolicyState, Metrics]:
         return self.descend(state, self.judge(state.weights, rollout, trace=1.0))

@@ -17,20 +17,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio import optimizer
 from qfolio.agents.actor_critic import (
     ActorCritic,
     ActorCriticState,
     Critics,
     critic_loss,
-    unit_of,
 )
-from qfolio.distributions import Categorical, Gaussian, LogisticNormal, Squashed
 from qfolio.fields import number, require
+from qfolio.learning import optimizer
+from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed
+from qfolio.learning.networks import Network, Outputs, outputs_of
+from qfolio.learning.replay import Experience
+from qfolio.learning.targets import follow, td_target
 from qfolio.mdp import Actions, Discrete, Metrics, Simplex, Task
-from qfolio.networks import Network, Outputs, outputs_of
-from qfolio.replay import Experience
-from qfolio.targets import follow, td_target
 
 LOG_STD = (-10.0, 2.0)
 """Where a normal number's log standard deviation is kept."""
@@ -77,7 +76,7 @@ def target_entropy(actions: Actions, spread: Float[Array, ""] | float) -> Float[
         return jnp.log1p(spread * (actions.n - 1))
     if isinstance(actions, Simplex):
         return actions.assets * jnp.log(spread) - math.lgamma(actions.assets + 1)
-    return actions.n * jnp.log(2 * unit_of(actions) * spread)
+    return actions.n * jnp.log(2 * actions.unit * spread)
 
 
 def expectations(

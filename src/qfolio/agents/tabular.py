@@ -21,10 +21,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from qfolio.errors import QfolioError
-from qfolio.exploration import epsilon_greedy
 from qfolio.fields import number, require, static
+from qfolio.learning.exploration import epsilon_greedy, epsilon_now
+from qfolio.learning.targets import bootstrap, td_target
 from qfolio.mdp import Agent, Discrete, Metrics, Task, Transition
-from qfolio.targets import bootstrap, td_target
 
 Values = Float[Array, "state action"]
 
@@ -103,11 +103,8 @@ class Tabular(Agent):
     def warm_up(self) -> int:
         return 0
 
-    def epsilon_now(self, state: TableState) -> Float[Array, ""]:
-        return jnp.maximum(self.epsilon_end, self.epsilon * self.epsilon_decay**state.episodes)
-
     def monitor(self, state: TableState) -> Metrics:
-        return {"epsilon": self.epsilon_now(state)}
+        return {"epsilon": epsilon_now(self, state.episodes)}
 
     def weights(self, state: TableState) -> Tables:
         return state.tables
@@ -124,7 +121,7 @@ class Tabular(Agent):
         self, state: TableState, observation: Int[Array, " batch"], key: PRNGKeyArray
     ) -> Int[Array, " batch"]:
         values = self.action_values(state.tables, observation)
-        return epsilon_greedy(key, values, self.epsilon_now(state))
+        return epsilon_greedy(key, values, epsilon_now(self, state.episodes))
 
     def observe(self, state: State, rollout: Transition) -> State:
         finished = (rollout.terminated | rollout.truncated).sum(dtype=jnp.int32)
@@ -180,7 +177,7 @@ class ExpectedSarsa(Tabular):
     def learn(
         self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[TableState, Metrics]:
-        move, epsilon = Move.of(rollout), self.epsilon_now(state)
+        move, epsilon = Move.of(rollout), epsilon_now(self, state.episodes)
         values = state.tables[0, move.next_state]
         following = (1 - epsilon) * values.max(-1) + epsilon * values.mean(-1)
         state = self.update(state, move, following)
@@ -231,7 +228,7 @@ class Sarsa(Tabular):
     ) -> tuple[SarsaState, Metrics]:
         move, last = Move.of(rollout), state.last
         values = state.tables[0, last.next_state]
-        drawn = epsilon_greedy(key, values, self.epsilon_now(state))
+        drawn = epsilon_greedy(key, values, epsilon_now(self, state.episodes))
         action = jnp.where(last.truncated, drawn, move.action)
         following = jnp.take_along_axis(values, action[:, None], axis=1)[:, 0]
         state = self.update(state, last, following)

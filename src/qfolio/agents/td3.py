@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.agents.ddpg import DDPG, Learned
 from qfolio.fields import number, require, static
+from qfolio.learning.replay import Experience
 from qfolio.mdp import Metrics
-from qfolio.replay import Experience
 
 
 class TD3(DDPG):

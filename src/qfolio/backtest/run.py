@@ -11,13 +11,10 @@ returns.csv, weights.csv, summary.json and the report.
 """
 
 import csv
-import datetime
 import io
-import platform
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.metadata import version as version_of
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -163,12 +160,7 @@ class Backtest:
                 }
                 for name, preset in agents.items()
             },
-            "device": devices.describe(),
-            "versions": {
-                "python": platform.python_version(),
-                **{name: version_of(name) for name in ("jax", "equinox", "numpy", "skfolio")},
-            },
-            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            **devices.circumstances("python", "jax", "equinox", "numpy", "skfolio"),
         }
         backtest = cls(prices, config, None)
         if out is not None:

@@ -13,7 +13,7 @@ from qfolio.commands.arguments import INTERRUPTED, Count, Folder, Name
 from qfolio.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.comparison import Comparison, Entrant
+    from qfolio.comparison.run import Comparison, Entrant
     from qfolio.runs import Progress
 
 
@@ -52,7 +52,7 @@ def compare(
 
     devices.configure()
     from qfolio import console
-    from qfolio.comparison import Comparison
+    from qfolio.comparison.run import Comparison
 
     if resume is None:
         task = task or "pendulum"
@@ -93,7 +93,7 @@ def _entrants(
 ) -> "dict[str, Entrant]":
     """The agents that ``--agents`` names, by what it calls them."""
     from qfolio import presets, registry, settings
-    from qfolio.comparison import Entrant
+    from qfolio.comparison.run import Entrant
 
     task_class = registry.find("task", registry.TASKS, task)
     entrants: dict[str, Entrant] = {}
@@ -121,29 +121,20 @@ def _entrants(
 
 def _train(run: "Comparison") -> None:
     """Trains with a bar, and a line for each agent that is finished."""
-    import rich.progress
-
     from qfolio import console
 
     count = len(run.entrants)
-    columns = (
-        rich.progress.BarColumn(bar_width=24),
-        rich.progress.TextColumn("{task.description}"),
-    )
-    with rich.progress.Progress(
-        *columns, console=console.console, transient=True, disable=not console.console.is_terminal
-    ) as live:
-        bar = live.add_task("", total=1.0)
+    with console.bar("") as update:
 
         def note(name: str, number: int, now: "Progress | None") -> None:
             if now is None:
-                live.console.print(f"{number + 1} of {count}: {name}")
-                live.update(bar, completed=0.0, description="compiling")
+                console.console.print(f"{number + 1} of {count}: {name}")
+                update(completed=0.0, description="compiling")
                 return
             left = datetime.timedelta(seconds=round(now.seconds_left))
             speed = f"{now.steps_per_second:,.0f} steps/s"
             status = f"{name} ({number + 1} of {count})  {speed}  {left} left"
-            live.update(bar, completed=min(now.done / now.total, 1.0), description=status)
+            update(completed=min(now.done / now.total, 1.0), description=status)
 
         run.run(note)
 
@@ -164,7 +155,7 @@ def print_ranking(content: dict[str, Any]) -> None:
     from rich.text import Text
 
     from qfolio import console
-    from qfolio.ranking import HEADLINE, amount, share, span
+    from qfolio.comparison.ranking import HEADLINE, amount, share, span
 
     ranking = content["ranking"]
     write = share if ranking["measure"] == "regret" else amount

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from qfolio import settings
-from qfolio.commands.arguments import Assignments, Count, Folder, Name
+from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, Name
 from qfolio.errors import QfolioError
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ def continual(
     epsilon: Share = None,
     assignments: Assignments = (),
     out: Folder = None,
+    resume: Folder = None,
 ) -> None:
     """Change a task after training and compare ways to go on: how soon each recovers, at what cost.
 
@@ -49,40 +50,40 @@ def continual(
         epsilon: How much a renewed agent explores at first, 0.3 otherwise.
         assignments: Hyperparameters, and the task's settings before the change.
         out: A new folder for the report; runs/… otherwise.
+        resume: Go on in this folder; only what was under way when it was stopped is done again.
     """
+    given = (task, agent, preset, episodes, seeds, seed, rate, renewal, epsilon, out)
+    if resume is not None and (
+        change or assignments or any(option is not None for option in given)
+    ):
+        raise QfolioError("--resume keeps what was started; add nothing.")
     from qfolio import devices
 
     devices.configure()
-    import rich.progress
-
     from qfolio import console, continual, presets
-    from qfolio.files import new_folder, require_new, write_json
     from qfolio.report.continual import verdict, write_continual_report
 
-    task, preset = task or "pendulum", preset or "fast"
-    agent = agent or presets.default_agent(task)
-    shares = {"rate": rate, "renewal": renewal, "epsilon": epsilon}
-    options: dict[str, Any] = {k: x for k, x in shares.items() if x is not None}
-    options |= {} if seed is None else {"seed": seed}
-    plan = _plan(task, change, agent, preset, episodes, seeds, assignments, options)
-    name = f"{task.replace('/', '-')}-continual-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    folder = out or Path("runs") / name
-    require_new(folder)
-    columns = (
-        rich.progress.BarColumn(bar_width=24),
-        rich.progress.TextColumn("{task.description}"),
-    )
-    with rich.progress.Progress(
-        *columns, console=console.console, transient=True, disable=not console.console.is_terminal
-    ) as live:
-        bar = live.add_task("compiling", total=1.0)
-        content = continual.compare(
-            plan, lambda way, done: live.update(bar, completed=done, description=way)
-        )
-    content["command"] = shlex.join(["qfolio", *sys.argv[1:]])
-    with new_folder(folder) as place:
-        write_json(place / "continual.json", content)
-        write_continual_report(place, content)
+    if resume is None:
+        task, preset = task or "pendulum", preset or "fast"
+        agent = agent or presets.default_agent(task)
+        shares = {"rate": rate, "renewal": renewal, "epsilon": epsilon}
+        options: dict[str, Any] = {k: x for k, x in shares.items() if x is not None}
+        options |= {} if seed is None else {"seed": seed}
+        plan = _plan(task, change, agent, preset, episodes, seeds, assignments, options)
+        name = f"{task.replace('/', '-')}-continual-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+        folder = out or Path("runs") / name
+        continual.create(plan, folder, shlex.join(["qfolio", *sys.argv[1:]]))
+    else:
+        folder = resume
+    try:
+        with console.bar("compiling") as update:
+            content = continual.compare(
+                folder, lambda way, done: update(completed=done, description=way)
+            )
+    except KeyboardInterrupt:  # what is finished is on disk
+        console.say(f"Stopped. Go on with: qfolio continual --resume {folder}")
+        sys.exit(INTERRUPTED)
+    write_continual_report(folder, content)
     _print(content)
     console.say(verdict(content))
     console.say(f"Report: {folder / 'report.html'}")

@@ -15,7 +15,7 @@ from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, N
 from qfolio.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.tuning import Progress, Tuning
+    from qfolio.tuning.run import Progress, Tuning
 
 Ranges = Annotated[tuple[str, ...], arg(metavar="NAME=RANGE …", help_behavior_hint="")]
 
@@ -92,14 +92,14 @@ def tune(
 
 def _tuning() -> Any:
     try:
-        import qfolio.tuning
+        import qfolio.tuning.run
     except ModuleNotFoundError as error:
         if error.name != "optuna":
             raise
         raise QfolioError(
             "qfolio tune chooses configurations with Optuna; pip install 'qfolio[tune]'."
         ) from None
-    return qfolio.tuning
+    return qfolio.tuning.run
 
 
 def _new(
@@ -114,9 +114,10 @@ def _new(
     assignments: tuple[str, ...],
     out: Path | None,
 ) -> "Tuning":
-    from qfolio import presets, registry, search
+    from qfolio import presets, registry
     from qfolio.runs import check_counts
-    from qfolio.tuning import Tuning
+    from qfolio.tuning import search
+    from qfolio.tuning.run import Tuning
 
     task_class = registry.find("task", registry.TASKS, task_name)
     agent_class = registry.find("agent", registry.AGENTS, agent_name)
@@ -169,19 +170,10 @@ def far(work: "Tuning") -> str:
 
 def _run(work: "Tuning") -> None:
     """Trains with a line for each batch and a bar within it."""
-    import rich.progress
-
-    from qfolio.console import console, number, say
+    from qfolio.console import bar, number, say
 
     say("".join(f"{name:>11}" for name in ("trials", "diverged", "best", "preset", "an hour")))
-    columns = (
-        rich.progress.BarColumn(bar_width=24),
-        rich.progress.TextColumn("{task.description}"),
-    )
-    with rich.progress.Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as live:
-        bar = live.add_task("training a batch", total=1.0)
+    with bar("training a batch") as update:
 
         def note(now: "Progress") -> None:
             best, own = (number(x and x.value) for x in (now.best, now.preset))
@@ -189,7 +181,7 @@ def _run(work: "Tuning") -> None:
             cells = (f"{now.done}/{now.total}", str(now.diverged), best, own, rate)
             say("".join(f"{cell:>11}" for cell in cells))
 
-        work.run(note, lambda done: live.update(bar, completed=done))
+        work.run(note, lambda done: update(completed=done))
 
 
 def _conclude(work: "Tuning") -> None:
@@ -218,7 +210,7 @@ def _conclude(work: "Tuning") -> None:
 def command(work: "Tuning", values: dict[str, Any]) -> str:
     """The command line that trains a configuration, and the one that goes on with the search."""
     from qfolio.presets import preset
-    from qfolio.search import written
+    from qfolio.tuning.search import written
 
     config = work.config
     base = preset(config["preset"], config["task"], config["agent"])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qfolio.ranking import HEADLINE, THRESHOLDS, Result, amount, curve, share, span
+from qfolio.comparison.ranking import HEADLINE, THRESHOLDS, Result, amount, curve, share, span
 from qfolio.report import palette, rendering
 from qfolio.report.data import Floats
 from qfolio.report.figures import (

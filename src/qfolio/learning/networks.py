@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio.encoders import CNN, LSTM, MLP, RNN, Window, uniform
 from qfolio.errors import QfolioError
+from qfolio.learning.encoders import CNN, LSTM, MLP, RNN, Window, uniform
 from qfolio.mdp import Actions, Discrete, Simplex, Task, View
 
 

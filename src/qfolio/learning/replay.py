@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from qfolio.learning.priorities import Priorities
+from qfolio.learning.targets import n_step
 from qfolio.mdp import Transition
-from qfolio.priorities import Priorities
-from qfolio.targets import n_step
 
 
 class Experience(NamedTuple):

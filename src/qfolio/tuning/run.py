@@ -6,7 +6,6 @@ and, at the end, summary.json. Any number of processes may work on one folder at
 starts later, or again, goes on from what the journal says.
 """
 
-import datetime
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -18,21 +17,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optuna
 from jaxtyping import Array, Float, Key
 
 import qfolio
-from qfolio import devices, search, settings
+from qfolio import devices, settings
 from qfolio.errors import QfolioError
 from qfolio.evaluation import start_keys
 from qfolio.files import new_folder, read_json, require_types, write_json
 from qfolio.host import population_of
-from qfolio.journal import Asked, Journal, Trial, best_of
 from qfolio.mdp import Agent, Task
 from qfolio.registry import AGENTS, TASKS, name_of
 from qfolio.runs import check_counts, configured_agent, configured_task, interruptible
-from qfolio.search import Value
 from qfolio.training import begin
+from qfolio.tuning import search
+from qfolio.tuning.journal import Asked, Journal, Trial, best_of
+from qfolio.tuning.search import Value
 
 FORMAT = 1
 """Of the study folder; raised whenever an older folder can no longer be read."""
@@ -129,9 +128,7 @@ class Tuning:
             "steps": steps,
             "batch": batch,
             "fresh_seeds": fresh_seeds,
-            "device": devices.describe(),
-            "versions": {"jax": jax.__version__, "optuna": optuna.__version__},
-            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            **devices.circumstances("jax", "optuna"),
         }
         folder = Path(out)
         with new_folder(folder) as unfinished:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from qfolio.fields import require
-from qfolio.targets import huber_loss
+from qfolio.learning.targets import huber_loss
 
 Losses = tuple[Float[Array, " batch"], Float[Array, " batch"]]
 

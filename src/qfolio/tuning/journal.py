@@ -20,7 +20,7 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import TrialState
 
 from qfolio.errors import QfolioError
-from qfolio.search import Dimension, Value
+from qfolio.tuning.search import Dimension, Value
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)  # else it prints a line for every trial
 

@@ -7,7 +7,6 @@ on from the last checkpoint of the agent that was training.
 """
 
 import dataclasses
-import datetime
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,13 +20,13 @@ import numpy as np
 
 import qfolio
 from qfolio import devices, settings
+from qfolio.comparison.operations import operations_per_step
+from qfolio.comparison.ranking import Result, conclusion, listed, rank
 from qfolio.errors import QfolioError
 from qfolio.evaluation import start_keys
 from qfolio.files import new_folder, read_json, require_types, write_json
 from qfolio.host import HostPopulation
 from qfolio.mdp import Agent, Task
-from qfolio.operations import operations_per_step
-from qfolio.ranking import Result, conclusion, listed, rank
 from qfolio.registry import AGENTS, TASKS, name_of
 from qfolio.runs import Progress, Run, check_counts, configured_agent, configured_task
 from qfolio.training import begin
@@ -123,8 +122,7 @@ class Comparison:
                 }
                 for name, entrant in entrants.items()
             },
-            "device": devices.describe(),
-            "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            **devices.circumstances(),
         }
         with new_folder(Path(out)) as folder:
             write_json(folder / FILE, {**config, "results": {}})

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio import networks
-from qfolio.encoders import MLP
+from qfolio.learning import networks
+from qfolio.learning.encoders import MLP
 from qfolio.mdp import Task
 
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qfolio.journal import Trial
-from qfolio.ranking import listed
-from qfolio.search import Dimension, positions
+from qfolio.comparison.ranking import listed
+from qfolio.tuning.journal import Trial
+from qfolio.tuning.search import Dimension, positions
 
 Floats = NDArray[np.float64]
 

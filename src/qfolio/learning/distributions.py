@@ -131,9 +131,8 @@ def policy_of(
     if isinstance(actions, Simplex):
         y = output[..., 1:] - output[..., :1]
         return LogisticNormal(Gaussian(y, jnp.broadcast_to(log_std, y.shape[-1:])))
-    unit = actions.bound if math.isfinite(actions.bound) else 1.0
-    log_std = jnp.broadcast_to(log_std + math.log(unit), output.shape[-1:])
-    return Gaussian(unit * output, log_std)
+    log_std = jnp.broadcast_to(log_std + math.log(actions.unit), output.shape[-1:])
+    return Gaussian(actions.unit * output, log_std)
 
 
 def _with_cash(y: Float[Array, "*batch asset"]) -> Float[Array, "*batch entry"]:

@@ -1,8 +1,15 @@
 """How agents that value actions explore."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+
+def epsilon_now(agent: Any, episodes: Int[Array, ""]) -> Float[Array, ""]:
+    """ε of the agent's settings after so many finished episodes: it falls with each of them."""
+    return jnp.maximum(agent.epsilon_end, agent.epsilon * agent.epsilon_decay**episodes)
 
 
 def epsilon_greedy(
