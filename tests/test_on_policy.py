@@ -358,11 +358,11 @@ def test_reinforce_wants_whole_episodes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "limit"), [("ppo", 0.06), ("a2c", 0.15)])
+@pytest.mark.parametrize(("name", "limit"), [("ppo", 0.05), ("a2c", 0.12), ("reinforce", 0.12)])
 def test_presets_learn_the_pendulum(name, limit):
-    """Both well within public figures: A2C's −163 is a regret of 19 %, PPO's −172 one of 26 %."""
+    """All well within public figures: A2C's −163 is a regret of 19 %, PPO's −172 one of 26 %."""
     fast = preset("fast", "pendulum", name)
-    run = train(Pendulum(torques=0), fast.build(), episodes=fast.episodes, seeds=2, seed=100)
+    run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=2, seed=100)
     regrets = run.grade()["regret_per_seed"]
     assert max(regrets) <= limit, regrets
     assert min(regrets) > -0.005, "nothing beats the optimum"

@@ -343,7 +343,7 @@ PRESETS = {
         ),
     },
     ("pendulum", "ppo"): {
-        "fast": Preset("ppo", _PPO, episodes=15_616, seeds=8, task={"torques": 0}),
+        "fast": Preset("ppo", _PPO, episodes=15_616, seeds=8),
     },
     ("pendulum", "a2c"): {
         "fast": Preset("a2c", _A2C, episodes=15_616, seeds=8, task={"torques": 0}),
