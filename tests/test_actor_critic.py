@@ -421,5 +421,5 @@ def test_fast_presets_swing_the_pendulum_up(agent):
     task = Pendulum(**fast.task)
     run = train(task, fast.build(), episodes=fast.episodes, seeds=2, seed=100)
     regrets = run.grade()["regret_per_seed"]
-    assert max(regrets) <= 0.15, regrets
+    assert max(regrets) <= 0.1, regrets
     assert min(regrets) > -0.005, "nothing beats the optimum"

@@ -354,7 +354,7 @@ PRESETS = {
     ("pendulum", "ddpg"): _torque(
         "ddpg", environments=32, replay_capacity=262_144, exploration=0.3
     ),
-    ("pendulum", "td3"): _torque("td3", actor_rate=0.4, target_noise=0.05, target_rate=0.06),
+    ("pendulum", "td3"): _torque("td3", policy_delay=1, target_noise=0.05, exploration=0.3),
     ("pendulum", "sac"): _torque("sac", spread=0.05, actor_rate=0.6),
     ("pendulum", "mbpo"): {"fast": Preset("mbpo", _MODEL, 50, seeds=8, task={"torques": 0})},
     ("market/kelly", "pathwise"): _pathwise(
