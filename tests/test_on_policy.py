@@ -140,7 +140,8 @@ def plain_loss(name, agent, weights, batch):
     """The loss of a policy over one number, step by step, by another's densities."""
     observation, action = np.asarray(batch.observation), np.asarray(batch.action)
     std = 2 * np.exp(float(weights.log_std[0]))  # the bound is 2
-    policy = stats.norm(2 * dense(weights.actor.mlp, observation)[:, 0], std)
+    mean = 2 * 2 * np.tanh(dense(weights.actor.mlp, observation)[:, 0] / 2)
+    policy = stats.norm(mean, std)
     log_prob, total = policy.logpdf(action[:, 0]), 0.0
     advantage = np.asarray(batch.advantage)
     scaled = (advantage - advantage.mean()) / advantage.std()

@@ -116,7 +116,8 @@ def test_wealth_equals_a_ledger_of_shares(block: int, **case: Any) -> None:
         relative = np.array(wealths) / wealths[0]
         np.testing.assert_allclose(result.wealth[i], relative, rtol=1e-10)
         np.testing.assert_allclose(result.turnover[i], turnovers, atol=1e-10)
-    np.testing.assert_allclose(result.returns, result.wealth[:, 1:] / result.wealth[:, :-1] - 1)
+    relatives = result.wealth[:, 1:] / result.wealth[:, :-1]
+    np.testing.assert_allclose(result.returns, relatives - 1, atol=1e-14)
     np.testing.assert_allclose(result.growth.sum(-1), np.log(result.wealth[:, -1]), atol=1e-12)
     # Weights are on the simplex, and a day without an order is free to the last bit.
     assert (result.weights >= 0).all()
