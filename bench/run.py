@@ -137,31 +137,36 @@ def against(
 
 def of_families(effort: Effort) -> Outcome:
     """Policy gradients and actor–critics, here and in other libraries, which must be slower."""
-    figures: list[Figure] = []
-    rates: Rates = {}
+    outcomes = {}
     for algorithm, agent in families().items():
         # rejax has no DDPG, and its TD3 stands for both.
         without = {"ddpg": "rejax"}.get(algorithm)
         targets = {library: 1.0 for library in LIBRARIES if library != without}
         own = trained(Population(Pendulum(torques=0), agent, [0]))
         name = algorithm.upper()
-        found, speeds = against(algorithm, name, own, targets, effort)
-        figures += found
-        rates |= {f"{name}: {who}": speed for who, speed in speeds.items()}
-    return figures, rates
+        outcomes[name] = against(algorithm, name, own, targets, effort)
+    return joined(outcomes)
 
 
 def of_host_loop(effort: Effort) -> Outcome:
     """Agents in an environment of Gymnasium, here and in stable-baselines3."""
-    figures: list[Figure] = []
-    rates: Rates = {}
+    outcomes = {}
     for algorithm, agent in hosted().items():
         own = trained(HostPopulation(GymnasiumTask("CartPole-v1"), agent, [0]))
         name = f"{algorithm.upper()} on CartPole-v1"
         targets = {"stable_baselines3": 2.0}
-        found, speeds = against(f"{algorithm}-cartpole", name, own, targets, effort)
-        figures += found
-        rates |= {f"{name}: {who}": speed for who, speed in speeds.items()}
+        outcomes[name] = against(f"{algorithm}-cartpole", name, own, targets, effort)
+    return joined(outcomes)
+
+
+def joined(outcomes: dict[str, Outcome]) -> Outcome:
+    """Outcomes of several algorithms as one, their rates under the algorithm's name."""
+    figures = [figure for found, _ in outcomes.values() for figure in found]
+    rates = {
+        f"{name}: {who}": speed
+        for name, (_, speeds) in outcomes.items()
+        for who, speed in speeds.items()
+    }
     return figures, rates
 
 

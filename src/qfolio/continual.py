@@ -199,16 +199,17 @@ def compare(folder: Path, listener: Listener = lambda name, share: None) -> dict
     seeds = range(plan.seed, plan.seed + plan.seeds)
     grades = Grades(plan.task), Grades(plan.changed)
     first = Population(plan.task, plan.agent, seeds)
+    missing = [way for way in WAYS if way not in courses]
     if "training" not in content:
         training = _learn(first, plan.episodes, 1, grades, partial(listener, "first training"))
         write_tree(folder / LEARNED, first.fetch())
         content["optimum"] = {"old": grades[0].optimum, "new": grades[1].optimum}
         content["training"] = training._asdict()
         write_json(folder / FILE, content)
-    for way in WAYS:
-        if way in courses:
-            continue
-        learned = read_tree(folder / LEARNED, first.fetch())
+    elif missing:
+        first.restore(read_tree(folder / LEARNED, first.fetch()))
+    learned = first.fetch()
+    for way in missing:
         agent = {"going on": plan.going_on, "renewed": plan.renewed}.get(way, plan.agent)
         population = Population(plan.changed, agent, seeds)
         if way == "renewed":

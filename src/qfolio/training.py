@@ -328,8 +328,8 @@ class Population:
             bad = {str(s): None for s, ok in zip(self.seeds, healthy, strict=True) if not ok}
             raise QfolioError(
                 f"The loss of seed {', '.join(bad)} is no longer finite after {self.steps} steps; "
-                "lower learning_rate, or bound the gradient (huber of dqn, or gradient_norm where "
-                "there is one)."
+                "lower learning_rate, or bound the gradient (huber or gradient_norm, whichever the "
+                "agent has)."
             )
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:

@@ -65,7 +65,7 @@ def critic_loss(
     goal: Float[Array, " batch"],
     huber: Float[Array, ""] | float,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """The mean loss of the errors to one goal, summed over the critics; and what to report."""
+    """Mean Huber loss of the errors to one goal, summed over the critics; and what to report."""
     q = critics(batch.observation, batch.action)
     loss = huber_loss(q - goal, huber).mean(1).sum()
     return loss, {"loss": loss, "q": q.mean()}

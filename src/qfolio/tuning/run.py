@@ -231,7 +231,8 @@ class Tuning:
         if found is None:
             raise QfolioError(
                 f"None of the {len(trials)} configurations kept a finite loss; search lower "
-                "learning rates, or bound the gradient (huber of dqn, gradient_norm of others)."
+                "learning rates, or bound the gradient (huber or gradient_norm, whichever the "
+                "agent has)."
             )
         path = self.folder / "summary.json"
         if path.exists() and (summary := read_json(path)).get("best") == found.values:
