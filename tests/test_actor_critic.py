@@ -414,7 +414,7 @@ def test_refuses_what_makes_no_sense(kind, settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("agent", ["td3", "sac"])
+@pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
 def test_fast_presets_swing_the_pendulum_up(agent):
     """docs/actor_critic.md says how far single seeds stay behind; an idle agent loses 900 %."""
     fast = preset("fast", "pendulum", agent)
