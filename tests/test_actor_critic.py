@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from qfolio.agents import ddpg, sac
-from qfolio.agents.actor_critic import Critics, critic_loss, uniform
+from qfolio.agents.actor_critic import Batch, Critics, critic_loss, uniform
 from qfolio.agents.ddpg import DDPG
 from qfolio.agents.sac import SAC
 from qfolio.agents.td3 import TD3
 from qfolio.errors import QfolioError
 from qfolio.learning.distributions import Gaussian, LogisticNormal, Squashed
 from qfolio.learning.replay import Experience
-from qfolio.mdp import Box, Discrete, Simplex
+from qfolio.mdp import Box, Discrete, Simplex, Transition
 from qfolio.presets import preset
 from qfolio.runs import train
 from qfolio.tasks.pendulum import Pendulum
@@ -25,6 +25,7 @@ from qfolio.training import Population
 from probes import Aim, AimWeights, OneState
 
 DISCOUNT = 0.8
+ANY = [-jnp.inf, jnp.inf]  # rewards that allow every value
 STATES = jnp.array([[0.5], [-0.5]])
 BEST = jnp.array([[1.0], [-1.0]])
 SMALL = {
@@ -53,7 +54,8 @@ def begin(agent, task, observation, key):
 
 
 @eqx.filter_jit
-def updated(agent, learned, batch):
+def updated(agent, learned, steps, discount=None, rewards=ANY):
+    batch = Batch(steps, agent.discount if discount is None else discount, jnp.array(rewards))
     return agent.update(learned, batch, jax.random.key(0))[0]
 
 
@@ -92,6 +94,15 @@ def test_a_deterministic_actor_finds_the_best_action_and_its_value(kind):
     lost = clipped_variance(0.2, 0.1) if kind is TD3 else 0.0
     later = DISCOUNT / (1 - DISCOUNT) * (1 - lost)
     np.testing.assert_allclose(values, [1 + later, 1], rtol=0.02)
+
+
+def test_returns_over_steps_lead_to_the_same_policy():
+    """Rewards between now and the value that follows are those of actions with noise."""
+    noise = 0.2
+    end = learned(Aim(horizon=50), DDPG(**SMALL, exploration=noise, n_steps=3))
+    np.testing.assert_allclose(end.actor(STATES), BEST, atol=0.16)  # 4 %: returns vary more
+    later = sum(DISCOUNT**k * (1 - noise**2 * (k % 3 > 0)) for k in range(1, 100))
+    np.testing.assert_allclose(end.critics(STATES, BEST)[0], [1 + later, 1], rtol=0.02)
 
 
 def clipped_variance(scale, clip):
@@ -163,6 +174,33 @@ def test_the_targets_action_is_smoothed_and_the_smaller_value_taken():
     np.testing.assert_allclose(values, np.minimum(total, 3 - total), rtol=1e-6)
 
 
+def test_the_actor_climbs_the_smaller_value():
+    """Of a² and 2 − 2a at a = 1 it is the second, which falls with a."""
+    critics = lambda observation, a: jnp.stack([a[:, 0] ** 2, 2 - 2 * a[:, 0]])  # noqa: E731
+    np.testing.assert_allclose(actor_slope(Box(1), critics, 1.0), 2)
+    np.testing.assert_allclose(actor_slope(Box(1), critics, 0.5), -1)
+
+
+def test_outputs_come_back_from_where_tanh_is_flat():
+    """The critics want ever more of the action; 0.1 (5 − 4)² pulls stronger there, not before."""
+    critics = lambda observation, a: a.T  # noqa: E731
+    flat = lambda x: 3 / np.cosh(x) ** 2  # the slope of 3 tanh(x)  # noqa: E731
+    np.testing.assert_allclose(actor_slope(Box(1, 3.0), critics, 5.0), 0.2 - flat(5), rtol=1e-4)
+    np.testing.assert_allclose(actor_slope(Box(1, 3.0), critics, -5.0), -0.2 - flat(5), rtol=1e-4)
+    np.testing.assert_allclose(actor_slope(Box(1, 3.0), critics, 3.9), -flat(3.9), rtol=1e-4)
+    np.testing.assert_allclose(actor_slope(Box(1), critics, 5.0), -1)
+
+
+def actor_slope(actions, critics, output):
+    """Of the actor's loss, in what its network puts out."""
+
+    def loss(output):
+        actor = ddpg.Actor(lambda observation: output[None, None], actions)
+        return ddpg.actor_loss(actor, critics, jnp.zeros((1, 1)))[0]
+
+    return jax.grad(loss)(jnp.array(output))
+
+
 def test_actor_and_targets_wait_for_the_critics():
     agent = TD3(hidden=(8,), policy_delay=3, target_rate=0.25)
     now, moved = begun(agent), []
@@ -198,11 +236,41 @@ def test_nothing_follows_what_is_terminal():
     agent = DDPG(hidden=(8,), discount=0.9, reward_scale=0.5, learning_rate=0.01)
     start, batch = begun(agent), batch_of()
     q_next = start.critics(batch.next_observation, start.actor(batch.next_observation))[0]
-    goal = 0.5 * batch.reward + jnp.array([0, 0.9, 0.9, 0, 0.9, 0.9]) * q_next
+    following = jnp.array([0.9, 0.81, 0.9, 0.81, 0.729, 0.9])  # as returns over steps end
+    goal = 0.5 * batch.reward + following * ~batch.terminal * q_next
     expected = adams_first_step(
         lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01
     )
-    assert_close(updated(agent, start, batch).critics, expected, 1e-5)
+    assert_close(updated(agent, start, batch, following).critics, expected, 1e-5)
+
+
+def test_what_follows_is_brought_to_what_rewards_allow():
+    """Rewards from −2 to 1, halved, with γ = 0.9: values from −10 to 5."""
+    agent = DDPG(hidden=(8,), discount=0.9, reward_scale=0.5)
+    steps = batch_of(4)._replace(reward=jnp.zeros(4), terminal=jnp.array([False] * 3 + [True]))
+    batch = Batch(steps, 0.9, jnp.array([-2.0, 1.0]))
+    goal = agent.goal(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]))
+    np.testing.assert_allclose(goal, [-9, 4.5, 2.7, 0], rtol=1e-5)
+    # Entropy that is worth 0.1 a step adds to what is possible, and one that costs takes away.
+    goal = agent.goal(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]), 0.1)
+    np.testing.assert_allclose(goal, [-9, 5.4, 2.7, 0], rtol=1e-5)
+    goal = agent.goal(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]), -0.1)
+    np.testing.assert_allclose(goal, [-9.9, 4.5, 2.7, 0], rtol=1e-5)
+
+
+def test_all_rewards_count_however_old():
+    agent = DDPG(hidden=(8,), environments=2, replay_capacity=2, learning_starts=2)
+    state = agent.init(Aim(), jax.random.key(0))
+    for reward in ([0.5, -3.0], [2.0, 0.0], [0.0, 0.0]):
+        state = agent.observe(state, rollout_of(jnp.array([reward])))
+    np.testing.assert_array_equal(state.rewards, [-3, 2])
+
+
+def rollout_of(reward):
+    """A step of Aim in each environment that paid ``reward``."""
+    no, zero = jnp.zeros(reward.shape, bool), jnp.zeros(reward.shape)
+    view = zero[..., None]
+    return Transition(zero, view, view, reward, zero, view, no, no)
 
 
 def central(loss, weights, step=1e-6):
@@ -392,7 +460,7 @@ def test_fits_markets(kind, network, task):
         view = jax.vmap(lambda key: task.observe(task.reset(key)))(jax.random.split(key, 3))
         action = agent.act(state, view, key)
         batch = Experience(view, action, jnp.zeros(3), view, jnp.zeros(3, bool))
-        return state.learned, agent.update(state.learned, batch, key)[0]
+        return state.learned, updated(agent, state.learned, batch)
 
     before, after = jax.eval_shape(step)
     same = eqx.tree_equal(before, after)

@@ -12,7 +12,7 @@ from qfolio.learning import heads
 from qfolio.learning.distributional import Categorical, project, quantile_huber_loss
 from qfolio.learning.encoders import MLP
 from qfolio.learning.optimizer import learning_rate
-from qfolio.learning.targets import bootstrap, chosen, huber_loss, td_target
+from qfolio.learning.targets import bootstrap, chosen, huber_loss, possible_values, td_target
 from qfolio.mdp import Transition
 from qfolio.presets import preset
 from qfolio.tasks.pendulum import Pendulum
@@ -44,6 +44,16 @@ def test_bootstrap_by_hand():
 def test_td_target_by_hand():
     goal = td_target(jnp.array([1.0, 1.0]), jnp.array([False, True]), jnp.array([10.0, 10.0]), 0.9)
     np.testing.assert_allclose(goal, [10, 1])
+
+
+def test_possible_values_by_hand():
+    """An episode may end at once or go on for ever."""
+    values = lambda *rewards: possible_values(jnp.array(rewards), 0.75)  # noqa: E731
+    np.testing.assert_allclose(values(-2.0, 1.0), [-8, 4])
+    np.testing.assert_allclose(values(-2.0, -1.0), [-8, -1])
+    np.testing.assert_allclose(values(1.0, 2.0), [1, 8])
+    np.testing.assert_allclose(values(0.0, 0.0), [0, 0])
+    assert np.isfinite(possible_values(jnp.array([-1.0, 1.0]), 1.0)).all()
 
 
 def test_huber_loss_by_hand():

@@ -77,6 +77,7 @@ _RAINBOW = {
     "epsilon": 0.0,
     "epsilon_end": 0.0,
     "updates": 2,
+    "discount": 0.99,
     "huber": 1.0,
     "learning_rate_steps": 15_000.0,
 }
@@ -145,6 +146,7 @@ _TORQUE = {
     "environments": 12,
     "episode_steps": 28,
     "batch_size": 256,
+    "n_steps": 2,
     "replay_capacity": 131_072,
     "learning_starts": 1024,
     "target_rate": 0.03,
@@ -152,6 +154,7 @@ _TORQUE = {
     "learning_rate": 3e-3,
     "learning_rate_final": 0.0,
     "learning_rate_steps": 8000.0,
+    "actor_rate": 0.6,
     "huber": 0.3,
     "reward_scale": 0.3,
 }
@@ -160,6 +163,7 @@ _MODEL = {  # 2,000 real steps, with 4 gradient steps of SAC for each behind the
     **_TORQUE,
     "environments": 1,
     "episode_steps": 40,
+    "n_steps": 1,
     "replay_capacity": 2048,
     "learning_starts": 200,
     "learning_rate_steps": 7200.0,
@@ -355,7 +359,7 @@ PRESETS = {
         "ddpg", environments=32, replay_capacity=262_144, exploration=0.3
     ),
     ("pendulum", "td3"): _torque("td3", policy_delay=1, target_noise=0.05, exploration=0.3),
-    ("pendulum", "sac"): _torque("sac", spread=0.05, actor_rate=0.6),
+    ("pendulum", "sac"): _torque("sac", spread=0.05),
     ("pendulum", "mbpo"): {"fast": Preset("mbpo", _MODEL, 50, seeds=8, task={"torques": 0})},
     ("market/kelly", "pathwise"): _pathwise(
         307_200, environments=1024, rollout=5, learning_rate_steps=300.0, reward_scale=10.0

@@ -9,7 +9,7 @@ holds every formula and its place.
 import abc
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,12 +17,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
 from qfolio.learning import networks, optimizer
 from qfolio.learning.networks import KINDS, Flat, Network
-from qfolio.learning.replay import Experience, Replay
-from qfolio.learning.targets import huber_loss
+from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
+from qfolio.learning.targets import huber_loss, possible_values, td_target
 from qfolio.mdp import Actions, Agent, Discrete, Metrics, Simplex, Task, Transition
 
 Weights = TypeVar("Weights", bound=PyTree)
@@ -71,12 +70,27 @@ def critic_loss(
     return loss, {"loss": loss, "q": q.mean()}
 
 
+class Batch(NamedTuple):
+    """What a gradient step learns from."""
+
+    steps: Experience
+    discount: Discount  # of what follows them
+    rewards: Float[Array, "2"]  # the lowest and the highest that there ever were
+
+
+def extremes(before: Float[Array, "2"], reward: Float[Array, " batch"]) -> Float[Array, "2"]:
+    """The lowest and the highest of ``before`` and of ``reward``."""
+    lowest, highest = before
+    return jnp.stack([jnp.minimum(lowest, reward.min()), jnp.maximum(highest, reward.max())])
+
+
 class ActorCriticState(eqx.Module):
     """All that an agent learns and remembers."""
 
     learned: Any  # what gradient steps change; its actor explores
     replay: Replay
     steps: Int[Array, ""]  # of each environment
+    rewards: Float[Array, "2"]  # the lowest and the highest that there ever were
 
 
 class ActorCritic(Agent):
@@ -88,6 +102,7 @@ class ActorCritic(Agent):
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     batch_size: int = static(256)
     updates: int = static(1)  # gradient steps per step of all environments
+    n_steps: int = static(1)  # whose rewards a target adds up
     replay_capacity: int = static(100_000)  # transitions
     learning_starts: int = static(1000)  # transitions by random actions before learning
     target_rate: float = number(0.005)  # how far targets go towards the online networks each time
@@ -101,10 +116,8 @@ class ActorCritic(Agent):
     huber: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
 
     def __check_init__(self) -> None:
-        counts = "environments batch_size updates"
-        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
-        require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
+        require_replay(self)
+        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "input_gain actor_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
@@ -112,11 +125,6 @@ class ActorCritic(Agent):
         require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
         optimizer.require_schedule(self)
         require_sizes(self)
-        if self.learning_starts > self.replay_capacity:
-            raise QfolioError(
-                f"learning_starts is {self.learning_starts}, more than replay_capacity "
-                f"({self.replay_capacity}) can hold; lower the one or raise the other."
-            )
 
     @abc.abstractmethod
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Any:
@@ -127,7 +135,7 @@ class ActorCritic(Agent):
         """Actions for a batch of observations, with exploration."""
 
     @abc.abstractmethod
-    def update(self, learned: Any, batch: Experience, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+    def update(self, learned: Any, batch: Batch, key: PRNGKeyArray) -> tuple[Any, Metrics]:
         """One gradient step of all that learns."""
 
     def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState:
@@ -138,13 +146,15 @@ class ActorCritic(Agent):
             reward=jnp.array(0.0),
             next_observation=observation,
             terminal=jnp.array(False),
+            last=jnp.array(False) if self.n_steps > 1 else None,
         )
         learned = self.begin(task, observation, key)
-        replay = Replay.empty(row, self.replay_capacity, self.environments)
-        return ActorCriticState(learned, replay, jnp.array(0, jnp.int32))
+        replay = Replay.empty(row, self.replay_capacity, self.environments, self.n_steps)
+        none = jnp.array([jnp.inf, -jnp.inf])
+        return ActorCriticState(learned, replay, jnp.array(0, jnp.int32), none)
 
     def warm_up(self) -> int:
-        return max(0, math.ceil(self.learning_starts / self.environments) - 1)
+        return warm_up(self)
 
     def act(self, state: ActorCriticState, observation: PyTree, key: PRNGKeyArray) -> Array:
         random_key, key = jax.random.split(key)
@@ -153,22 +163,27 @@ class ActorCritic(Agent):
         return jnp.where(state.steps < self.warm_up(), random, action)
 
     def observe(self, state: ActorCriticState, rollout: Transition) -> ActorCriticState:
-        replay = state.replay.add(Experience.of(rollout))
-        return ActorCriticState(state.learned, replay, state.steps + 1)
+        row = Experience.of(rollout, with_last=self.n_steps > 1)
+        rewards = extremes(state.rewards, row.reward)
+        return ActorCriticState(state.learned, state.replay.add(row), state.steps + 1, rewards)
 
     def learn(
         self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[ActorCriticState, Metrics]:
         state = self.observe(state, rollout)
-        learned, metrics = self.practise(state.learned, state.replay, key)
-        return ActorCriticState(learned, state.replay, state.steps), metrics
+        learned, metrics = self.practise(state.learned, state.replay, state.rewards, key)
+        return eqx.tree_at(lambda s: s.learned, state, learned), metrics
 
-    def practise(self, learned: Any, replay: Replay, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+    def practise(
+        self, learned: Any, replay: Replay, rewards: Float[Array, "2"], key: PRNGKeyArray
+    ) -> tuple[Any, Metrics]:
         """``updates`` gradient steps on batches from a buffer."""
 
         def update(learned: Any, key: PRNGKeyArray) -> tuple[Any, Metrics]:
             sample_key, key = jax.random.split(key)
-            return self.update(learned, replay.sample(sample_key, self.batch_size), key)
+            index = replay.draw(sample_key, self.batch_size)
+            batch = Batch(*join(replay, index, self.discount), rewards)
+            return self.update(learned, batch, key)
 
         if self.updates == 1:
             learned, metrics = update(learned, key)
@@ -178,10 +193,25 @@ class ActorCritic(Agent):
         return learned, {**means, "q": means["q"] / self.reward_scale}
 
     def carry_over(self, state: ActorCriticState, fresh: ActorCriticState) -> ActorCriticState:
-        return ActorCriticState(state.learned, fresh.replay, state.steps)
+        return eqx.tree_at(lambda s: (s.replay, s.rewards), state, (fresh.replay, fresh.rewards))
 
     def weights(self, state: ActorCriticState) -> Any:
         return state.learned.actor
+
+    def goal(
+        self, batch: Batch, following: Float[Array, " batch"], bonus: Array | float = 0.0
+    ) -> Float[Array, " batch"]:
+        """Bellman target, where what follows is brought to what the rewards so far allow.
+
+        bonus: what each later step is worth besides its reward.
+        """
+        rewards = self.reward_scale * batch.rewards
+        rewards = rewards + jnp.stack([jnp.minimum(bonus, 0.0), jnp.maximum(bonus, 0.0)])
+        following = jnp.clip(following, *possible_values(rewards, self.discount))
+        steps = batch.steps
+        return td_target(
+            self.reward_scale * steps.reward, steps.terminal, following, batch.discount
+        )
 
     def descend(
         self,

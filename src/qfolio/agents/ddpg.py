@@ -15,14 +15,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio import simplex
-from qfolio.agents.actor_critic import ActorCritic, Critics, critic_loss
+from qfolio.agents.actor_critic import ActorCritic, Batch, Critics, critic_loss
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require
 from qfolio.learning import optimizer
 from qfolio.learning.networks import Network, outputs_of
 from qfolio.learning.replay import Experience
-from qfolio.learning.targets import follow, td_target
+from qfolio.learning.targets import follow
 from qfolio.mdp import Box, Discrete, Metrics, Simplex, Task
+
+FLAT = 4.0
+"""Output beyond which tanh counts as flat; there it is within 0.0007 of its bound."""
+
+SATURATION = 0.1
+"""What the square of an output's way beyond costs, in scaled reward."""
 
 
 class Actor(eqx.Module):
@@ -35,12 +41,21 @@ class Actor(eqx.Module):
     actions: Box | Simplex
 
     def __call__(self, observation: PyTree) -> Float[Array, "batch entry"]:
-        output = self.network(observation)
+        return self.among(self.network(observation))
+
+    def among(self, output: Float[Array, "batch entry"]) -> Float[Array, "batch entry"]:
+        """The actions that the network's outputs stand for."""
         if isinstance(self.actions, Simplex):
             return jax.nn.softmax(output)
         if math.isinf(self.actions.bound):
             return output
         return self.actions.bound * jnp.tanh(output)
+
+    def saturation(self, output: Float[Array, "batch entry"]) -> Float[Array, ""]:
+        """Mean square of how far outputs are where tanh is flat; 0 where there is no tanh."""
+        if isinstance(self.actions, Simplex) or math.isinf(self.actions.bound):
+            return jnp.array(0.0)
+        return (jnp.maximum(jnp.abs(output) - FLAT, 0.0) ** 2).sum(-1).mean()
 
     def perturb(
         self, action: Float[Array, "batch entry"], noise: Float[Array, "batch entry"]
@@ -66,8 +81,13 @@ class Learned(eqx.Module):
 def actor_loss(
     actor: Actor, critics: Critics, observation: PyTree
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Minus the mean of Q(s, π(s)) by the first critic."""
-    return -critics(observation, actor(observation))[0].mean(), {}
+    """Minus the mean of Q(s, π(s)), by the smaller critic where there are several.
+
+    No gradient leads back from where tanh is flat, so that going there costs a little.
+    """
+    output = actor.network(observation)
+    value = critics(observation, actor.among(output)).min(0).mean()
+    return SATURATION * actor.saturation(output) - value, {}
 
 
 class DDPG(ActorCritic):
@@ -105,22 +125,19 @@ class DDPG(ActorCritic):
         noise = self.exploration * jax.random.normal(key, action.shape)
         return learned.actor.perturb(action, noise)
 
-    def update(
-        self, learned: Learned, batch: Experience, key: PRNGKeyArray
-    ) -> tuple[Learned, Metrics]:
+    def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
         learned, metrics = self.evaluate(learned, batch, key)
-        return self.improve(learned, batch), metrics
+        return self.improve(learned, batch.steps), metrics
 
     def evaluate(
-        self, learned: Learned, batch: Experience, key: PRNGKeyArray
+        self, learned: Learned, batch: Batch, key: PRNGKeyArray
     ) -> tuple[Learned, Metrics]:
         """A step of the critics towards the Bellman target."""
-        reward = self.reward_scale * batch.reward
-        following = self.following(learned, batch.next_observation, key)
-        goal = td_target(reward, batch.terminal, following, self.discount)
+        following = self.following(learned, batch.steps.next_observation, key)
+        goal = self.goal(batch, following)
         rate = optimizer.learning_rate(self, learned.critic_adam.count)
         critics, adam, metrics = self.descend(
-            critic_loss, learned.critics, learned.critic_adam, rate, batch, goal, self.huber
+            critic_loss, learned.critics, learned.critic_adam, rate, batch.steps, goal, self.huber
         )
         learned = eqx.tree_at(lambda x: (x.critics, x.critic_adam), learned, (critics, adam))
         return learned, metrics
@@ -132,7 +149,7 @@ class DDPG(ActorCritic):
         return learned.target_critics(observation, learned.target_actor(observation))[0]
 
     def improve(self, learned: Learned, batch: Experience) -> Learned:
-        """A step of the actor up the first critic; then the targets follow."""
+        """A step of the actor up the critics; then the targets follow."""
         rate = self.actor_rate * optimizer.learning_rate(self, learned.critic_adam.count)
         actor, adam, _ = self.descend(
             actor_loss, learned.actor, learned.actor_adam, rate, learned.critics, batch.observation

@@ -32,7 +32,7 @@ from qfolio.learning.distributional import Values
 from qfolio.learning.exploration import epsilon_greedy, epsilon_now
 from qfolio.learning.networks import KINDS, Network
 from qfolio.learning.priorities import Priorities
-from qfolio.learning.replay import Experience, Replay, join
+from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
 from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
 from qfolio.mdp import Agent, Contrast, Discrete, ExogenousTask, Metrics, Task, Transition
 
@@ -99,10 +99,9 @@ class DQN(Agent):
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
 
     def __check_init__(self) -> None:
-        counts = "environments batch_size updates target_period n_steps"
-        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
-        require(self, "episode_steps learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
+        require_replay(self)
+        require(self, "target_period", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "input_gain noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         optimizer.require_schedule(self)
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
@@ -119,13 +118,6 @@ class DQN(Agent):
         if self.market_baseline and self.batch_size < 2:
             raise QfolioError(
                 "market_baseline compares holders; it needs a batch_size of 2 or more."
-            )
-        needed = max(self.learning_starts, self.n_steps * self.environments)
-        if needed > self.replay_capacity:
-            raise QfolioError(
-                f"learning_starts is {self.learning_starts} and n_steps × environments is "
-                f"{self.n_steps * self.environments}, and replay_capacity "
-                f"({self.replay_capacity}) can hold fewer; lower the ones or raise the other."
             )
 
     def contrast(self) -> Contrast:
@@ -168,7 +160,7 @@ class DQN(Agent):
         )
 
     def warm_up(self) -> int:
-        return max(self.n_steps, math.ceil(self.learning_starts / self.environments)) - 1
+        return warm_up(self)
 
     def monitor(self, state: DQNState) -> Metrics:
         return {"epsilon": epsilon_now(self, state.episodes)}
@@ -273,7 +265,7 @@ class DQN(Agent):
         online: Network,
         target: Network,
         batch: Experience,
-        discount: Float[Array, "*#batch"] | float,
+        discount: Discount,
         key: PRNGKeyArray,
     ) -> Losses:
         """discount: of what follows the batch's rewards. key: of the noise."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from qfolio.agents.actor_critic import ActorCriticState, uniform
+from qfolio.agents.actor_critic import ActorCriticState, extremes, uniform
 from qfolio.agents.sac import SAC
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
@@ -105,6 +105,7 @@ class MBPO(SAC):
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "imagined_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         require(self, "model_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "n_steps", lambda x: x == 1, "1: imagined steps stand alone")
         require_sizes(self, "model_hidden")
 
     def init(self, task: Task, key: PRNGKeyArray) -> MBPOState:
@@ -131,6 +132,7 @@ class MBPO(SAC):
             learned=start.learned,
             replay=Replay.empty(rows, self.replay_capacity, self.environments),
             steps=start.steps,
+            rewards=start.rewards,
             model=model,
             model_adam=optimizer.begin(model.members),
             imagined=Replay.empty(step, self.imagined_capacity, width),
@@ -141,7 +143,11 @@ class MBPO(SAC):
         key = jax.random.fold_in(jax.random.key(0), state.steps)
         counts = jax.random.poisson(key, 1.0, (len(step.reward), self.members))
         replay = state.replay.add(Remembered(step, counts.astype(jnp.float32)))
-        return eqx.tree_at(lambda s: (s.replay, s.steps), state, (replay, state.steps + 1))
+        return eqx.tree_at(
+            lambda s: (s.replay, s.steps, s.rewards),
+            state,
+            (replay, state.steps + 1, extremes(state.rewards, step.reward)),
+        )
 
     def learn(
         self, task: Task, state: MBPOState, rollout: Transition, key: PRNGKeyArray
@@ -150,8 +156,10 @@ class MBPO(SAC):
         model_key, imagine_key, key = jax.random.split(key, 3)
         model, model_adam, metrics = self._study(state, model_key)
         imagined = self._imagine(model, state, imagine_key)
-        learned, more = self.practise(state.learned, imagined, key)
-        state = MBPOState(learned, state.replay, state.steps, model, model_adam, imagined)
+        learned, more = self.practise(state.learned, imagined, state.rewards, key)
+        state = MBPOState(
+            learned, state.replay, state.steps, state.rewards, model, model_adam, imagined
+        )
         return state, metrics | more
 
     def _study(
@@ -193,4 +201,5 @@ class MBPO(SAC):
         return state.imagined.add(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps))
 
     def carry_over(self, state: MBPOState, fresh: MBPOState) -> MBPOState:
-        return eqx.tree_at(lambda s: (s.replay, s.imagined), state, (fresh.replay, fresh.imagined))
+        state = super().carry_over(state, fresh)
+        return eqx.tree_at(lambda s: s.imagined, state, fresh.imagined)

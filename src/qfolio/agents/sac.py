@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from qfolio.agents.actor_critic import (
     ActorCritic,
     ActorCriticState,
+    Batch,
     Critics,
     critic_loss,
 )
@@ -27,8 +28,7 @@ from qfolio.fields import number, require
 from qfolio.learning import optimizer
 from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed
 from qfolio.learning.networks import Network, Outputs, outputs_of
-from qfolio.learning.replay import Experience
-from qfolio.learning.targets import follow, td_target
+from qfolio.learning.targets import follow
 from qfolio.mdp import Actions, Discrete, Metrics, Simplex, Task
 
 LOG_STD = (-10.0, 2.0)
@@ -169,26 +169,25 @@ class SAC(ActorCritic):
     def explore(self, learned: Learned, observation: PyTree, key: PRNGKeyArray) -> Array:
         return learned.actor(observation).sample(key)
 
-    def update(
-        self, learned: Learned, batch: Experience, key: PRNGKeyArray
-    ) -> tuple[Learned, Metrics]:
+    def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
         next_key, key = jax.random.split(key)
         temperature = jnp.exp(learned.log_temperature)
         rate = optimizer.learning_rate(self, learned.critic_adam.count)
 
         following, entropy = expectations(
-            learned.actor, learned.target_critics, batch.next_observation, next_key
+            learned.actor, learned.target_critics, batch.steps.next_observation, next_key
         )
         value = following + temperature * entropy
-        goal = td_target(self.reward_scale * batch.reward, batch.terminal, value, self.discount)
+        wanted = target_entropy(learned.actor.actions, self.spread)
+        goal = self.goal(batch, value, temperature * wanted)
         critics, critic_adam, metrics = self.descend(
-            critic_loss, learned.critics, learned.critic_adam, rate, batch, goal, self.huber
+            critic_loss, learned.critics, learned.critic_adam, rate, batch.steps, goal, self.huber
         )
         actor, actor_adam, more = self.descend(
             actor_loss, learned.actor, learned.actor_adam, self.actor_rate * rate,
-            critics, temperature, batch.observation, key,
+            critics, temperature, batch.steps.observation, key,
         )  # fmt: skip
-        excess = more["entropy"] - target_entropy(actor.actions, self.spread)
+        excess = more["entropy"] - wanted
         log_temperature, temperature_adam, last = self.descend(
             temperature_loss, learned.log_temperature, learned.temperature_adam, rate, excess
         )

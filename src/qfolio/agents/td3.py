@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from qfolio.agents.actor_critic import Batch
 from qfolio.agents.ddpg import DDPG, Learned
 from qfolio.fields import number, require, static
-from qfolio.learning.replay import Experience
 from qfolio.mdp import Metrics
 
 
@@ -32,12 +32,10 @@ class TD3(DDPG):
         require(self, "target_noise target_clip", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "policy_delay", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
 
-    def update(
-        self, learned: Learned, batch: Experience, key: PRNGKeyArray
-    ) -> tuple[Learned, Metrics]:
+    def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
         learned, metrics = self.evaluate(learned, batch, key)
         due = learned.critic_adam.count % self.policy_delay == 0
-        improve = lambda learned: self.improve(learned, batch)  # noqa: E731
+        improve = lambda learned: self.improve(learned, batch.steps)  # noqa: E731
         return lax.cond(due, improve, lambda learned: learned, learned), metrics
 
     def following(

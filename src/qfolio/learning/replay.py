@@ -1,7 +1,8 @@
 """The replay buffer: a ring of the latest transitions (Lin 1992; Mnih et al. 2015)."""
 
 import dataclasses
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,9 +10,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from qfolio.errors import QfolioError
+from qfolio.fields import require
 from qfolio.learning.priorities import Priorities
 from qfolio.learning.targets import n_step
 from qfolio.mdp import Transition
+
+Discount = Float[Array, "*#batch"] | float
+"""Of what follows a batch of experience."""
 
 
 class Experience(NamedTuple):
@@ -148,7 +154,7 @@ class Replay(eqx.Module):
 
 def join(
     replay: Replay, index: Int[Array, " n"], discount: Float[Array, ""] | float
-) -> tuple[Experience, Float[Array, "*#n"] | float]:
+) -> tuple[Experience, Discount]:
     """Rows of experience over the buffer's ``steps``, and the discount of what follows them.
 
     They end with the last of these steps or with the episode, and lead to the true next observation
@@ -165,3 +171,23 @@ def join(
         reward=reward, next_observation=end.next_observation, terminal=end.terminal
     )
     return joined, discount ** (stop + 1)
+
+
+def require_replay(agent: Any) -> None:
+    """Raises QfolioError where the settings of an agent's buffer make no sense."""
+    counts = "environments batch_size updates n_steps"
+    require(agent, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+    require(agent, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
+    require(agent, "learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
+    joined = agent.n_steps * agent.environments
+    if max(agent.learning_starts, joined) > agent.replay_capacity:
+        raise QfolioError(
+            f"learning_starts is {agent.learning_starts} and n_steps × environments is {joined}, "
+            f"and replay_capacity ({agent.replay_capacity}) can hold fewer; lower the ones or "
+            "raise the other."
+        )
+
+
+def warm_up(agent: Any) -> int:
+    """Steps of all environments before an agent's buffer has enough to learn from."""
+    return max(agent.n_steps, math.ceil(agent.learning_starts / agent.environments)) - 1

@@ -39,6 +39,15 @@ def td_target(
     return reward + jnp.where(terminal, 0.0, discount * following)
 
 
+def possible_values(
+    rewards: Float[Array, "2"], discount: Float[Array, ""] | float
+) -> Float[Array, "2"]:
+    """The lowest and the highest return over one step or more, of rewards between two numbers."""
+    forever = rewards / jnp.maximum(1 - discount, 1e-9)
+    lowest, highest = jnp.stack([rewards, forever], axis=1)
+    return jnp.stack([lowest.min(), highest.max()])
+
+
 def n_step(
     reward: Float[Array, "step batch"],
     last: Bool[Array, "step batch"],
