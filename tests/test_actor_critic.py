@@ -484,10 +484,10 @@ def test_refuses_what_makes_no_sense(kind, settings):
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
 def test_fast_presets_swing_the_pendulum_up(agent):
-    """docs/actor_critic.md says how far single seeds stay behind; an idle agent loses 900 %."""
+    """What docs/actor_critic.md promises for every seed; an idle agent loses 900 %."""
     fast = preset("fast", "pendulum", agent)
     task = Pendulum(**fast.task)
     run = train(task, fast.build(), episodes=fast.episodes, seeds=2, seed=100)
     regrets = run.grade()["regret_per_seed"]
-    assert max(regrets) <= 0.1, regrets
+    assert max(regrets) <= 0.05, regrets
     assert min(regrets) > -0.005, "nothing beats the optimum"

@@ -356,7 +356,7 @@ PRESETS = {
         "fast": Preset("reinforce", _REINFORCE, episodes=62_496, seeds=8, task={"torques": 0}),
     },
     ("pendulum", "ddpg"): _torque(
-        "ddpg", environments=32, replay_capacity=262_144, exploration=0.3
+        "ddpg", environments=32, replay_capacity=262_144, exploration=0.3, actor_rate=0.3
     ),
     ("pendulum", "td3"): _torque("td3", policy_delay=1, target_noise=0.05, exploration=0.3),
     ("pendulum", "sac"): _torque("sac", spread=0.05),
