@@ -360,6 +360,14 @@ def test_the_soft_goal_counts_the_next_steps_entropy():
         lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01
     )
     assert_close(updated(agent, start, batch).critics, expected, 1e-5)
+    # A last reward of −1 and entropy worth 0.7 H̄ are the most that can follow.
+    most = -1 + 0.7 * math.log1p(0.184)
+    goal = batch.reward + 0.9 * jnp.minimum(q + 0.7 * entropy, most) * ~batch.terminal
+    expected = adams_first_step(
+        lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01
+    )
+    bounded = updated(agent, start, batch, rewards=[-jnp.inf, -1.0])
+    assert_close(bounded.critics, expected, 1e-5)
 
 
 @pytest.mark.parametrize(("spread", "rises"), [(0.01, False), (2.0, True)])

@@ -78,12 +78,6 @@ class Batch(NamedTuple):
     rewards: Float[Array, "2"]  # the lowest and the highest that there ever were
 
 
-def extremes(before: Float[Array, "2"], reward: Float[Array, " batch"]) -> Float[Array, "2"]:
-    """The lowest and the highest of ``before`` and of ``reward``."""
-    lowest, highest = before
-    return jnp.stack([jnp.minimum(lowest, reward.min()), jnp.maximum(highest, reward.max())])
-
-
 class ActorCriticState(eqx.Module):
     """All that an agent learns and remembers."""
 
@@ -163,9 +157,19 @@ class ActorCritic(Agent):
         return jnp.where(state.steps < self.warm_up(), random, action)
 
     def observe(self, state: ActorCriticState, rollout: Transition) -> ActorCriticState:
-        row = Experience.of(rollout, with_last=self.n_steps > 1)
-        rewards = extremes(state.rewards, row.reward)
-        return ActorCriticState(state.learned, state.replay.add(row), state.steps + 1, rewards)
+        step = Experience.of(rollout, with_last=self.n_steps > 1)
+        lowest, highest = state.rewards
+        rewards = jnp.stack(
+            [jnp.minimum(lowest, step.reward.min()), jnp.maximum(highest, step.reward.max())]
+        )
+        replay = state.replay.add(self.row(step, state.steps))
+        return eqx.tree_at(
+            lambda s: (s.replay, s.steps, s.rewards), state, (replay, state.steps + 1, rewards)
+        )
+
+    def row(self, step: Experience, steps: Int[Array, ""]) -> PyTree:
+        """What the buffer keeps of a step of all environments, the ``steps``-th."""
+        return step
 
     def learn(
         self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray

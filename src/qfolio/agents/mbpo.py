@@ -13,9 +13,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.agents.actor_critic import ActorCriticState, extremes, uniform
+from qfolio.agents.actor_critic import ActorCriticState, uniform
 from qfolio.agents.sac import SAC
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
@@ -138,16 +138,10 @@ class MBPO(SAC):
             imagined=Replay.empty(step, self.imagined_capacity, width),
         )
 
-    def observe(self, state: MBPOState, rollout: Transition) -> MBPOState:
-        step = Experience.of(rollout)
-        key = jax.random.fold_in(jax.random.key(0), state.steps)
+    def row(self, step: Experience, steps: Int[Array, ""]) -> Remembered:
+        key = jax.random.fold_in(jax.random.key(0), steps)
         counts = jax.random.poisson(key, 1.0, (len(step.reward), self.members))
-        replay = state.replay.add(Remembered(step, counts.astype(jnp.float32)))
-        return eqx.tree_at(
-            lambda s: (s.replay, s.steps, s.rewards),
-            state,
-            (replay, state.steps + 1, extremes(state.rewards, step.reward)),
-        )
+        return Remembered(step, counts.astype(jnp.float32))
 
     def learn(
         self, task: Task, state: MBPOState, rollout: Transition, key: PRNGKeyArray
