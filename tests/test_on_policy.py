@@ -140,8 +140,8 @@ def plain_loss(name, agent, weights, batch):
     """The loss of a policy over one number, step by step, by another's densities."""
     observation, action = np.asarray(batch.observation), np.asarray(batch.action)
     std = 2 * np.exp(float(weights.log_std[0]))  # the bound is 2
-    mean = 2 * 2 * np.tanh(dense(weights.actor.mlp, observation)[:, 0] / 2)
-    policy = stats.norm(mean, std)
+    output = dense(weights.actor.mlp, observation)[:, 0]
+    policy = stats.norm(2 * output, std)
     log_prob, total = policy.logpdf(action[:, 0]), 0.0
     advantage = np.asarray(batch.advantage)
     scaled = (advantage - advantage.mean()) / advantage.std()
@@ -157,7 +157,10 @@ def plain_loss(name, agent, weights, batch):
     value = dense(weights.critic.mlp, observation)[:, 0]
     error = ((np.asarray(batch.goal) - value) ** 2).mean()
     entropy = stats.norm(0, std).entropy()
-    return total / len(advantage) + agent.value_weight * error - agent.entropy_weight * entropy
+    beyond = np.maximum(np.abs(output) - 2, 0)
+    assert beyond.any(), "some means are to be out of reach"
+    total = total / len(advantage) + 0.1 * (beyond**2).mean()
+    return total + agent.value_weight * error - agent.entropy_weight * entropy
 
 
 @pytest.mark.parametrize(
@@ -181,7 +184,7 @@ def test_loss_and_gradient(name, kind):
         # Some way from the policy that drew the actions, so that some ratios are clipped.
         leaves, structure = jax.tree.flatten(state.weights)
         noise = [
-            np.random.default_rng(i).normal(0, 0.3, leaf.shape) for i, leaf in enumerate(leaves)
+            np.random.default_rng(i).normal(0, 0.6, leaf.shape) for i, leaf in enumerate(leaves)
         ]
         weights = jax.tree.unflatten(structure, [x + n for x, n in zip(leaves, noise, strict=True)])
         loss = jax.jit(lambda weights: agent.loss(weights, batch)[0])
@@ -359,11 +362,21 @@ def test_reinforce_wants_whole_episodes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "limit"), [("ppo", 0.05), ("a2c", 0.12), ("reinforce", 0.12)])
-def test_presets_learn_the_pendulum(name, limit):
+@pytest.mark.parametrize(
+    ("name", "seed", "limit"),
+    [
+        ("ppo", 100, 0.05),
+        ("a2c", 100, 0.10),
+        # Lost, at a regret of 457 %, before means out of reach cost anything.
+        ("a2c", 236, 0.10),
+        ("a2c", 283, 0.10),
+        ("reinforce", 100, 0.08),
+    ],
+)
+def test_presets_learn_the_pendulum(name, seed, limit):
     """All well within public figures: A2C's −163 is a regret of 19 %, PPO's −172 one of 26 %."""
     fast = preset("fast", "pendulum", name)
-    run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=2, seed=100)
+    run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=2, seed=seed)
     regrets = run.grade()["regret_per_seed"]
     assert max(regrets) <= limit, regrets
     assert min(regrets) > -0.005, "nothing beats the optimum"

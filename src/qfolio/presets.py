@@ -125,18 +125,18 @@ _A2C = {
     "environments": 8,
     "rollout": 8,
     "trace": 0.95,
-    "discount": 0.98,
+    "discount": 0.99,
     "learning_rate": 1e-3,
     "learning_rate_steps": 15_616.0,
-    "entropy_weight": 0.01,
+    "entropy_weight": 0.02,
 }
 
 _REINFORCE = {
     **_ON_POLICY,
     "environments": 16,
     "rollout": 64,
-    "discount": 0.98,
-    "learning_rate": 1e-3,
+    "discount": 0.99,
+    "learning_rate": 2e-3,
     "learning_rate_steps": 3906.0,
 }
 

@@ -19,16 +19,13 @@ from qfolio.agents.actor_critic import ActorCritic, Batch, Critics, critic_loss
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require
 from qfolio.learning import optimizer
-from qfolio.learning.networks import Network, outputs_of
+from qfolio.learning.networks import Network, outputs_of, saturation
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import follow
 from qfolio.mdp import Box, Discrete, Metrics, Simplex, Task
 
-FLAT = 4.0
+REACH = 4.0
 """Output beyond which tanh counts as flat; there it is within 0.0007 of its bound."""
-
-SATURATION = 0.1
-"""What the square of an output's way beyond costs, in scaled reward."""
 
 
 class Actor(eqx.Module):
@@ -50,12 +47,6 @@ class Actor(eqx.Module):
         if math.isinf(self.actions.bound):
             return output
         return self.actions.bound * jnp.tanh(output)
-
-    def saturation(self, output: Float[Array, "batch entry"]) -> Float[Array, ""]:
-        """Mean square of how far outputs are where tanh is flat; 0 where there is no tanh."""
-        if isinstance(self.actions, Simplex) or math.isinf(self.actions.bound):
-            return jnp.array(0.0)
-        return (jnp.maximum(jnp.abs(output) - FLAT, 0.0) ** 2).sum(-1).mean()
 
     def perturb(
         self, action: Float[Array, "batch entry"], noise: Float[Array, "batch entry"]
@@ -83,11 +74,11 @@ def actor_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """Minus the mean of Q(s, π(s)), by the smaller critic where there are several.
 
-    No gradient leads back from where tanh is flat, so that going there costs a little.
+    Where tanh is flat there is something to pay.
     """
     output = actor.network(observation)
     value = critics(observation, actor.among(output)).min(0).mean()
-    return SATURATION * actor.saturation(output) - value, {}
+    return saturation(actor.actions, output, REACH) - value, {}
 
 
 class DDPG(ActorCritic):

@@ -22,6 +22,10 @@ from qfolio.learning.targets import advantages
 from qfolio.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 
 
+REACH = 2.0
+"""Mean, in bounds, beyond which nearly all draws count as cut to the bound."""
+
+
 class PolicyAndValue(eqx.Module):
     """A policy (the actor) and the discounted return that it is expected to earn (the critic)."""
 
@@ -153,12 +157,14 @@ class OnPolicy(Agent):
         """What the policy raises, by the log density that it gives to the batch's actions."""
 
     def loss(self, weights: PolicyAndValue, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
-        """Minus the objective, with the critic's error and the policy's entropy."""
-        policy = weights.policy(batch.observation)
+        """Minus the objective and the policy's entropy, with the critic's error."""
+        output = weights.actor(batch.observation)
+        policy = policy_of(weights.actions, output, weights.log_std)
         loss = -self.objective(policy.log_prob(batch.action), batch).mean()
         value_loss = ((batch.goal - weights.value(batch.observation)) ** 2).mean()
         entropy = policy.entropy().mean()
         total = loss + self.value_weight * value_loss - self.entropy_weight * entropy
+        total += networks.saturation(weights.actions, output, REACH)
         return total, {"loss": loss, "value_loss": value_loss, "entropy": entropy}
 
     def descend(self, state: OnPolicyState, batch: Batch) -> tuple[OnPolicyState, Metrics]:

@@ -131,11 +131,8 @@ def policy_of(
     if isinstance(actions, Simplex):
         y = output[..., 1:] - output[..., :1]
         return LogisticNormal(Gaussian(y, jnp.broadcast_to(log_std, y.shape[-1:])))
-    # Far beyond the bounds all draws come to the same action, and nothing is learned any more; as
-    # far as twice the bound a mean can go, which keeps some draws within.
-    mean = 2 * jnp.tanh(output / 2) if math.isfinite(actions.bound) else output
     log_std = jnp.broadcast_to(log_std + math.log(actions.unit), output.shape[-1:])
-    return Gaussian(actions.unit * mean, log_std)
+    return Gaussian(actions.unit * output, log_std)
 
 
 def _with_cash(y: Float[Array, "*batch asset"]) -> Float[Array, "*batch entry"]:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.errors import QfolioError
 from qfolio.learning.encoders import CNN, LSTM, MLP, RNN, Window, uniform
-from qfolio.mdp import Actions, Discrete, Simplex, Task, View
+from qfolio.mdp import Actions, Box, Discrete, Simplex, Task, View
 
 
 class Flat(eqx.Module):
@@ -162,6 +162,19 @@ def outputs_of(actions: Actions) -> Outputs:
     if isinstance(actions, Discrete) and actions.each:
         return Outputs(actions.pooled, actions.each)
     return Outputs(actions.n)
+
+
+def saturation(
+    actions: Actions, output: Float[Array, "batch output"], reach: float
+) -> Float[Array, ""]:
+    """What an actor pays for outputs that all come to the same action, those beyond ±``reach``.
+
+    No gradient leads back from there. It is a tenth of the mean square of the way beyond, and 0
+    where actions have no bound.
+    """
+    if not isinstance(actions, Box) or math.isinf(actions.bound):
+        return jnp.array(0.0)
+    return 0.1 * (jnp.maximum(jnp.abs(output) - reach, 0.0) ** 2).sum(-1).mean()
 
 
 def build(
