@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.fields import number, require, sizes, static
 from qfolio.learning import networks, optimizer
-from qfolio.learning.networks import KINDS, Flat, Network
+from qfolio.learning.networks import Flat, Network
 from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
 from qfolio.learning.targets import huber_loss, possible_values, td_target
 from qfolio.mdp import Actions, Agent, Discrete, Metrics, Simplex, Task, Transition
@@ -112,13 +112,11 @@ class ActorCritic(Agent):
     def __check_init__(self) -> None:
         require_replay(self)
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
-        require(self, "input_gain actor_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "actor_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
-        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "discount target_rate", lambda x: 0 <= x <= 1, "between 0 and 1")
-        require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
         optimizer.require_schedule(self)
-        require_sizes(self)
+        networks.require_network(self)
 
     @abc.abstractmethod
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Any:

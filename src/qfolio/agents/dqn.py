@@ -26,11 +26,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from qfolio.agents import hindsight
 from qfolio.agents.hindsight import Move
 from qfolio.errors import QfolioError
-from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.fields import number, require, sizes, static
 from qfolio.learning import distributional, heads, optimizer
 from qfolio.learning.distributional import Values
 from qfolio.learning.exploration import epsilon_greedy, epsilon_now
-from qfolio.learning.networks import KINDS, Network
+from qfolio.learning.networks import Network, require_network
 from qfolio.learning.priorities import Priorities
 from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
 from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
@@ -102,16 +102,14 @@ class DQN(Agent):
         require_replay(self)
         require(self, "target_period", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
-        require(self, "input_gain noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         optimizer.require_schedule(self)
-        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
         fractions = "discount target_rate epsilon epsilon_end epsilon_decay"
         require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
         exponents = "priority_exponent importance_exponent"
         require(self, exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
-        require_sizes(self)
-        require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+        require_network(self)
         distributional.require_values(self)
         if self.all_actions:
             hindsight.require_plain(self)

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.fields import number, require, sizes, static
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
-from qfolio.learning.networks import KINDS, Flat, Network, Outputs, outputs_of
+from qfolio.learning.networks import Flat, Network, Outputs, outputs_of
 from qfolio.learning.targets import advantages
 from qfolio.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 
@@ -83,11 +83,8 @@ class OnPolicy(Agent):
         require(self, "gradient_norm", lambda x: x > 0, "greater than 0")
         require(self, "value_weight entropy_weight", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "std", lambda x: 1e-9 <= x <= 1e9, "from 10⁻⁹ to 10⁹")
-        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-        require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
         optimizer.require_schedule(self)
-        require_sizes(self)
+        networks.require_network(self)
 
     @property
     def rollout_steps(self) -> int:

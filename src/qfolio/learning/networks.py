@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.errors import QfolioError
+from qfolio.fields import require, require_sizes
 from qfolio.learning.encoders import CNN, LSTM, MLP, RNN, Window, uniform
 from qfolio.mdp import Actions, Box, Discrete, Simplex, Task, View
 
@@ -175,6 +176,14 @@ def saturation(
     if not isinstance(actions, Box) or math.isinf(actions.bound):
         return jnp.array(0.0)
     return 0.1 * (jnp.maximum(jnp.abs(output) - reach, 0.0) ** 2).sum(-1).mean()
+
+
+def require_network(agent: Any) -> None:
+    """Raises QfolioError where the settings of an agent's networks make no sense."""
+    require(agent, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+    require_sizes(agent)
+    require(agent, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+    require(agent, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
 
 
 def build(
