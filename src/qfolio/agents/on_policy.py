@@ -21,7 +21,6 @@ from qfolio.learning.networks import Flat, Network, Outputs, outputs_of
 from qfolio.learning.targets import advantages
 from qfolio.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 
-
 REACH = 2.0
 """Mean, in bounds, beyond which nearly all draws count as cut to the bound."""
 
