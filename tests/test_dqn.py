@@ -12,6 +12,7 @@ from qfolio.learning import heads
 from qfolio.learning.distributional import Categorical, project, quantile_huber_loss
 from qfolio.learning.encoders import MLP
 from qfolio.learning.optimizer import learning_rate
+from qfolio.learning.replay import Experience
 from qfolio.learning.targets import bootstrap, chosen, huber_loss, possible_values, td_target
 from qfolio.mdp import Transition
 from qfolio.presets import preset
@@ -375,6 +376,22 @@ def test_sizes_of_noise_are_learned(task, agent):
     noisy = gradient.mlp.streams[0]
     assert largest(noisy.weight_scales) > 0
     assert largest(noisy.bias_scales) > 0
+
+
+def test_goals_are_without_noise(task, agent):
+    """Only the values that are compared with them are noisy."""
+    agent = dataclasses.replace(agent, noisy=True, double=True, noise_scale=0.0)
+    quiet = agent.init(task, jax.random.key(0)).online
+    loud = dataclasses.replace(agent, noise_scale=5.0).init(task, jax.random.key(0)).online
+    batch = jax.tree.map(lambda x: jnp.ones((4, *x.shape), x.dtype), Experience.like(jnp.ones(3)))
+    batch = batch._replace(terminal=jnp.zeros(4, bool))
+
+    def spread(online, target):
+        each = lambda key: agent._losses(online, target, batch, 0.9, key).each  # noqa: E731
+        return np.ptp(jax.vmap(each)(jax.random.split(jax.random.key(1), 5)), axis=0)
+
+    np.testing.assert_array_equal(spread(quiet, loud), 0)
+    assert (spread(loud, quiet) > 1e-3).all()
 
 
 def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):

@@ -71,14 +71,10 @@ _RAINBOW = {
     "n_steps": 2,
     "prioritised": True,
     "values": "quantile",
-    "atoms": 16,
+    "atoms": 8,
     "noisy": True,
     "noise_scale": 0.1,
-    "epsilon": 0.0,
-    "epsilon_end": 0.0,
     "updates": 2,
-    "discount": 0.99,
-    "huber": 1.0,
     "learning_rate_steps": 15_000.0,
 }
 

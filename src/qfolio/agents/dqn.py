@@ -267,14 +267,11 @@ class DQN(Agent):
         key: PRNGKeyArray,
     ) -> Losses:
         """discount: of what follows the batch's rewards. key: of the noise."""
-        selecting = online
-        if self.noisy:
-            keys = jax.random.split(key, 3)
-            online, target, selecting = map(heads.draw_noise, (online, target, online), keys)
+        noisy = heads.draw_noise(online, key) if self.noisy else online
         values = self._values
-        z = self._read(online, batch.observation)
+        z = self._read(noisy, batch.observation)
         z_next = self._read(target, batch.next_observation)
-        selector = self._read(selecting, batch.next_observation) if self.double else z_next
+        selector = self._read(online, batch.next_observation) if self.double else z_next
         following = bootstrap(z_next, values.mean(selector))
 
         reward = self.reward_scale * batch.reward
