@@ -11,6 +11,7 @@ from qfolio.files import read_tree, write_tree
 from qfolio.learning import heads
 from qfolio.learning.distributional import Categorical, project, quantile_huber_loss
 from qfolio.learning.encoders import MLP
+from qfolio.learning.exploration import epsilon_greedy
 from qfolio.learning.optimizer import learning_rate
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import bootstrap, chosen, huber_loss, possible_values, td_target
@@ -230,7 +231,7 @@ def test_adam_equals_its_formula(task):
         {"n_steps": 0}, {"n_steps": 30, "environments": 4, "replay_capacity": 100},
         {"priority_exponent": 1.1}, {"values": "means"}, {"atoms": 1, "values": "categorical"},
         {"v_max": -10.0, "values": "categorical"}, {"huber": float("inf"), "values": "quantile"},
-        {"noise_scale": -1.0},
+        {"noise_scale": -1.0}, {"persistence": 1.5},
     ],
 )  # fmt: skip
 def test_refuses_what_makes_no_sense(settings):
@@ -240,7 +241,7 @@ def test_refuses_what_makes_no_sense(settings):
 
 @pytest.mark.parametrize(
     "changes", [{"values": "quantile", "huber": 1.0}, {"n_steps": 2}, {"prioritised": True},
-                {"noisy": True}],
+                {"noisy": True}, {"persistence": 0.5}],
 )  # fmt: skip
 def test_all_actions_refuses_what_moves_do_not_give(changes):
     with pytest.raises(QfolioError, match=f"take {next(iter(changes))}="):
@@ -367,6 +368,28 @@ def test_noise_is_drawn_anew_for_each_act_and_explores(task):
     state = quiet.init(task, jax.random.key(0))
     actions = jax.vmap(act)(jax.random.split(jax.random.key(1), 50))
     assert set(actions.tolist()) == {int(quiet.policy(state.online, observation)[0])}
+
+
+def test_exploring_goes_on_with_the_last_action(task):
+    """With ε = 1 and full persistence every action is the last one of its environment."""
+    agent = DQN(hidden=(8,), environments=3, replay_capacity=7, persistence=1.0, learning_starts=3)
+    state = agent.init(task, jax.random.key(0))
+    for turn in range(5):  # the ring of 9 rows begins anew
+        last = jnp.array([turn, 1, 2]) % 3
+        steps = rollout(agent)
+        state = agent.observe(state, steps._replace(action=last[None]))
+        seen = agent.act(state, jnp.ones((3, 3)), jax.random.key(turn))
+        np.testing.assert_array_equal(seen, last)
+
+
+def test_how_often_the_last_action_comes_again():
+    """ε · persistence, and else ε-greedy: 0.6 · 0.5 = 0.3, and 0.7 · (0.6 / 4) by chance."""
+    values, last = jnp.array([[0.0, 9.0, 0.0, 0.0]]), jnp.array([2])
+    draw = lambda key: epsilon_greedy(key, values, 0.6, last, 0.5)[0]  # noqa: E731
+    actions = jax.vmap(draw)(jax.random.split(jax.random.key(0), 20_000))
+    shares = np.bincount(actions, minlength=4) / len(actions)
+    chance = 0.7 * 0.6 / 4
+    np.testing.assert_allclose(shares, [chance, 0.7 * 0.4 + chance, 0.3 + chance, chance], atol=0.01)
 
 
 def test_sizes_of_noise_are_learned(task, agent):

@@ -277,7 +277,7 @@ def _gym_dqn(id: str, steps: int, **changes: Any) -> dict[str, Preset]:
 
 
 def _torque(agent: str, **changes: Any) -> dict[str, Preset]:
-    """The pendulum with any torque; 8,000 gradient steps."""
+    """The pendulum with any torque; 8,000 steps of all environments."""
     changes = {**_TORQUE, **changes}
     episodes = 289 * changes["environments"]
     return {"fast": Preset(agent, changes, episodes, seeds=8, task={"torques": 0})}
@@ -352,7 +352,13 @@ PRESETS = {
         "fast": Preset("reinforce", _REINFORCE, episodes=62_496, seeds=8, task={"torques": 0}),
     },
     ("pendulum", "ddpg"): _torque(
-        "ddpg", environments=32, replay_capacity=262_144, exploration=0.3, actor_rate=0.3
+        "ddpg",
+        environments=32,
+        replay_capacity=262_144,
+        updates=2,
+        learning_rate_steps=16_000.0,
+        exploration=0.3,
+        actor_rate=0.3,
     ),
     ("pendulum", "td3"): _torque("td3", policy_delay=1, target_noise=0.05, exploration=0.3),
     ("pendulum", "sac"): _torque("sac", spread=0.05),
@@ -391,16 +397,20 @@ PRESETS = {
     ("gym:CartPole-v1", "dqn"): _gym_dqn("CartPole-v1", 120_000, discount=0.98, epsilon_end=0.05),
     ("gym:CartPole-v1", "ppo"): {"fast": _gym("CartPole-v1", "ppo", 100_000, **_GYM_PPO)},
     ("gym:Acrobot-v1", "dqn"): _gym_dqn("Acrobot-v1", 60_000),
-    # The goal is hardly ever found by chance, but what was never tried keeps its value of about 0,
-    # above all that was; unless returns over steps and a flat first layer level it down.
+    # The goal is hardly ever found by chance. What was never tried keeps its value of about 0, above
+    # all that was, unless returns over steps, a stream for V or a flat first layer level it down;
+    # and a push that lasts gets there.
     ("gym:MountainCar-v0", "dqn"): _gym_dqn(
         "MountainCar-v0",
-        240_000,
+        400_000,
         input_gain=10.0,
+        dueling=False,
         n_steps=1,
+        discount=0.98,
         environments=16,
         replay_capacity=262_144,
         epsilon_decay=0.98,
+        persistence=0.9,
         reward_scale=0.03,
     ),
     ("gym:LunarLander-v3", "dqn"): _gym_dqn(

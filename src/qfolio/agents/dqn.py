@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from qfolio.agents import hindsight
 from qfolio.agents.hindsight import Move
 from qfolio.errors import QfolioError
-from qfolio.fields import number, require, sizes, static
+from qfolio.fields import constant, number, require, sizes, static
 from qfolio.learning import distributional, heads, optimizer
 from qfolio.learning.distributional import Values
 from qfolio.learning.exploration import epsilon_greedy, epsilon_now
@@ -94,6 +94,7 @@ class DQN(Agent):
     epsilon: float = number(1.0)
     epsilon_end: float = number(0.01)
     epsilon_decay: float = number(0.995)  # factor per finished episode
+    persistence: float = constant(0.0)  # share of exploring steps that repeat the last action
     huber: float = number(math.inf)  # |TD error| beyond which the loss is linear; inf: squared
     reward_scale: float = number(1.0)  # the network learns values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
@@ -105,7 +106,7 @@ class DQN(Agent):
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         optimizer.require_schedule(self)
         require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
-        fractions = "discount target_rate epsilon epsilon_end epsilon_decay"
+        fractions = "discount target_rate epsilon epsilon_end epsilon_decay persistence"
         require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
         exponents = "priority_exponent importance_exponent"
         require(self, exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
@@ -183,7 +184,9 @@ class DQN(Agent):
         if self.noisy:
             key, noise_key = jax.random.split(key)
             online = heads.draw_noise(online, noise_key)
-        return epsilon_greedy(key, self._q(online, observation), epsilon_now(self, state.episodes))
+        epsilon = epsilon_now(self, state.episodes)
+        last = state.replay.latest().action if self.persistence else None
+        return epsilon_greedy(key, self._q(online, observation), epsilon, last, self.persistence)
 
     def _q(self, network: Network, observation: PyTree) -> Float[Array, "batch action"]:
         return self._values.mean(self._read(network, observation))

@@ -16,8 +16,19 @@ def epsilon_greedy(
     key: PRNGKeyArray,
     values: Float[Array, "batch action"],
     epsilon: Float[Array, ""] | float,
+    last: Int[Array, " batch"] | None = None,
+    persistence: float = 0.0,
 ) -> Int[Array, " batch"]:
-    """The best action, or with probability ε any."""
+    """The best action, or with probability ε any; or else, before that, the ``last`` one again.
+
+    That has the probability ε · persistence, so that what explores goes on with what it does for
+    a while (temporally extended, Dabney et al. 2021, here of geometric lengths).
+    """
+    if last is not None:
+        key, again_key = jax.random.split(key)
+        drawn = epsilon_greedy(key, values, epsilon)
+        again = jax.random.uniform(again_key, last.shape) < epsilon * persistence
+        return jnp.where(again, last, drawn)
     n, greedy = values.shape[-1], values.argmax(-1)
     # One uniform decides both: below ε explore, and where below ε it fell picks the action.
     uniform = jax.random.uniform(key, greedy.shape)

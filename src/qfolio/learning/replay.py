@@ -132,6 +132,11 @@ class Replay(eqx.Module):
     def at(self, index: Int[Array, " n"]) -> PyTree:
         return self.unpack(self.rows[index])
 
+    def latest(self) -> PyTree:
+        """The ``width`` rows that were written last; zeros before the first."""
+        start = (self.position - self.width) % self.rows.shape[0]
+        return self.unpack(lax.dynamic_slice_in_dim(self.rows, start, self.width))
+
     def ahead(self, index: Int[Array, " n"]) -> PyTree:
         """Rows and those of the next writes at the same place; leading axes (``steps``, n)."""
         offset = self.width * jnp.arange(self.steps)[:, None]
