@@ -397,9 +397,9 @@ PRESETS = {
     ("gym:CartPole-v1", "dqn"): _gym_dqn("CartPole-v1", 120_000, discount=0.98, epsilon_end=0.05),
     ("gym:CartPole-v1", "ppo"): {"fast": _gym("CartPole-v1", "ppo", 100_000, **_GYM_PPO)},
     ("gym:Acrobot-v1", "dqn"): _gym_dqn("Acrobot-v1", 60_000),
-    # The goal is hardly ever found by chance. A push that lasts gets there; and what was never tried
-    # keeps its value of about 0, above all that was, unless returns over steps, a stream for V or a
-    # flat first layer level it down.
+    # The goal is hardly ever found by chance. A push that lasts gets there; and what was never
+    # tried keeps its value of about 0, above all that was, unless returns over steps, a stream for
+    # V or a flat first layer level it down.
     ("gym:MountainCar-v0", "dqn"): _gym_dqn(
         "MountainCar-v0",
         400_000,
