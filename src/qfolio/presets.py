@@ -409,7 +409,6 @@ PRESETS = {
         discount=0.98,
         environments=16,
         replay_capacity=262_144,
-        epsilon_decay=0.98,
         persistence=0.9,
         reward_scale=0.03,
     ),
