@@ -37,8 +37,11 @@ class Move(NamedTuple):
 
 def require_plain(agent: Any) -> None:
     """Raises QfolioError where an agent wants what moves and holdings drawn anew do not give."""
-    plain = {"n_steps": 1, "prioritised": False, "noisy": False, "persistence": 0.0}
-    for name, value in {"values": "expected", **plain}.items():
+    plain: dict[str, Any] = {
+        "values": "expected", "n_steps": 1, "prioritised": False, "noisy": False,
+        "persistence": 0.0,
+    }  # fmt: skip
+    for name, value in plain.items():
         if getattr(agent, name) != value:
             raise QfolioError(
                 "all_actions learns expected values from single moves, all drawn alike, and needs "

@@ -19,10 +19,11 @@ def epsilon_greedy(
     last: Int[Array, " batch"] | None = None,
     persistence: float = 0.0,
 ) -> Int[Array, " batch"]:
-    """The best action, or with probability ε any; or else, before that, the ``last`` one again.
+    """The best action, or with probability ε any.
 
-    That has the probability ε · persistence, so that what explores goes on with what it does for
-    a while (temporally extended, Dabney et al. 2021, here of geometric lengths).
+    Where the ``last`` actions are given, they come again with probability ε · persistence, before
+    anything is chosen: what explores goes on with it for a while (after Dabney et al. 2021,
+    "Temporally-extended ε-greedy exploration").
     """
     if last is not None:
         key, again_key = jax.random.split(key)
