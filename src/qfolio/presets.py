@@ -92,7 +92,7 @@ _CATCH = {
     "discount": 0.97,
     "learning_rate": 1e-3,
     "learning_rate_final": 0.0,
-    "learning_rate_steps": 12_000.0,
+    "learning_rate_steps": 36_000.0,
     "epsilon_end": 0.1,
     "epsilon_decay": 0.9995,
 }
@@ -337,7 +337,7 @@ PRESETS = {
         "fast": Preset(
             "dqn",
             _CATCH,
-            episodes=38_400,
+            episodes=115_200,
             seeds=8,
             task={"rows": 12, "columns": 11, "decoys": 3},
         ),
