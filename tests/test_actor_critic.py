@@ -15,6 +15,7 @@ from qfolio.agents.td3 import TD3
 from qfolio.errors import QfolioError
 from qfolio.learning.distributions import Gaussian, LogisticNormal, Squashed
 from qfolio.learning.replay import Experience
+from qfolio.learning.targets import squash, unsquash
 from qfolio.mdp import Box, Discrete, Simplex, Transition
 from qfolio.presets import preset
 from qfolio.runs import train
@@ -84,10 +85,10 @@ def batch_of(n=6, actions=None):
 # Values and policies that are known by hand
 
 
-@pytest.mark.parametrize("kind", [DDPG, TD3])
-def test_a_deterministic_actor_finds_the_best_action_and_its_value(kind):
+@pytest.mark.parametrize(("kind", "rescale"), [(DDPG, False), (DDPG, True), (TD3, False)])
+def test_a_deterministic_actor_finds_the_best_action_and_its_value(kind, rescale):
     noise = {"target_noise": 0.2, "target_clip": 0.1} if kind is TD3 else {}
-    end = learned(Aim(), kind(**SMALL, exploration=0.2, **noise))
+    end = learned(Aim(), kind(**SMALL, exploration=0.2, rescale_values=rescale, **noise))
     np.testing.assert_allclose(end.actor(STATES), BEST, atol=0.08)  # 2 % of the range
     values = end.critics(STATES, BEST).mean(0)
     # Noise on the target's actions takes its variance off each later step.
@@ -258,6 +259,23 @@ def test_what_follows_is_brought_to_what_rewards_allow():
     np.testing.assert_allclose(goal, [-9.9, 4.5, 2.7, 0], rtol=1e-5)
 
 
+def test_critics_learn_roots_of_values():
+    """√(1 + |v|) − 1 with the sign of v; the critics' own numbers stay values."""
+    values, roots = jnp.array([0.0, 3.0, -8.0, 99.0]), jnp.array([0.0, 1.0, -2.0, 9.0])
+    np.testing.assert_allclose(squash(values), roots, atol=1e-6)
+    np.testing.assert_allclose(unsquash(roots), values, atol=1e-6)
+    plain, rescaled = begun(DDPG(hidden=(8,))), begun(DDPG(hidden=(8,), rescale_values=True))
+    batch = batch_of()
+    output = plain.critics(batch.observation, batch.action)
+    np.testing.assert_allclose(
+        rescaled.critics(batch.observation, batch.action), unsquash(output), rtol=1e-6
+    )
+    goal = jnp.linspace(-8.0, 3.0, 6)
+    loss, _ = critic_loss(rescaled.critics, batch, goal, math.inf)
+    expected, _ = critic_loss(plain.critics, batch, squash(goal), math.inf)
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+
+
 def test_all_rewards_count_however_old():
     agent = DDPG(hidden=(8,), environments=2, replay_capacity=2, learning_starts=2)
     state = agent.init(Aim(), jax.random.key(0))
@@ -291,6 +309,7 @@ def test_gradients_against_differences():
         batch = double(batch_of())
         goal = jnp.linspace(-1.0, 1.0, 6)
         deterministic, soft = double(begun(DDPG(hidden=(8, 8)))), double(begun(SAC(hidden=(8, 8))))
+        rescaled = double(begun(DDPG(hidden=(8, 8), rescale_values=True)))
         weighed = SAC(hidden=(8, 8))
         view = jax.vmap(AimWeights().observe)(batch.observation[:, 0])
         view_of_one = jax.tree.map(lambda x: x[0], view)
@@ -308,6 +327,14 @@ def test_gradients_against_differences():
             "critic of numbers": (
                 lambda c: critic_loss(c, numbers, goal, jnp.inf)[0],
                 numbered.critics,
+            ),
+            "critic of roots": (
+                lambda c: critic_loss(c, batch, goal, jnp.inf)[0],
+                rescaled.critics,
+            ),
+            "actor by roots": (
+                lambda a: ddpg.actor_loss(a, rescaled.critics, batch.observation)[0],
+                rescaled.actor,
             ),
             "deterministic actor": (
                 lambda a: ddpg.actor_loss(a, deterministic.critics, batch.observation)[0],
@@ -335,6 +362,7 @@ def test_soft_values_by_hand():
     class FixedCritics(Critics):
         def __init__(self):
             self.networks = Fixed(jnp.array([[1.0, 5.0], [4.0, 2.0]]))
+            self.rescaled = False
 
     actor = sac.Actor(Fixed(jnp.log(jnp.array([1.0, 3.0]))), Discrete(2))
     q, entropy = sac.expectations(actor, FixedCritics(), jnp.zeros((1, 1)), jax.random.key(0))

@@ -406,7 +406,8 @@ def test_goals_are_without_noise(task, agent):
     agent = dataclasses.replace(agent, noisy=True, double=True, noise_scale=0.0)
     quiet = agent.init(task, jax.random.key(0)).online
     loud = dataclasses.replace(agent, noise_scale=5.0).init(task, jax.random.key(0)).online
-    batch = jax.tree.map(lambda x: jnp.ones((4, *x.shape), x.dtype), Experience.like(jnp.ones(3)))
+    row = Experience.like(jnp.ones(3), jnp.array(0))
+    batch = jax.tree.map(lambda x: jnp.ones((4, *x.shape), x.dtype), row)
     batch = batch._replace(terminal=jnp.zeros(4, bool))
 
     def spread(online, target):

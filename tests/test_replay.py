@@ -87,7 +87,7 @@ def test_returns_over_steps_by_hand():
 
 def test_steps_are_joined_up_to_the_end_of_their_episode():
     """A termination leaves nothing to follow; a truncation leads to its own next observation."""
-    row = Experience.like(jnp.zeros(1), with_last=True)
+    row = Experience.like(jnp.zeros(1), jnp.array(0), with_last=True)
     replay = Replay.empty(row, 6, 2, steps=3)
     ends = [[False, False], [True, True], [False, False]]
     terminal = [[False, False], [True, False], [False, True]]

@@ -53,6 +53,8 @@ _FAST = {
     "epsilon_decay": 0.995,
     "huber": 0.3,
     "reward_scale": 0.3,
+    "v_min": -100.0,
+    "v_max": 100.0,
 }
 
 _BEST = {
@@ -145,14 +147,14 @@ _TORQUE = {
     "n_steps": 2,
     "replay_capacity": 131_072,
     "learning_starts": 1024,
-    "target_rate": 0.03,
+    "target_rate": 0.02,
     "discount": 0.995,
     "learning_rate": 3e-3,
     "learning_rate_final": 0.0,
     "learning_rate_steps": 8000.0,
     "actor_rate": 0.6,
     "huber": 0.3,
-    "reward_scale": 0.3,
+    "rescale_values": True,
 }
 
 _MODEL = {  # 2,000 real steps, with 4 gradient steps of SAC for each behind the first 200

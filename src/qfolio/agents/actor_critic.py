@@ -14,14 +14,13 @@ from typing import Any, NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.fields import number, require, sizes, static
 from qfolio.learning import networks, optimizer
 from qfolio.learning.networks import Flat, Network
 from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
-from qfolio.learning.targets import huber_loss, possible_values, td_target
+from qfolio.learning.targets import huber_loss, possible_values, squash, td_target, unsquash
 from qfolio.mdp import Actions, Agent, Discrete, Metrics, Simplex, Task, Transition
 
 Weights = TypeVar("Weights", bound=PyTree)
@@ -43,19 +42,33 @@ class Critics(eqx.Module):
     """
 
     networks: Network  # with a leading critic axis
+    rescaled: bool = eqx.field(static=True)  # the networks give roots of values
 
-    def __init__(self, make: Callable[[PRNGKeyArray], Network], n: int, key: PRNGKeyArray) -> None:
+    def __init__(
+        self, make: Callable[[PRNGKeyArray], Network], n: int, rescaled: bool, key: PRNGKeyArray
+    ) -> None:
         self.networks = jax.vmap(make)(jax.random.split(key, n))
+        self.rescaled = rescaled
 
     def __call__(self, observation: PyTree, action: Array) -> Float[Array, "critic batch"]:
         """Q(s, a) of each critic."""
         if jnp.issubdtype(action.dtype, jnp.integer):
             return jnp.take_along_axis(self.every(observation), action[None, :, None], -1)[..., 0]
-        return jax.vmap(lambda network: network((observation, action))[:, 0])(self.networks)
+        return self._values(lambda network: network((observation, action))[:, 0])
 
     def every(self, observation: PyTree) -> Float[Array, "critic batch action"]:
         """Q(s, ·) of each critic, where actions are numbered."""
-        return jax.vmap(lambda network: network(observation))(self.networks)
+        return self._values(lambda network: network(observation))
+
+    def _values(self, read: Callable[[Any], Array]) -> Array:
+        outputs = jax.vmap(read)(self.networks)
+        return unsquash(outputs) if self.rescaled else outputs
+
+    def errors(
+        self, q: Float[Array, "critic batch"], goal: Float[Array, " batch"]
+    ) -> Float[Array, "critic batch"]:
+        """How far off the networks' outputs were, when they said ``q``."""
+        return squash(q) - squash(goal) if self.rescaled else q - goal
 
 
 def critic_loss(
@@ -66,7 +79,7 @@ def critic_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """Mean Huber loss of the errors to one goal, summed over the critics; and what to report."""
     q = critics(batch.observation, batch.action)
-    loss = huber_loss(q - goal, huber).mean(1).sum()
+    loss = huber_loss(critics.errors(q, goal), huber).mean(1).sum()
     return loss, {"loss": loss, "q": q.mean()}
 
 
@@ -108,6 +121,7 @@ class ActorCritic(Agent):
     reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
     huber: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
+    rescale_values: bool = static(False)  # critics learn roots of values: small ones weigh more
 
     def __check_init__(self) -> None:
         require_replay(self)
@@ -132,14 +146,8 @@ class ActorCritic(Agent):
 
     def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState:
         observation = task.observe(task.reset(key))
-        row = Experience(
-            observation=observation,
-            action=uniform(task.actions, key, 1)[0],
-            reward=jnp.array(0.0),
-            next_observation=observation,
-            terminal=jnp.array(False),
-            last=jnp.array(False) if self.n_steps > 1 else None,
-        )
+        action = uniform(task.actions, key, 1)[0]
+        row = Experience.like(observation, action, with_last=self.n_steps > 1)
         learned = self.begin(task, observation, key)
         replay = Replay.empty(row, self.replay_capacity, self.environments, self.n_steps)
         none = jnp.array([jnp.inf, -jnp.inf])
@@ -187,12 +195,8 @@ class ActorCritic(Agent):
             batch = Batch(*join(replay, index, self.discount), rewards)
             return self.update(learned, batch, key)
 
-        if self.updates == 1:
-            learned, metrics = update(learned, key)
-        else:
-            learned, metrics = lax.scan(update, learned, jax.random.split(key, self.updates))
-        means = {name: value.mean() for name, value in metrics.items()}
-        return learned, {**means, "q": means["q"] / self.reward_scale}
+        learned, metrics = optimizer.repeat(update, learned, self.updates, key)
+        return learned, {**metrics, "q": metrics["q"] / self.reward_scale}
 
     def carry_over(self, state: ActorCriticState, fresh: ActorCriticState) -> ActorCriticState:
         return eqx.tree_at(lambda s: (s.replay, s.rewards), state, (fresh.replay, fresh.rewards))
@@ -246,4 +250,4 @@ class ActorCritic(Agent):
         gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
         gains = jnp.append(gain, jnp.full(action.shape, 1 / task.actions.unit))
         make = lambda key: Flat((observation, action), self.hidden, 1, key, gains)  # noqa: E731
-        return Critics(make, count, key)
+        return Critics(make, count, self.rescale_values, key)

@@ -101,16 +101,15 @@ class DQN(Agent):
 
     def __check_init__(self) -> None:
         require_replay(self)
+        require_network(self)
+        optimizer.require_schedule(self)
         require(self, "target_period", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        optimizer.require_schedule(self)
         require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
         fractions = "discount target_rate epsilon epsilon_end epsilon_decay persistence"
-        require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
-        exponents = "priority_exponent importance_exponent"
-        require(self, exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
-        require_network(self)
+        exponents = " priority_exponent importance_exponent"
+        require(self, fractions + exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
         distributional.require_values(self)
         if self.all_actions:
             hindsight.require_plain(self)
@@ -141,12 +140,12 @@ class DQN(Agent):
         state = task.reset(key)
         observation = task.observe(state)
         online = heads.build(self, task, observation, self._values.atoms, key)
+        zero = jnp.array(0, jnp.int32)
         if self.all_actions:
             hindsight.require_exogenous(task)
             row: Experience | Move = Move(state.market, state.market)
         else:
-            row = Experience.like(observation, with_last=self.n_steps > 1)
-        zero = jnp.array(0, jnp.int32)
+            row = Experience.like(observation, zero, with_last=self.n_steps > 1)
         return DQNState(
             online=online,
             target=online,
@@ -212,27 +211,21 @@ class DQN(Agent):
         self, task: Task, state: DQNState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[DQNState, Metrics]:
         state = self.observe(state, rollout)
-        replay = state.replay
-        update = partial(self._update, task, replay, state.target)
-        carry = (state.online, state.optimizer, replay.priorities)
-        if self.updates == 1:
-            carry, (loss, max_q) = update(carry, key)
-        else:
-            carry, (loss, max_q) = lax.scan(update, carry, jax.random.split(key, self.updates))
-        online, adam, priorities = carry
-
+        update = partial(self._update, task, state.replay, state.target)
+        learned = (state.online, state.optimizer, state.replay.priorities)
+        learned, metrics = optimizer.repeat(update, learned, self.updates, key)
+        online, adam, priorities = learned
         due = state.steps % self.target_period == 0
         rate = self.target_rate if self.target_period == 1 else jnp.where(due, self.target_rate, 0)
         target = follow(state.target, online, rate)
-        replay = dataclasses.replace(replay, priorities=priorities)
-        state = DQNState(online, target, adam, replay, state.episodes, state.steps)
-        return state, {"loss": loss.mean(), "max_q": max_q.mean()}
+        replay = dataclasses.replace(state.replay, priorities=priorities)
+        return DQNState(online, target, adam, replay, state.episodes, state.steps), metrics
 
     def _update(
-        self, task: Task, replay: Replay, target: Network, carry: Learned, key: PRNGKeyArray
-    ) -> tuple[Learned, tuple[Float[Array, ""], Float[Array, ""]]]:
+        self, task: Task, replay: Replay, target: Network, learned: Learned, key: PRNGKeyArray
+    ) -> tuple[Learned, Metrics]:
         """One gradient step, with its loss and the batch's mean max_a Q(s, a)."""
-        online, adam, priorities = carry
+        online, adam, priorities = learned
         draw_key = key
         if self.all_actions or self.noisy:
             draw_key, key = jax.random.split(key)
@@ -251,10 +244,9 @@ class DQN(Agent):
 
         (loss, losses), gradient = jax.value_and_grad(objective, has_aux=True)(online)
         if priorities is not None and losses.off is not None:
-            # A little more, so that nothing is never drawn again.
-            priorities = priorities.set(index, (losses.off + 1e-6) ** self.priority_exponent)
+            priorities = priorities.follow(index, losses.off, self.priority_exponent)
         online, adam = optimizer.descend(self, online, gradient, adam)
-        return (online, adam, priorities), (loss, losses.max_q)
+        return (online, adam, priorities), {"loss": loss, "max_q": losses.max_q}
 
     def _importance_exponent(self, update: Int[Array, ""]) -> Float[Array, ""]:
         """β: a line from its first value to 1, which is there when the cosine of the rate ends."""
@@ -289,10 +281,7 @@ class DQN(Agent):
         self, task: Task, online: Network, target: Network, moves: Move, key: PRNGKeyArray
     ) -> Losses:
         assert isinstance(task, ExogenousTask)
-        error, q = hindsight.errors(
-            task, moves, key, partial(self._q, online), partial(self._q, target),
-            discount=self.discount, reward_scale=self.reward_scale,
-            double=self.double, baseline=self.market_baseline,
-        )  # fmt: skip
+        q = partial(self._q, online), partial(self._q, target)
+        error, values = hindsight.errors(self, task, moves, key, *q)
         each = huber_loss(error, self.huber)
-        return Losses(each, None, q.max(1).mean() / self.reward_scale)
+        return Losses(each, None, values.max(1).mean() / self.reward_scale)

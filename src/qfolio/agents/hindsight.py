@@ -64,20 +64,17 @@ def require_exogenous(task: Task) -> None:
 
 
 def errors(
+    agent: Any,
     task: ExogenousTask,
     moves: Move,
     key: PRNGKeyArray,
     online: Q,
     target: Q,
-    *,
-    discount: Float[Array, ""] | float,
-    reward_scale: Float[Array, ""] | float,
-    double: bool,
-    baseline: bool,
 ) -> tuple[Float[Array, "batch action"], Float[Array, "batch action"]]:
     """Goal less value for every action from a holding drawn for each move, and the values.
 
-    baseline: rewards count from what the same move pays another holder, on average over actions.
+    With the agent's ``market_baseline`` rewards count from what the same move pays another holder,
+    on average over actions.
     """
     count = len(jax.tree.leaves(moves)[0])
     holdings = jax.vmap(task.draw_holding)(jax.random.split(key, count))
@@ -89,7 +86,7 @@ def errors(
 
     actions = jnp.arange(q.shape[-1])
     reward, next_holdings = jax.vmap(partial(after, holdings))(actions)  # (action, batch)
-    if baseline:
+    if agent.market_baseline:
         # It depends on the market alone: taking it off leaves the best policy as it is, and takes
         # off what all actions have in common of the market's noise (input-dependent baselines, Mao
         # et al. 2019).
@@ -100,8 +97,8 @@ def errors(
     def goal(reward: Array, holding: PyTree) -> Array:
         view = jax.vmap(task.observe)(Position(moves.next_market, holding))
         q_next = target(view)
-        following = bootstrap(q_next, online(view) if double else q_next)
-        return td_target(reward_scale * reward, never, following, discount)
+        following = bootstrap(q_next, online(view) if agent.double else q_next)
+        return td_target(agent.reward_scale * reward, never, following, agent.discount)
 
     goals = lax.stop_gradient(jax.vmap(goal)(reward, next_holdings)).T
     return goals - q, q

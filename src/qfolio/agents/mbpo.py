@@ -173,10 +173,9 @@ class MBPO(SAC):
             return (members, adam), metrics
 
         carry = (state.model.members, state.model_adam)
-        keys = jax.random.split(key, self.model_updates)
-        (members, adam), metrics = lax.scan(update, carry, keys)
+        (members, adam), metrics = optimizer.repeat(update, carry, self.model_updates, key)
         model = eqx.tree_at(lambda m: m.members, state.model, members)
-        return model, adam, jax.tree.map(jnp.mean, metrics)
+        return model, adam, metrics
 
     def _imagine(self, model: Model, state: MBPOState, key: PRNGKeyArray) -> Replay:
         """The buffer of imagined steps, with those of the present policy and model."""

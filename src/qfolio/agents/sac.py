@@ -138,7 +138,7 @@ class SAC(ActorCritic):
         outputs = outputs_of(task.actions)
         if isinstance(task.actions, Discrete):
             make = partial(self.build, task, observation, outputs)
-            critics = Critics(make, 2, critic_key)
+            critics = Critics(make, 2, self.rescale_values, critic_key)
         else:
             critics = self.build_critics(task, observation, 2, critic_key)
             weights = isinstance(task.actions, Simplex)  # cash needs no standard deviation

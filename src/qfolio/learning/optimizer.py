@@ -1,13 +1,16 @@
 """Adam (Kingma & Ba 2015) with a cosine learning rate (Loshchilov & Hutter 2017)."""
 
+from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, PyTree
+from jax import lax
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.fields import require
+from qfolio.mdp import Metrics
 
 Weights = TypeVar("Weights", bound=PyTree)
 
@@ -30,6 +33,19 @@ def descend(
     if rate is None:
         rate = learning_rate(agent, optimizer.count)
     return jax.tree.map(lambda w, d: w - rate * d, weights, direction), optimizer
+
+
+def repeat(
+    update: Callable[[Weights, PRNGKeyArray], tuple[Weights, Metrics]],
+    weights: Weights,
+    times: int,
+    key: PRNGKeyArray,
+) -> tuple[Weights, Metrics]:
+    """``times`` gradient steps one after the other, and the means of their metrics."""
+    if times == 1:
+        return update(weights, key)
+    weights, metrics = lax.scan(update, weights, jax.random.split(key, times))
+    return weights, {name: value.mean() for name, value in metrics.items()}
 
 
 def clip(gradient: Weights, norm: Float[Array, ""] | float) -> Weights:

@@ -68,6 +68,12 @@ class Priorities(eqx.Module):
             node = node * FAN + child
         return node
 
+    def follow(
+        self, index: Int[Array, " n"], off: Float[Array, " n"], exponent: Float[Array, ""] | float
+    ) -> "Priorities":
+        """Rows set to how far ``off`` their values were, to the power of ``exponent`` (α)."""
+        return self.set(index, (off + 1e-6) ** exponent)  # a little more: any is drawn again
+
     def importance(
         self, index: Int[Array, " n"], exponent: Float[Array, ""] | float
     ) -> Float[Array, " n"]:

@@ -31,11 +31,11 @@ class Experience(NamedTuple):
     last: Bool[Array, "*batch"] | None = None  # of its episode; returns over steps stop there
 
     @staticmethod
-    def like(observation: PyTree, *, with_last: bool = False) -> "Experience":
-        """A row's shapes and types, where actions are numbered."""
+    def like(observation: PyTree, action: Array, *, with_last: bool = False) -> "Experience":
+        """An example of a row, for its shapes and types."""
         no = jnp.array(False)
-        action, reward = jnp.array(0, jnp.int32), jnp.array(0.0)
-        return Experience(observation, action, reward, observation, no, no if with_last else None)
+        last = no if with_last else None
+        return Experience(observation, action, jnp.array(0.0), observation, no, last)
 
     @staticmethod
     def of(

@@ -48,6 +48,20 @@ def possible_values(
     return jnp.stack([lowest.min(), highest.max()])
 
 
+def squash(value: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """sign(v)(√(1 + |v|) − 1): like v/2 near zero, like a root far from it.
+
+    Value rescaling of Pohlen et al. (2018, proposition A.2) without its small linear term, which
+    bounds the slope of the inverse; here values are bounded instead.
+    """
+    return value / (1 + jnp.sqrt(1 + jnp.abs(value)))
+
+
+def unsquash(root: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """The value whose ``squash`` is ``root``."""
+    return root * (2 + jnp.abs(root))
+
+
 def n_step(
     reward: Float[Array, "step batch"],
     last: Bool[Array, "step batch"],
