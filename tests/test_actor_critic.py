@@ -518,15 +518,12 @@ def test_refuses_what_makes_no_sense(kind, settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("agent", "limit"), [("ddpg", 0.10), ("td3", 0.05), ("sac", 0.05)])
-def test_fast_presets_swing_the_pendulum_up(agent, limit):
-    """What docs/actor_critic.md says of every seed; an idle agent loses 900 %.
-
-    DDPG is to come to 5 %, too, and does not yet: seed 100 ends at 6.6 %.
-    """
+@pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
+def test_fast_presets_swing_the_pendulum_up(agent):
+    """What docs/actor_critic.md says of every seed; an idle agent loses 900 %."""
     fast = preset("fast", "pendulum", agent)
     task = Pendulum(**fast.task)
     run = train(task, fast.build(), episodes=fast.episodes, seeds=2, seed=100)
     regrets = run.grade()["regret_per_seed"]
-    assert max(regrets) <= limit, regrets
+    assert max(regrets) <= 0.05, regrets
     assert min(regrets) > -0.005, "nothing beats the optimum"

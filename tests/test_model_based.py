@@ -8,8 +8,9 @@ import pytest
 
 from qfolio.agents.mbpo import MBPO, Model, model_loss
 from qfolio.errors import QfolioError
-from qfolio.learning.encoders import MLP
+from qfolio.learning.encoders import SmoothMLP
 from qfolio.learning.replay import Experience
+from qfolio.learning.targets import unsquash
 from qfolio.mdp import Box, Discrete, Transition
 from qfolio.presets import preset
 from qfolio.runs import train
@@ -37,8 +38,8 @@ class Constant(eqx.Module):
 
 
 def constant_model(actions=None):
-    """Three members: changes (1, 0), (2, 0) and (3, 0) of the range (1, 4); rewards 10, 20, 30."""
-    rows = jnp.array([[1.0, 0, 10, 0], [2, 0, 20, 0.4], [3, 0, 30, 0.6]])
+    """Three members: changes (1, 0), (2, 0) and (3, 0) of the range (1, 4); rewards 3, 8, 15."""
+    rows = jnp.array([[1.0, 0, 1, 0], [2, 0, 2, 0.4], [3, 0, 3, 0.6]])  # √(1 + r) − 1
     return Model(Constant(rows), jnp.array([1.0, 4.0]), actions or Box(1, 2.0))
 
 
@@ -46,7 +47,8 @@ def test_one_member_drawn_at_random_predicts_each_step():
     observation = jnp.tile(jnp.array([5.0, 7.0]), (3000, 1))
     action = jnp.zeros((3000, 1))
     step = constant_model().imagine(observation, action, jax.random.key(0))
-    member = np.asarray(step.reward / 10).astype(int)
+    member = np.searchsorted([3.0, 8.0, 15.0], np.asarray(step.reward)) + 1
+    np.testing.assert_allclose(step.reward, (member + 1) ** 2 - 1)
     np.testing.assert_allclose(np.bincount(member)[1:] / 3000, 1 / 3, atol=0.03)
     np.testing.assert_allclose(step.next_observation[:, 0], 5 + member)
     np.testing.assert_allclose(step.next_observation[:, 1], 7)
@@ -59,16 +61,16 @@ def steps(n=4, actions=None):
     return Experience(
         observation=observation,
         action=jnp.zeros((n, 1)),
-        reward=jnp.array([10.0, 30, 10, 30]),
+        reward=jnp.array([3.0, 15, 3, 15]),
         next_observation=observation + jnp.array([[1.0, 4], [1, -4], [3, 4], [3, -4]]),
         terminal=jnp.array([False, False, False, True]),
     )
 
 
 def test_the_models_loss_by_hand():
-    """Errors in units of the batch's standard deviations: 1 of both changes, 10 of the reward."""
+    """Errors in units of the batch's standard deviations, which are all 1."""
     model, step = constant_model(), steps()
-    truth = [[1.0, 1, 10, 0], [1, -1, 30, 0], [3, 1, 10, 0], [3, -1, 30, 1]]
+    truth = [[1.0, 1, 1, 0], [1, -1, 3, 0], [3, 1, 1, 0], [3, -1, 3, 1]]
     np.testing.assert_allclose(model.truth(step), truth)
     counts = jnp.zeros((4, 3)).at[0].set(jnp.array([1.0, 0, 2])).at[3, 1].set(1.0)
     first = 1.0 / 4  # the first step, by the first member: only the second change is wrong, by 1
@@ -93,7 +95,7 @@ def test_numbered_actions_are_told_apart():
 def test_the_models_gradient_against_differences():
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(1), 4)
-        members = jax.vmap(lambda key: MLP((3 + 11, 8, 3 + 2), key))(keys[:2])
+        members = jax.vmap(lambda key: SmoothMLP((3 + 11, 8, 3 + 2), key))(keys[:2])
         model = Model(members, jnp.array([1.0, 1, 8]), Discrete(11))
         step = Experience(
             observation=jax.random.normal(keys[0], (5, 3)),
@@ -151,9 +153,9 @@ def test_learns_values_from_imagined_steps():
     state = jax.tree.map(lambda x: jnp.array(x[0]), population.fetch().agent)
     states, best = jnp.array([[0.5], [-0.5]]), jnp.array([[1.0], [-1.0]])
     np.testing.assert_allclose(agent.policy(agent.weights(state), states), best, atol=0.05)
-    change, reward, terminal = jnp.split(state.model(states, best).mean(0), [1, 2], 1)
+    change, root, terminal = jnp.split(state.model(states, best).mean(0), [1, 2], 1)
     np.testing.assert_allclose(change, [[0], [0]], atol=0.02)
-    np.testing.assert_allclose(reward, [[1], [1]], atol=0.05)
+    np.testing.assert_allclose(unsquash(root), [[1], [1]], atol=0.05)
     np.testing.assert_allclose(terminal, [[0], [1]], atol=0.05)
     values = state.learned.critics(states, best).mean(0)
     np.testing.assert_allclose(values, [5, 1], rtol=0.05)  # hardly any entropy is wanted

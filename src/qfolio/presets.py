@@ -164,6 +164,8 @@ _MODEL = {  # 2,000 real steps, with 4 gradient steps of SAC for each behind the
     "n_steps": 1,
     "replay_capacity": 2048,
     "learning_starts": 200,
+    "target_rate": 0.03,
+    "discount": 0.99,
     "learning_rate_steps": 7200.0,
     "huber": math.inf,
     "updates": 4,

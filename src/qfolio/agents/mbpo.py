@@ -20,19 +20,24 @@ from qfolio.agents.sac import SAC
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
 from qfolio.learning import optimizer
-from qfolio.learning.encoders import MLP
+from qfolio.learning.encoders import SmoothMLP
 from qfolio.learning.replay import Experience, Replay
+from qfolio.learning.targets import squash, unsquash
 from qfolio.mdp import Actions, Discrete, Metrics, Task, Transition
+
+GAIN = 3.0
+"""Of the model's first layer: its inputs, which go to ±1, are to reach where SiLU bends."""
 
 
 class Model(eqx.Module):
     """An ensemble of networks; their weights have a leading axis.
 
     They see observations and actions taken to ±1, and predict the change of the observation in
-    units of its range, the reward, and whether nothing follows (as a number, 0 or 1).
+    units of its range, the reward's root, and whether nothing follows (as a number, 0 or 1).
+    Small rewards decide where large ones are avoided, and a root is finer near zero.
     """
 
-    members: MLP
+    members: SmoothMLP
     scale: Float[Array, " seen"]  # range of each component of an observation
     actions: Actions
 
@@ -50,7 +55,7 @@ class Model(eqx.Module):
     def truth(self, step: Experience) -> Float[Array, "batch seen+2"]:
         """What would have been right to predict."""
         change = (step.next_observation - step.observation) / self.scale
-        return jnp.column_stack([change, step.reward, step.terminal])
+        return jnp.column_stack([change, squash(step.reward), step.terminal])
 
     def imagine(
         self, observation: Float[Array, "batch seen"], action: Array, key: PRNGKeyArray
@@ -59,8 +64,9 @@ class Model(eqx.Module):
         expected = self(observation, action)
         member = jax.random.randint(key, expected.shape[1:2], 0, len(expected))
         drawn = expected[member, jnp.arange(len(member))]
-        change, reward, terminal = drawn[:, :-2], drawn[:, -2], drawn[:, -1] > 0.5
-        return Experience(observation, action, reward, observation + self.scale * change, terminal)
+        change, root, terminal = drawn[:, :-2], drawn[:, -2], drawn[:, -1] > 0.5
+        follows = observation + self.scale * change
+        return Experience(observation, action, unsquash(root), follows, terminal)
 
 
 def model_loss(
@@ -119,8 +125,9 @@ class MBPO(SAC):
         actions = task.actions
         entries = actions.n if isinstance(actions, Discrete) else uniform(actions, key, 1).shape[1]
         layers = (observation.size + entries, *self.model_hidden, observation.size + 2)
+        make = lambda key: SmoothMLP(layers, key, GAIN)  # noqa: E731
         model = Model(
-            jax.vmap(lambda key: MLP(layers, key))(jax.random.split(model_key, self.members)),
+            jax.vmap(make)(jax.random.split(model_key, self.members)),
             jnp.broadcast_to(jnp.array(task.observation_scale), observation.shape),
             actions,
         )

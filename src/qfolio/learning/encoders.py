@@ -46,9 +46,20 @@ class MLP(eqx.Module):
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         *hidden, last = zip(self.weights, self.biases, strict=True)
         for weight, bias in hidden:
-            x = jax.nn.relu(x @ weight + bias)
+            x = self.activate(x @ weight + bias)
         weight, bias = last
         return x @ weight + bias
+
+    def activate(self, x: Float[Array, "*batch units"]) -> Float[Array, "*batch units"]:
+        """What a layer's units give."""
+        return jax.nn.relu(x)
+
+
+class SmoothMLP(MLP):
+    """The same with SiLU, x σ(x), between the layers (Elfwing et al. 2018): no kinks."""
+
+    def activate(self, x: Float[Array, "*batch units"]) -> Float[Array, "*batch units"]:
+        return jax.nn.silu(x)
 
 
 class CNN(eqx.Module):
