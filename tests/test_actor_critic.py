@@ -129,8 +129,9 @@ def test_a_soft_actor_finds_the_best_distribution_its_value_and_its_temperature(
     np.testing.assert_allclose(end.critics(STATES, BEST).mean(0), [1 + later, 1], rtol=0.02)
 
 
-def test_a_soft_choice_among_numbered_actions():
-    agent = SAC(**SMALL, spread=0.5)
+@pytest.mark.parametrize("rescale", [False, True])
+def test_a_soft_choice_among_numbered_actions(rescale):
+    agent = SAC(**SMALL, spread=0.5, rescale_values=rescale)
     end = learned(OneState(), agent, 1500)
     values = agent.action_values(sac.Policy(end.actor, end.critics), jnp.ones((1, 1)))
     np.testing.assert_allclose(values, [[0, 1]], atol=0.02)

@@ -244,7 +244,7 @@ class DQN(Agent):
 
         (loss, losses), gradient = jax.value_and_grad(objective, has_aux=True)(online)
         if priorities is not None and losses.off is not None:
-            priorities = priorities.follow(index, losses.off, self.priority_exponent)
+            priorities = priorities.update(index, losses.off, self.priority_exponent)
         online, adam = optimizer.descend(self, online, gradient, adam)
         return (online, adam, priorities), {"loss": loss, "max_q": losses.max_q}
 

@@ -68,7 +68,7 @@ class Priorities(eqx.Module):
             node = node * FAN + child
         return node
 
-    def follow(
+    def update(
         self, index: Int[Array, " n"], off: Float[Array, " n"], exponent: Float[Array, ""] | float
     ) -> "Priorities":
         """Rows set to how far ``off`` their values were, to the power of ``exponent`` (α)."""
