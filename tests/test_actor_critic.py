@@ -15,7 +15,7 @@ from qfolio.agents.td3 import TD3
 from qfolio.errors import QfolioError
 from qfolio.learning.distributions import Gaussian, LogisticNormal, Squashed
 from qfolio.learning.replay import Experience
-from qfolio.learning.targets import squash, unsquash
+from qfolio.learning.targets import Scale, squash, unsquash
 from qfolio.mdp import Box, Discrete, Simplex, Transition
 from qfolio.presets import preset
 from qfolio.runs import train
@@ -363,7 +363,7 @@ def test_soft_values_by_hand():
     class FixedCritics(Critics):
         def __init__(self):
             self.networks = Fixed(jnp.array([[1.0, 5.0], [4.0, 2.0]]))
-            self.rescaled = False
+            self.scale = Scale(roots=False)
 
     actor = sac.Actor(Fixed(jnp.log(jnp.array([1.0, 3.0]))), Discrete(2))
     q, entropy = sac.expectations(actor, FixedCritics(), jnp.zeros((1, 1)), jax.random.key(0))

@@ -1,4 +1,5 @@
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -9,17 +10,32 @@ from qfolio.agents.dqn import DQN
 from qfolio.errors import QfolioError
 from qfolio.files import read_tree, write_tree
 from qfolio.learning import heads
-from qfolio.learning.distributional import Categorical, project, quantile_huber_loss
+from qfolio.learning.distributional import (
+    Categorical,
+    Expected,
+    Quantile,
+    project,
+    quantile_huber_loss,
+)
 from qfolio.learning.encoders import MLP
 from qfolio.learning.exploration import epsilon_greedy
 from qfolio.learning.optimizer import learning_rate
 from qfolio.learning.replay import Experience
-from qfolio.learning.targets import bootstrap, chosen, huber_loss, possible_values, td_target
+from qfolio.learning.targets import (
+    Scale,
+    bootstrap,
+    chosen,
+    huber_loss,
+    possible_values,
+    td_target,
+)
 from qfolio.mdp import Transition
 from qfolio.presets import preset
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.tasks.synthetic import Ar1, Merton
 from qfolio.training import Population
+
+VALUES, ROOTS = Scale(roots=False), Scale(roots=True)
 
 
 def rollout(agent, observation=1.0, reward=1.0, terminated=False, truncated=False):
@@ -241,7 +257,7 @@ def test_refuses_what_makes_no_sense(settings):
 
 @pytest.mark.parametrize(
     "changes", [{"values": "quantile", "huber": 1.0}, {"n_steps": 2}, {"prioritised": True},
-                {"noisy": True}, {"persistence": 0.5}],
+                {"noisy": True}, {"persistence": 0.5}, {"rescale_values": True}],
 )  # fmt: skip
 def test_all_actions_refuses_what_moves_do_not_give(changes):
     with pytest.raises(QfolioError, match=f"take {next(iter(changes))}="):
@@ -282,9 +298,12 @@ def test_categorical_projection_equals_the_published_algorithm():
         np.testing.assert_allclose(result, projected_by_hand(outcomes, shares, support), atol=1e-12)
 
 
-def test_the_projection_keeps_means_within_the_support():
+@pytest.mark.parametrize("spacing", ["equal", "unequal"])
+def test_the_projection_keeps_means_within_the_support(spacing):
     rng = np.random.default_rng(1)
     support = jnp.linspace(-3.0, 5.0, 9)
+    if spacing == "unequal":
+        support = jnp.sort(support.at[1:-1].set(rng.uniform(-3, 5, 7)))
     outcomes = jnp.array(rng.uniform(-3, 5, (50, 7)))
     shares = jnp.array(rng.dirichlet(np.ones(7), 50))
     means = (project(outcomes, shares, support) * support).sum(1)
@@ -292,13 +311,35 @@ def test_the_projection_keeps_means_within_the_support():
 
 
 def test_the_categorical_priority_is_the_divergence():
-    kind = Categorical(5, -2.0, 2.0)
+    kind = Categorical(VALUES, 5, -2.0, 2.0)
     z = jax.random.normal(jax.random.key(0), (3, 5))
     goal = kind.outcomes(z)
     loss, off = kind.loss(z, goal, z)  # the goal is the estimate itself
     np.testing.assert_allclose(off, 0.0, atol=1e-6)
     assert (loss > 0.1).all()
     assert (kind.loss(z, goal + 1, z)[1] > 0.01).all()
+
+
+def test_values_of_roots_by_hand():
+    """The root of 3 is 1, that of 8 is 2: z (2 + z)."""
+    expected = Expected(ROOTS, math.inf)
+    z, goal = jnp.array([[1.0]]), jnp.array([[8.0]])
+    np.testing.assert_allclose(expected.mean(z), [3.0])
+    np.testing.assert_allclose(expected.outcomes(z), [[3.0]])
+    np.testing.assert_allclose(expected.loss(z, goal, z), [[0.5], [1.0]], rtol=1e-6)
+
+    categorical = Categorical(ROOTS, 5, -8.0, 8.0)
+    np.testing.assert_allclose(categorical.support, [-8, -3, 0, 3, 8], atol=1e-6)
+    z = jnp.log(jnp.array([[0.1, 0.2, 0.3, 0.1, 0.3]]))
+    np.testing.assert_allclose(categorical.mean(z), [-0.8 - 0.6 + 0.3 + 2.4], rtol=1e-5)
+
+    quantile = Quantile(ROOTS, 2, 10.0)
+    z, goal = jnp.array([[2.0, 0.0]]), jnp.array([[15.0, 3.0]])  # whose roots are 3 and 1
+    np.testing.assert_allclose(quantile.mean(z), [4.0])
+    np.testing.assert_allclose(quantile.outcomes(z), [[8.0, 0.0]])
+    loss, off = quantile.loss(z, goal, z)
+    np.testing.assert_allclose(loss, quantile_huber_loss(z, jnp.array([[3.0, 1.0]]), 10.0))
+    np.testing.assert_allclose(off, [9.0 - 4.0])
 
 
 def test_quantile_huber_loss_by_hand():

@@ -20,7 +20,7 @@ from qfolio.fields import number, require, sizes, static
 from qfolio.learning import networks, optimizer
 from qfolio.learning.networks import Flat, Network
 from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
-from qfolio.learning.targets import huber_loss, possible_values, squash, td_target, unsquash
+from qfolio.learning.targets import Scale, huber_loss, possible_values, td_target
 from qfolio.mdp import Actions, Agent, Discrete, Metrics, Simplex, Task, Transition
 
 Weights = TypeVar("Weights", bound=PyTree)
@@ -42,13 +42,13 @@ class Critics(eqx.Module):
     """
 
     networks: Network  # with a leading critic axis
-    rescaled: bool = eqx.field(static=True)  # the networks give roots of values
+    scale: Scale = eqx.field(static=True)  # of what the networks give
 
     def __init__(
-        self, make: Callable[[PRNGKeyArray], Network], n: int, rescaled: bool, key: PRNGKeyArray
+        self, make: Callable[[PRNGKeyArray], Network], n: int, scale: Scale, key: PRNGKeyArray
     ) -> None:
         self.networks = jax.vmap(make)(jax.random.split(key, n))
-        self.rescaled = rescaled
+        self.scale = scale
 
     def __call__(self, observation: PyTree, action: Array) -> Float[Array, "critic batch"]:
         """Q(s, a) of each critic."""
@@ -61,14 +61,13 @@ class Critics(eqx.Module):
         return self._values(lambda network: network(observation))
 
     def _values(self, read: Callable[[Any], Array]) -> Array:
-        outputs = jax.vmap(read)(self.networks)
-        return unsquash(outputs) if self.rescaled else outputs
+        return self.scale.values(jax.vmap(read)(self.networks))
 
     def errors(
         self, q: Float[Array, "critic batch"], goal: Float[Array, " batch"]
     ) -> Float[Array, "critic batch"]:
         """How far off the networks' outputs were, when they said ``q``."""
-        return squash(q) - squash(goal) if self.rescaled else q - goal
+        return self.scale.outputs(q) - self.scale.outputs(goal)
 
 
 def critic_loss(
@@ -250,4 +249,4 @@ class ActorCritic(Agent):
         gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
         gains = jnp.append(gain, jnp.full(action.shape, 1 / task.actions.unit))
         make = lambda key: Flat((observation, action), self.hidden, 1, key, gains)  # noqa: E731
-        return Critics(make, count, self.rescale_values, key)
+        return Critics(make, count, Scale(self.rescale_values), key)

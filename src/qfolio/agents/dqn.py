@@ -31,7 +31,7 @@ from qfolio.learning import distributional, heads, optimizer
 from qfolio.learning.distributional import Values
 from qfolio.learning.exploration import epsilon_greedy, epsilon_now
 from qfolio.learning.networks import Network, require_network
-from qfolio.learning.priorities import Priorities
+from qfolio.learning.priorities import Priorities, importance_exponent_now
 from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
 from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
 from qfolio.mdp import Agent, Contrast, Discrete, ExogenousTask, Metrics, Task, Transition
@@ -98,6 +98,9 @@ class DQN(Agent):
     huber: float = number(math.inf)  # |TD error| beyond which the loss is linear; inf: squared
     reward_scale: float = number(1.0)  # the network learns values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
+    rescale_values: bool = static(
+        False
+    )  # the network learns roots of values: small ones weigh more
 
     def __check_init__(self) -> None:
         require_replay(self)
@@ -192,9 +195,7 @@ class DQN(Agent):
 
     def _read(self, network: Network, observation: PyTree) -> Float[Array, "batch action atom"]:
         """What the network says of each action; ``_values`` knows what it means."""
-        outputs = network(observation)
-        z = outputs.reshape(outputs.shape[0], -1, self._values.atoms)
-        return heads.duel(z) if self.dueling else z
+        return heads.read(self, self._values.atoms, network, observation)
 
     def observe(self, state: DQNState, rollout: Transition) -> DQNState:
         wrong, with_last = self.time_limit_terminal, self.n_steps > 1
@@ -232,7 +233,7 @@ class DQN(Agent):
         index = dataclasses.replace(replay, priorities=priorities).draw(draw_key, self.batch_size)
         weight: Array | float = 1.0
         if priorities is not None:
-            weight = priorities.importance(index, self._importance_exponent(adam.count))
+            weight = priorities.importance(index, importance_exponent_now(self, adam.count))
 
         def objective(online: Network) -> tuple[Float[Array, ""], Losses]:
             if self.all_actions:
@@ -247,11 +248,6 @@ class DQN(Agent):
             priorities = priorities.update(index, losses.off, self.priority_exponent)
         online, adam = optimizer.descend(self, online, gradient, adam)
         return (online, adam, priorities), {"loss": loss, "max_q": losses.max_q}
-
-    def _importance_exponent(self, update: Int[Array, ""]) -> Float[Array, ""]:
-        """β: a line from its first value to 1, which is there when the cosine of the rate ends."""
-        done = jnp.minimum(update / self.learning_rate_steps, 1.0)
-        return self.importance_exponent + (1 - self.importance_exponent) * done
 
     def _losses(
         self,

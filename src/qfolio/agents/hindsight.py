@@ -39,7 +39,7 @@ def require_plain(agent: Any) -> None:
     """Raises QfolioError where an agent wants what moves and holdings drawn anew do not give."""
     plain: dict[str, Any] = {
         "values": "expected", "n_steps": 1, "prioritised": False, "noisy": False,
-        "persistence": 0.0,
+        "persistence": 0.0, "rescale_values": False,
     }  # fmt: skip
     for name, value in plain.items():
         if getattr(agent, name) != value:

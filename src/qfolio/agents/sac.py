@@ -28,7 +28,7 @@ from qfolio.fields import number, require
 from qfolio.learning import optimizer
 from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed
 from qfolio.learning.networks import Network, Outputs, outputs_of
-from qfolio.learning.targets import follow
+from qfolio.learning.targets import Scale, follow
 from qfolio.mdp import Actions, Discrete, Metrics, Simplex, Task
 
 LOG_STD = (-10.0, 2.0)
@@ -138,7 +138,7 @@ class SAC(ActorCritic):
         outputs = outputs_of(task.actions)
         if isinstance(task.actions, Discrete):
             make = partial(self.build, task, observation, outputs)
-            critics = Critics(make, 2, self.rescale_values, critic_key)
+            critics = Critics(make, 2, Scale(self.rescale_values), critic_key)
         else:
             critics = self.build_critics(task, observation, 2, critic_key)
             weights = isinstance(task.actions, Simplex)  # cash needs no standard deviation

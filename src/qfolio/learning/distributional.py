@@ -3,7 +3,7 @@
 A network gives ``atoms`` numbers z for each action. Each kind of value says what they mean: their
 ``mean`` is the action value, ``outcomes`` are the returns that may follow, each of which makes a
 goal, and ``loss`` is the distance of z from the goals, with how far off the value was, to set
-priorities by.
+priorities by. Numbers that stand for returns may be roots of them (``Scale``).
 """
 
 import math
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from qfolio.fields import require
-from qfolio.learning.targets import huber_loss
+from qfolio.learning.targets import Scale, huber_loss
 
 Losses = tuple[Float[Array, " batch"], Float[Array, " batch"]]
 
@@ -22,6 +22,7 @@ Losses = tuple[Float[Array, " batch"], Float[Array, " batch"]]
 class Expected(NamedTuple):
     """The expected return alone (Mnih et al. 2015)."""
 
+    scale: Scale
     huber: Float[Array, ""] | float
 
     @property
@@ -29,10 +30,10 @@ class Expected(NamedTuple):
         return 1
 
     def mean(self, z: Float[Array, "*batch 1"]) -> Float[Array, "*batch"]:
-        return z[..., 0]
+        return self.scale.values(z[..., 0])
 
     def outcomes(self, z: Float[Array, "batch 1"]) -> Float[Array, "batch 1"]:
-        return z
+        return self.scale.values(z)
 
     def loss(
         self,
@@ -40,20 +41,22 @@ class Expected(NamedTuple):
         goal: Float[Array, "batch 1"],
         following: Float[Array, "batch 1"],
     ) -> Losses:
-        error = (goal - z)[:, 0]
+        error = (self.scale.outputs(goal) - z)[:, 0]
         return huber_loss(error, self.huber), jnp.abs(error)
 
 
 class Categorical(NamedTuple):
-    """Probabilities, as logits, of returns equally spaced (C51; Bellemare et al. 2017)."""
+    """Probabilities, as logits, of returns, or roots, equally spaced (Bellemare et al. 2017)."""
 
+    scale: Scale
     atoms: int
     low: Float[Array, ""] | float
     high: Float[Array, ""] | float
 
     @property
     def support(self) -> Float[Array, " atom"]:
-        return self.low + (self.high - self.low) * jnp.linspace(0.0, 1.0, self.atoms)
+        low, high = (self.scale.outputs(jnp.asarray(end)) for end in (self.low, self.high))
+        return self.scale.values(low + (high - low) * jnp.linspace(0.0, 1.0, self.atoms))
 
     def mean(self, z: Float[Array, "*batch atom"]) -> Float[Array, "*batch"]:
         return (jax.nn.softmax(z) * self.support).sum(-1)
@@ -76,14 +79,15 @@ class Categorical(NamedTuple):
 class Quantile(NamedTuple):
     """The return's quantiles at the middles of equal parts (Dabney et al. 2018)."""
 
+    scale: Scale
     atoms: int
     huber: Float[Array, ""] | float
 
     def mean(self, z: Float[Array, "*batch atom"]) -> Float[Array, "*batch"]:
-        return z.mean(-1)
+        return self.scale.values(z).mean(-1)
 
     def outcomes(self, z: Float[Array, "batch atom"]) -> Float[Array, "batch atom"]:
-        return z
+        return self.scale.values(z)
 
     def loss(
         self,
@@ -91,8 +95,8 @@ class Quantile(NamedTuple):
         goal: Float[Array, "batch atom"],
         following: Float[Array, "batch atom"],
     ) -> Losses:
-        off = jnp.abs(goal.mean(-1) - z.mean(-1))
-        return quantile_huber_loss(z, goal, self.huber), off
+        off = jnp.abs(goal.mean(-1) - self.mean(z))
+        return quantile_huber_loss(z, self.scale.outputs(goal), self.huber), off
 
 
 Values = Expected | Categorical | Quantile
@@ -102,11 +106,12 @@ KINDS = ("expected", "categorical", "quantile")
 
 def values_of(agent: Any) -> Values:
     """What the settings of an agent ask for."""
+    scale = Scale(agent.rescale_values)
     if agent.values == "categorical":
-        return Categorical(agent.atoms, agent.v_min, agent.v_max)
+        return Categorical(scale, agent.atoms, agent.v_min, agent.v_max)
     if agent.values == "quantile":
-        return Quantile(agent.atoms, agent.huber)
-    return Expected(agent.huber)
+        return Quantile(scale, agent.atoms, agent.huber)
+    return Expected(scale, agent.huber)
 
 
 def require_values(agent: Any) -> None:
@@ -125,15 +130,17 @@ def project(
     probabilities: Float[Array, "batch outcome"],
     support: Float[Array, " atom"],
 ) -> Float[Array, "batch atom"]:
-    """Probabilities of outcomes, brought to equal spacing (Bellemare et al. 2017, eq. 7).
+    """Probabilities of outcomes, brought to an increasing support (Bellemare et al. 2017, eq. 7).
 
     Each outcome's probability goes to its two neighbours, the nearer the more, so that the mean
     stays; what lies beyond the support goes to its ends.
     """
-    spacing = support[1] - support[0]
-    clipped = jnp.clip(outcomes, support[0], support[-1])
-    distance = jnp.abs(clipped[:, None, :] - support[:, None]) / spacing
-    return jnp.einsum("bao,bo->ba", jnp.maximum(1 - distance, 0.0), probabilities)
+    gaps = jnp.diff(support)[:, None]
+    passed = jnp.clip((outcomes[:, None, :] - support[:-1, None]) / gaps, 0.0, 1.0)
+    above = jnp.einsum("bgo,bo->bg", passed, probabilities)  # what goes beyond each gap's lower end
+    total = probabilities.sum(-1, keepdims=True)
+    reached = jnp.concatenate([total, above, jnp.zeros_like(total)], axis=1)
+    return jnp.maximum(reached[:, :-1] - reached[:, 1:], 0.0)
 
 
 def quantile_huber_loss(

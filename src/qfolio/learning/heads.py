@@ -100,6 +100,15 @@ def build(
     return eqx.tree_at(last, network, Streams(last(network), first, noise, key))
 
 
+def read(
+    agent: Any, atoms: int, network: networks.Network, observation: PyTree
+) -> Float[Array, "batch action atom"]:
+    """What a network from ``build`` says of each action."""
+    outputs = network(observation)
+    z = outputs.reshape(outputs.shape[0], -1, atoms)
+    return duel(z) if agent.dueling else z
+
+
 def draw_noise(network: PyTree, key: PRNGKeyArray) -> PyTree:
     """The network with one draw of noise on all its noisy layers."""
     is_noisy = lambda x: isinstance(x, NoisyMLP)  # noqa: E731

@@ -1,5 +1,7 @@
 """Priorities of the rows of a replay buffer (Schaul et al. 2016): a tree of sums in arrays."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -80,3 +82,9 @@ class Priorities(eqx.Module):
         """Weights (N P(i))^−exponent of rows drawn, the largest of them 1 (section 3.4)."""
         drawn = self.of(index)
         return (drawn.min() / drawn) ** exponent
+
+
+def importance_exponent_now(agent: Any, updates: Int[Array, ""]) -> Float[Array, ""]:
+    """β of the agent's settings: a line to 1, which is there when its learning rate is down."""
+    done = jnp.minimum(updates / agent.learning_rate_steps, 1.0)
+    return agent.importance_exponent + (1 - agent.importance_exponent) * done

@@ -1,6 +1,6 @@
 """What values and policies are learned towards: pure functions of a few numbers."""
 
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +60,20 @@ def squash(value: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 def unsquash(root: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """The value whose ``squash`` is ``root``."""
     return root * (2 + jnp.abs(root))
+
+
+class Scale(NamedTuple):
+    """Whether networks give values, or roots of them, among which small values weigh more."""
+
+    roots: bool
+
+    def values(self, outputs: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """What a network's outputs say."""
+        return unsquash(outputs) if self.roots else outputs
+
+    def outputs(self, values: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """What a network should give for values."""
+        return squash(values) if self.roots else values
 
 
 def n_step(
