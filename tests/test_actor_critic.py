@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from qfolio.agents import ddpg, sac
-from qfolio.agents.actor_critic import Batch, Critics, critic_loss, uniform
+from qfolio.agents.actor_critic import Batch, Critics, critic_loss
 from qfolio.agents.ddpg import DDPG
 from qfolio.agents.sac import SAC
 from qfolio.agents.td3 import TD3
 from qfolio.errors import QfolioError
 from qfolio.learning.distributions import Gaussian, LogisticNormal, Squashed
+from qfolio.learning.exploration import uniform
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import Scale, squash, unsquash
 from qfolio.mdp import Box, Discrete, Simplex, Transition

@@ -9,11 +9,13 @@ from qfolio.tasks.pendulum import Pendulum
 
 
 @pytest.mark.slow
-def test_fast_preset_comes_within_5_percent_of_the_optimum():
-    fast = preset("fast")
-    run = train(Pendulum(), fast.build(), episodes=fast.episodes, seeds=4, seed=100)
+@pytest.mark.parametrize(("name", "seeds", "worst"), [("fast", 4, 0.05), ("categorical", 2, 0.08)])
+def test_presets_come_near_the_optimum(name, seeds, worst):
+    """Of 40 seeds of categorical, one was beyond 5 %, by less than 2 points."""
+    chosen = preset(name)
+    run = train(Pendulum(), chosen.build(), episodes=chosen.episodes, seeds=seeds, seed=100)
     regrets = run.grade()["regret_per_seed"]
-    assert max(regrets) <= 0.05, regrets
+    assert max(regrets) <= worst, regrets
     assert min(regrets) > -0.005, "nothing beats the optimum"
 
 

@@ -80,6 +80,19 @@ _RAINBOW = {
     "learning_rate_steps": 15_000.0,
 }
 
+_CATEGORICAL = {
+    **_FAST,
+    "values": "categorical",
+    "rescale_values": True,
+    "reward_scale": 1.0,
+    "v_min": -400.0,
+    "v_max": 400.0,
+    "n_steps": 2,
+    "target_rate": 0.02,
+    "updates": 2,
+    "learning_rate_steps": 15_000.0,
+}
+
 _HIDDEN = {**_FAST, "network": "lstm", "hidden": (64, 128), "input_gain": 12.0}
 
 _CATCH = {
@@ -330,6 +343,7 @@ PRESETS = {
     ("pendulum", "dqn"): {
         "fast": Preset("dqn", _FAST, episodes=8608, seeds=8),
         "best": Preset("dqn", _BEST, episodes=24_032, seeds=8),
+        "categorical": Preset("dqn", _CATEGORICAL, episodes=8608, seeds=8),
         "rainbow": Preset("dqn", _RAINBOW, episodes=8608, seeds=8),
         # Each hyperparameter of the report that qfolio grew out of; they are DQN's defaults.
         "report": Preset("dqn", {}, episodes=600, seeds=1),

@@ -18,21 +18,13 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.fields import number, require, sizes, static
 from qfolio.learning import networks, optimizer
+from qfolio.learning.exploration import uniform
 from qfolio.learning.networks import Flat, Network
 from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
 from qfolio.learning.targets import Scale, huber_loss, possible_values, td_target
-from qfolio.mdp import Actions, Agent, Discrete, Metrics, Simplex, Task, Transition
+from qfolio.mdp import Agent, Discrete, Metrics, Task, Transition
 
 Weights = TypeVar("Weights", bound=PyTree)
-
-
-def uniform(actions: Actions, key: PRNGKeyArray, n: int) -> Array:
-    """``n`` actions drawn uniformly; from [−1, 1] where they have no bounds."""
-    if isinstance(actions, Discrete):
-        return jax.random.randint(key, (n,), 0, actions.n, jnp.int32)
-    if isinstance(actions, Simplex):
-        return jax.random.dirichlet(key, jnp.ones(actions.assets + 1), (n,))
-    return jax.random.uniform(key, (n, actions.n), minval=-actions.unit, maxval=actions.unit)
 
 
 class Critics(eqx.Module):

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.agents.actor_critic import ActorCriticState, uniform
+from qfolio.agents.actor_critic import ActorCriticState
 from qfolio.agents.sac import SAC
 from qfolio.errors import QfolioError
 from qfolio.fields import number, require, require_sizes, sizes, static
 from qfolio.learning import optimizer
 from qfolio.learning.encoders import SmoothMLP
+from qfolio.learning.exploration import uniform
 from qfolio.learning.replay import Experience, Replay
 from qfolio.learning.targets import squash, unsquash
 from qfolio.mdp import Actions, Discrete, Metrics, Task, Transition

@@ -46,8 +46,8 @@ def train(
         agent: Which algorithm: dqn, reinforce, a2c, ppo, ddpg, td3, sac, mbpo; where states are
             numbered, q-learning, sarsa, expected-sarsa, double-q, dyna-q; in markets pathwise.
             Without, the first that has presets for the task.
-        preset: fast (the default); of dqn on the pendulum also best, rainbow, and report (the run
-            that qfolio grew out of).
+        preset: fast (the default); of dqn on the pendulum also best, categorical, rainbow, and
+            report (the run that qfolio grew out of).
         episodes: Training episodes of each agent; the preset says how many otherwise. Those of
             fast and best are short: 28 and 40 steps.
         steps: Instead of episodes, steps of each agent's environments.

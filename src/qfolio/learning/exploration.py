@@ -1,10 +1,12 @@
-"""How agents that value actions explore."""
+"""How agents explore: ε-greedily, or by actions drawn uniformly."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from qfolio.mdp import Actions, Discrete, Simplex
 
 
 def epsilon_now(agent: Any, episodes: Int[Array, ""]) -> Float[Array, ""]:
@@ -31,7 +33,16 @@ def epsilon_greedy(
         again = jax.random.uniform(again_key, last.shape) < epsilon * persistence
         return jnp.where(again, last, drawn)
     n, greedy = values.shape[-1], values.argmax(-1)
-    # One uniform decides both: below ε explore, and where below ε it fell picks the action.
-    uniform = jax.random.uniform(key, greedy.shape)
-    explored = jnp.minimum(uniform / jnp.maximum(epsilon, 1e-30) * n, n - 1).astype(jnp.int32)
-    return jnp.where(uniform < epsilon, explored, greedy)
+    # One number decides both: below ε explore, and where below ε it fell picks the action.
+    drawn = jax.random.uniform(key, greedy.shape)
+    explored = jnp.minimum(drawn / jnp.maximum(epsilon, 1e-30) * n, n - 1).astype(jnp.int32)
+    return jnp.where(drawn < epsilon, explored, greedy)
+
+
+def uniform(actions: Actions, key: PRNGKeyArray, n: int) -> Array:
+    """``n`` actions drawn uniformly; from [−1, 1] where they have no bounds."""
+    if isinstance(actions, Discrete):
+        return jax.random.randint(key, (n,), 0, actions.n, jnp.int32)
+    if isinstance(actions, Simplex):
+        return jax.random.dirichlet(key, jnp.ones(actions.assets + 1), (n,))
+    return jax.random.uniform(key, (n, actions.n), minval=-actions.unit, maxval=actions.unit)
