@@ -25,6 +25,8 @@ from qfolio.comparison.run import Comparison, Entrant
 from qfolio.errors import QfolioError
 from qfolio.presets import PRESETS, Preset
 from qfolio.report.comparison import comparison_data, render_comparison, tidy
+from qfolio.report.figures import percent_tick
+from qfolio.report.rendering import THIN_SPACE
 from qfolio.runs import Run
 from qfolio.tasks.pendulum import Pendulum
 from qfolio.tasks.synthetic import Kelly, Regime
@@ -457,3 +459,11 @@ def test_tidy_leaves_names_alone():
     text = tidy("double-q-2 is at -0.40 % after 51,200 steps, q-learning 3,4")
     assert text.startswith("double-q-2 is at \N{MINUS SIGN}0.40\N{NARROW NO-BREAK SPACE}% after 51")
     assert text.endswith("q-learning 3,4")
+
+
+@pytest.mark.parametrize(
+    ("tick", "label"),
+    [(0.001, "0.1"), (0.024, "2.4"), (0.05, "5"), (0.00025, "0.025"), (5.0, "500")],
+)
+def test_ticks_have_the_digits_that_tell_them_apart(tick, label):
+    assert percent_tick(tick) == f"{label}{THIN_SPACE}%"

@@ -4,12 +4,13 @@ A Q-network estimates the discounted return of each action. Collecting: actions 
 and transitions go into a replay buffer. Training: it regresses, on batches from the buffer, towards
 r + γ max_a Q'(s', a), where Q' is a target network that follows it slowly.
 
-Options, all of which together are Rainbow (Hessel et al. 2018): double Q-learning (van Hasselt et
+Options, which together are Rainbow (Hessel et al. 2018): double Q-learning (van Hasselt et
 al. 2016), dueling networks (Wang et al. 2016), returns over n steps, prioritised replay (Schaul et
 al. 2016), noisy networks (Fortunato et al. 2018), and distributions of returns in place of their
-means (Bellemare et al. 2017; Dabney et al. 2018). In an exogenous task ``all_actions`` learns from
-one move of the market what every action would have led to. docs/dqn.md holds every formula, the
-place where it stands here, and each deviation from the papers.
+means (Bellemare et al. 2017; Dabney et al. 2018). Besides, a network may learn roots of values
+(after Pohlen et al. 2018), and in an exogenous task ``all_actions`` learns from one move of the
+market what every action would have led to. docs/dqn.md holds every formula, the place where it
+stands here, and each deviation from the papers.
 """
 
 import dataclasses
@@ -98,9 +99,7 @@ class DQN(Agent):
     huber: float = number(math.inf)  # |TD error| beyond which the loss is linear; inf: squared
     reward_scale: float = number(1.0)  # the network learns values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
-    rescale_values: bool = static(
-        False
-    )  # the network learns roots of values: small ones weigh more
+    rescale_values: bool = static(False)  # learn roots of values: small ones weigh more
 
     def __check_init__(self) -> None:
         require_replay(self)

@@ -63,7 +63,11 @@ def unsquash(root: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 class Scale(NamedTuple):
-    """Whether networks give values, or roots of them, among which small values weigh more."""
+    """Whether networks give values, or roots of them, among which small values weigh more.
+
+    Where there is chance, the mean of goals' roots is not the root of their mean: a value learned
+    so is nearer to zero than the mean.
+    """
 
     roots: bool
 

@@ -569,8 +569,8 @@ def percent_axis(axis: Any) -> None:
 
 
 def percent_tick(tick: float) -> str:
-    """A fraction as the label of a tick: 0.1 %, 5 %."""
-    return percent(tick, max(0, -math.floor(math.log10(tick) + 2 + 1e-9)))
+    """A fraction as the label of a tick, with the digits that it has: 0.1 %, 2.5 %, 5 %."""
+    return percent(tick, next(n for n in range(16) if math.isclose(round(tick, 2 + n), tick)))
 
 
 def short_tick(tick: float) -> str:
