@@ -6,7 +6,7 @@ an H200 (float32 without tensor cores). docs/benchmarks.md says how they are cou
 
 from time import perf_counter
 
-from qfolio import devices
+from qfolio.core import devices
 
 devices.configure()
 
@@ -14,8 +14,8 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from qfolio.evaluation import start_keys  # noqa: E402
-from qfolio.training import Population  # noqa: E402
+from qfolio.core.evaluation import start_keys  # noqa: E402
+from qfolio.core.training import Population  # noqa: E402
 from workload import EPISODES, bytes_moved, operations, report  # noqa: E402
 
 TARGET = 180.0

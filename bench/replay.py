@@ -51,7 +51,7 @@ def orders(strategies: int, values: np.ndarray) -> np.ndarray:
 
 
 def qfolio(values: np.ndarray, strategies: int) -> Contestant:
-    from qfolio.backtest.simulation import simulate
+    from qfolio.portfolio.backtest.simulation import simulate
 
     decisions = orders(strategies, values)
 

@@ -26,7 +26,7 @@ from typing import Annotated, Any
 ENVIRONMENT = dict(os.environ)
 """For other processes: without the flags that `configure` sets for this one."""
 
-from qfolio import devices  # noqa: E402
+from qfolio.core import devices  # noqa: E402
 
 devices.configure()
 
@@ -36,11 +36,11 @@ import tyro  # noqa: E402
 from jax import lax  # noqa: E402
 
 import replay  # noqa: E402
-from qfolio.host import HostPopulation  # noqa: E402
-from qfolio.presets import preset  # noqa: E402
+from qfolio.core.host import HostPopulation  # noqa: E402
+from qfolio.core.training import CHUNK, Population  # noqa: E402
+from qfolio.experiments.presets import preset  # noqa: E402
 from qfolio.tasks.gymnasium import GymnasiumTask  # noqa: E402
 from qfolio.tasks.pendulum import Pendulum  # noqa: E402
-from qfolio.training import CHUNK, Population  # noqa: E402
 from race import Contestant, Rates, Ratio, process, race, ratio, timed  # noqa: E402
 from workload import EPISODES, families, hosted, layers, products, report  # noqa: E402
 

@@ -11,8 +11,8 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.ppo import PPO
 from qfolio.agents.sac import SAC
 from qfolio.agents.td3 import TD3
-from qfolio.mdp import Agent
-from qfolio.presets import preset
+from qfolio.core.mdp import Agent
+from qfolio.experiments.presets import preset
 from qfolio.tasks.pendulum import Pendulum
 
 EPISODES = preset("report").episodes

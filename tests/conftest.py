@@ -10,8 +10,8 @@ os.environ.setdefault("QFOLIO_CACHE", str(Path(__file__).parents[1] / ".cache"))
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # no window on anybody's screen
 
 with install_import_hook("qfolio", "beartype.beartype"):
-    from qfolio import devices
     from qfolio.agents.dqn import DQN
+    from qfolio.core import devices
     from qfolio.tasks.pendulum import Pendulum
 
 devices.configure()

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from qfolio.mdp import Box, Discrete, Simplex, Step, Task, View
+from qfolio.core.mdp import Box, Discrete, Simplex, Step, Task, View
 
 TERMINATED, GOES_ON = jnp.array(True), jnp.array(False)
 

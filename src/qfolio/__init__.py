@@ -14,7 +14,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from qfolio.core.version import __version__
 
 if TYPE_CHECKING:
     from qfolio.agents.a2c import A2C as A2C
@@ -26,20 +26,20 @@ if TYPE_CHECKING:
     from qfolio.agents.reinforce import REINFORCE as REINFORCE
     from qfolio.agents.sac import SAC as SAC
     from qfolio.agents.td3 import TD3 as TD3
-    from qfolio.backtest.run import Backtest as Backtest
-    from qfolio.errors import QfolioError as QfolioError
-    from qfolio.markets.prices import load as load_prices  # noqa: F401
-    from qfolio.policy import Policy as Policy
-    from qfolio.presets import preset as preset
-    from qfolio.runs import Run as Run
-    from qfolio.runs import train as train
+    from qfolio.core.errors import QfolioError as QfolioError
+    from qfolio.experiments.presets import preset as preset
+    from qfolio.experiments.run import Run as Run
+    from qfolio.experiments.run import train as train
+    from qfolio.portfolio.backtest.run import Backtest as Backtest
+    from qfolio.portfolio.policy import Policy as Policy
+    from qfolio.portfolio.prices.table import load as load_prices  # noqa: F401
+    from qfolio.portfolio.task import Portfolio as Portfolio
     from qfolio.tasks.finite import FiniteMDP as FiniteMDP
     from qfolio.tasks.pendulum import Pendulum as Pendulum
-    from qfolio.tasks.portfolio import Portfolio as Portfolio
 
 _HOMES = {
     "A2C": "qfolio.agents.a2c:A2C",
-    "Backtest": "qfolio.backtest.run:Backtest",
+    "Backtest": "qfolio.portfolio.backtest.run:Backtest",
     "DDPG": "qfolio.agents.ddpg:DDPG",
     "DQN": "qfolio.agents.dqn:DQN",
     "FiniteMDP": "qfolio.tasks.finite:FiniteMDP",
@@ -47,16 +47,16 @@ _HOMES = {
     "MBPO": "qfolio.agents.mbpo:MBPO",
     "Pathwise": "qfolio.agents.pathwise:Pathwise",
     "Pendulum": "qfolio.tasks.pendulum:Pendulum",
-    "Policy": "qfolio.policy:Policy",
-    "Portfolio": "qfolio.tasks.portfolio:Portfolio",
+    "Policy": "qfolio.portfolio.policy:Policy",
+    "Portfolio": "qfolio.portfolio.task:Portfolio",
     "REINFORCE": "qfolio.agents.reinforce:REINFORCE",
-    "QfolioError": "qfolio.errors:QfolioError",
-    "Run": "qfolio.runs:Run",
+    "QfolioError": "qfolio.core.errors:QfolioError",
+    "Run": "qfolio.experiments.run:Run",
     "SAC": "qfolio.agents.sac:SAC",
     "TD3": "qfolio.agents.td3:TD3",
-    "load_prices": "qfolio.markets.prices:load",
-    "preset": "qfolio.presets:preset",
-    "train": "qfolio.runs:train",
+    "load_prices": "qfolio.portfolio.prices.table:load",
+    "preset": "qfolio.experiments.presets:preset",
+    "train": "qfolio.experiments.run:train",
 }
 
 __all__ = ["__version__", *_HOMES]

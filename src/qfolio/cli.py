@@ -12,7 +12,7 @@ from qfolio.commands.continual import continual
 from qfolio.commands.portfolio import allocate, backtest, prices
 from qfolio.commands.training import evaluate, train, watch
 from qfolio.commands.tuning import tune
-from qfolio.errors import QfolioError
+from qfolio.core.errors import QfolioError
 
 OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
 

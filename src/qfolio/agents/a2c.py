@@ -8,8 +8,8 @@ docs/policy_gradients.md has the formulas and the deviations from the paper.
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState
-from qfolio.fields import number, require, static
-from qfolio.mdp import Metrics, Task, Transition
+from qfolio.core.fields import number, require, static
+from qfolio.core.mdp import Metrics, Task, Transition
 
 
 class A2C(OnPolicy):

@@ -16,13 +16,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio.fields import number, require, sizes, static
+from qfolio.core.fields import number, require, sizes, static
+from qfolio.core.mdp import Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.exploration import uniform
 from qfolio.learning.networks import Flat, Network
 from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
 from qfolio.learning.targets import Scale, huber_loss, possible_values, td_target
-from qfolio.mdp import Agent, Discrete, Metrics, Task, Transition
 
 Weights = TypeVar("Weights", bound=PyTree)
 

@@ -14,15 +14,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio import simplex
 from qfolio.agents.actor_critic import ActorCritic, Batch, Critics, critic_loss
-from qfolio.errors import QfolioError
-from qfolio.fields import number, require
+from qfolio.core import simplex
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import number, require
+from qfolio.core.mdp import Box, Discrete, Metrics, Simplex, Task
 from qfolio.learning import optimizer
 from qfolio.learning.networks import Network, outputs_of, saturation
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import follow
-from qfolio.mdp import Box, Discrete, Metrics, Simplex, Task
 
 REACH = 4.0
 """Output beyond which tanh counts as flat; there it is within 0.0007 of its bound."""

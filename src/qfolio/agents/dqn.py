@@ -26,8 +26,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.agents import hindsight
 from qfolio.agents.hindsight import Move
-from qfolio.errors import QfolioError
-from qfolio.fields import constant, number, require, sizes, static
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import constant, number, require, sizes, static
+from qfolio.core.mdp import Agent, Contrast, Discrete, ExogenousTask, Metrics, Task, Transition
 from qfolio.learning import distributional, heads, optimizer
 from qfolio.learning.distributional import Values
 from qfolio.learning.exploration import epsilon_greedy, epsilon_now
@@ -35,7 +36,6 @@ from qfolio.learning.networks import Network, require_network
 from qfolio.learning.priorities import Priorities, importance_exponent_now
 from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
 from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
-from qfolio.mdp import Agent, Contrast, Discrete, ExogenousTask, Metrics, Task, Transition
 
 
 class DQNState(eqx.Module):

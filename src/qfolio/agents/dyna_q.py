@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.agents.tabular import Move, TableState, Tabular
-from qfolio.errors import QfolioError
-from qfolio.fields import require, static
-from qfolio.mdp import Metrics, Task, Transition
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import require, static
+from qfolio.core.mdp import Metrics, Task, Transition
 
 
 class Counts(eqx.Module):

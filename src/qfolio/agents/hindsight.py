@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio.errors import QfolioError
+from qfolio.core.errors import QfolioError
+from qfolio.core.mdp import ExogenousTask, Position, Task, Transition
 from qfolio.learning.targets import bootstrap, td_target
-from qfolio.mdp import ExogenousTask, Position, Task, Transition
 
 Q = Callable[[PyTree], Float[Array, "batch action"]]
 """From observations to action values."""

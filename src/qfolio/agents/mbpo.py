@@ -17,14 +17,14 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.agents.actor_critic import ActorCriticState
 from qfolio.agents.sac import SAC
-from qfolio.errors import QfolioError
-from qfolio.fields import number, require, require_sizes, sizes, static
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import number, require, require_sizes, sizes, static
+from qfolio.core.mdp import Actions, Discrete, Metrics, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.encoders import SmoothMLP
 from qfolio.learning.exploration import uniform
 from qfolio.learning.replay import Experience, Replay
 from qfolio.learning.targets import squash, unsquash
-from qfolio.mdp import Actions, Discrete, Metrics, Task, Transition
 
 GAIN = 3.0
 """Of the model's first layer: its inputs, which go to ±1, are to reach where SiLU bends."""

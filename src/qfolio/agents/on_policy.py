@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio.fields import number, require, sizes, static
+from qfolio.core.fields import number, require, sizes, static
+from qfolio.core.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
 from qfolio.learning.networks import Flat, Network, Outputs, outputs_of
 from qfolio.learning.targets import advantages
-from qfolio.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 
 REACH = 2.0
 """Mean, in bounds, beyond which nearly all draws count as cut to the bound."""

@@ -16,12 +16,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio import simplex
-from qfolio.errors import QfolioError
-from qfolio.fields import number, require, require_sizes, sizes, static
-from qfolio.learning import optimizer
-from qfolio.learning.networks import SHARED, Reading, Shared
-from qfolio.mdp import (
+from qfolio.core import simplex
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import number, require, require_sizes, sizes, static
+from qfolio.core.mdp import (
     Agent,
     Box,
     Discrete,
@@ -33,6 +31,8 @@ from qfolio.mdp import (
     Transition,
     View,
 )
+from qfolio.learning import optimizer
+from qfolio.learning.networks import SHARED, Reading, Shared
 
 
 class Band(eqx.Module):

@@ -12,9 +12,9 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, normalised
-from qfolio.errors import QfolioError
-from qfolio.fields import number, require, static
-from qfolio.mdp import Metrics, Task, Transition
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import number, require, static
+from qfolio.core.mdp import Metrics, Task, Transition
 
 
 class PPO(OnPolicy):

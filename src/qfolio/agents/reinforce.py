@@ -9,9 +9,9 @@ the deviations from the paper.
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, normalised
-from qfolio.errors import QfolioError
-from qfolio.fields import static
-from qfolio.mdp import Metrics, Task, Transition
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import static
+from qfolio.core.mdp import Metrics, Task, Transition
 
 
 class REINFORCE(OnPolicy):

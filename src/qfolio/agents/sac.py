@@ -24,12 +24,12 @@ from qfolio.agents.actor_critic import (
     Critics,
     critic_loss,
 )
-from qfolio.fields import number, require
+from qfolio.core.fields import number, require
+from qfolio.core.mdp import Actions, Discrete, Metrics, Simplex, Task
 from qfolio.learning import optimizer
 from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed
 from qfolio.learning.networks import Network, Outputs, outputs_of
 from qfolio.learning.targets import Scale, follow
-from qfolio.mdp import Actions, Discrete, Metrics, Simplex, Task
 
 LOG_STD = (-10.0, 2.0)
 """Where a normal number's log standard deviation is kept."""

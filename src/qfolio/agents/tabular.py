@@ -20,11 +20,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from qfolio.errors import QfolioError
-from qfolio.fields import number, require, static
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import number, require, static
+from qfolio.core.mdp import Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning.exploration import epsilon_greedy, epsilon_now
 from qfolio.learning.targets import bootstrap, td_target
-from qfolio.mdp import Agent, Discrete, Metrics, Task, Transition
 
 Values = Float[Array, "state action"]
 

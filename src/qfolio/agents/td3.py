@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.agents.actor_critic import Batch
 from qfolio.agents.ddpg import DDPG, Learned
-from qfolio.fields import number, require, static
-from qfolio.mdp import Metrics
+from qfolio.core.fields import number, require, static
+from qfolio.core.mdp import Metrics
 
 
 class TD3(DDPG):

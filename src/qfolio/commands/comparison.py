@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from qfolio.commands.arguments import INTERRUPTED, Count, Folder, Name
-from qfolio.errors import QfolioError
+from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.comparison.run import Comparison, Entrant
-    from qfolio.runs import Progress
+    from qfolio.experiments.comparison.run import Comparison, Entrant
+    from qfolio.experiments.run import Progress
 
 
 def compare(
@@ -48,11 +48,11 @@ def compare(
         raise QfolioError("--resume keeps what the comparison was started with; add nothing.")
     if episodes is not None and steps is not None:
         raise QfolioError("--episodes and --steps both say how far to train; give one of them.")
-    from qfolio import devices
+    from qfolio.core import devices
 
     devices.configure()
-    from qfolio import console
-    from qfolio.comparison.run import Comparison
+    from qfolio.commands import console
+    from qfolio.experiments.comparison.run import Comparison
 
     if resume is None:
         task = task or "pendulum"
@@ -92,8 +92,9 @@ def _entrants(
     task: str, agents: str, preset: str | None, budget: dict[str, int]
 ) -> "dict[str, Entrant]":
     """The agents that ``--agents`` names, by what it calls them."""
-    from qfolio import presets, registry, settings
-    from qfolio.comparison.run import Entrant
+    from qfolio.core import registry, settings
+    from qfolio.experiments import presets
+    from qfolio.experiments.comparison.run import Entrant
 
     task_class = registry.find("task", registry.TASKS, task)
     entrants: dict[str, Entrant] = {}
@@ -121,7 +122,7 @@ def _entrants(
 
 def _train(run: "Comparison") -> None:
     """Trains with a bar, and a line for each agent that is finished."""
-    from qfolio import console
+    from qfolio.commands import console
 
     count = len(run.entrants)
     with console.bar("") as update:
@@ -140,7 +141,7 @@ def _train(run: "Comparison") -> None:
 
 
 def _finish(run: "Comparison") -> None:
-    from qfolio import console
+    from qfolio.commands import console
     from qfolio.report.comparison import write_comparison_report
 
     content = run.finish()
@@ -154,8 +155,8 @@ def print_ranking(content: dict[str, Any]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from qfolio import console
-    from qfolio.comparison.ranking import HEADLINE, amount, share, span
+    from qfolio.commands import console
+    from qfolio.experiments.comparison.ranking import HEADLINE, amount, share, span
 
     ranking = content["ranking"]
     write = share if ranking["measure"] == "regret" else amount

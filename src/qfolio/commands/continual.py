@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio import settings
 from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, Name
-from qfolio.errors import QfolioError
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.continual import Plan
+    from qfolio.experiments.continual import Plan
 
 Changes = Annotated[tuple[str, ...], arg(metavar="NAME=VALUE …", help_behavior_hint="")]
 Share = Annotated[float | None, arg(metavar="X", help_behavior_hint="")]
@@ -57,10 +57,11 @@ def continual(
         change or assignments or any(option is not None for option in given)
     ):
         raise QfolioError("--resume keeps what was started; add nothing.")
-    from qfolio import devices
+    from qfolio.core import devices
 
     devices.configure()
-    from qfolio import console, continual, presets
+    from qfolio.commands import console
+    from qfolio.experiments import continual, presets
     from qfolio.report.continual import verdict, write_continual_report
 
     if resume is None:
@@ -99,8 +100,9 @@ def _plan(
     assignments: tuple[str, ...],
     options: dict[str, Any],
 ) -> "Plan":
-    from qfolio import presets, registry
-    from qfolio.continual import Plan
+    from qfolio.core import registry
+    from qfolio.experiments import presets
+    from qfolio.experiments.continual import Plan
 
     task_class = registry.find("task", registry.TASKS, task_name)
     registry.find("agent", registry.AGENTS, agent_name)
@@ -124,8 +126,8 @@ def _print(content: dict[str, Any]) -> None:
     """A row for each way."""
     from rich.table import Table
 
-    from qfolio.console import console
-    from qfolio.statistics import interquartile_mean
+    from qfolio.commands.console import console
+    from qfolio.core.statistics import interquartile_mean
 
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("way")

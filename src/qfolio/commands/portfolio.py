@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from qfolio import settings
 from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, File, Folder, Name, Names
-from qfolio.errors import QfolioError
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.backtest.run import Backtest
-    from qfolio.presets import Preset
+    from qfolio.experiments.presets import Preset
+    from qfolio.portfolio.backtest.run import Backtest
 
 Missing = Literal["error", "drop-asset", "forward-fill"]
 Late = Literal["error", "drop-asset", "trim", "join"]
@@ -42,8 +42,8 @@ def prices(
         features: Columns of further numbers, which are no assets.
         date: The column of dates, where its name does not tell.
     """
-    from qfolio import console
-    from qfolio.markets.prices import check, describe, load
+    from qfolio.commands import console
+    from qfolio.portfolio.prices.table import check, describe, load
 
     options: dict[str, Any] = dict(missing=missing, late=late, features=features, date=date)
     findings = check(file, **options)
@@ -103,12 +103,12 @@ def backtest(
         date: The column of dates, where its name does not tell.
     """
     options = dict(locals())
-    from qfolio import devices
+    from qfolio.core import devices
 
     devices.configure()
-    from qfolio import console
-    from qfolio.backtest.run import Backtest
-    from qfolio.markets.prices import load
+    from qfolio.commands import console
+    from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.portfolio.prices.table import load
 
     if not 0 <= cost_bps <= 2000:
         raise QfolioError(f"--cost-bps is {cost_bps:g}; it must be from 0 to 2000.")
@@ -179,13 +179,13 @@ def allocate(
         date: The column of dates, where its name does not tell.
         as_json: Print JSON instead of a table.
     """
-    from qfolio import devices
+    from qfolio.core import devices
 
     devices.configure()
-    from qfolio import console
-    from qfolio.allocation import Allocation, read_holdings, require_fresh
-    from qfolio.backtest.run import Backtest
-    from qfolio.markets.prices import load
+    from qfolio.commands import console
+    from qfolio.portfolio.allocation import Allocation, read_holdings, require_fresh
+    from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.portfolio.prices.table import load
 
     run = Backtest.open(folder)
     policy = run.policy(agent)
@@ -216,7 +216,8 @@ def _split(text: str) -> list[str]:
 
 
 def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
-    from qfolio import presets, registry
+    from qfolio.core import registry
+    from qfolio.experiments import presets
 
     registry.find("agent", registry.AGENTS, name)
     chosen = presets.preset(preset, "portfolio", name)
@@ -226,8 +227,8 @@ def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
 def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
     """Presets with settings changed: of one agent (dqn.discount), of all that have it, or the
     task's."""
-    from qfolio import registry
-    from qfolio.tasks.portfolio import Portfolio
+    from qfolio.core import registry
+    from qfolio.portfolio.task import Portfolio
 
     used = set()
     changed = {}
@@ -258,7 +259,7 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
 
 
 def _report(run: "Backtest", folder: Path) -> None:
-    from qfolio import console
+    from qfolio.commands import console
     from qfolio.report.backtest import write_backtest_report
     from qfolio.report.collect import backtest_data
 

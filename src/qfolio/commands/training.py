@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from qfolio import settings
 from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, Name
-from qfolio.errors import QfolioError
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.runs import Run
+    from qfolio.experiments.run import Run
 
 
 def train(
@@ -61,11 +61,12 @@ def train(
             markets, one action at a time instead of all at once).
         live: Show an episode in a window now and then, while training.
     """
-    from qfolio import devices
+    from qfolio.core import devices
 
     devices.configure()
-    from qfolio import console, presets
-    from qfolio.runs import Run
+    from qfolio.commands import console
+    from qfolio.experiments import presets
+    from qfolio.experiments.run import Run
 
     budget = {"episodes": episodes, "steps": steps}
     asked = {name: amount for name, amount in budget.items() if amount is not None}
@@ -116,10 +117,10 @@ def evaluate(
     """
     if episodes is not None and episodes < 1:
         raise QfolioError(f"--episodes is {episodes}; it must be at least 1.")
-    from qfolio import devices
+    from qfolio.core import devices
 
     devices.configure()
-    from qfolio.runs import Run
+    from qfolio.experiments.run import Run
 
     run = Run.open(folder)
     episodes = episodes or run.population.starts
@@ -127,7 +128,7 @@ def evaluate(
     if as_json:
         print(json.dumps({"folder": str(folder), "starts": episodes, **result}, indent=2))
     else:
-        from qfolio.console import print_result
+        from qfolio.commands.console import print_result
 
         print_result(run.population.seeds, result)
 
@@ -139,16 +140,16 @@ def watch(folder: Positional[Path], *, episodes: int = 3) -> None:
         folder: A run folder.
         episodes: Episodes to show in the window.
     """
-    from qfolio import devices
-    from qfolio.watch import Window, has_display
+    from qfolio.commands.window import Window, has_display
+    from qfolio.core import devices
 
     if episodes < 1:
         raise QfolioError(f"--episodes is {episodes}; it must be at least 1.")
     devices.configure()
-    from qfolio.evaluation import STARTS
+    from qfolio.core.evaluation import STARTS
+    from qfolio.experiments.run import Run
     from qfolio.report.animation import pendulum_gif
     from qfolio.report.collect import EPISODE_START, greedy_episode
-    from qfolio.runs import Run
     from qfolio.tasks.pendulum import Pendulum
 
     run = Run.open(folder)
@@ -180,8 +181,9 @@ def _new_run(
     folder: Path,
     chosen: dict[str, str],
 ) -> "Run":
-    from qfolio import presets, registry
-    from qfolio.runs import Run
+    from qfolio.core import registry
+    from qfolio.experiments import presets
+    from qfolio.experiments.run import Run
 
     task_class = registry.find("task", registry.TASKS, task_name)
     registry.find("agent", registry.AGENTS, agent_name)
@@ -200,8 +202,8 @@ def _new_run(
 
 def _train(run: "Run", budget: dict[str, int], show: Callable[["Run"], None] | None = None) -> None:
     """Trains with live progress, beside the optimum."""
-    from qfolio import console
-    from qfolio.evaluation import start_keys
+    from qfolio.commands import console
+    from qfolio.core.evaluation import start_keys
 
     solution, optimum = run.task.optimum(), None
     if solution is not None:
@@ -213,8 +215,8 @@ def _train(run: "Run", budget: dict[str, int], show: Callable[["Run"], None] | N
 
 def _contrast(run: "Run", folder: Path) -> "Run | None":
     """The same training with the one thing changed that the report contrasts; resumable too."""
-    from qfolio.console import say
-    from qfolio.runs import Run
+    from qfolio.commands.console import say
+    from qfolio.experiments.run import Run
 
     variant = run.agent.contrast()
     if variant is None:
@@ -240,7 +242,7 @@ def _contrast(run: "Run", folder: Path) -> "Run | None":
 
 
 def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
-    from qfolio.console import console, print_result, print_rule, say
+    from qfolio.commands.console import console, print_result, print_rule, say
     from qfolio.report.collect import report_data
     from qfolio.report.page import write_report
 
@@ -261,7 +263,7 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
 
 def _command(run: "Run") -> str:
     """The command line that repeats a run, and the one that goes on with it."""
-    from qfolio.presets import preset, presets_of
+    from qfolio.experiments.presets import preset, presets_of
 
     config = run.config
     resume = f"qfolio train --resume {run.folder}"
@@ -287,7 +289,7 @@ def _command(run: "Run") -> str:
 @contextlib.contextmanager
 def _window(live: bool) -> Iterator[Callable[["Run"], None] | None]:
     """What ``--live`` shows: the first agent's episode in a window, at each point of the curve."""
-    from qfolio.watch import Window, has_display
+    from qfolio.commands.window import Window, has_display
 
     if not live:
         yield None

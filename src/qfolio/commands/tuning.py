@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio import settings
 from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, Name
-from qfolio.errors import QfolioError
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.tuning.run import Progress, Tuning
+    from qfolio.experiments.tuning.run import Progress, Tuning
 
 Ranges = Annotated[tuple[str, ...], arg(metavar="NAME=RANGE …", help_behavior_hint="")]
 
@@ -56,11 +56,12 @@ def tune(
         join: Work on the search in this folder, beside other processes or after them; with
             --trials, up to a new number of trials.
     """
-    from qfolio import devices
+    from qfolio.core import devices
 
     devices.configure()
     tuning = _tuning()
-    from qfolio import console, presets
+    from qfolio.commands import console
+    from qfolio.experiments import presets
 
     given: list[Any] = [task, agent, preset, seeds, episodes, steps, out]
     asked = {name: n for name, n in (("episodes", episodes), ("steps", steps)) if n is not None}
@@ -92,14 +93,14 @@ def tune(
 
 def _tuning() -> Any:
     try:
-        import qfolio.tuning.run
+        import qfolio.experiments.tuning.run
     except ModuleNotFoundError as error:
         if error.name != "optuna":
             raise
         raise QfolioError(
             "qfolio tune chooses configurations with Optuna; pip install 'qfolio[tune]'."
         ) from None
-    return qfolio.tuning.run
+    return qfolio.experiments.tuning.run
 
 
 def _new(
@@ -114,10 +115,11 @@ def _new(
     assignments: tuple[str, ...],
     out: Path | None,
 ) -> "Tuning":
-    from qfolio import presets, registry
-    from qfolio.runs import check_counts
-    from qfolio.tuning import search
-    from qfolio.tuning.run import Tuning
+    from qfolio.core import registry
+    from qfolio.experiments import presets
+    from qfolio.experiments.run import check_counts
+    from qfolio.experiments.tuning import search
+    from qfolio.experiments.tuning.run import Tuning
 
     task_class = registry.find("task", registry.TASKS, task_name)
     agent_class = registry.find("agent", registry.AGENTS, agent_name)
@@ -170,7 +172,7 @@ def far(work: "Tuning") -> str:
 
 def _run(work: "Tuning") -> None:
     """Trains with a line for each batch and a bar within it."""
-    from qfolio.console import bar, number, say
+    from qfolio.commands.console import bar, number, say
 
     say("".join(f"{name:>11}" for name in ("trials", "diverged", "best", "preset", "an hour")))
     with bar("training a batch") as update:
@@ -185,7 +187,7 @@ def _run(work: "Tuning") -> None:
 
 
 def _conclude(work: "Tuning") -> None:
-    from qfolio.console import console, say
+    from qfolio.commands.console import console, say
     from qfolio.report.tuning import sweep, write_tuning_report
 
     with console.status("Training the best and the preset with fresh seeds, to grade them"):
@@ -209,8 +211,8 @@ def _conclude(work: "Tuning") -> None:
 
 def command(work: "Tuning", values: dict[str, Any]) -> str:
     """The command line that trains a configuration, and the one that goes on with the search."""
-    from qfolio.presets import preset
-    from qfolio.tuning.search import written
+    from qfolio.experiments.presets import preset
+    from qfolio.experiments.tuning.search import written
 
     config = work.config
     base = preset(config["preset"], config["task"], config["agent"])

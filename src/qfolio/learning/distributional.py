@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from qfolio.fields import require
+from qfolio.core.fields import require
 from qfolio.learning.targets import Scale, huber_loss
 
 Losses = tuple[Float[Array, " batch"], Float[Array, " batch"]]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.mdp import Actions, Discrete, Simplex
+from qfolio.core.mdp import Actions, Discrete, Simplex
 
 
 class Categorical(eqx.Module):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio.errors import QfolioError
+from qfolio.core.errors import QfolioError
 
 Gain = Float[Array, "*inputs"] | float
 """Factors of an encoder's first weights, one for each channel or for all."""

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from qfolio.core.mdp import Task
 from qfolio.learning import networks
 from qfolio.learning.encoders import MLP
-from qfolio.mdp import Task
 
 
 class NoisyMLP(MLP):

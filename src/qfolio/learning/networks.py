@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio.errors import QfolioError
-from qfolio.fields import require, require_sizes
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import require, require_sizes
+from qfolio.core.mdp import Actions, Box, Discrete, Simplex, Task, View
 from qfolio.learning.encoders import CNN, LSTM, MLP, RNN, Window, uniform
-from qfolio.mdp import Actions, Box, Discrete, Simplex, Task, View
 
 
 class Flat(eqx.Module):

@@ -9,8 +9,8 @@ import optax
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio.fields import require
-from qfolio.mdp import Metrics
+from qfolio.core.fields import require
+from qfolio.core.mdp import Metrics
 
 Weights = TypeVar("Weights", bound=PyTree)
 

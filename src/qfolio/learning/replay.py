@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio.errors import QfolioError
-from qfolio.fields import require
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import require
+from qfolio.core.mdp import Transition
 from qfolio.learning.priorities import Priorities
 from qfolio.learning.targets import n_step
-from qfolio.mdp import Transition
 
 Discount = Float[Array, "*#batch"] | float
 """Of what follows a batch of experience."""

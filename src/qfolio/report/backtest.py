@@ -20,9 +20,9 @@ from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from qfolio.backtest.assessment import Assessment, Difference
-from qfolio.backtest.performance import drawdown, monthly
-from qfolio.errors import QfolioError
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.assessment import Assessment, Difference
+from qfolio.portfolio.backtest.performance import drawdown, monthly
 from qfolio.report import palette
 from qfolio.report.data import Floats
 from qfolio.report.figures import LEAD, new_figure, save_png

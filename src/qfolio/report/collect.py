@@ -9,19 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from qfolio.backtest.assessment import Assessment
-from qfolio.backtest.run import Backtest, Entry
-from qfolio.evaluation import greedy, play, start_keys
-from qfolio.mdp import Agent, Policy, Position
-from qfolio.optimum.followed import FollowedOptimum
+from qfolio.core.evaluation import greedy, play, start_keys
+from qfolio.core.mdp import Agent, Policy, Position
+from qfolio.core.training import episode_steps
+from qfolio.experiments.run import Run
+from qfolio.portfolio.backtest.assessment import Assessment
+from qfolio.portfolio.backtest.run import Backtest, Entry
+from qfolio.portfolio.market import Market
+from qfolio.portfolio.synthetic import Ar1, NoTrade, OneAsset, Synthetic
 from qfolio.report.backtest import BacktestData, StrategySeries
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
 from qfolio.report.words import AGENTS, words_of
-from qfolio.runs import Run
-from qfolio.tasks.market import Market
+from qfolio.solvers.followed import FollowedOptimum
 from qfolio.tasks.pendulum import Pendulum, PendulumState
-from qfolio.tasks.synthetic import Ar1, NoTrade, OneAsset, Synthetic
-from qfolio.training import episode_steps
 
 _HELD = 201
 """At how many weights or positions a policy is drawn."""

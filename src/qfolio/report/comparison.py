@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qfolio.comparison.ranking import HEADLINE, THRESHOLDS, Result, amount, curve, share, span
+from qfolio.core.statistics import bootstrap_interval, interquartile_mean
+from qfolio.experiments.comparison.ranking import (
+    HEADLINE,
+    THRESHOLDS,
+    Result,
+    amount,
+    curve,
+    share,
+    span,
+)
 from qfolio.report import palette, rendering
 from qfolio.report.data import Floats
 from qfolio.report.figures import (
@@ -37,7 +46,6 @@ from qfolio.report.rendering import (
     setting_groups,
 )
 from qfolio.report.words import words_of
-from qfolio.statistics import bootstrap_interval, interquartile_mean
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

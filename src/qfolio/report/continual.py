@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qfolio.continual import WAYS
+from qfolio.core.statistics import bootstrap_interval, interquartile_mean
+from qfolio.experiments.continual import WAYS
 from qfolio.report import palette
 from qfolio.report.figures import LEAD, NARROW, new_figure, percent_axis, save_png, short_tick, svgs
 from qfolio.report.rendering import amount, duration, number, percent, render, setting_groups
-from qfolio.statistics import bootstrap_interval, interquartile_mean
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,6 +14,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from qfolio.core.statistics import bootstrap_interval, interquartile_mean
 from qfolio.report import palette
 from qfolio.report.data import (
     Curve,
@@ -27,7 +28,6 @@ from qfolio.report.data import (
     decimals,
 )
 from qfolio.report.rendering import number, percent
-from qfolio.statistics import bootstrap_interval, interquartile_mean
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

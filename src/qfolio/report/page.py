@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from qfolio.core.statistics import interquartile_mean
 from qfolio.report import figures
 from qfolio.report.animation import pendulum_gif
 from qfolio.report.data import MarketData, ReportData, decimals
@@ -22,7 +23,6 @@ from qfolio.report.rendering import (
     render,
     setting_groups,
 )
-from qfolio.statistics import interquartile_mean
 
 
 def write_report(folder: Path, data: ReportData) -> None:

@@ -12,22 +12,22 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from qfolio.core.statistics import mean_interval
+from qfolio.experiments.tuning import search
+from qfolio.experiments.tuning.journal import Trial, best_of
+from qfolio.experiments.tuning.search import Dimension, Value
+from qfolio.experiments.tuning.sensitivity import Effect, Sensitivity, sensitivity, short, verdicts
 from qfolio.report import palette
 from qfolio.report.data import decimals
 from qfolio.report.figures import LEAD, NARROW, WIDE, new_figure, save_png, svgs
 from qfolio.report.rendering import THIN_SPACE, counted, number, percent, render, setting_groups
 from qfolio.report.words import AGENTS, words_of
-from qfolio.statistics import mean_interval
-from qfolio.tuning import search
-from qfolio.tuning.journal import Trial, best_of
-from qfolio.tuning.search import Dimension, Value
-from qfolio.tuning.sensitivity import Effect, Sensitivity, sensitivity, short, verdicts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from qfolio.tuning.run import Tuning
+    from qfolio.experiments.tuning.run import Tuning
 
 SHADES = 5
 """Shades of trials from the first to the last, or from the worst to the best."""

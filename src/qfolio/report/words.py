@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from qfolio.registry import GYM
+from qfolio.core.registry import GYM
 
 
 class Words(NamedTuple):

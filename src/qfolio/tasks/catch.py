@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
-from qfolio.errors import QfolioError
-from qfolio.fields import require, static
-from qfolio.mdp import Discrete, Step, Task
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import require, static
+from qfolio.core.mdp import Discrete, Step, Task
 
 
 class CatchState(NamedTuple):

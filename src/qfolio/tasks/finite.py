@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from numpy.typing import ArrayLike
 
-from qfolio.errors import QfolioError
-from qfolio.fields import require, static
-from qfolio.mdp import Discrete, Step, Task
-from qfolio.optimum.finite import FiniteOptimum, Model
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import require, static
+from qfolio.core.mdp import Discrete, Step, Task
+from qfolio.solvers.finite import FiniteOptimum, Model
 
 
 class FiniteMDP(Task):

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from qfolio.fields import require, static
-from qfolio.optimum.grid import GridOptimum, cell
+from qfolio.core.fields import require, static
+from qfolio.solvers.grid import GridOptimum, cell
 from qfolio.tasks.finite import FiniteMDP
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 

@@ -17,15 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from qfolio.errors import QfolioError
-from qfolio.fields import require, static
-from qfolio.mdp import Box, Discrete, Step, Task
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import require, static
+from qfolio.core.host import HostTask
+from qfolio.core.mdp import Box, Discrete, Step
 
 UNLIMITED = 1000
 """Steps after which an episode is cut where the environment itself has no time limit."""
 
 
-class GymnasiumTask(Task):
+class GymnasiumTask(HostTask):
     """An environment by its ID in Gymnasium's registry, such as ``CartPole-v1``.
 
     Observations are numbers (a Box, of any shape) or one of ``states`` numbers (Discrete). Actions
@@ -164,7 +165,7 @@ def _spec(id: str) -> Any:
     module, _, name = id.rpartition(":")
     try:
         if module or name.startswith("qfolio/"):
-            import_module(module or "qfolio.gym")
+            import_module(module or "qfolio.adapters.gym")
         return gymnasium.spec(name)
     except ImportError as reason:
         raise QfolioError(f"{module} cannot be imported for {id} ({reason}).") from None

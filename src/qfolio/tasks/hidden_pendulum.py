@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from qfolio.fields import require, static
-from qfolio.mdp import Box, Discrete, Step, Task
-from qfolio.optimum.grid import GridOptimum
+from qfolio.core.fields import require, static
+from qfolio.core.mdp import Box, Discrete, Step, Task
+from qfolio.solvers.grid import GridOptimum
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 
 

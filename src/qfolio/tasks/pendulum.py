@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.fields import number, require, static
-from qfolio.mdp import Box, Discrete, Step, Task
-from qfolio.optimum.grid import GridOptimum
+from qfolio.core.fields import number, require, static
+from qfolio.core.mdp import Box, Discrete, Step, Task
+from qfolio.solvers.grid import GridOptimum
 
 
 class PendulumState(NamedTuple):

@@ -1,0 +1,359 @@
+"""qfolio's tasks as environments of Gymnasium, for other libraries' agents.
+
+>>> import gymnasium, qfolio.adapters.gym
+>>> env = gymnasium.make("qfolio/Portfolio-v0", prices="prices.csv", cost=0.001, horizon=250)
+>>> env = gymnasium.make("qfolio/Pendulum-v0", torques=0)
+
+``IDS`` holds the others, one for each task that ``qfolio train`` knows by name.
+"""
+
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError
+from qfolio.core.registry import TASKS, find
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.costs import drift
+from qfolio.portfolio.prices.table import load
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ImportError:
+    raise QfolioError("qfolio.adapters.gym needs Gymnasium: pip install 'qfolio[gym]'.") from None
+
+ID = "qfolio/Portfolio-v0"
+
+IDS = {name: f"qfolio/{where.partition(':')[2]}-v0" for name, where in TASKS.items()}
+"""Of the tasks by name, such as qfolio/Pendulum-v0."""
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+Observation = dict[str, np.ndarray]
+
+
+class PortfolioEnv(gymnasium.Env[Observation, Any]):
+    """Trade the assets of a price table over ``horizon`` rows, starting from cash.
+
+    **Observation**: "features", for each asset the window of scaled log returns (and any other
+    features) up to today, of shape (assets, window, channels); and "holding", the weights of the
+    assets held now (the rest is cash).
+
+    **Action**: N + 1 numbers, cash first, of which the nearest point of the simplex is taken as
+    target weights (Euclidean projection, no asset above ``cap``); so weights stand for themselves.
+    With ``menu`` ("grid:10", "tilts:0.1"), the number of an allocation instead.
+
+    **Step**: a decision at row t is executed at the close of row t + lag, and its reward is that of
+    the return of row t + lag + 1, net of the exact cost. Wealth is kept in double precision, by the
+    same replay as the backtest's. Episodes are truncated after ``horizon`` steps and never
+    terminate.
+
+    ``info`` holds "wealth" (1 at the start), "cost" (share of wealth paid for this step's trade),
+    "turnover", "target" (weights decided, cash first), "date" (of the row observed) and
+    "return_date" (of the row that earned the last return). It knows more than an agent may.
+
+    Args:
+        prices: Anything that ``qfolio.load_prices`` reads; None for skfolio's 20 stocks.
+        scaled_by: The table that the scale of observations comes from, if not ``prices``: to test
+            on later prices, give those that were trained on.
+        render_mode: "ansi" for a line of text, or None.
+        task: Settings of the portfolio task: window, lag, cost, cap, menu, reward, horizon, ….
+
+    ``reset`` draws the first row, unless told ``options={"start": row}``.
+    """
+
+    metadata = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012
+
+    def __init__(
+        self,
+        prices: Any = None,
+        *,
+        scaled_by: Any = None,
+        render_mode: str | None = None,
+        **task: Any,
+    ) -> None:
+        from qfolio.portfolio.task import Portfolio
+
+        if render_mode not in (None, "ansi"):
+            raise QfolioError(f"render_mode is {render_mode!r}; it must be 'ansi' or None.")
+        self.render_mode = render_mode
+        self.prices = load(prices)
+        chosen = settings.convert(Portfolio, task)
+        self.task = Portfolio.of(self.prices, **chosen)
+        if scaled_by is not None:
+            other = load(scaled_by)
+            if (other.assets, other.feature_names) != (
+                self.prices.assets,
+                self.prices.feature_names,
+            ):
+                raise QfolioError("scaled_by must have the assets and features of prices.")
+            scale = Portfolio.of(other, **chosen)
+            self.task = _programs().scaled(self.task, scale)
+        assets, channels = len(self.prices.assets), self.task.center.shape[0]
+        self.first = int(self.task.first)
+        self.last = int(self.task.last) - self.task.horizon + 1
+        self.observation_space = spaces.Dict(
+            {
+                "features": spaces.Box(
+                    -_LARGEST, _LARGEST, (assets, self.task.window, channels), np.float32
+                ),
+                "holding": spaces.Box(0.0, 1.0, (assets,), np.float32),
+            }
+        )
+        self.action_space = (
+            spaces.Discrete(self.task.actions.n)
+            if self.task.menu
+            else spaces.Box(-1.0, 1.0, (assets + 1,), np.float32)
+        )
+        self._row, self._steps = -1, self.task.horizon  # over
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts in cash, at a row from ``first`` to ``last``."""
+        super().reset(seed=seed)
+        start = (options or {}).get("start")
+        if start is None:
+            start = self.np_random.integers(self.first, self.last + 1)
+        elif not isinstance(start, int | np.integer) or not self.first <= start <= self.last:
+            raise QfolioError(
+                f"start is {start!r}; an episode of {self.task.horizon} steps can start at rows "
+                f"{self.first} to {self.last} of this table."
+            )
+        self._row, self._steps, self._wealth = int(start), 0, 1.0
+        self._held = np.eye(len(self.prices.assets) + 1)[0]
+        self._moments = np.asarray(self.task.hold(self._held).moments, float)
+        self._target, self._cost, self._turnover = self._held, 0.0, 0.0
+        return self._observe(), self._info()
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Decides for today's row and moves to the next."""
+        if self._steps >= self.task.horizon:
+            raise QfolioError("The episode is over; call reset() first.")
+        row, lag = self._row, self.task.lag
+        self._target = _programs().target(self.task, self._held, self._checked(action))
+        values = self.prices.values[row : row + lag + 2]
+        traded = simulate(
+            values, self._target[None], first=0, cost=self.task.cost, lag=lag, start=self._held
+        )
+        growth = 1 + float(traded.returns[0])
+        reward, self._moments = _programs().utility(self.task, growth, self._moments)
+        self._held = drift(self._target, np.nan_to_num(values[1] / values[0], nan=1.0))
+        self._wealth *= growth
+        self._cost, self._turnover = float(traded.cost[0]), float(traded.turnover[0])
+        self._row, self._steps = row + 1, self._steps + 1
+        over = self._steps >= self.task.horizon
+        return self._observe(), float(reward), False, over, self._info()
+
+    def render(self) -> str | None:
+        """Date, wealth and what is held, in a line."""
+        if self.render_mode is None or self._row < 0:
+            return None
+        named = zip(("cash", *self.prices.assets), self._held, strict=True)
+        held = ", ".join(f"{name} {weight:.0%}" for name, weight in named if weight >= 0.005)
+        return f"{self._day(self._row)}  wealth {self._wealth:.4f}  {held}\n"
+
+    def _checked(self, action: Any) -> np.ndarray:
+        space = self.action_space
+        if isinstance(space, spaces.Discrete):
+            if not space.contains(action):
+                raise QfolioError(f"The action is {action!r}; it must be from 0 to {space.n - 1}.")
+            return np.asarray(action, np.int32)
+        try:
+            scores = np.asarray(action, float)
+        except (TypeError, ValueError):
+            scores = np.empty(0)
+        if scores.shape != space.shape or not np.isfinite(scores).all():
+            raise QfolioError(
+                f"An action must be {space.shape[0]} finite numbers, cash first; this one has the "
+                f"shape {scores.shape}."
+            )
+        return scores
+
+    def _observe(self) -> Observation:
+        return {
+            "features": _programs().features(self.task, self._row),
+            "holding": np.clip(self._held[1:], 0, 1).astype(np.float32),
+        }
+
+    def _info(self) -> dict[str, Any]:
+        earned = self._row + self.task.lag if self._steps else self._row
+        return {
+            "wealth": self._wealth,
+            "cost": self._cost,
+            "turnover": self._turnover,
+            "target": self._target.copy(),
+            "date": self._day(self._row),
+            "return_date": self._day(earned),
+        }
+
+    def _day(self, row: int) -> str:
+        return str(self.prices.dates[row])[:10]
+
+
+class _Programs:
+    """The task's own rules, compiled once for all environments; jax is imported at first use.
+
+    They run in double precision where their inputs are.
+    """
+
+    def __init__(self) -> None:
+        import equinox as eqx
+        import jax
+
+        from qfolio.core import devices, simplex
+        from qfolio.core.mdp import Position
+
+        devices.configure()
+
+        @jax.jit
+        def target(task: Any, held: Any, action: Any) -> Any:
+            if not task.menu:
+                action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
+            return task.intent(Position(task.first, task.hold(held)), action)
+
+        self._target = target
+        self._utility = jax.jit(lambda task, growth, moments: task.utility(growth, moments))
+        self._features = jax.jit(lambda task, row: task.features(row))
+        self._double = partial(jax.enable_x64, True)
+        where = lambda task: (task.center, task.scale)  # noqa: E731
+        self.scaled = lambda task, by: eqx.tree_at(where, task, where(by))
+
+    def target(self, task: Any, held: np.ndarray, action: np.ndarray) -> np.ndarray:
+        with self._double():
+            weights = np.asarray(self._target(task, held, action), float)
+        return np.asarray(weights / weights.sum())
+
+    def utility(self, task: Any, growth: float, moments: np.ndarray) -> tuple[float, np.ndarray]:
+        with self._double():
+            reward, moments = self._utility(task, np.asarray(growth), moments)
+            return float(reward), np.asarray(moments)
+
+    def features(self, task: Any, row: int) -> np.ndarray:
+        return np.array(self._features(task, np.int32(row)))
+
+
+_programs = cache(_Programs)
+
+
+class TaskEnv(gymnasium.Env[Any, Any]):
+    """A task of ``qfolio train`` by its name, compiled, one step at a time.
+
+    Observations are those of qfolio's agents: numbers (Box), one of a few numbers (Discrete) or in
+    markets a Dict of each asset's "features" and the "holding". Actions are numbered (Discrete),
+    or numbers (Box); where they are weights of a market, the nearest point of the simplex is taken.
+    Episodes are truncated after the task's ``horizon``. Raises QfolioError for settings and actions
+    that do not fit.
+
+    Args:
+        name: Of the task, such as "pendulum".
+        render_mode: None; there is nothing to be seen.
+        settings: Of the task, such as torques=0.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, name: str, *, render_mode: str | None = None, **chosen: Any) -> None:
+        import jax
+
+        from qfolio.core import devices
+        from qfolio.core.mdp import Discrete, Simplex, View
+
+        if render_mode is not None:
+            raise QfolioError(f"render_mode is {render_mode!r}; {name} has none.")
+        devices.configure()
+        task: Any = settings.build(find("task", TASKS, name), chosen)
+        self.task, self._steps = task, task.horizon  # over
+        self._there = jax.device_put(task)  # its arrays need not travel at each step
+        seen = jax.eval_shape(lambda key: task.observe(task.reset(key)), jax.random.key(0))
+        number = lambda x: spaces.Box(-_LARGEST, _LARGEST, x.shape, np.float32)  # noqa: E731
+        self._named = isinstance(seen, View)
+        self.observation_space: spaces.Space[Any]
+        if task.states is not None:
+            self.observation_space = spaces.Discrete(task.states)
+        elif self._named:
+            self.observation_space = spaces.Dict({k: number(x) for k, x in seen._asdict().items()})
+        else:
+            self.observation_space = number(seen)
+        actions = task.actions
+        self.action_space: spaces.Space[Any]
+        if isinstance(actions, Discrete):
+            self.action_space = spaces.Discrete(actions.n)
+        elif isinstance(actions, Simplex):
+            self.action_space = spaces.Box(-1.0, 1.0, (actions.assets + 1,), np.float32)
+        else:
+            bound = actions.bound
+            self.action_space = spaces.Box(-bound, bound, (actions.n,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """A start state, drawn anew."""
+        super().reset(seed=seed)
+        self._steps = 0
+        self._seed = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
+        self._state, observation = _stepping().reset(self._there, self._seed)
+        return self._told(observation), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self._steps >= self.task.horizon:
+            raise QfolioError("The episode is over; call reset() first.")
+        numbered = isinstance(self.action_space, spaces.Discrete)
+        given = np.asarray(action, None if numbered else np.float32)
+        if not self.action_space.contains(given) or not np.isfinite(given).all():
+            raise QfolioError(f"The action is {action!r}; it must be in {self.action_space}.")
+        after, observation = _stepping().step(
+            self._there, self._state, given, self._seed, np.int32(self._steps)
+        )
+        self._state, self._steps = after.state, self._steps + 1
+        terminated = bool(after.terminated)
+        truncated = self._steps >= self.task.horizon and not terminated
+        if terminated:
+            self._steps = self.task.horizon
+        return self._told(observation), float(after.reward), terminated, truncated, {}
+
+    def _told(self, observation: Any) -> Any:
+        if self._named:
+            return {name: np.array(x) for name, x in observation._asdict().items()}
+        if isinstance(self.observation_space, spaces.Discrete):
+            return np.int64(observation)
+        return np.array(observation, np.float32)
+
+
+class _Stepping:
+    """How a task is reset and stepped, compiled once for all environments of a kind."""
+
+    def __init__(self) -> None:
+        import jax
+
+        from qfolio.core import simplex
+        from qfolio.core.mdp import Discrete, Simplex
+
+        @jax.jit
+        def reset(task: Any, seed: Any) -> Any:
+            state = task.reset(jax.random.key(seed))
+            return state, task.observe(state)
+
+        @jax.jit
+        def step(task: Any, state: Any, action: Any, seed: Any, time: Any) -> Any:
+            if isinstance(task.actions, Discrete):
+                action = action.astype(jax.numpy.int32)
+            elif isinstance(task.actions, Simplex):
+                action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
+            key = jax.random.fold_in(jax.random.key(seed), time)
+            after = task.step(state, action, key)
+            return after, task.observe(after.state)
+
+        self.reset, self.step = reset, step
+
+
+_stepping = cache(_Stepping)
+
+if ID not in gymnasium.registry:
+    gymnasium.register(ID, entry_point="qfolio.adapters.gym:PortfolioEnv")
+for _name, _id in IDS.items():
+    if _id not in gymnasium.registry:
+        gymnasium.register(_id, entry_point="qfolio.adapters.gym:TaskEnv", kwargs={"name": _name})

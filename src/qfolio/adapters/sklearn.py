@@ -1,0 +1,366 @@
+"""Policies as estimators of scikit-learn, for the model selection and the reports of skfolio.
+
+>>> from qfolio.adapters.sklearn import PortfolioPolicy
+>>> from skfolio.model_selection import WalkForward, cross_val_predict
+>>> cross_val_predict(PortfolioPolicy(seeds=2), X, cv=WalkForward(train_size=1260, test_size=252))
+"""
+
+import inspect
+from typing import Any
+
+import numpy as np
+from skfolio import Portfolio
+from skfolio.optimization import BaseOptimization
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.registry import AGENTS, find
+from qfolio.core.settings import names
+from qfolio.experiments import presets
+from qfolio.portfolio.backtest.simulation import Simulation, simulate
+from qfolio.portfolio.costs import drift
+from qfolio.portfolio.prices.table import Prices
+
+OWN = ("cost", "lag", "cap", "window")
+"""Settings of the portfolio task that are parameters of the estimator."""
+
+
+class PortfolioPolicy(BaseOptimization):
+    """A learned policy that trades every day, as an estimator.
+
+    ``X`` holds simple returns, of shape (observations, assets), as in skfolio; a row of it is
+    earned by the decision that was made ``lag`` + 1 rows before. So predictions begin with
+    decisions made at the last rows of the training data, whose returns the fitted estimator keeps
+    for this and for the window that the policy looks at; and ``fit`` learns from all of its rows
+    but the last ``lag``, which lie behind the first of those decisions. Nothing that is decided at
+    a row depends on a later one.
+
+    ``predict`` takes the rows of ``X`` to follow those that were learned from. Where both have
+    dates, it looks up which rows came before, and if these are too few for a window (as on the
+    training data themselves), what is held stays as it is until there are enough. Rows that a
+    splitter purges in between are not seen; the market then stands still for the policy.
+
+    Parameters
+    ----------
+    agent : str, default="pathwise"
+        "pathwise" or "dqn".
+
+    preset : str, default="fast"
+        Name of the hyperparameters to start from.
+
+    episodes : int, default=None
+        Training episodes of each seed in ``fit``; those of the preset if None.
+
+    update_episodes : int, default=None
+        The same for each ``partial_fit`` but the first; one for each of the agent's environments
+        if None.
+
+    seeds : int, default=None
+        Agents that are trained, whose mean decision is followed; those of the preset if None.
+
+    seed : int, default=0
+        The first agent's seed; the others have the next ones.
+
+    window : int, default=None
+        Rows of returns that the policy sees; that of the preset if None.
+
+    cost : float, default=0.001
+        Of trading one way, as a fraction of what is traded; both learning and predicted returns
+        pay it exactly.
+
+    lag : int, default=1
+        Rows between a decision and its execution.
+
+    cap : float, default=1.0
+        Most that one asset may weigh.
+
+    settings : dict, default=None
+        Settings of the agent or of the portfolio task in place of the preset's, by name.
+
+    portfolio_params : dict, default=None
+        Parameters of the predicted portfolio, such as ``name`` or ``annualization_factor``.
+
+    fallback, raise_on_failure :
+        What happens when fitting fails, as in skfolio's other models.
+
+    previous_weights : float, dict or array-like of shape (n_assets,), default=None
+        Weights of the assets held at the close before the first row that is predicted (the rest is
+        cash); nothing but cash if None. skfolio's walk-forward functions pass on what the last
+        fold held.
+
+    Attributes
+    ----------
+    policy_ : qfolio.portfolio.policy.Policy
+        What was learned.
+
+    weights_ : ndarray of shape (n_assets,)
+        Target weights after the last row that was learned from, for who holds
+        ``previous_weights``. The sum is less than 1 where the policy wants cash.
+
+    returns_ : ndarray of shape (n_observations, n_assets)
+        The last returns that were seen.
+
+    observations_ : pandas.Index or None
+        Their dates.
+
+    n_samples_seen_ : int
+        Number of all returns that were seen, also of those that are no longer kept.
+
+    n_features_in_, feature_names_in_ :
+        Number and names of the assets.
+    """
+
+    policy_: Any
+    returns_: np.ndarray
+    observations_: Any
+    n_samples_seen_: int
+
+    def __init__(
+        self,
+        agent: str = "pathwise",
+        preset: str = "fast",
+        episodes: int | None = None,
+        update_episodes: int | None = None,
+        seeds: int | None = None,
+        seed: int = 0,
+        window: int | None = None,
+        cost: float = 0.001,
+        lag: int = 1,
+        cap: float = 1.0,
+        settings: dict[str, Any] | None = None,
+        portfolio_params: dict[str, Any] | None = None,
+        fallback: Any = None,
+        previous_weights: Any = None,
+        raise_on_failure: bool = True,
+    ) -> None:
+        super().__init__(
+            portfolio_params=portfolio_params,
+            fallback=fallback,
+            previous_weights=previous_weights,
+            raise_on_failure=raise_on_failure,
+        )
+        self.agent = agent
+        self.preset = preset
+        self.episodes = episodes
+        self.update_episodes = update_episodes
+        self.seeds = seeds
+        self.seed = seed
+        self.window = window
+        self.cost = cost
+        self.lag = lag
+        self.cap = cap
+        self.settings = settings
+
+    @property
+    def needs_previous_weights(self) -> bool:
+        """Always: a fold starts with what the last one held, and pays for what it changes."""
+        return True
+
+    def fit(self, X: Any, y: Any = None) -> "PortfolioPolicy":
+        """Learns a policy from simple returns of shape (n_observations, n_assets)."""
+        from qfolio.core import devices
+        from qfolio.portfolio.policy import train
+
+        devices.configure()
+        returns = validate_data(self, X, dtype=np.float64)
+        chosen, task = self._chosen()
+        self._held()  # odd holdings are refused before time is spent on training
+        self.returns_, self.observations_ = returns, _dates(X)
+        self.n_samples_seen_ = len(returns)
+        self.policy_ = train(
+            self._learned(),
+            chosen,
+            seeds=self.seeds,
+            seed=self.seed,
+            episodes=self.episodes,
+            **task,
+        )
+        self.weights_ = self._tomorrow()
+        return self
+
+    def partial_fit(self, X: Any, y: Any = None) -> "PortfolioPolicy":
+        """Goes on learning from returns of the same assets that follow those seen before.
+
+        The first call is a ``fit``; each later one looks at as many of the last rows as that.
+        """
+        self._validate_partial_fit_fallback()
+        if not hasattr(self, "policy_"):
+            return self.fit(X, y)
+        returns, dates = validate_data(self, X, reset=False, dtype=np.float64), _dates(X)
+        if dates is None or self.observations_ is None:
+            self.observations_ = None
+        else:
+            if not dates[0] > self.observations_[-1]:
+                raise ValueError(
+                    f"X begins at {dates[0]}, but rows up to {self.observations_[-1]} were learned "
+                    "from already; partial_fit takes new rows only."
+                )
+            self.observations_ = self.observations_.append(dates)[-len(self.returns_) :]
+        self.returns_ = np.concatenate([self.returns_, returns])[-len(self.returns_) :]
+        self.n_samples_seen_ += len(returns)
+        self.policy_ = self.policy_.update(self._learned(), self.update_episodes)
+        self.weights_ = self._tomorrow()
+        return self
+
+    def predict(self, X: Any) -> Any:
+        """The portfolio that follows the policy, day by day, over the rows of ``X``.
+
+        Returns
+        -------
+        PolicyPortfolio
+            One return for each row, net of costs.
+        """
+        check_is_fitted(self, "weights_")
+        if self.weights_ is None or getattr(self, "fallback_", None) is not None:
+            return super().predict(X)
+        returns = validate_data(self, X, reset=False, dtype=np.float64)
+        simulation = self._followed(self._before(X), returns)
+        params = dict(self.portfolio_params or {})
+        for name in ("transaction_costs", "management_fees", "previous_weights"):
+            if name in params:
+                raise QfolioError(
+                    f"portfolio_params has {name!r}; a policy's returns are net of its own cost, "
+                    "so set cost (or previous_weights) of the estimator."
+                )
+        params.pop("weight_drift", None)  # a policy's weights always drift
+        params.setdefault("name", type(self).__name__)
+        previous = self._held()[1:]
+        return PolicyPortfolio(X, simulation, previous_weights=previous, **params)
+
+    def _chosen(self) -> tuple[presets.Preset, dict[str, Any]]:
+        """The preset with the settings that were changed, and the task's own parameters."""
+        chosen = presets.preset(self.preset, "portfolio", self.agent)
+        changes = dict(self.settings or {})
+        for name in changes.keys() & set(OWN):
+            raise QfolioError(f"{name} is a parameter of its own; leave it out of settings.")
+        mine = names(find("agent", AGENTS, chosen.agent))
+        of_agent = {name: value for name, value in changes.items() if name in mine}
+        of_task = {name: value for name, value in changes.items() if name not in mine}
+        window = {} if self.window is None else {"window": self.window}
+        task = {"cost": self.cost, "lag": self.lag, "cap": self.cap, **window, **of_task}
+        return chosen._replace(settings={**chosen.settings, **of_agent}), task
+
+    def _learned(self) -> Prices:
+        """The rows up to the first decision that a prediction begins with."""
+        learned = self.returns_[: len(self.returns_) - self.lag]
+        dropped = self.n_samples_seen_ - len(self.returns_)
+        return _prices(learned, self._assets(), first=dropped)
+
+    def _assets(self) -> tuple[str, ...]:
+        named = getattr(self, "feature_names_in_", None)
+        if named is None:
+            return tuple(f"x{i}" for i in range(self.n_features_in_))
+        return tuple(map(str, named))
+
+    def _held(self) -> np.ndarray:
+        """``previous_weights`` with cash first, of shape (entry,)."""
+        weights = np.zeros(self.n_features_in_)
+        if self.previous_weights is not None:
+            weights = self._clean_previous_weights(n_assets=self.n_features_in_)
+        if not (weights >= -1e-9).all() or not weights.sum() <= 1 + 1e-6:
+            raise ValueError("previous_weights must not be negative, nor sum to more than 1.")
+        weights = np.maximum(weights, 0)
+        held = np.append(max(0.0, 1 - weights.sum()), weights)
+        return np.asarray(held / held.sum())
+
+    def _tomorrow(self) -> np.ndarray:
+        window = self.policy_.task.window
+        prices = _prices(self.returns_[-window:], self._assets())
+        targets, _ = self.policy_.decide(prices, window, self._held(), 1)
+        return np.asarray(targets[0, 1:])
+
+    def _before(self, X: Any) -> np.ndarray:
+        """The returns that are known before the first row of ``X``."""
+        dates = _dates(X)
+        if dates is None or self.observations_ is None:
+            return self.returns_
+        try:
+            return self.returns_[: int(self.observations_.searchsorted(dates[0]))]
+        except TypeError:  # labels of different kinds have no order
+            return self.returns_
+
+    def _followed(self, before: np.ndarray, returns: np.ndarray) -> Simulation:
+        task, days = self.policy_.task, len(returns)
+        window, lag = task.window, task.lag
+        before = before[max(0, len(before) - window - lag) :]
+        # Rows that are missing before the first decision's window; nothing moves in them.
+        missing = window + lag - len(before)
+        still = np.zeros((missing, returns.shape[1]))
+        prices = _prices(np.concatenate([still, before, returns]), self._assets())
+        values = prices.values
+        # Row window + lag is the last before X, and row window that of the first decision.
+        start = drift(self._held(), values[window] / values[window + lag])
+        decisions = np.full((days, 1 + returns.shape[1]), np.nan)  # NaN: no order
+        if missing < days:
+            first = window + missing
+            held = drift(start, values[first] / values[window])
+            decisions[missing:], _ = self.policy_.decide(prices, first, held, days - missing)
+        return simulate(values, decisions, first=window, cost=task.cost, lag=lag, start=start)
+
+
+class PolicyPortfolio(Portfolio):
+    """A portfolio whose weights a policy changes every day; costs are in its returns.
+
+    ``weights`` are means over the days, ``weights_per_observation`` those of each day, and
+    ``turnover`` is the sum of what was traded. simulation: the replay, with cash, turnover and cost
+    of each day.
+    """
+
+    __slots__ = {"simulation"}
+    _read_only_attrs = Portfolio._read_only_attrs | {"simulation"}
+
+    def __init__(self, X: Any, simulation: Simulation, **params: Any) -> None:
+        if "weights" in params:
+            raise TypeError(
+                "The weights of a policy change from day to day; its portfolio cannot be scaled, "
+                "or combined with another."
+            )
+        path = simulation.weights[:, 1:]
+        super().__init__(X, weights=path.mean(0), weight_drift=True, **params)
+        last = 1 + np.asarray(X, dtype=float)[-1]
+        own = {
+            "returns": simulation.returns,
+            "ending_weights": drift(simulation.weights[-1], last)[1:],
+            "simulation": simulation,
+            "_weights_path": path,
+        }
+        for name, value in (("_loaded", False), *own.items(), ("_loaded", True)):  # else read-only
+            setattr(self, name, value)
+
+    @property
+    def turnover(self) -> float:
+        """Value bought plus value sold, over the wealth before each trade, summed over the days."""
+        return float(self.simulation.turnover.sum())
+
+    def contribution(self, *args: Any, **kwargs: Any) -> Any:
+        """Not defined: skfolio's contributions are derivatives by constant weights."""
+        raise NotImplementedError("Contributions are not defined for weights that change daily.")
+
+    def _get_init_params(self) -> dict[str, Any]:
+        """What it can be made from again, by name."""
+        kept = set(inspect.signature(Portfolio.__init__).parameters)
+        kept -= {"self", "kwargs", "weights", "weight_drift", "sample_weight"}
+        params = {name: getattr(self, name) for name in sorted(kept)}
+        return {**params, "sample_weight": self._sample_weight, "simulation": self.simulation}
+
+
+def _dates(X: Any) -> Any:
+    """The labels of the rows, where they can tell which came before which."""
+    index: Any = getattr(X, "index", None)
+    if not hasattr(index, "is_monotonic_increasing"):
+        return None
+    counted = index.dtype.kind == "i" and np.array_equal(index, np.arange(len(index)))
+    return index if index.is_monotonic_increasing and index.is_unique and not counted else None
+
+
+def _prices(returns: np.ndarray, assets: tuple[str, ...], first: int = 0) -> Prices:
+    """Prices that begin with 1 and have these simple returns; days are counted from ``first``."""
+    if not (returns > -1).all():
+        row, asset = np.argwhere(~(returns > -1))[0]
+        raise ValueError(
+            f"The return of {assets[asset]!r} in row {row} is {returns[row, asset]:g}; a simple "
+            "return must be above -1."
+        )
+    values = np.cumprod(np.concatenate([np.ones((1, len(assets))), 1 + returns]), axis=0)
+    days = np.datetime64("1970-01-01") + first + np.arange(len(values))
+    return Prices(days, assets, values)

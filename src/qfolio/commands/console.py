@@ -1,0 +1,253 @@
+"""What the commands print: live progress and tables."""
+
+import contextlib
+import datetime
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import rich.progress
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from qfolio.core.training import episode_steps
+
+if TYPE_CHECKING:
+    from qfolio.experiments.run import Progress, Run
+    from qfolio.portfolio.allocation import Allocation
+    from qfolio.portfolio.backtest import run as backtesting
+    from qfolio.portfolio.backtest.assessment import Assessment
+    from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.portfolio.prices.checks import Finding
+
+console = Console(highlight=False)
+
+
+def say(text: str) -> None:
+    print(text, flush=True)
+
+
+@contextlib.contextmanager
+def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., None]]:
+    """A bar with text beside it, on terminals only and gone at the end.
+
+    Yields what moves it: ``update(completed=…)``, with ``description=…`` where the text changes.
+    """
+    columns = (
+        rich.progress.BarColumn(bar_width=24),
+        rich.progress.TextColumn("{task.description}"),
+    )
+    with rich.progress.Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as live:
+        yield partial(live.update, live.add_task(text, total=total, completed=done))
+
+
+def describe(run: "Run") -> str:
+    config = run.config
+    seeds = f"{config['seeds']} seed" + "s" * (config["seeds"] > 1)
+    preset = config["preset"] or "none"
+    return (
+        f"{config['agent'].upper()} on {config['task']} · preset {preset} · {seeds} · "
+        f"{config['device']}"
+    )
+
+
+def train(
+    run: "Run",
+    budget: dict[str, int],
+    optimum: float | None,
+    show: Callable[["Run"], None] | None = None,
+) -> None:
+    """Trains with a line for each point of the curve and a bar between them.
+
+    budget: episodes or steps, as ``Run.train`` takes them. optimum: on the curve's start states.
+    show: called with the run at each point of the curve.
+    """
+    ((unit, total),) = budget.items()
+    steps = episode_steps(run.task, run.agent)
+    value = "return" if steps == run.task.horizon else f"return/{steps}"  # of shorter episodes
+    columns = (unit, value, "greedy", "optimum", "epsilon", "steps/s", "left")
+    say("".join(f"{name:>11}" for name in columns))
+    with bar("compiling", total, run.done(unit)) as update:
+
+        def note(now: "Progress") -> None:
+            done, value = f"{now.done:,}", number(now.mean_return)
+            rate = f"{now.steps_per_second:,.0f}"
+            epsilon = "–" if math.isnan(now.epsilon) else f"{now.epsilon:.2f}"
+            left = str(datetime.timedelta(seconds=round(now.seconds_left)))
+            status = f"{done} {unit}  return {value}  ε {epsilon}  {rate} steps/s  {left} left"
+            update(completed=min(now.done, total), description=status)
+            if now.greedy_return is not None:
+                cells = (done, value, number(now.greedy_return), number(optimum))
+                say("".join(f"{cell:>11}" for cell in (*cells, epsilon, rate, left)))
+                if show is not None:
+                    show(run)
+
+        run.train(**budget, listener=note)
+
+
+def print_result(seeds: list[int], result: dict[str, Any]) -> None:
+    """A row for each seed and their mean, from ``Run.grade``."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for name in ("seed", "return", "optimum", "regret", "overestimation"):
+        table.add_column(name, justify="right", min_width=9)
+    returns, over = result["return_per_seed"], result["overestimation_per_seed"]
+    regrets = result["regret_per_seed"] or [math.nan] * len(returns)
+    optimum = number(result["optimum"])
+    for seed, *values in zip(seeds, returns, regrets, over, strict=True):
+        table.add_row(str(seed), *_cells(optimum, *values))
+    table.add_section()
+    means = (
+        sum(math.nan if x is None else x for x in column) / len(column)
+        for column in (returns, regrets, over)
+    )
+    table.add_row("mean", *_cells(optimum, *means))
+    console.print(table)
+    if result["return_ci95"]:
+        low, high = result["return_ci95"]
+        say(f"95 % interval of the mean return over seeds: {number(low)} to {number(high)}")
+    else:
+        say("One seed has no interval; train several with --seeds.")
+
+
+def number(value: float | None) -> str:
+    """One decimal, or four digits that matter where that says too little."""
+    if value is None or math.isnan(value):
+        return "–"
+    return f"{value:,.1f}" if abs(value) >= 10 or not value else f"{value:#.4g}"
+
+
+def _cells(optimum: str, value: float, regret: float, over: float | None) -> tuple[str, ...]:
+    share = "–" if math.isnan(regret) else f"{round(regret, 4) + 0.0:.2%}"
+    return number(value), optimum, share, number(over)
+
+
+def print_rule(rule: dict[str, Any]) -> None:
+    """What the learned policies do, beside what is best, from ``Run.grade``."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("rule")
+    for name in ("exact", "learned, mean", "farthest seed"):
+        table.add_column(name, justify="right")
+    for name, exact in rule["exact"].items():
+        learned = [seed[name] for seed in rule["per_seed"]]
+        farthest = max(learned, key=lambda value: abs(value - exact))
+        mean = sum(learned) / len(learned)
+        table.add_row(name, f"{exact:.4f}", f"{mean:.4f}", f"{farthest:.4f}")
+    console.print(table)
+
+
+def print_findings(findings: "list[Finding]") -> None:
+    """What is wrong with a price table, errors first."""
+    for finding in sorted(findings, key=lambda finding: finding.severity != "error"):
+        said = f"{finding.severity}: {finding}".removesuffix("?")
+        say(f"{said}. {finding.advice or ''}".rstrip())
+    errors = sum(finding.count for finding in findings if finding.severity == "error")
+    warnings = sum(finding.count for finding in findings if finding.severity == "warning")
+    if findings:
+        say(f"{errors:,} errors, {warnings:,} warnings.")
+
+
+def print_prices(facts: dict[str, Any]) -> None:
+    """What a price table holds, from ``prices.describe``."""
+    say(
+        f"{facts['source']}: {facts['rows']:,} rows of {facts['assets']:,} assets, "
+        f"{facts['first']} to {facts['last']}, about {facts['periods_per_year']:g} a year."
+    )
+    if facts["features"]:
+        say(f"Features: {', '.join(facts['features'])}.")
+    if facts["note"]:
+        say(f"Note: {facts['note']}")
+
+
+def describe_backtest(backtest: "Backtest") -> str:
+    config = backtest.config
+    return (
+        f"{len(backtest.folds)} folds ({backtest.folds[0].name} to {str(backtest.dates[-1])[:10]}) "
+        f"· {len(backtest.prices.assets)} assets · {' and '.join(backtest.agents)} · "
+        f"{config['seeds']} seeds · {config['cost'] * 1e4:g} bp · lag {config['lag']} · "
+        f"{config['device']}"
+    )
+
+
+def run_backtest(backtest: "Backtest") -> None:
+    """Trains with a bar and the time left."""
+    last = ""
+    with bar("compiling") as update:
+
+        def note(now: "backtesting.Progress") -> None:
+            nonlocal last
+            left = datetime.timedelta(seconds=round(now.seconds_left))
+            description = f"training {now.agent}  {now.done:.0%}  {left} left"
+            update(completed=now.done, description=description)
+            if not console.is_terminal and f"{now.done:.1f}" != last:  # a line for each tenth
+                last = f"{now.done:.1f}"
+                say(description)
+
+        backtest.run(note)
+
+
+def print_assessment(assessment: "Assessment") -> None:
+    """A row for each strategy, and what follows from it in words."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("a year, net")
+    for name in ("growth", "vol.", "Sharpe", "fall", "traded", "cost"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, strategy in assessment.strategies.items():
+        value = {key: measure.mean for key, measure in strategy.measures.items()}
+        style = "bold" if strategy.kind == "agent" else None
+        table.add_row(
+            name,
+            f"{value['growth']:.2%}",
+            f"{value['volatility']:.1%}",
+            f"{value['sharpe']:.2f}",
+            f"{value['drawdown']:.1%}",
+            f"{value['turnover']:.1f}",
+            f"{value['cost_drag']:.2%}",
+            style=style,
+        )
+    console.print(table)
+    verdicts = [
+        difference.verdict
+        for strategy in assessment.strategies.values()
+        for difference in (strategy.to_reference, strategy.to_best_baseline)
+        if strategy.kind == "agent" and difference is not None
+    ]
+    for verdict in dict.fromkeys(verdicts):  # the two are one where equal weights are the best
+        say(verdict)
+
+
+def print_allocation(allocation: "Allocation") -> None:
+    """The trades of tomorrow, and what they cost."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("asset")
+    for name in ("price", "weight now", "target", "trade, money", "trade, shares"):
+        table.add_column(name, justify="right")
+    held, targets = allocation.held, allocation.weights
+    rows = zip(
+        allocation.assets,
+        allocation.prices,
+        held[1:],
+        targets[1:],
+        allocation.trades,
+        strict=True,
+    )
+    for asset, price, now, target, trade in rows:
+        if now or target or trade:
+            table.add_row(
+                Text(asset),
+                f"{price:,.2f}",
+                f"{now:.2%}",
+                f"{target:.2%}",
+                f"{trade * price:+,.2f}",
+                f"{trade:+,.4g}",
+            )
+    table.add_row("cash", "", f"{held[0]:.2%}", f"{targets[0]:.2%}", "", "")
+    console.print(table)
+    say(
+        f"After the close of {allocation.date}: wealth {allocation.wealth:,.2f}, expected cost "
+        f"{allocation.cost:,.2f}, cash left {allocation.cash_after:,.2f}. "
+        "Assets that are neither held nor wanted are left out."
+    )

@@ -1,0 +1,158 @@
+"""How jax is set up, and how the members of a population share the processor.
+
+A population is a pytree whose leaves have a leading member axis: one member for each seed (or
+configuration). Devices share the members. On a GPU a device steps its members in lockstep (vmap).
+On a CPU each core is a device of its own, and takes its members one after the other: one agent's
+weights then stay in its cache, its matrix products keep their shape, and a member's arithmetic does
+not depend on how many others there are, to the last bit.
+"""
+
+import datetime
+import os
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import version
+from platform import python_version
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import NamedSharding, PartitionSpec
+from jaxtyping import Array
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import cache_directory
+
+LOCKSTEP = {"gpu", "tpu"}
+"""Platforms that step their members in lockstep."""
+
+
+def configure() -> None:
+    """Makes each CPU core a device and keeps compiled programs on disk.
+
+    Takes effect if called before jax first computes; whatever the user has set himself stays.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    wanted = {
+        "--xla_force_host_platform_device_count": str(len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1),
+        "--xla_cpu_multi_thread_eigen": "false",
+    }  # fmt: skip
+    new = [f"{flag}={value}" for flag, value in wanted.items() if flag not in flags]
+    os.environ["XLA_FLAGS"] = " ".join([flags, *new]).strip()
+    if not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
+        jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "programs"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def describe() -> str:
+    device = jax.devices()[0]
+    return f"{len(jax.devices())} × {device.device_kind} ({device.platform})"
+
+
+def circumstances(*programs: str) -> dict[str, str | dict[str, str]]:
+    """When and on what something begins, as its file on disk tells.
+
+    programs: Python, or libraries, whose versions it tells, too.
+    """
+    versions = {name: python_version() if name == "python" else version(name) for name in programs}
+    return {
+        "device": describe(),
+        **({"versions": versions} if programs else {}),
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+
+
+def require_memory(tree: Any, count: int) -> None:
+    """Raises QfolioError where ``count`` members shaped like ``tree`` cannot fit, before trying."""
+    needed = count * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+    stats = jax.devices()[0].memory_stats()
+    if stats:
+        there = stats["bytes_limit"] * len(jax.devices())
+    elif hasattr(os, "sysconf"):
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    else:
+        return
+    if needed > there:
+        raise QfolioError(
+            f"These settings need {needed / 2**30:,.1f} GiB of memory and there are "
+            f"{there / 2**30:,.1f}; lower hidden, replay_capacity or the number of seeds."
+        )
+
+
+class Members:
+    """``count`` members spread over the devices, each in a slot of its device.
+
+    one_by_one: whether members of a device take turns; else they advance in lockstep.
+
+    Outside, leaves have a leading axis of ``count``; on the devices, one of slots. ``place`` and
+    ``fetch`` go from the one to the other.
+    """
+
+    def __init__(self, count: int) -> None:
+        devices = jax.devices()[: min(len(jax.devices()), count)]
+        self.one_by_one = devices[0].platform not in LOCKSTEP
+        # Two slots or more where members take turns: XLA drops an axis of one and then rounds
+        # differently. There, a slot without a member costs memory, but no time.
+        slots = max(2 if self.one_by_one else 1, -(-count // len(devices)))
+        shares = np.array_split(np.arange(count), len(devices))
+        self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
+        self._filling = np.concatenate([np.resize(share, slots) for share in shares])
+        self._sharding = NamedSharding(
+            jax.sharding.Mesh(np.array(devices), ("member",)), PartitionSpec("member")
+        )
+        taken = np.array([len(share) for share in shares], np.int32)
+        self._taken = jax.device_put(taken, self._sharding)
+
+    def place(self, tree: Any) -> Any:
+        """Moves each member to a device."""
+        slots = jax.tree.map(lambda x: np.asarray(x)[self._filling], tree)
+        return jax.device_put(slots, self._sharding)
+
+    def fetch(self, tree: Any) -> Any:
+        """The members as numpy arrays."""
+        return jax.tree.map(lambda x: np.asarray(x)[self._slots], tree)
+
+    def compile(
+        self, function: Callable[..., Any], *example: Any, split: int = 1, donate: bool = False
+    ) -> Any:
+        """``function(*members, *shared)`` as a program over all members' slots.
+
+        example: arguments shaped like those to come; the first ``split`` of them have an axis of
+        slots, the others go to each member as they are. donate: the first one's memory is reused.
+        """
+
+        def on_device(taken: Array, *args: Any) -> Any:
+            one = lambda members: function(*members, *args[split:])  # noqa: E731
+            members = args[:split]
+            return _map(one, members, taken[0]) if self.one_by_one else jax.vmap(one)(members)
+
+        def on_all(taken: Array, *args: Any) -> Any:
+            each, same = self._sharding.spec, PartitionSpec()
+            return jax.shard_map(
+                on_device,
+                mesh=self._sharding.mesh,
+                in_specs=(each, *[each] * split, *[same] * (len(args) - split)),
+                out_specs=each,
+                check_vma=False,
+            )(taken, *args)
+
+        program = jax.jit(on_all, donate_argnums=1 if donate else ())
+        return partial(program.lower(self._taken, *example).compile(), self._taken)
+
+
+def _map(function: Callable[[Any], Any], members: Any, count: Array) -> Any:
+    """``lax.map`` over the first ``count`` members only."""
+    at = lambda i: jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, i, 0, False), members)  # noqa: E731
+    shapes = jax.eval_shape(function, at(0))
+    length = jax.tree.leaves(members)[0].shape[0]
+    results = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
+
+    def body(i: Array, results: Any) -> Any:
+        put = lambda all, one: lax.dynamic_update_index_in_dim(all, one, i, 0)  # noqa: E731
+        return jax.tree.map(put, results, function(at(i)))
+
+    return lax.fori_loop(0, count, body, results)

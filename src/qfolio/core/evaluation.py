@@ -1,0 +1,106 @@
+"""How good a policy is: greedy returns from fixed starts, and how far its values overestimate."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
+
+from qfolio.core.mdp import Agent, Policy, Task
+
+STARTS = 1024
+"""Start states that results are graded on; those along the learning curve are the first of them."""
+
+CURVE_STARTS = 64
+"""Start states of the evaluations along the learning curve."""
+
+
+def start_keys(n: int = STARTS) -> Key[Array, " start"]:
+    """Keys of the fixed start states; the first of many are the same as few."""
+    return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(20151), i))(jnp.arange(n))
+
+
+class Greedy(NamedTuple):
+    """Greedy episodes from some starts."""
+
+    returns: Float[Array, " start"]  # undiscounted, over the task's horizon
+    overestimation: Float[Array, ""]  # NaN where the agent estimates no action values
+
+
+def tail_steps(discount: float | None) -> int:
+    """Steps after which a reward counts for less than 1 % (at most 2,000)."""
+    if discount is None:
+        return 0
+    return min(2000, math.ceil(math.log(0.01) / math.log(min(max(discount, 1e-9), 1 - 1e-9))))
+
+
+def evaluate(
+    task: Task, agent: Agent, weights: PyTree, keys: Key[Array, " start"], tail: int
+) -> Greedy:
+    """Follows the greedy policy from each key's start state over the horizon and ``tail`` steps.
+
+    The return counts the horizon. The overestimation is the mean over the states visited in it of
+    max_a Q(s, a) less the discounted return that really followed (van Hasselt et al. 2016,
+    section 3); the tail is there so that what follows is not cut off.
+    """
+    starts = jax.vmap(task.reset)(keys)
+
+    def step(carry: tuple[PyTree, Array], time: Array) -> tuple[tuple[PyTree, Array], tuple]:
+        states, alive = carry
+        observation = jax.vmap(task.observe)(states)
+        values = agent.action_values(weights, observation)
+        best = jnp.full(alive.shape, jnp.nan) if values is None else values.max(-1)
+        actions = agent.policy(weights, observation)
+        step_keys = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
+        after = jax.vmap(task.step)(states, actions, step_keys)
+        reward = jnp.where(alive, after.reward, 0.0)
+        return (after.state, alive & ~after.terminated), (reward, best, alive)
+
+    discount = 1.0 if agent.discount is None else agent.discount
+
+    alive = jnp.ones(keys.shape, bool)
+    times = jnp.arange(task.horizon + tail)
+    _, (rewards, best, visited) = lax.scan(step, (starts, alive), times)
+
+    def back(following: Array, reward: Array) -> tuple[Array, Array]:
+        now = reward + discount * following
+        return now, now
+
+    _, discounted = lax.scan(back, jnp.zeros(keys.shape), rewards, reverse=True)
+    first = slice(0, task.horizon)
+    error = jnp.where(visited, best - discounted, 0.0)[first].sum() / visited[first].sum()
+    return Greedy(rewards[first].sum(0), error)
+
+
+def greedy(task: Task, agent: Agent, weights: PyTree) -> Policy:
+    """What an agent's greedy policy intends in a state."""
+
+    def policy(state: PyTree) -> Array:
+        view = jax.tree.map(lambda x: x[None], task.observe(state))
+        return task.intent(state, agent.policy(weights, view)[0])
+
+    return policy
+
+
+class Episode(NamedTuple):
+    """One greedy episode, step by step."""
+
+    states: PyTree  # (time + 1, ...)
+    actions: Array  # (time, ...)
+    rewards: Float[Array, " time"]
+
+
+def play(task: Task, agent: Agent, weights: PyTree, key: PRNGKeyArray) -> Episode:
+    """One greedy episode of the task's horizon from the start state of ``key``."""
+
+    def step(state: PyTree, time: Array) -> tuple[PyTree, tuple]:
+        action = agent.policy(weights, task.observe(state)[None])[0]
+        after = task.step(state, action, jax.random.fold_in(key, time))
+        return after.state, (after.state, action, after.reward)
+
+    start = task.reset(key)
+    _, (states, actions, rewards) = lax.scan(step, start, jnp.arange(task.horizon))
+    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
+    return Episode(states, actions, rewards)

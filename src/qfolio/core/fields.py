@@ -1,0 +1,41 @@
+"""How agents and tasks declare and check their settings."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+
+from qfolio.core.errors import QfolioError
+
+
+def static(default: Any) -> Any:
+    """A setting that shapes the program."""
+    return eqx.field(static=True, default=default)
+
+
+def number(default: float) -> Any:
+    """A setting that is an input of the program: members may differ in it."""
+    return eqx.field(converter=float, default=default)
+
+
+def constant(default: float) -> Any:
+    """A number that shapes the program."""
+    return eqx.field(static=True, converter=float, default=default)
+
+
+def sizes(*default: int) -> Any:
+    """Layer sizes."""
+    return eqx.field(static=True, converter=tuple, default=default)
+
+
+def require(instance: Any, names: str, holds: Callable[[Any], bool], wanted: str) -> None:
+    """Raises QfolioError for the first of the settings that does not hold."""
+    for name in names.split():
+        value = getattr(instance, name)
+        if isinstance(value, str | int | float | tuple) and not holds(value):  # not while traced
+            raise QfolioError(f"{name} is {value}; it must be {wanted}.")
+
+
+def require_sizes(instance: Any, name: str = "hidden") -> None:
+    holds = lambda x: len(x) > 0 and min(x) >= 1 and max(x) < 2**31  # noqa: E731
+    require(instance, name, holds, "one or more layer sizes")

@@ -1,0 +1,140 @@
+"""Files that are never half-written and never executed: atomic writes, safetensors, the cache."""
+
+import contextlib
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from qfolio.core.errors import QfolioError
+
+UNFINISHED = ".part"
+"""Ending of files that a killed process may have left."""
+
+
+def cache_directory() -> Path:
+    """Where compiled programs and solved optima are kept; safe to delete at any time."""
+    if path := os.environ.get("QFOLIO_CACHE"):
+        return Path(path)
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData/Local")
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library/Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "qfolio"
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes to a temporary name beside ``path``, then renames: a reader sees all or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def require_new(folder: Path) -> None:
+    """Raises QfolioError where ``folder`` already holds something."""
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise QfolioError(
+            f"{folder} is not empty; name a new folder, or go on with --resume {folder}."
+        )
+
+
+@contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Another name to fill the folder under; at the end it is renamed, so it is whole or absent."""
+    require_new(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    yield temporary
+    mask = os.umask(0)
+    os.umask(mask)
+    temporary.chmod(0o777 & ~mask)  # as the user's new folders are
+    if folder.exists():
+        folder.rmdir()
+    temporary.rename(folder)
+
+
+def write_json(path: Path, content: Any) -> None:
+    write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Raises QfolioError where the file is missing or holds no JSON object."""
+    try:
+        content = json.loads(path.read_text())
+    except OSError as error:
+        raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
+    except (ValueError, RecursionError) as error:
+        raise QfolioError(f"{path} is damaged, it holds no valid JSON ({error}).") from None
+    if not isinstance(content, dict):
+        raise QfolioError(f"{path} is damaged, it holds no JSON object.")
+    return content
+
+
+def require_types(content: dict[str, Any], wanted: dict[str, Any]) -> None:
+    """Raises QfolioError for the first name whose value is missing or of another type."""
+    for name, kind in wanted.items():
+        if name not in content or not isinstance(content[name], kind):
+            raise QfolioError(f"{name} is missing or of the wrong type.")
+
+
+def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Named arrays as safetensors, which hold numbers only and cannot carry code."""
+    write_bytes(path, save({name: np.asarray(a, order="C") for name, a in arrays.items()}))
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Raises QfolioError where the file is missing, truncated or not safetensors."""
+    try:
+        return load(path.read_bytes())
+    except OSError as error:
+        raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
+    except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise QfolioError(
+            f"{path} is no safetensors file or is damaged ({error}); restore it or train anew."
+        ) from None
+
+
+def write_tree(path: Path, tree: Any) -> None:
+    """The arrays of a pytree, by the names of their places in it."""
+    write_arrays(path, _named(tree))
+
+
+def read_tree(path: Path, template: Any) -> Any:
+    """``template`` with its arrays from a file, which must fit it name by name."""
+    import jax
+
+    arrays, wanted = read_arrays(path), _named(template)
+    fits = wanted.keys() == arrays.keys() and all(
+        arrays[name].shape == leaf.shape and arrays[name].dtype == leaf.dtype
+        for name, leaf in wanted.items()
+    )
+    if not fits:
+        raise QfolioError(
+            f"{path} does not belong to the settings beside it; "
+            "restore the two together, or train anew."
+        )
+    return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])
+
+
+def _named(tree: Any) -> dict[str, Any]:
+    import jax
+
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

@@ -1,0 +1,296 @@
+"""The training loop for environments that cannot be compiled: the twin of ``training.py``.
+
+The agents are the same, and so is what is compiled of them: one program takes the rollout that has
+just come to its end, learns from it and answers with the next actions. Python steps the
+environments of Gymnasium in between. Members take turns: while their programs compute, on as many
+cores as there are, the environments of another are stepped.
+"""
+
+import abc
+from collections.abc import Callable, Generator, Hashable, Iterable, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Key, PyTree
+
+from qfolio.core.evaluation import Greedy
+from qfolio.core.mdp import Agent, Task, Transition
+from qfolio.core.training import (
+    Episodes,
+    Population,
+    TrainingState,
+    absorb,
+    begin,
+    episode_steps,
+    healthy,
+    programs_of,
+    step_keys,
+)
+
+T = TypeVar("T")
+
+CHUNK = 200
+"""Steps between two returns to the caller, at least (whole rollouts)."""
+
+LANES = 10
+"""Environments that are stepped side by side when a member is graded."""
+
+
+class Facts(Protocol):
+    """How observations and actions are translated between an environment and agents."""
+
+    def given(self, actions: np.ndarray) -> list[Any]:
+        """A batch of agents' actions, each as the environment takes it."""
+        ...
+
+    def seen(self, observation: Any) -> Any:
+        """An environment's observation as agents get it."""
+        ...
+
+
+class HostTask(Task):
+    """A task whose environment is stepped from Python, by Gymnasium's interface."""
+
+    @property
+    @abc.abstractmethod
+    def facts(self) -> Facts:
+        """How observations and actions are translated."""
+
+    @property
+    @abc.abstractmethod
+    def observation(self) -> tuple[tuple[int, ...], type]:
+        """Shape and type of an observation."""
+
+    @abc.abstractmethod
+    def make(self, **options: Any) -> Any:
+        """A new environment, without a time limit."""
+
+
+class Outcome(NamedTuple):
+    """What a step of some environments led to; ``observation`` is from before any reset."""
+
+    reward: Float[np.ndarray, " environment"]
+    observation: np.ndarray  # (environment, ...)
+    terminated: Bool[np.ndarray, " environment"]
+    truncated: Bool[np.ndarray, " environment"]
+
+
+class Environments:
+    """Environments of one task in a row, stepped one after the other.
+
+    limit: steps after which their episodes are truncated. observation: what is seen now.
+    """
+
+    def __init__(self, task: HostTask, limit: int, count: int) -> None:
+        self._facts, self._limit = task.facts, limit
+        self._environments = [task.make() for _ in range(count)]
+        self._steppers = [environment.step for environment in self._environments]
+        shape, kind = task.observation
+        self.observation: np.ndarray = np.zeros((count, *shape), kind)
+        self._steps = np.zeros(count, np.int32)
+
+    def reset(self, index: int, seed: int | None = None) -> None:
+        """Starts an episode in one place."""
+        observation, _ = self._environments[index].reset(seed=seed)
+        self.observation[index] = self._facts.seen(observation)
+        self._steps[index] = 0
+
+    def step(self, actions: np.ndarray, which: Iterable[int] | None = None) -> Outcome:
+        """One step of all, or only of those in some places; resets none."""
+        count = len(self._steppers)
+        reward = np.zeros(count, np.float32)
+        terminated, truncated = np.zeros(count, bool), np.zeros(count, bool)
+        after = np.zeros_like(self.observation)
+        given, seen = self._facts.given(actions), self._facts.seen
+        for i in range(count) if which is None else which:
+            observation, reward[i], terminated[i], truncated[i], _ = self._steppers[i](given[i])
+            after[i] = seen(observation)
+        self.observation = after
+        self._steps += 1
+        truncated = (truncated | (self._steps >= self._limit)) & ~terminated
+        return Outcome(reward, after, terminated, truncated)
+
+    def restart(self, finished: Bool[np.ndarray, " environment"]) -> None:
+        """Starts an episode where one is over; what was observed before stays as it is."""
+        if finished.any():
+            self.observation = self.observation.copy()
+            for i in np.flatnonzero(finished).tolist():
+                self.reset(i)
+
+
+class HostPopulation(Population):
+    """A population whose task is stepped from Python.
+
+    Restored, it goes on with what its agents know, in environments that start new episodes.
+    """
+
+    starts, curve_starts = 100, 10
+    task: HostTask
+
+    def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
+        length = self.agent.rollout_steps
+        self._rows = length * -(-CHUNK // length)
+        self._programs = programs_of((form, "host", self._rows))
+        self._own = [jax.device_put([x[i] for x in own]) for i in range(len(self.seeds))]
+        self._states = [
+            self._start("begin", lambda task, agent, seed: begin(task, agent, seed), seed, own)
+            for seed, own in zip(np.array(self.seeds, np.uint32), self._own, strict=True)
+        ]
+        self._environments: list[Environments] = []
+        self._judges: list[Environments] = []
+
+    def restore(self, state: TrainingState) -> None:
+        tally = jax.tree.map(np.zeros_like, state.tally)
+        state = eqx.tree_at(lambda s: s.tally, state, tally)
+        each = range(len(self.seeds))
+        self._states = [jax.device_put(jax.tree.map(lambda x, i=i: x[i], state)) for i in each]
+        self._environments = []
+
+    def advance(self, steps: int, *, strict: bool = True) -> Episodes:
+        if not self._environments:
+            self._environments = [self._make(seed) for seed in self.seeds]
+        steps, learning = self._plan(steps, self._rows)
+        players = [self._play(member, steps, learning) for member in range(len(self.seeds))]
+        records = _stack(_take_turns(players))
+        if strict:
+            self._require_healthy()
+        return records
+
+    def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
+        """Greedy returns (member, start) from environments that the keys seed.
+
+        The overestimation is not told: what would have followed a time limit cannot be seen.
+        """
+        if not self._judges:
+            limit = self.task.horizon
+            self._judges = [Environments(self.task, limit, LANES) for _ in self.seeds]
+        seeds = np.asarray(jax.random.key_data(keys))[:, -1].tolist()
+        judged = _take_turns([self._judge(member, seeds) for member in range(len(self.seeds))])
+        unknown: Any = np.full(len(self.seeds), np.nan)
+        return Greedy(_stack(judged), unknown)
+
+    def _make(self, seed: int) -> Environments:
+        """A member's environments; all their randomness derives from its seed and step."""
+        limit, count = episode_steps(self.task, self.agent), self.agent.environments
+        environments = Environments(self.task, limit, count)
+        for i in range(count):
+            entropy = np.random.SeedSequence((seed, i, self.steps))
+            environments.reset(i, int(entropy.generate_state(1)[0]))
+        return environments
+
+    def _play(self, member: int, steps: int, learning: bool) -> Generator[None, None, Episodes]:
+        """Some steps of a member; yields whenever it has something to compute."""
+        length, name = self.agent.rollout_steps, "learn" if learning else "collect"
+        environments, own = self._environments[member], self._own[member]
+        state = self._states[member]
+        # At each step jax takes apart what it gets: a list of arrays is quicker than modules.
+        carry, form = jax.tree.flatten((state, self._blank(state)))
+
+        def act(task: Task, agent: Agent, carry: PyTree, seen: Array, time: Array) -> Array:
+            state, _ = jax.tree.unflatten(form, carry)
+            return agent.act(state.agent, seen, step_keys(state.key, state.steps + time)[0])
+
+        def learn(
+            task: Task, agent: Agent, carry: PyTree, rollout: Transition, seen: Array, row: Array
+        ) -> tuple[PyTree, Array]:
+            state, records = jax.tree.unflatten(form, carry)
+            state, record, _ = absorb(task, agent, state, rollout, learning=learning)
+            put = lambda all, some: lax.dynamic_update_slice_in_dim(all, some, row, 0)  # noqa: E731
+            carry = jax.tree.leaves((state, jax.tree.map(put, records, record)))
+            return carry, act(task, agent, carry, seen, jnp.int32(0))
+
+        actions = self._start("act", act, carry, own, environments.observation, np.int32(0))
+        for row in range(0, steps, length):
+            rollout = []
+            for time in range(1, length + 1):
+                yield
+                seen, action = environments.observation, np.asarray(actions)
+                outcome = environments.step(action)
+                rollout.append((seen, action, *outcome))
+                environments.restart(outcome.terminated | outcome.truncated)
+                seen = environments.observation
+                if time < length:
+                    actions = self._start("act", act, carry, own, seen, np.int32(time))
+            before, action, *outcomes = map(_in_time, zip(*rollout, strict=True))
+            reward, after, terminated, truncated = outcomes
+            transition = Transition((), before, action, reward, (), after, terminated, truncated)
+            inputs = transition, seen, np.int32(row)
+            carry, actions = self._start(name, learn, carry, own, *inputs, donate=True)
+
+        def check(task: Task, agent: Agent, state: TrainingState) -> Array:
+            return healthy(agent, state)
+
+        state, records = jax.tree.unflatten(form, carry)
+        fine = self._start("healthy", check, state, own)
+        self._states[member] = eqx.tree_at(lambda s: s.healthy, state, fine)
+        return records
+
+    def _judge(self, member: int, seeds: list[int]) -> Generator[None, None, np.ndarray]:
+        """Returns of a member's greedy policy from each seed."""
+        environments, own = self._judges[member], self._own[member]
+        weights = self.agent.weights(self._states[member].agent)
+
+        def policy(task: Task, agent: Agent, weights: PyTree, seen: Array) -> Array:
+            return agent.policy(weights, seen)
+
+        returns = np.zeros(len(seeds))
+        for first in range(0, len(seeds), LANES):
+            some = seeds[first : first + LANES]
+            running = list(range(len(some)))
+            for i in running:
+                environments.reset(i, some[i])
+            while running:
+                actions = self._start("policy", policy, weights, own, environments.observation)
+                yield
+                outcome = environments.step(np.asarray(actions), running)
+                returns[first : first + LANES] += outcome.reward[: len(some)]
+                over = outcome.terminated | outcome.truncated
+                running = [i for i in running if not over[i]]
+        return returns
+
+    def _blank(self, state: TrainingState) -> Episodes:
+        """Records of a chunk in which no episode has ended yet."""
+        shape = (self._rows, self.agent.environments)
+        monitored = jax.eval_shape(self.agent.monitor, state.agent)
+        zeros: Any = np.zeros(shape, np.float32)
+        never: Any = np.zeros(shape, bool)
+        metrics = dict.fromkeys(monitored | state.tally.metrics, zeros)
+        return Episodes(never, zeros, metrics)
+
+    def _fetch(self, where: Callable[[TrainingState], PyTree]) -> PyTree:
+        return _stack([where(state) for state in self._states])
+
+    def _compile(self, one: Callable[..., Any], *args: Any, donate: bool) -> Any:
+        return jax.jit(one, donate_argnums=0 if donate else ()).lower(*args).compile()
+
+
+def population_of(task: Task, agents: Agent | Sequence[Agent], seeds: Sequence[int]) -> Population:
+    """Members of a task, compiled or stepped from Python as the task needs it."""
+    kind = HostPopulation if isinstance(task, HostTask) else Population
+    return kind(task, agents, seeds)
+
+
+def _stack(members: Sequence[PyTree]) -> PyTree:
+    return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *members)
+
+
+def _in_time(rows: Sequence[np.ndarray]) -> Any:
+    """What came step by step, with a leading axis of time."""
+    return np.stack(rows) if len(rows) > 1 else rows[0][None]
+
+
+def _take_turns(players: Sequence[Generator[None, None, T]]) -> list[T]:
+    """Lets each go on until it yields, in turn, until all have returned."""
+    results: dict[int, T] = {}
+    while len(results) < len(players):
+        for i, player in enumerate(players):
+            if i not in results:
+                try:
+                    next(player)
+                except StopIteration as end:
+                    results[i] = end.value
+    return [results[i] for i in range(len(players))]

@@ -1,0 +1,94 @@
+"""Hyperparameters as text: from ``name=value`` and JSON to an object's fields, and back."""
+
+import dataclasses
+import difflib
+import json
+import math
+import typing
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+from qfolio.core.errors import QfolioError
+
+T = TypeVar("T")
+
+
+def describe(instance: Any) -> dict[str, Any]:
+    """The settings of an agent or task as JSON values; infinity becomes the text "inf"."""
+    values = {name: getattr(instance, name) for name in _types(type(instance))}
+    return {k: "inf" if v == math.inf else list(v) if isinstance(v, tuple) else v
+            for k, v in values.items()}  # fmt: skip
+
+
+def names(kind: type) -> set[str]:
+    """What can be set of an agent or task."""
+    return set(_types(kind))
+
+
+def _types(kind: type) -> dict[str, Any]:
+    """What can be written as text and JSON; arrays are no settings."""
+    hints = typing.get_type_hints(kind)
+    kinds = (bool, int, float, str, tuple[int, ...])
+    return {f.name: hints[f.name] for f in dataclasses.fields(kind) if hints[f.name] in kinds}
+
+
+def build(kind: type[T], settings: Mapping[str, Any]) -> T:
+    """An agent or task with these fields set; the rest keep their defaults.
+
+    Values are JSON values or text. Raises QfolioError for names and values that do not fit.
+    """
+    return kind(**convert(kind, settings))
+
+
+def convert(kind: type, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of an agent or task as values of the right types; see ``build``."""
+    types = _types(kind)
+    known = sorted(types)
+    for name in settings:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}."
+            raise QfolioError(f"{kind.__name__} has no setting {name!r}; {hint}")
+    return {name: _convert(name, types[name], value) for name, value in settings.items()}
+
+
+def parse(assignments: Iterable[str]) -> dict[str, str]:
+    """``["name=value", …]`` as a dictionary."""
+    pairs = {}
+    for assignment in assignments:
+        name, equals, value = assignment.partition("=")
+        if not (name.strip() and equals and value.strip()):
+            raise QfolioError(
+                f"--set takes name=value, for example discount=0.99; {assignment!r} is not."
+            )
+        pairs[name.strip().replace("-", "_")] = value.strip()
+    return pairs
+
+
+def _convert(name: str, kind: Any, value: Any) -> Any:
+    try:
+        if kind is bool:
+            return {"true": True, "false": False}[str(value).lower()]
+        if kind is int:
+            number = float(value)
+            if isinstance(value, bool) or number != int(number):
+                raise ValueError
+            return int(number)
+        if kind is float:
+            number = float(value)
+            if isinstance(value, bool) or math.isnan(number):
+                raise ValueError
+            return number
+        if kind is str:
+            if not isinstance(value, str):
+                raise ValueError
+            return value
+        if isinstance(value, str):  # tuple[int, ...]: 256,256
+            value = value.strip("()[] ").rstrip(",").split(",")
+        return tuple(_convert(name, int, item) for item in value)
+    except (ValueError, TypeError, KeyError, OverflowError, QfolioError):
+        examples = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+        wanted = examples.get(kind, "whole numbers with commas between, for example 256,256")
+        raise QfolioError(
+            f"{name} is {json.dumps(value, default=str)}; it must be {wanted}."
+        ) from None

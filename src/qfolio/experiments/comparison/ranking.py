@@ -1,0 +1,312 @@
+"""What follows from the results of several agents on one task: measures, a ranking, a conclusion.
+
+A result is graded by its regret, the share of the exact optimum's return that it misses, or by its
+return where no optimum is known. Intervals are bootstraps over seeds (``qfolio.core.statistics``).
+Agents count as told apart where an exact rank test of their seeds says so, with Holm's correction
+for the number of pairs: intervals of few seeds are too narrow, and one of many pairs is easily
+lucky. Seeds of two agents count as independent; where they share some luck (the same first weights,
+say), the test is only the more careful.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.statistics import (
+    Floats,
+    holm,
+    interquartile_mean,
+    probability_of_improvement,
+    rank_test,
+    stratified_interval,
+)
+
+THRESHOLDS = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+"""Shares of the optimum that a learning curve may come within."""
+
+HEADLINE = 0.1
+"""The threshold that stands in tables and sentences."""
+
+LEVEL = 0.05
+"""How often the comparison of all pairs may tell agents apart that are alike."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What the seeds of one agent reached, and what they took; JSON values only.
+
+    Attributes:
+        returns: Mean return of each seed's final policy on the fixed starts.
+        optimum: The exact optimum on the same starts; None where it is not known.
+        starts, curve_starts: How many these are, and those along the learning curve.
+        curve_steps: Environment steps of a seed at each point of the learning curve.
+        curve_returns: Greedy returns there, a row for each point.
+        curve_optimum: The exact optimum on the starts of the curve.
+        episodes, env_steps: Of each seed, in training.
+        seconds_train, seconds_compile: For all seeds, side by side.
+        seconds_per_seed: Of training, on one core or as a share of its device.
+        steps_per_second: Environment steps of all seeds.
+        operations_per_step: Multiplications and additions in products of matrices for each
+            environment step, learning included; None where nothing is compiled.
+        state_bytes: Of a seed's whole training: weights, optimiser, replay, environments.
+        policy_bytes, parameters: Of what is needed to act, in bytes and in numbers.
+    """
+
+    returns: list[float]
+    optimum: float | None
+    starts: int
+    curve_starts: int
+    curve_steps: list[int]
+    curve_returns: list[list[float]]
+    curve_optimum: float | None
+    episodes: int
+    env_steps: int
+    seconds_train: float
+    seconds_compile: float
+    seconds_per_seed: float
+    steps_per_second: float
+    operations_per_step: float | None
+    state_bytes: int
+    policy_bytes: int
+    parameters: int
+
+
+def rank(results: dict[str, Result]) -> dict[str, Any]:
+    """Everything that is derived from the results of two agents or more, as JSON values.
+
+    "measure" is "regret" (a share of the optimum, small is good) or "return"; "order" names the
+    agents, best first; "agents" holds the measures of each, "pairs" how each stands to each other.
+    "common_steps" is the shortest training, up to which "area" averages the learning curves.
+    """
+    graded = all(result.optimum for result in results.values())  # there is no share of zero
+    sign = -1.0 if graded else 1.0  # a large score is good
+    scores = {name: sign * _final(result, graded) for name, result in results.items()}
+    goal = max(float(interquartile_mean(result.curve_returns[-1])) for result in results.values())
+    common = min(result.env_steps for result in results.values())
+    agents = {
+        name: _measures(result, sign * scores[name], graded, goal, common)
+        for name, result in results.items()
+    }
+    order = sorted(results, key=lambda name: sign * agents[name]["final"]["iqm"], reverse=True)
+    return {
+        "measure": "regret" if graded else "return",
+        "seeds": min(len(result.returns) for result in results.values()),
+        "seeds_needed": fewest_seeds(math.comb(len(results), 2)),
+        "order": order,
+        "goal": None if graded else goal,
+        "common_steps": common,
+        "agents": agents,
+        "pairs": _pairs(scores, order, sign),
+    }
+
+
+def regret(returns: Any, optimum: float) -> Floats:
+    """The share of the optimum's return that is missed; of zero there are none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((optimum - np.asarray(returns, dtype=float)) / np.abs(optimum))
+
+
+def curve(result: Result, measure: str) -> Floats:
+    """The learning curve of each seed in the measure of the ranking, shape (point, seed)."""
+    if measure == "return":
+        return np.asarray(result.curve_returns, dtype=float)
+    assert result.curve_optimum is not None
+    return regret(result.curve_returns, result.curve_optimum)
+
+
+def steps_within(steps: Sequence[int], regrets: Floats, threshold: float) -> list[int | None]:
+    """For each seed, at which point its curve comes within the threshold to stay; None if never.
+
+    steps: of the points. regrets: of shape (point, seed).
+    """
+    outside = ~(regrets <= threshold)
+    # The first point behind the last one outside.
+    first = len(outside) - np.argmax(outside[::-1], axis=0)
+    first = np.where(outside.any(0), first, 0)
+    return [int(steps[i]) if i < len(steps) else None for i in first.tolist()]
+
+
+def middle_steps(steps: Sequence[int | None]) -> float | None:
+    """The interquartile mean, where seeds that never arrived count as slower than all others.
+
+    None where one of these lies in the middle half.
+    """
+    arrived = [float(count) for count in steps if count is not None]
+    if len(arrived) < 0.75 * len(steps):
+        return None
+    late = [max(arrived)] * (len(steps) - len(arrived))  # beyond the middle half, without weight
+    return float(interquartile_mean(arrived + late))
+
+
+def area(steps: Sequence[int], values: Floats, until: int) -> Floats:
+    """Mean height of curves from the first step to ``until``, for values of shape (point, seed)."""
+    ends = np.append([x for x in steps if x < until], until)
+    heights = np.stack([np.interp(ends, steps, column) for column in values.T])
+    return np.asarray(np.trapezoid(heights, ends, axis=-1) / (ends[-1] - ends[0]))
+
+
+def conclusion(ranking: dict[str, Any]) -> list[str]:
+    """What may be said of a ranking, in sentences, and no more than that."""
+    first, seeds = ranking["order"][0], ranking["seeds"]
+    each = f"with {seeds} seed{'s' if seeds > 1 else ''} each"
+    beaten = {
+        row["second"]: row["told_apart"] and row["probability"] > 0.5
+        for row in ranking["pairs"]
+        if row["first"] == first
+    }
+    valued = {name: f"{name} ({figure(ranking, name)})" for name in beaten}
+    tied = [valued[name] for name, worse in beaten.items() if not worse]
+    worse = [valued[name] for name, worse in beaten.items() if worse]
+    best = (
+        f"{first} ends nearest to the exact optimum: its regret is"
+        if ranking["measure"] == "regret"
+        else f"{first} ends with the highest return:"
+    )
+    sentence = f"{each.capitalize()} it can be told apart from {listed(worse)}." if worse else ""
+    if tied:
+        sentence = f"{each.capitalize()} it cannot be told apart from {listed(tied, 'or')}"
+        sentence += f"; {listed(worse)} do{'es' * (len(worse) == 1)} worse." if worse else "."
+    if seeds < ranking["seeds_needed"]:
+        count = len(ranking["order"])
+        none = f"no two of {count} agents can" if count > 2 else "two agents cannot"
+        sentence = (
+            f"{each.capitalize()} {none} be told apart, whatever they reach; it takes "
+            f"{ranking['seeds_needed']} seeds or more."
+        )
+    return [f"{best} {figure(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
+
+
+def figure(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
+    """An agent's final regret or return as text."""
+    write = share if ranking["measure"] == "regret" else amount
+    final = ranking["agents"][name]["final"]
+    text = write(final["iqm"])
+    if interval and final["interval"] is not None:
+        text += f" (95 % interval {' to '.join(map(write, final['interval']))})"
+    return text
+
+
+def share(fraction: float) -> str:
+    """A fraction in percent, with the two digits that matter, down to a thousandth of a percent."""
+    size = abs(100 * fraction)
+    if size < 5e-4:
+        return "0 %"
+    digits = min(3, max(0, 1 - math.floor(math.log10(size))))
+    return f"{100 * fraction:,.{digits}f} %"
+
+
+def amount(value: float) -> str:
+    """A number with the four digits that matter."""
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    return f"{value:#.4g}" if abs(value) >= 1 else f"{value:.4g}"
+
+
+def span(seconds: float) -> str:
+    """Seconds as text, with the two digits that matter."""
+    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:,.0f} s"
+
+
+def listed(names: Sequence[str], word: str = "and") -> str:
+    """Names as a part of a sentence."""
+    return f" {word} ".join([*([", ".join(names[:-1])] if names[1:] else []), names[-1]])
+
+
+def _quickest(ranking: dict[str, Any]) -> str:
+    """Who comes near the optimum, or the best return, with the fewest steps and in least time."""
+    goal = "the optimum" if ranking["measure"] == "regret" else "the best return"
+    near = f"within {HEADLINE:.0%} of {goal}".replace("%", " %")
+    arrived = {
+        name: entry
+        for name in ranking["order"]
+        for entry in ranking["agents"][name]["within"]
+        if entry["threshold"] == HEADLINE and entry["steps"] is not None
+    }
+    if not arrived:
+        return f"No agent comes to stay {near}."
+    frugal = min(arrived, key=lambda name: arrived[name]["steps"])
+    quick = min(arrived, key=lambda name: arrived[name]["seconds"])
+    steps = f"{arrived[frugal]['steps']:,.0f}"
+    seconds = f"{span(arrived[quick]['seconds'])} a seed"
+    if len(arrived) == 1:
+        return f"Only {frugal} comes to stay {near}: after {steps} steps and {seconds}."
+    least = f"{quick} the least time" if quick != frugal else "the least time"
+    return f"To stay {near}, {frugal} needs the fewest steps ({steps}) and {least} ({seconds})."
+
+
+def fewest_seeds(pairs: int) -> int:
+    """The number of seeds from which on the rank test can tell agents apart among so many pairs."""
+    return next(n for n in range(1, 100) if 2 * pairs / math.comb(2 * n, n) <= LEVEL)
+
+
+def _final(result: Result, graded: bool) -> Floats:
+    if graded:
+        assert result.optimum is not None
+        return regret(result.returns, result.optimum)
+    return np.asarray(result.returns, dtype=float)
+
+
+def _measures(
+    result: Result, final: Floats, graded: bool, goal: float, common: int
+) -> dict[str, Any]:
+    """final: regrets or returns of the seeds. goal: return of the best, where no optimum is."""
+    returns = np.asarray(result.curve_returns, dtype=float)
+    optimum = result.curve_optimum if graded and result.curve_optimum else goal
+    heights = curve(result, "regret" if graded else "return")
+    areas = area(result.curve_steps, heights, common)
+    return {
+        "final": {
+            **_spread(final),
+            "mean": float(final.mean()),
+            "worst": float(final.max() if graded else final.min()),
+            "per_seed": final.tolist(),
+        },
+        "area": _spread(areas),
+        "within": [
+            _within(result, regret(returns, optimum), threshold) for threshold in THRESHOLDS
+        ],
+    }
+
+
+def _spread(values: Floats) -> dict[str, Any]:
+    """Interquartile mean over seeds, and its interval, which one seed does not have."""
+    interval = list(stratified_interval([values])) if len(values) > 1 else None
+    return {"iqm": float(interquartile_mean(values)), "interval": interval}
+
+
+def _within(result: Result, regrets: Floats, threshold: float) -> dict[str, Any]:
+    steps = steps_within(result.curve_steps, regrets, threshold)
+    middle = middle_steps(steps)
+    pace = result.seconds_per_seed / max(result.env_steps, 1)
+    return {
+        "threshold": threshold,
+        "steps": middle,
+        "seconds": None if middle is None else middle * pace,
+        "reached": sum(count is not None for count in steps),
+        "per_seed": steps,
+    }
+
+
+def _pairs(scores: dict[str, Floats], order: Sequence[str], sign: float) -> list[dict[str, Any]]:
+    """How each agent stands to each of those behind it."""
+    pairs = list(combinations(order, 2))
+    p_values = holm([rank_test(scores[a], scores[b]) for a, b in pairs])
+
+    def difference(x: Floats, y: Floats) -> Floats:
+        return sign * (interquartile_mean(x) - interquartile_mean(y))
+
+    rows = []
+    for (a, b), p in zip(pairs, p_values.tolist(), strict=True):
+        both = [scores[a], scores[b]]
+        several = min(map(len, both)) > 1
+        row: dict[str, Any] = {"first": a, "second": b, "p": p, "told_apart": p <= LEVEL}
+        statistics = {"probability": probability_of_improvement, "difference": difference}
+        for key, statistic in statistics.items():
+            interval = list(stratified_interval(both, statistic)) if several else None
+            row |= {key: float(statistic(*both)), f"{key}_interval": interval}
+        rows.append(row)
+    return rows

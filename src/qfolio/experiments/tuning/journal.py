@@ -1,0 +1,212 @@
+"""The trials of a hyperparameter search, on disk; Optuna stands behind.
+
+journal.log is Optuna's own record: lines of JSON, appended, nothing of which is ever unpickled. Any
+number of processes may work on one journal. Each holds a file under processes/ locked while it
+lives, so that the others can tell when it is dead and try its trials anew.
+"""
+
+import contextlib
+import math
+import sys
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import optuna
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.trial import TrialState
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.tuning.search import Dimension, Value
+
+optuna.logging.set_verbosity(optuna.logging.WARNING)  # else it prints a line for every trial
+
+_KNOWN = (TrialState.COMPLETE, TrialState.PRUNED)
+_HELD = (*_KNOWN, TrialState.RUNNING)
+
+
+class Trial(NamedTuple):
+    """A configuration that was trained."""
+
+    number: int
+    values: dict[str, Value]  # of the searched settings
+    returns: tuple[float | None, ...]  # greedy, by seed; None where the loss was no longer finite
+    is_preset: bool
+    at_random: bool  # drawn from the whole space, not chosen for what was known
+    seconds: float  # its share of its batch's time, compiling included
+
+    @property
+    def value(self) -> float:
+        """The mean over seeds; NaN where one of them diverged."""
+        return float(np.mean([math.nan if x is None else x for x in self.returns]))
+
+
+class Asked(NamedTuple):
+    """A configuration that is to be trained."""
+
+    values: dict[str, Value]
+    trial: optuna.Trial
+
+
+class Journal:
+    """The trials of a search in its folder."""
+
+    def __init__(
+        self, folder: Path, space: Sequence[Dimension], *, at_random: int, seed: int | None
+    ) -> None:
+        """Reads the journal, or begins one.
+
+        at_random: trials drawn at random before the sampler chooses. seed: of what is drawn; None
+        takes it from the system.
+        """
+        self.folder, self.space, self._at_random = folder, space, at_random
+        self._process = uuid.uuid4().hex
+        path = folder / "journal.log"
+        lock = JournalFileOpenLock(str(path))
+        try:
+            _mend(path, lock)
+            self._study = optuna.create_study(
+                storage=JournalStorage(JournalFileBackend(str(path), lock)),
+                study_name="qfolio",
+                direction="maximize",
+                load_if_exists=True,
+                # The constant liar keeps those of a batch apart.
+                sampler=optuna.samplers.TPESampler(
+                    seed=seed, constant_liar=True, n_startup_trials=at_random
+                ),
+            )
+            self.trials()
+        except (ValueError, LookupError, TypeError, AttributeError, AssertionError) as error:
+            raise QfolioError(f"{path} is damaged ({error}); restore it, or search anew.") from None
+
+    def trials(self) -> list[Trial]:
+        """What all processes have trained so far, in the order in which it was asked for."""
+        found = []
+        for trial in self._study.get_trials(states=_KNOWN):
+            noted = trial.user_attrs
+            values = self._values(trial.params)
+            returns, is_preset = tuple(noted["returns"]), noted.get("preset", False)
+            at_random = noted.get("at random", False) and not is_preset
+            found.append(
+                Trial(trial.number, values, returns, is_preset, at_random, noted["seconds"])
+            )
+        return found
+
+    def in_hand(self) -> int:
+        """Trials that processes are working on."""
+        return len(self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
+
+    @contextlib.contextmanager
+    def at_work(self) -> Iterator[None]:
+        """Shows the others that this process lives."""
+        place = self.folder / "processes" / self._process
+        place.parent.mkdir(exist_ok=True)
+        try:
+            with locked(place):
+                yield
+        finally:
+            place.unlink(missing_ok=True)
+
+    def ask(self, count: int, total: int, preset: Mapping[str, Value]) -> list[Asked]:
+        """What to train next: ``count`` trials, or as many as are missing to ``total``.
+
+        preset: a configuration that comes first, where the space holds it.
+        """
+        with locked(self.folder / "asking.lock"):
+            self._give_up_the_dead()
+            self._enqueue(preset)
+            states = [trial.state for trial in self._study.get_trials(deepcopy=False)]
+            held = sum(state in _HELD for state in states)
+            known = sum(state in _KNOWN for state in states)
+            distributions = {dim.key: dim.distribution() for dim in self.space}
+            asked = []
+            for _ in range(min(count, total - held)):
+                trial = self._study.ask(distributions)
+                trial.set_user_attr("process", self._process)
+                trial.set_user_attr("at random", known < self._at_random)
+                asked.append(Asked(self._values(trial.params), trial))
+            return asked
+
+    def tell(self, asked: Asked, returns: Sequence[float], seconds: float) -> None:
+        """Notes the returns of a trial by seed; where one is NaN, it is worse than all others."""
+        trial = asked.trial
+        trial.set_user_attr("returns", [x if math.isfinite(x) else None for x in returns])
+        trial.set_user_attr("seconds", round(seconds, 3))
+        value = float(np.mean(returns))
+        if math.isfinite(value):
+            self._study.tell(trial, value)
+        else:
+            self._study.tell(trial, state=TrialState.PRUNED)
+
+    def give_up(self, asked: Asked) -> None:
+        """Notes that a trial was not finished; another will take its place."""
+        self._study.tell(asked.trial, state=TrialState.FAIL)
+
+    def _values(self, params: Mapping[str, Value]) -> dict[str, Value]:
+        return {dim.name: dim.value(params[dim.key]) for dim in self.space}
+
+    def _enqueue(self, preset: Mapping[str, Value]) -> None:
+        noted = (
+            trial.user_attrs.get("preset", False)
+            for trial in self._study.get_trials(deepcopy=False)
+            if trial.state != TrialState.FAIL
+        )
+        if all(dim.covers(preset[dim.name]) for dim in self.space) and not any(noted):
+            stored = {dim.key: dim.stored(preset[dim.name]) for dim in self.space}
+            self._study.enqueue_trial(stored, user_attrs={"preset": True})
+
+    def _give_up_the_dead(self) -> None:
+        for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+            process = trial.user_attrs.get("process")
+            place = self.folder / "processes" / str(process)
+            if process is not None and place.exists():
+                with locked(place, wait=False) as free:
+                    if not free:
+                        continue
+                place.unlink(missing_ok=True)
+            self._study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+
+
+def best_of(trials: Sequence[Trial]) -> Trial | None:
+    """The trial with the highest mean return, where one kept a finite loss."""
+    finite = [trial for trial in trials if math.isfinite(trial.value)]
+    return max(finite, key=lambda trial: trial.value, default=None)
+
+
+@contextlib.contextmanager
+def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
+    """Holds a file locked against other processes; yields whether it could be had.
+
+    The system takes the lock off when the process ends, however it ends.
+    """
+    with path.open("a") as file:
+        try:
+            if sys.platform == "win32":
+                import msvcrt
+
+                msvcrt.locking(file.fileno(), msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK, 1)
+            else:
+                import fcntl
+
+                fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+        else:
+            yield True
+
+
+def _mend(journal: Path, lock: JournalFileOpenLock) -> None:
+    """Takes off a last line that a crash has cut short; Optuna would not read on after it."""
+    if not journal.exists():
+        return
+    lock.acquire()
+    try:
+        content = journal.read_bytes()
+        if not content.endswith(b"\n"):
+            with journal.open("r+b") as file:
+                file.truncate(content.rfind(b"\n") + 1)
+    finally:
+        lock.release()

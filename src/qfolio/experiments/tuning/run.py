@@ -1,0 +1,316 @@
+"""A hyperparameter search: configurations chosen by Optuna, trained many at a time.
+
+Configurations × seeds are the members of one population, so that a batch of them is one compiled
+program. The folder holds study.json (what is searched, written once), the journal of all trials
+and, at the end, summary.json. Any number of processes may work on one folder at once; one that
+starts later, or again, goes on from what the journal says.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from qfolio.core import devices, settings
+from qfolio.core.errors import QfolioError
+from qfolio.core.evaluation import start_keys
+from qfolio.core.files import new_folder, read_json, require_types, write_json
+from qfolio.core.host import population_of
+from qfolio.core.mdp import Agent, Task
+from qfolio.core.registry import AGENTS, TASKS, name_of
+from qfolio.core.training import begin
+from qfolio.core.version import __version__
+from qfolio.experiments.run import check_counts, configured_agent, configured_task, interruptible
+from qfolio.experiments.tuning import search
+from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
+from qfolio.experiments.tuning.search import Value
+
+FORMAT = 1
+"""Of the study folder; raised whenever an older folder can no longer be read."""
+
+STARTS = 256
+"""Start states that configurations are compared on."""
+
+FRESH = 1000
+"""The first of the seeds that the best configuration is trained with anew, at the end."""
+
+RANDOM = 0.5
+"""Share of the trials that are drawn at random before Optuna's sampler chooses: its own gather
+around the best, and do not show what happens elsewhere."""
+
+
+def tuning_keys(n: int = STARTS) -> Key[Array, " start"]:
+    """Keys of the start states for tuning; none of them is among those that results are graded on.
+
+    Choosing by what is graded would make every grade too good.
+    """
+    return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(70607), i))(jnp.arange(n))
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a search is, after each batch."""
+
+    done: int  # trials of all processes
+    total: int
+    diverged: int
+    best: Trial | None
+    preset: Trial | None
+    seconds: float  # of this batch
+    seconds_compile: float  # of these
+    trials: int  # in this batch
+
+
+class Tuning:
+    """A search in its folder; make it with ``Tuning.create`` or ``Tuning.open``."""
+
+    def __init__(self, config: dict[str, Any], folder: Path, sampler_seed: int | None) -> None:
+        self.config, self.folder = config, folder
+        self.task, self.agent = configured_task(config), configured_agent(config)
+        kind = type(self.agent)
+        texts = config["search"].items()
+        self.space = [search.dimension(name, text, kind) for name, text in texts]
+        self.interrupted = False
+        self.journal = Journal(
+            folder,
+            self.space,
+            at_random=max(2, round(RANDOM * config["trials"])),
+            seed=sampler_seed,
+        )
+
+    @classmethod
+    def create(
+        cls,
+        task: Task,
+        agent: Agent,
+        space: Sequence[search.Dimension],
+        *,
+        trials: int,
+        seeds: int,
+        episodes: int | None = None,
+        steps: int | None = None,
+        batch: int,
+        fresh_seeds: int,
+        preset: str,
+        out: Path | str,
+    ) -> "Tuning":
+        """A search before its first trial; ``out`` must be a new or empty folder.
+
+        agent: gives the settings that are not searched; it came from ``preset``, perhaps changed.
+        trials: configurations in all. episodes, steps: how far each agent is trained; one of the
+        two. batch: configurations trained at once. fresh_seeds: of the final comparison.
+        """
+        check_counts(episodes, max(seeds, fresh_seeds), FRESH, steps=steps)
+        _require_counts(trials=trials, batch=batch, seeds=seeds, fresh_seeds=fresh_seeds)
+        search.require_buildable(type(agent), settings.describe(agent), space)
+        jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))  # fits the task?
+        config = {
+            "kind": "tuning",
+            "format": FORMAT,
+            "version": __version__,
+            "task": name_of(TASKS, task),
+            "task_settings": settings.describe(task),
+            "agent": name_of(AGENTS, agent),
+            "preset": preset,
+            "agent_settings": settings.describe(agent),
+            "search": {dim.name: str(dim) for dim in space},
+            "trials": trials,
+            "seeds": seeds,
+            "episodes": episodes,
+            "steps": steps,
+            "batch": batch,
+            "fresh_seeds": fresh_seeds,
+            **devices.circumstances("jax", "optuna"),
+        }
+        folder = Path(out)
+        with new_folder(folder) as unfinished:
+            write_json(unfinished / "study.json", config)
+        return cls(config, folder, sampler_seed=0)
+
+    @classmethod
+    def open(
+        cls, folder: Path | str, *, trials: int | None = None, batch: int | None = None
+    ) -> "Tuning":
+        """A search as its journal tells it, to join or to go on with.
+
+        trials: a new number of configurations in all. batch: of this process alone.
+        """
+        folder = Path(folder)
+        config = _read_config(folder)
+        if trials is not None:
+            config["trials"] = trials
+            _require_counts(trials=trials)
+            write_json(folder / "study.json", config)
+        if batch is not None:
+            _require_counts(batch=batch)
+            config["batch"] = batch
+        # Not the first process's random numbers once more.
+        return cls(config, folder, sampler_seed=None)
+
+    @property
+    def budget(self) -> dict[str, int]:
+        """How far each agent is trained: ``{"episodes": n}`` or ``{"steps": n}``."""
+        given = {name: self.config[name] for name in ("episodes", "steps")}
+        return {name: amount for name, amount in given.items() if amount is not None}
+
+    def configured(self, values: dict[str, Value]) -> Agent:
+        """The agent with these values of the searched settings."""
+        described = settings.describe(self.agent)
+        return settings.build(type(self.agent), {**described, **values})
+
+    def run(
+        self,
+        listener: Callable[[Progress], None] | None = None,
+        chunk_listener: Callable[[float], None] | None = None,
+    ) -> None:
+        """Trains batch after batch until there are as many trials as the configuration says.
+
+        A first Ctrl-C stops after the current batch and sets ``interrupted``; a second one gives
+        the batch up. chunk_listener: told how much of a batch is done.
+        """
+        preset = {dim.name: search.own_value(self.agent, dim) for dim in self.space}
+        batch, total = self.config["batch"], self.config["trials"]
+        with self.journal.at_work(), interruptible() as stop:
+            while asked := self.journal.ask(batch, total, preset):
+                now = self._train(asked, chunk_listener)
+                if listener is not None:
+                    listener(now)
+                if stop.is_set():
+                    self.interrupted = now.done < total
+                    return
+
+    def trained(
+        self,
+        agents: Sequence[Agent],
+        seeds: Sequence[int],
+        keys: Key[Array, " start"],
+        listener: Callable[[float], None] | None = None,
+    ) -> tuple[Float[np.ndarray, "agent seed"], float]:
+        """Mean greedy returns of each agent and seed, NaN where the loss did not stay finite.
+
+        Also returns the seconds that compiling took. Agents that share all settings which shape the
+        program are one population. All of a population take as many steps as the episodes would
+        if none ended early, so that an agent's result does not depend on its company.
+        """
+        groups = defaultdict(list)
+        for index, agent in enumerate(agents):
+            groups[jax.tree.structure(agent)].append(index)
+        result = np.full((len(agents), len(seeds)), np.nan)
+        seconds_compile = 0.0
+        for number, indices in enumerate(groups.values()):
+            members = [agents[index] for index in indices for _ in seeds]
+            population = population_of(self.task, members, [*seeds] * len(indices))
+            total = population.steps_left(**self.budget)
+            while population.steps < total and any(population.healthy):
+                population.advance(total - population.steps, strict=False)
+                if listener is not None:
+                    listener((number + min(1.0, population.steps / total)) / len(groups))
+            played = population.evaluate(keys[: population.starts], tail=0)
+            returns = np.asarray(played.returns).mean(1)
+            finite = np.array(population.healthy) & np.isfinite(returns)
+            result[indices] = np.where(finite, returns, np.nan).reshape(len(indices), len(seeds))
+            seconds_compile += population.seconds_compile
+        return result, seconds_compile
+
+    def conclude(self, listener: Callable[[float], None] | None = None) -> dict[str, Any]:
+        """Trains the best configuration with fresh seeds, beside the agent that it started from.
+
+        Both are graded on the fixed start states, which tuning never saw. The result is written to
+        summary.json, and read from there where the best is still the same.
+        """
+        trials = self.journal.trials()
+        found = best_of(trials)
+        if found is None:
+            raise QfolioError(
+                f"None of the {len(trials)} configurations kept a finite loss; search lower "
+                "learning rates, or bound the gradient (huber or gradient_norm, whichever the "
+                "agent has)."
+            )
+        path = self.folder / "summary.json"
+        if path.exists() and (summary := read_json(path)).get("best") == found.values:
+            return summary
+        seeds = range(FRESH, FRESH + self.config["fresh_seeds"])
+        agents = [self.configured(found.values), self.agent]
+        returns, _ = self.trained(agents, seeds, start_keys(), listener)
+        solution = self.task.optimum()
+
+        def optimum(keys: Key[Array, " start"]) -> float | None:
+            return None if solution is None else float(solution.returns(keys).mean())
+
+        best, preset = [[x if math.isfinite(x) else None for x in row] for row in returns.tolist()]
+        summary = {
+            "best": found.values,
+            "return_tuned_on": found.value,
+            "seeds": list(seeds),
+            "return_per_seed": best,
+            "preset_return_per_seed": preset,
+            "optimum": optimum(start_keys()),
+            "optimum_tuned_on": optimum(tuning_keys()),
+        }
+        write_json(path, summary)
+        return summary
+
+    def _train(
+        self, asked: Sequence[Asked], listener: Callable[[float], None] | None = None
+    ) -> Progress:
+        """Trains a batch and notes what it returned."""
+        start = perf_counter()
+        try:
+            agents = [self.configured(one.values) for one in asked]
+            seeds = range(self.config["seeds"])
+            returns, seconds_compile = self.trained(agents, seeds, tuning_keys(), listener)
+        except BaseException:
+            for one in asked:
+                self.journal.give_up(one)
+            raise
+        seconds = perf_counter() - start
+        for one, row in zip(asked, returns, strict=True):
+            self.journal.tell(one, row.tolist(), seconds / len(asked))
+        trials = self.journal.trials()
+        return Progress(
+            done=len(trials),
+            total=self.config["trials"],
+            diverged=sum(math.isnan(trial.value) for trial in trials),
+            best=best_of(trials),
+            preset=next((trial for trial in trials if trial.is_preset), None),
+            seconds=seconds,
+            seconds_compile=seconds_compile,
+            trials=len(asked),
+        )
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    path = folder / "study.json"
+    if not path.is_file():
+        raise QfolioError(f"{folder} is no search: it has no study.json.")
+    config = read_json(path)
+    if config.get("format") != FORMAT:
+        raise QfolioError(
+            f"{folder} was written by qfolio {config.get('version', 'of an unknown version')} in "
+            f"another format; this is {__version__}: use that version, or search anew."
+        )
+    counts = dict.fromkeys(("trials", "seeds", "batch", "fresh_seeds"), int)
+    far = dict.fromkeys(("episodes", "steps"), int | None)
+    names = {"task": str, "agent": str, "preset": str}
+    nested = dict.fromkeys(("task_settings", "agent_settings", "search"), dict)
+    try:
+        require_types(config, {**counts, **far, **names, **nested})
+        check_counts(config["episodes"], config["seeds"], FRESH, steps=config["steps"])
+        _require_counts(**{name: config[name] for name in counts})
+    except QfolioError as error:
+        raise QfolioError(f"{path} is damaged: {error}") from None
+    return config
+
+
+def _require_counts(**counts: int) -> None:
+    for name, value in counts.items():
+        if not 1 <= value < 2**20:
+            raise QfolioError(f"{name} is {value}; it must be from 1 to {2**20 - 1}.")

@@ -1,0 +1,262 @@
+"""The space of a hyperparameter search: which settings, from where to where, and on what scale."""
+
+import dataclasses
+import itertools
+import math
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError
+
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+
+    from qfolio.core.mdp import Agent
+
+Value = float | str
+"""Of a searched setting: a number, or the text of a choice."""
+
+USUAL = {
+    "learning_rate": "1e-4..1e-2",
+    "discount": "0.9..0.999",
+    "target_rate": "1e-3..1",
+    "epsilon_decay": "0.9..0.999",
+    "huber": "0.1..10",
+    "reward_scale": "0.01..10",
+    "input_gain": "0.5..50",
+    "gradient_norm": "0.1..10",
+    "trace": "0.8..0.99",
+    "entropy_weight": "1e-4..0.1",
+    "clip": "0.05..0.5",
+    "exploration": "0.01..1",
+    "temperature": "0.01..1",
+}
+"""Searched unless told otherwise, of the numbers that an agent has; ranges for where its own value
+is 0, 1 or infinite and so says nothing about the scale."""
+
+AROUND = 10.0
+"""A range goes from the agent's own value divided by this to that times this."""
+
+PROGRAMS = 64
+"""The most combinations of settings that shape the program: each is compiled for itself."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Dimension:
+    """One searched setting: a range on a scale, or choices.
+
+    scale: "linear", "log", "near-one" (the logarithm of what is missing to 1) or "choice".
+    """
+
+    name: str
+    scale: str
+    low: float = math.nan
+    high: float = math.nan
+    choices: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        if self.choices:
+            return "|".join(self.choices)
+        prefix = "" if self.scale == _scale(self.low, self.high) else f"{self.scale}:"
+        return f"{prefix}{self.low}..{self.high}"
+
+    @property
+    def key(self) -> str:
+        """The name under which the journal holds it."""
+        return f"1-{self.name}" if self.scale == "near-one" else self.name
+
+    def distribution(self) -> "BaseDistribution":
+        from optuna.distributions import CategoricalDistribution, FloatDistribution
+
+        if self.choices:
+            return CategoricalDistribution(self.choices)
+        ends = (self.low, self.high)
+        if self.scale == "near-one":
+            ends = (_missing(self.high), _missing(self.low))
+        return FloatDistribution(*ends, log=self.scale != "linear")
+
+    def value(self, stored: Value) -> Value:
+        """The setting for what the journal holds, with four digits that matter."""
+        if isinstance(stored, str):
+            return stored
+        short = float(f"{stored:.4g}")
+        value = _missing(short) if self.scale == "near-one" else short
+        return min(max(value, self.low), self.high)
+
+    def stored(self, value: Value) -> Value:
+        """What the journal holds for a value of the setting."""
+        return _missing(value) if self.scale == "near-one" else value  # type: ignore[arg-type]
+
+    def position(self, value: Value) -> float:
+        """The place of a value on the scale: 0 at its low end, 1 at its high one."""
+        if isinstance(value, str):
+            return (self.choices.index(value) + 0.5) / len(self.choices)
+        if self.scale == "linear":
+            return (value - self.low) / (self.high - self.low)
+        ends = [self.low, value, self.high]
+        if self.scale == "near-one":
+            ends = [1 / _missing(end) for end in ends]
+        low, here, high = map(math.log, ends)
+        return (here - low) / (high - low)
+
+    def at(self, position: float) -> float:
+        """The number at a place on the scale."""
+        if self.scale == "linear":
+            return self.low + position * (self.high - self.low)
+        ends = (self.low, self.high)
+        if self.scale == "near-one":
+            ends = (_missing(self.low), _missing(self.high))
+        there = math.exp(math.log(ends[0]) + position * math.log(ends[1] / ends[0]))
+        return _missing(there) if self.scale == "near-one" else there
+
+    def covers(self, value: Value) -> bool:
+        if self.choices or isinstance(value, str):
+            return value in self.choices
+        return self.low <= value <= self.high
+
+    def around(self, value: float) -> "Dimension":
+        """The same on its scale around a value, where that says something about the scale."""
+        whole = 1.0 if self.high <= 1 else math.inf  # what is a share stays one
+        if self.scale == "near-one" and 0 < value < 1:
+            missing = _missing(value)
+            ends = (_missing(min(missing * AROUND, 1 - 1e-3)), _missing(missing / AROUND))
+        elif self.scale == "log" and 0 < value < math.inf:
+            ends = (value / AROUND, min(value * AROUND, whole))
+        else:
+            return self
+        low, high = (float(f"{end:.10g}") for end in ends)
+        return dataclasses.replace(self, low=low, high=high)
+
+
+def parse(assignments: Iterable[str], kind: type["Agent"]) -> list[Dimension]:
+    """``["name=low..high", "name=a|b", …]`` as dimensions of an agent's settings."""
+    space: dict[str, Dimension] = {}
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        name = name.strip().replace("-", "_")
+        if not (name and equals and text.strip()):
+            raise QfolioError(
+                "--search takes name=low..high or name=a|b|c, for example "
+                f"learning_rate=1e-4..1e-2; {assignment!r} is not."
+            )
+        if name in space:
+            raise QfolioError(f"--search names {name} twice.")
+        space[name] = dimension(name, text.strip(), kind)
+    return list(space.values())
+
+
+def dimension(name: str, text: str, kind: type["Agent"]) -> Dimension:
+    """A dimension from its text; raises QfolioError where that makes no sense."""
+    prefix, colon, rest = text.partition(":")
+    scale, body = (prefix.strip(), rest) if colon else ("", text)
+    low, dots, high = body.partition("..")
+    if not dots:
+        choices = [_canonical(kind, name, choice.strip()) for choice in body.split("|")]
+        if colon or len(choices) < 2 or len(set(choices)) < len(choices):
+            raise QfolioError(
+                f"{name}={text} leaves nothing to search; give a range (low..high) or different "
+                "choices (a|b|c), or fix it with --set."
+            )
+        return Dimension(name, "choice", choices=tuple(choices))
+    if scale not in ("", "log", "linear", "near-one"):
+        raise QfolioError(
+            f"{name}={text}: there is no scale {scale!r}; there are log, linear and near-one."
+        )
+    ends = [settings.convert(kind, {name: end.strip()})[name] for end in (low, high)]
+    if name not in numbers(kind):
+        raise QfolioError(
+            f"{name} shapes the program, so each of its values is compiled for itself; name them: "
+            f"{name}={_written(ends[0])}|{_written(ends[1])}."
+        )
+    bottom, top = ends
+    if not (bottom < top and math.isfinite(bottom) and math.isfinite(top)):
+        raise QfolioError(
+            f"{name}={text} is no range; the first number must be below the second, both finite."
+        )
+    scale = scale or _scale(bottom, top)
+    if (scale == "log" and bottom <= 0) or (scale == "near-one" and top >= 1):
+        limit = "above 0" if scale == "log" else "below 1"
+        raise QfolioError(f"{name}={text}: on the scale {scale} both ends must be {limit}.")
+    return Dimension(name, scale, bottom, top)
+
+
+def usual(agent: "Agent") -> list[Dimension]:
+    """What is searched unless told otherwise: the agent's numbers that usually matter."""
+    kind = type(agent)
+    names = [name for name in USUAL if name in numbers(kind)]
+    return [dimension(n, USUAL[n], kind).around(getattr(agent, n)) for n in names]
+
+
+def numbers(kind: type["Agent"]) -> list[str]:
+    """Settings that are inputs of the program: members of a population may differ in them."""
+    hints = typing.get_type_hints(kind)
+    fields = dataclasses.fields(kind)
+    return [f.name for f in fields if hints[f.name] is float and not f.metadata.get("static")]
+
+
+def require_buildable(
+    kind: type["Agent"], base: Mapping[str, Any], space: Sequence[Dimension]
+) -> None:
+    """Raises QfolioError where an end or a choice makes no agent, before anything is trained."""
+    if not space:
+        raise QfolioError(f"{kind.__name__} has no number that is usually searched; name some.")
+    for dim in space:
+        for value in dim.choices or (dim.low, dim.high):
+            settings.build(kind, {**base, dim.name: value})
+    shaping = [dim for dim in space if dim.choices and dim.name not in numbers(kind)]
+    programs = math.prod(len(dim.choices) for dim in shaping)
+    if programs > PROGRAMS:
+        raise QfolioError(
+            f"{' × '.join(dim.name for dim in shaping)} make {programs} programs to compile; name "
+            f"fewer choices, {PROGRAMS} combinations at most."
+        )
+    for choices in itertools.product(*(dim.choices for dim in shaping)):
+        chosen = {dim.name: choice for dim, choice in zip(shaping, choices, strict=True)}
+        settings.build(kind, {**base, **chosen})
+
+
+def own_value(agent: "Agent", dim: Dimension) -> Value:
+    """An agent's value of a searched setting."""
+    value = getattr(agent, dim.name)
+    return _written(value) if dim.choices else float(value)
+
+
+def written(settings: Mapping[str, Any]) -> list[str]:
+    """Settings as ``name=value``, as ``--set`` takes them."""
+    return [f"{name}={_written(value)}" for name, value in settings.items()]
+
+
+def positions(space: Sequence[Dimension], values: Mapping[str, Value]) -> np.ndarray:
+    """The place of one configuration on all scales."""
+    return np.clip([dim.position(values[dim.name]) for dim in space], 0.0, 1.0)
+
+
+def _scale(low: float, high: float) -> str:
+    """Logarithmic where the ends are a factor of 10 apart, from 0 or from 1."""
+    if low > 0 and high / low >= 10:
+        return "log"
+    if high < 1 and _missing(low) / _missing(high) >= 10:
+        return "near-one"
+    return "linear"
+
+
+def _missing(share: float) -> float:
+    """What is missing to 1, without the digits that the subtraction makes up."""
+    return float(f"{1 - share:.10g}")
+
+
+def _canonical(kind: type["Agent"], name: str, choice: str) -> str:
+    return _written(settings.convert(kind, {name: choice})[name])
+
+
+def _written(value: Any) -> str:
+    """A setting as ``--set`` takes it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return ",".join(map(str, value))
+    return str(value)

@@ -1,0 +1,117 @@
+"""Walk-forward folds: train on the past, decide over the next stretch, move on."""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+
+
+class Fold(NamedTuple):
+    """Rows of a price table that a policy learns from, and rows at which it then decides."""
+
+    name: str  # date, and where there is one the time, of the first return that it earns
+    train: slice
+    decisions: slice
+    recent: slice  # the last rows of training, as many as it has at least
+
+    def tradable(self, values: np.ndarray) -> np.ndarray:
+        """Assets with a price in every recent row of training, shape (asset,)."""
+        return ~np.isnan(values[self.recent]).any(0)
+
+    def complete(self, values: np.ndarray) -> "Fold":
+        """The fold, trained on the rows in which all of its tradable assets have prices only."""
+        gaps = np.isnan(values[self.train][:, self.tradable(values)]).any(1)
+        begin = self.train.start + int(gaps.sum())  # prices are missing before a start only
+        return self._replace(train=slice(begin, self.train.stop))
+
+
+def walk_forward(
+    dates: np.ndarray, train: str, test: str, lag: int, expanding: bool = False
+) -> list[Fold]:
+    """Folds one after the other, without a gap between their returns.
+
+    Training ends at the row of the first decision, so that no reward in it is earned after that
+    row: a decision at row t earns the move to row t + lag + 1 (this purges the last lag + 1
+    decisions). Windows of observations lie within the rows of training. The first fold trains on
+    the first stretch of the table; with ``expanding`` later ones keep its start.
+
+    Args:
+        dates: Shape (row,), ascending.
+        train, test: Lengths such as "5y", "6m", "8w" or "500d"; d counts rows.
+        lag: Rows between a decision and its execution.
+
+    Raises:
+        QfolioError: A length cannot be read, or the table is too short for one fold.
+    """
+    folds: list[Fold] = []
+    # Row of the first return of the first fold.
+    start = _after(dates, 0, train)
+    while start < len(dates):
+        end = min(_after(dates, start, test), len(dates))  # behind its last return
+        first = start - lag - 1
+        recent = _before(dates, first, train) if folds else 0
+        begin = 0 if expanding else recent
+        if first - begin < 1:
+            raise QfolioError(f"train={train} is shorter than the lag of {lag}; make it longer.")
+        decisions = slice(first, end - lag - 1)
+        name = spell(dates[start], dates)
+        folds.append(Fold(name, slice(begin, first + 1), decisions, slice(recent, first + 1)))
+        start = end
+    if not folds:
+        raise QfolioError(
+            f"{len(dates)} rows, {str(dates[0])[:10]} to {str(dates[-1])[:10]}, leave nothing to "
+            f"test after train={train}; shorten it, or bring more rows."
+        )
+    return folds
+
+
+def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) -> Fold:
+    """What a policy for tomorrow learns from: the last stretch of the table, or all of it."""
+    end = len(dates)
+    recent = _before(dates, end - 1, train)
+    begin = 0 if expanding else recent
+    return Fold(name, slice(begin, end), slice(end, end), slice(recent, end))
+
+
+def spell(date: np.datetime64, dates: np.ndarray) -> str:
+    """A date as text; with its time where rows are less than a day apart."""
+    days = dates.astype("datetime64[D]")
+    if (days[1:] > days[:-1]).all():
+        return str(date.astype("datetime64[D]"))
+    return str(date.astype("datetime64[s]")).replace(":", "").replace("T", "-")
+
+
+def parse_length(text: str) -> tuple[int, str]:
+    """Number and unit (y, m, w or d) of a length such as "5y"."""
+    match = re.fullmatch(r"\s*([0-9]{1,5})\s*([ymwd])\s*", text)
+    if match is None or int(match[1]) == 0:
+        raise QfolioError(f"A length is {text!r}; it must be like 5y, 6m, 8w or 500d (rows).")
+    return int(match[1]), match[2]
+
+
+def _after(dates: np.ndarray, row: int, length: str) -> int:
+    """The first row that is ``length`` or more after ``row``; len(dates) where there is none."""
+    count, unit = parse_length(length)
+    if unit == "d":
+        return min(row + count, len(dates))
+    return int(np.searchsorted(dates, _shift(dates[row], count, unit)))
+
+
+def _before(dates: np.ndarray, row: int, length: str) -> int:
+    """The first row that is at most ``length`` before ``row``."""
+    count, unit = parse_length(length)
+    if unit == "d":
+        return max(row - count, 0)
+    return int(np.searchsorted(dates, _shift(dates[row], -count, unit)))
+
+
+def _shift(date: np.datetime64, count: int, unit: str) -> np.datetime64:
+    """A calendar date some months or weeks away; the last of a month stays a last."""
+    day = date.astype("datetime64[D]")
+    if unit == "w":
+        return day + np.timedelta64(7 * count, "D")
+    month = day.astype("datetime64[M]") + np.timedelta64(count * (12 if unit == "y" else 1), "M")
+    last = (month + np.timedelta64(1, "M")).astype("datetime64[D]") - np.timedelta64(1, "D")
+    return min(month.astype("datetime64[D]") + (day - day.astype("datetime64[M]")), last)

@@ -1,0 +1,245 @@
+"""Replay of decisions on real prices, in double precision, with exact costs.
+
+The one rule of timing: a decision at row t sees prices up to row t and names target weights at the
+prices of row t. That is an order in shares, scaled to what the wealth affords. It is carried out at
+the close of row t + lag, when prices have moved what is held and what is wanted alike, and the cost
+of that trade is charged to the return of row t + lag + 1.
+"""
+
+import operator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.costs import remainder_factor, traded, with_cash
+
+TOLERANCE = 1e-6
+"""How far weights may be off the simplex; within this they are put back on it."""
+
+BLOCK = 60_000
+"""Numbers in an array that is worked on at a time: a core's cache holds several such arrays."""
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What became of D decisions; every array begins with the decisions' leading axes."""
+
+    returns: Floats
+    """Net returns, of shape (..., D)."""
+
+    turnover: Floats
+    """Value bought plus value sold, over the wealth before the trade, of shape (..., D)."""
+
+    cost: Floats
+    """Share of the wealth that the trade cost, of shape (..., D)."""
+
+    weights: Floats
+    """Weights right after the trade, cash first, of shape (..., D, N + 1)."""
+
+    @cached_property
+    def growth(self) -> Floats:
+        """Net log growth, of shape (..., D)."""
+        return np.log1p(self.returns)
+
+    @cached_property
+    def wealth(self) -> Floats:
+        """Wealth at the start, which is 1, and after each return, of shape (..., D + 1)."""
+        start = np.ones_like(self.returns, shape=(*self.returns.shape[:-1], 1))
+        return np.cumprod(np.concatenate([start, 1 + self.returns], axis=-1), axis=-1)
+
+
+def simulate(
+    values: ArrayLike,
+    decisions: ArrayLike,
+    *,
+    first: int,
+    cost: float,
+    lag: int = 1,
+    start: ArrayLike | None = None,
+) -> Simulation:
+    """Replay decisions made at the rows first, first + 1, …; each earns one return.
+
+    Args:
+        values: Prices of shape (rows, N), positive; NaN before an asset's first price.
+        decisions: Target weights of shape (..., D, N + 1), cash first, for D rows in succession;
+            a row of NaN gives no order.
+        first: Row of the first decision.
+        cost: Cost of trading one way, as a fraction of the value traded, 0 ≤ cost < 1.
+        lag: Rows between a decision and its trade, 0 or more.
+        start: Weights held at row ``first``, of shape (N + 1,) or (..., N + 1); all cash if None.
+
+    Returns:
+        The returns of rows first + lag + 1 to first + lag + D, and the trades before them.
+
+    Raises:
+        QfolioError: There are too few rows, cost or lag is out of range, a price is not positive
+            or missing after an asset's start, or weights are off the simplex by more than 1e-6 or
+            positive where the asset has no price yet.
+    """
+    prices, begun = _prices(values)
+    orders = np.asarray(decisions, dtype=float)
+    first, lag = operator.index(first), operator.index(lag)
+    rows, assets = prices.shape
+    if orders.ndim < 2 or orders.shape[-1] != assets + 1:
+        raise QfolioError(
+            f"Decisions have the shape {orders.shape}; for {assets} assets it must be "
+            f"(…, days, {assets + 1}), cash first."
+        )
+    *leading, days, entries = orders.shape
+    if not 0 <= cost < 1:
+        raise QfolioError(f"The cost is {cost}; it must be a fraction, at least 0 and below 1.")
+    if lag < 0 or first < 0:
+        raise QfolioError(f"Lag and first row are {lag} and {first}; both must be at least 0.")
+    if first + lag + days >= rows:
+        raise QfolioError(
+            f"{days} decisions from row {first} with a lag of {lag} need prices up to row "
+            f"{first + lag + days}, but row {rows - 1} is the last; decide for fewer days."
+        )
+    held = np.eye(entries)[0] if start is None else np.asarray(start, dtype=float)
+    try:
+        held = np.broadcast_to(held, (*leading, entries))
+    except ValueError:
+        raise QfolioError(
+            f"The start weights have the shape {held.shape}; for {assets} assets it must "
+            f"be {(entries,)} or {(*leading, entries)}, cash first."
+        ) from None
+
+    market = _Market(prices[first : first + lag + days + 1], begun[first:], first, days, lag)
+    orders, held = orders.reshape(-1, days, entries), held.reshape(-1, entries)
+    result = [*(np.empty(orders.shape[:2]) for _ in range(3)), np.empty(orders.shape)]
+    # glibc gives large freed arrays back to the system, which is slower than the arithmetic on
+    # them, but not those that are smaller than one that was freed before.
+    np.empty(2**21)
+    columns = max(1, BLOCK // entries)
+    together = max(1, columns // max(1, days))
+    for low in range(0, len(orders), together):
+        some = slice(low, low + together)
+        part = [array[some] for array in result]
+        _replay(market, orders[some], held[some], float(cost), columns, part)
+    return Simulation(*(array.reshape(*leading, *array.shape[1:]) for array in result))
+
+
+class _Market:
+    """The prices from the first decision to the last return, with cash before the assets.
+
+    Relatives have the assets as first axis, in memory, too: numpy then adds up a few long rows
+    instead of many short ones.
+    """
+
+    def __init__(self, prices: Floats, begun: Bools, first: int, days: int, lag: int) -> None:
+        self.prices = with_cash(prices)
+        self.begun = None if begun.all() else np.insert(begun, 0, True, axis=1)
+        self.first, self.days, self.lag = first, days, lag
+        to_trade = self.prices[lag : lag + days] / self.prices[:days]
+        after_trade = self.prices[lag + 1 :] / self.prices[lag:-1]
+        self.to_trade, self.after_trade = (r.T.copy()[:, None] for r in (to_trade, after_trade))
+
+    def moved(self, decided: NDArray[np.intp], trade: NDArray[np.intp]) -> Floats:
+        """Relatives from days of decisions to the trades of later days' decisions."""
+        return self.prices[trade + self.lag] / self.prices[decided]
+
+
+def _replay(
+    market: _Market,
+    orders: Floats,
+    held: Floats,
+    cost: float,
+    columns: int,
+    result: list[Floats],
+) -> None:
+    """Fills in the result of orders of shape (S, D, N + 1), some days of it at a time.
+
+    Arrays in here have the shape (N + 1, S, days). Whatever moves with prices alone is worth
+    weights times relatives, so that only sums have to be divided by.
+    """
+    returns, turnover, paid, weights = result
+    start, given = _on_simplex(market, held[:, None], 0)
+    if not given.all():
+        raise QfolioError("The start weights are NaN; give weights that sum to 1, or none at all.")
+    start = start[..., 0].T
+    worth = (start * market.moved(np.array(0), np.array(0))).T  # of what is held at the next trade
+    latest = np.full((len(orders), 1), -1)  # day of the last order
+    for low in range(0, market.days, columns):
+        now = slice(low, min(low + columns, market.days))
+        after, given = _on_simplex(market, orders[:, now], low)
+        after *= market.to_trade[..., now]
+        day = np.where(given, np.arange(now.start, now.stop), -1)
+        day = np.maximum(np.maximum.accumulate(day, axis=1), latest)
+        latest = day[:, -1:]
+        if not given.all():
+            who, when = np.nonzero(~given)
+            source = day[who, when]
+            ordered = np.maximum(orders[who, source], 0)
+            wanted = np.where(source[:, None] < 0, start[who], ordered)
+            after[:, who, when] = (wanted * market.moved(np.maximum(source, 0), when + low)).T
+        after /= after.sum(0)
+
+        grown = np.concatenate([worth[..., None], after * market.after_trade[..., now]], axis=-1)
+        worth = grown[..., -1]
+        growth = grown.sum(0)
+        before = grown[..., :-1] / growth[:, :-1]
+
+        before, after = np.moveaxis(before, 0, -1), np.moveaxis(after, 0, -1)
+        remainder = np.where(given, remainder_factor(before, after, cost), 1)
+        returns[:, now] = remainder * growth[:, 1:] - 1
+        turnover[:, now] = np.where(given, traded(before, after, remainder), 0)
+        paid[:, now] = 1 - remainder
+        weights[:, now] = after
+
+
+def _on_simplex(market: _Market, weights: Floats, day: int) -> tuple[Floats, Bools]:
+    """Checks weights of shape (S, days, N + 1) from a day on.
+
+    Returns them with the assets as first axis, and whether they are given, of shape (S, days).
+    """
+    columns = np.moveaxis(weights, -1, 0).copy()
+    total, least = columns.sum(0), columns.min(0)
+    given = ~np.isnan(total)
+    fits = (abs(total - 1) <= TOLERANCE) & (least >= -TOLERANCE)
+    if not fits.all():
+        fits |= np.isnan(columns).all(0)
+        if not fits.all():
+            who, when = np.argwhere(~fits)[0]
+            raise QfolioError(
+                f"Weights at row {market.first + day + when} sum to {total[who, when]:.8g}, the "
+                f"least of them is {least[who, when]:.3g}; they must sum to 1 and not be negative "
+                "(or all be NaN, which gives no order)."
+            )
+    if (least < 0).any():
+        np.maximum(columns, 0, out=columns)
+    if market.begun is not None:
+        begun = market.begun[day : day + columns.shape[-1]].T[:, None]
+        early = (columns > 0) & ~begun
+        if early.any():
+            asset, _, when = np.argwhere(early)[0]
+            raise QfolioError(
+                f"Weights at row {market.first + day + when} hold asset {asset - 1} (counted from "
+                "0) before its first price; give it weight 0 until then."
+            )
+    return columns, given
+
+
+def _prices(values: ArrayLike) -> tuple[Floats, Bools]:
+    """Checked prices, with an asset's first price before its start, and where it has one."""
+    prices = np.asarray(values, dtype=float)
+    if prices.ndim != 2:
+        raise QfolioError(f"Prices have the shape {prices.shape}; it must be (rows, assets).")
+    begun = ~np.isnan(prices)
+    fits = (prices > 0) & (prices < np.inf)
+    if not fits.all():
+        wrong = (begun & ~fits) | (np.maximum.accumulate(begun) & ~begun)
+        if wrong.any():
+            row, asset = np.argwhere(wrong)[0]
+            raise QfolioError(
+                f"The price of asset {asset} (counted from 0) at row {row} is "
+                f"{prices[row, asset]:g}; from its first price on all must be positive and finite."
+            )
+        starts = prices[begun.argmax(0), np.arange(prices.shape[1])]
+        prices = np.where(begun, prices, np.where(begun.any(0), starts, 1))
+    return prices, begun

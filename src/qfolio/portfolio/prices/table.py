@@ -1,0 +1,259 @@
+"""Prices in: a table is checked first, cell by cell, and only then becomes numbers.
+
+A gap is an error until the user names what shall become of it. Gaps are only ever filled forward:
+a price that was filled from a later one would tell an agent the future.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.prices import reading as tables
+from qfolio.portfolio.prices.checks import (
+    Finding,
+    day,
+    every_day,
+    examine,
+    hint,
+    spacing,
+    text_columns,
+)
+from qfolio.portfolio.prices.reading import quote
+
+DEFAULT_SOURCE = "skfolio: 20 US stocks"
+DEFAULT_NOTE = (
+    "20 US stocks picked later among those still listed in 2022 (survivors): strategies that hold "
+    "them look better than they could have been at the time."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Prices:
+    """A checked price table; its arrays cannot be written to.
+
+    Attributes:
+        dates: datetime64[s] of shape (rows,), strictly increasing.
+        assets: Names of the columns, without repetition.
+        values: float64 of shape (rows, assets), finite and positive; NaN only before an asset's
+            first row, where ``load`` was told late="join".
+        features: float64 of shape (rows, assets, channels); NaN only before an asset's first row.
+        feature_names: Names of the channels.
+        source: Where the table comes from.
+        note: What a reader of any result on it must be told.
+
+    Raises:
+        QfolioError: The arrays break one of these rules.
+    """
+
+    dates: np.ndarray
+    assets: tuple[str, ...]
+    values: np.ndarray
+    features: np.ndarray = field(default_factory=lambda: np.empty(0))
+    feature_names: tuple[str, ...] = ()
+    source: str = ""
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        dates = np.array(self.dates, dtype="datetime64[s]")
+        values = np.array(self.values, dtype=np.float64, order="C")
+        assets, channels = tuple(self.assets), tuple(self.feature_names)
+        shape = (len(dates), len(assets))
+        features = np.array(self.features, dtype=np.float64, order="C")
+        if not channels and not features.size:
+            features = features.reshape(*shape, 0)
+        if values.shape != shape or features.shape != (*shape, len(channels)):
+            raise QfolioError(
+                f"prices of shape {values.shape} and features of shape {features.shape} do not fit "
+                f"{shape[0]} dates, {shape[1]} assets and {len(channels)} feature names."
+            )
+        if len(set(assets)) < len(assets) or len(set(channels)) < len(channels):
+            raise QfolioError("names of assets and features must not repeat.")
+        if "cash" in map(str.lower, assets):
+            raise QfolioError("an asset cannot be called cash, which is money; rename the column.")
+        if np.isnat(dates).any() or (np.diff(dates) <= np.timedelta64(0, "s")).any():
+            raise QfolioError("dates must increase from row to row.")
+        started = np.logical_or.accumulate(~np.isnan(values), axis=0)
+        if not (np.isfinite(values) & (values > 0))[started].all():
+            raise QfolioError("prices must be finite and positive from an asset's first row on.")
+        if np.isinf(features).any() or np.isnan(features[started]).any():
+            raise QfolioError("features must be finite from an asset's first row on.")
+        for name, array in (("dates", dates), ("values", values), ("features", features)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "assets", assets)
+        object.__setattr__(self, "feature_names", channels)
+
+    @classmethod
+    def from_frame(cls, frame: Any, **options: Any) -> "Prices":
+        """A data frame, checked; the options are those of ``load``."""
+        return load(frame, **options)
+
+    def __len__(self) -> int:
+        return len(self.dates)
+
+    @property
+    def relatives(self) -> np.ndarray:
+        """price[k] / price[k-1] for k = 1 … rows-1, of shape (rows-1, assets); cf. ``first_rows``.
+
+        The relative of an asset's first own row is NaN, like those before it.
+        """
+        return np.asarray(self.values[1:] / self.values[:-1])
+
+    @property
+    def first_rows(self) -> np.ndarray:
+        """The row of each asset's first price, of shape (assets,); ``rows`` if there is none."""
+        priced = ~np.isnan(self.values)
+        return np.where(priced.any(axis=0), priced.argmax(axis=0), len(self))
+
+    @property
+    def periods_per_year(self) -> float:
+        """252 for business days, 365 for every day, 52, 12, 4 or 1, else the rows a year holds."""
+        return _periods_per_year(self.dates)
+
+    @property
+    def digest(self) -> str:
+        """16 hexadecimal digits that tell tables of different content apart."""
+        names = repr((self.assets, self.feature_names, self.values.shape))
+        sha = hashlib.sha256(names.encode("utf-8", "surrogatepass"))
+        sha.update(self.dates.astype("<i8").tobytes())
+        for array in (self.values, self.features):
+            sha.update(np.where(np.isnan(array), np.nan, array).astype("<f8").tobytes())
+        return sha.hexdigest()[:16]
+
+    def select(self, assets: Sequence[str]) -> "Prices":
+        """These assets, in this order. Raises QfolioError for unknown ones."""
+        places = {name: j for j, name in enumerate(self.assets)}
+        for name in assets:
+            if name not in places:
+                raise QfolioError(f"there is no asset {quote(name)}{hint(name, self.assets)}.")
+        columns = [places[name] for name in assets]
+        return self._part(slice(None), columns)
+
+    def between(self, start: int | None, stop: int | None) -> "Prices":
+        """Rows start … stop-1, counted as Python does."""
+        return self._part(slice(start, stop), slice(None))
+
+    def to_frame(self) -> Any:
+        """The prices as a pandas data frame, dates in its index."""
+        import pandas as pd
+
+        index = pd.DatetimeIndex(self.dates, name="date")
+        return pd.DataFrame(self.values.copy(), index=index, columns=list(self.assets))
+
+    def _part(self, rows: slice, columns: Any) -> "Prices":
+        return Prices(
+            self.dates[rows], tuple(np.array(self.assets, dtype=object)[columns]),
+            self.values[rows][:, columns], self.features[rows][:, columns], self.feature_names,
+            self.source, self.note,
+        )  # fmt: skip
+
+
+def load(
+    source: Any = None,
+    *,
+    missing: str = "error",
+    late: str = "error",
+    features: Sequence[str] = (),
+    date: str | None = None,
+) -> Prices:
+    """Read and check a price table.
+
+    Args:
+        source: Path of a CSV or Parquet file; a data frame that narwhals knows (pandas, polars,
+            pyarrow, …); None for skfolio's 20 US stocks, 1990 to 2022, which need no download;
+            or Prices, which are returned as they are. A table is wide (a column of dates, then a
+            column per asset) or long (columns of dates, of assets and of prices, known by their
+            names, such as date, ticker and close, in any order of rows).
+        missing: What becomes of a missing price after an asset's first: "error", "drop-asset", or
+            "forward-fill" (the last known price stands; also for features). Comes before ``late``.
+        late: What becomes of assets whose first price comes later than the table's: "error",
+            "drop-asset", "trim" (the table starts with the last of them) or "join" (they are NaN
+            before their first row).
+        features: Columns of further numbers: in a long table one for each asset and date, in a
+            wide table for the whole market, the same for all assets.
+        date: The column of dates, where its name does not tell.
+
+    Raises:
+        QfolioError: The table has errors (the first are named), or there is no table.
+    """
+    if isinstance(source, Prices):
+        return source
+    prices, findings = _read(source, missing, late, features, date)
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if prices is None or errors:
+        shown = "; ".join(str(finding) for finding in errors[:2])
+        rest = sum(finding.count for finding in errors[2:])
+        more = f"; and {rest:,} more" if rest else ""
+        advice = " ".join(dict.fromkeys(f.advice for f in errors[:2] if f.advice))
+        label = f"{quote(Path(source).name)}: " if isinstance(source, str | Path) else ""
+        raise QfolioError(f"{label}{shown}{more}.{' ' * bool(advice)}{advice}")
+    return prices
+
+
+def check(
+    source: Any = None,
+    *,
+    missing: str = "error",
+    late: str = "error",
+    features: Sequence[str] = (),
+    date: str | None = None,
+) -> list[Finding]:
+    """Everything that is wrong with a table or looks odd, by row and column; see ``load``.
+
+    At most five cells of one kind are named, the rest is counted. ``load`` succeeds with the same
+    arguments exactly where no finding is an error.
+
+    Raises:
+        QfolioError: There is no table to check: no such file, not text, rows of unequal length.
+    """
+    return _read(source, missing, late, features, date)[1]
+
+
+def describe(prices: Prices) -> dict[str, Any]:
+    """What a report says of a table, as JSON values."""
+    return {
+        "source": prices.source,
+        "rows": len(prices),
+        "assets": len(prices.assets),
+        "first": day(prices.dates[0]) if len(prices) else None,
+        "last": day(prices.dates[-1]) if len(prices) else None,
+        "periods_per_year": prices.periods_per_year,
+        "features": list(prices.feature_names),
+        "late_assets": int((prices.first_rows > 0).sum()),
+        "digest": prices.digest,
+        "note": prices.note,
+    }
+
+
+def _read(
+    source: Any, missing: str, late: str, features: Sequence[str], date: str | None
+) -> tuple[Prices | None, list[Finding]]:
+    """The prices (None where the table has errors) and all findings."""
+    label, note = "", ""
+    if source is None:
+        from skfolio.datasets import load_sp500_dataset
+
+        source, label, note = load_sp500_dataset(), DEFAULT_SOURCE, DEFAULT_NOTE
+    table = tables.read(source, lambda names: text_columns(names, date))
+    channels = (features,) if isinstance(features, str) else tuple(features)
+    content, findings = examine(table, missing, late, channels, date)
+    if not content:
+        return None, findings
+    return Prices(**content, source=label or table.source, note=note), findings
+
+
+def _periods_per_year(dates: np.ndarray) -> float:
+    if len(dates) < 2:
+        return 252.0
+    steps, usual = spacing(dates)
+    if 0.9 <= usual <= 1.1:
+        return 365.0 if every_day(dates) else 252.0
+    for low, high, periods in ((6, 8, 52.0), (27, 32, 12.0), (88, 93, 4.0), (360, 370, 1.0)):
+        if low <= usual <= high:
+            return periods
+    return float(365.25 * len(steps) / steps.sum())

@@ -1,0 +1,39 @@
+"""The optimum of a task whose best policy is known: graded by following it on the same paths."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Key, PyTree
+
+from qfolio.core.mdp import ExogenousTask
+
+
+class FollowedOptimum:
+    """Returns of an exact policy from the starts, and with the random numbers, of an evaluation.
+
+    policy: from a state of ``task`` to an action of it.
+    """
+
+    def __init__(self, task: ExogenousTask, policy: Callable[[PyTree], Array]) -> None:
+        self.task, self.policy = task, policy
+
+    def returns(self, keys: Key[Array, " start"]) -> np.ndarray:
+        """Undiscounted returns over the task's horizon, one for each key."""
+        return np.asarray(_follow(self.task, self.policy, keys))
+
+
+@partial(eqx.filter_jit, donate="none")
+def _follow(task: ExogenousTask, policy: Any, keys: Key[Array, " start"]) -> Array:
+    def step(states: PyTree, time: Array) -> tuple[PyTree, Array]:
+        # The keys of ``qfolio.core.evaluation.evaluate``: common random numbers.
+        step_keys = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
+        after = jax.vmap(task.step)(states, jax.vmap(policy)(states), step_keys)
+        return after.state, after.reward
+
+    return lax.scan(step, jax.vmap(task.reset)(keys), jnp.arange(task.horizon))[1].sum(0)

@@ -1,0 +1,270 @@
+"""The environment under Gymnasium's rules, and its money by the backtest's replay."""
+
+import importlib.util
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from qfolio.adapters import gym
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.prices.table import Prices
+
+ROWS, WINDOW, HORIZON = 60, 5, 12
+CASH = [1.0, -1, -1, -1]
+
+
+def table(seed=0, rows=ROWS, features=0):
+    rng = np.random.default_rng(seed)
+    values = np.exp(np.cumsum(rng.normal(0, 0.02, (rows, 3)), axis=0))
+    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    names = tuple(f"f{i}" for i in range(features))
+    return Prices(dates, ("a", "b", "c"), values, rng.normal(size=(rows, 3, features)), names)
+
+
+def environment(prices=None, **task):
+    prices = table() if prices is None else prices
+    return gymnasium.make(
+        gym.ID, prices=prices, **{"window": WINDOW, "horizon": HORIZON, "cost": 0.01, **task}
+    )
+
+
+# Torques are in N m, and positions have no bounds: advice that does not apply.
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space")
+@pytest.mark.filterwarnings("ignore:.*A Box action space")
+@pytest.mark.parametrize("name", gym.IDS)
+def test_every_task_is_an_environment(name):
+    env = gymnasium.make(gym.IDS[name])
+    check_env(env.unwrapped)
+    first, again = [env.reset(seed=3)[0] for _ in range(2)]
+    np.testing.assert_equal(first, again)
+
+
+def test_an_episode_ends_at_the_horizon_or_before():
+    env = gymnasium.make(gym.IDS["pendulum"], horizon=3, torques=0)
+    env.reset(seed=0)
+    ends = [env.step(np.ones(1, np.float32))[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+    with pytest.raises(QfolioError, match="reset"):
+        env.unwrapped.step(np.ones(1, np.float32))
+    cliff = gymnasium.make(gym.IDS["finite/cliff"])
+    cliff.reset(seed=0)
+    *_, end = [cliff.step(action) for action in (0, *[1] * 11, 2)]  # up, along the edge, down
+    assert end[2:4] == (True, False)
+
+
+def test_its_steps_are_those_of_the_task():
+    """Gymnasium's own pendulum is the oracle."""
+    env = gymnasium.make(gym.IDS["pendulum"], torques=0)
+    other = gymnasium.make("Pendulum-v1").unwrapped
+    seen, _ = env.reset(seed=5)
+    other.reset(seed=0)
+    other.state = np.array([np.arctan2(seen[1], seen[0]), seen[2]], float)
+    for torque in np.linspace(-2, 2, 40, dtype=np.float32):
+        seen, reward, *_ = env.step(torque[None])
+        expected, cost, *_ = other.step(torque[None])
+        np.testing.assert_allclose(seen, expected, atol=1e-3)
+        np.testing.assert_allclose(reward, cost, atol=1e-3)
+
+
+def test_scores_become_the_nearest_weights_of_a_market():
+    env = gymnasium.make(gym.IDS["market/kelly"])
+    for scores in ([0.7, 0.7], [-0.5, -0.5], [0.5, 0.5]):
+        env.reset(seed=1)
+        seen = env.step(np.array(scores, np.float32))[0]
+        holdings = seen["holding"]
+        assert 0.4 < holdings[0] < 0.6  # a half, drifted by one step
+
+
+def test_a_task_says_what_is_wrong():
+    env = gymnasium.make(gym.IDS["pendulum"])
+    env.reset(seed=0)
+    for action in (11, -1, 0.5):
+        with pytest.raises(QfolioError, match="must be in Discrete"):
+            env.unwrapped.step(action)
+    with pytest.raises(QfolioError, match="did you mean torques"):
+        gym.TaskEnv("pendulum", torqes=3)
+    with pytest.raises(QfolioError, match="render_mode"):
+        gym.TaskEnv("pendulum", render_mode="human")
+
+
+def play(env, **reset):
+    """An episode of random actions: what was seen, earned and told."""
+    rng = np.random.default_rng(0)
+    observation, info = env.reset(**reset)
+    record, over = [(observation, 0.0, info)], False
+    while not over:
+        space = env.action_space
+        discrete = isinstance(space, gymnasium.spaces.Discrete)
+        action = int(rng.integers(space.n)) if discrete else rng.uniform(-1, 1, space.shape)
+        observation, reward, terminated, over, info = env.step(action)
+        assert not terminated
+        record.append((observation, reward, info))
+    return record
+
+
+@pytest.mark.parametrize(
+    "task", [{"lag": 0}, {"menu": "tilts:0.1", "cap": 0.5}, {"reward": "differential-sharpe"}]
+)
+def test_gymnasium_finds_nothing_to_warn_of(task):
+    check_env(environment(table(features=1), **task).unwrapped)
+    check_env(environment(render_mode="ansi", **task).unwrapped)
+
+
+@pytest.mark.parametrize("lag", [0, 1, 3])
+@pytest.mark.parametrize("task", [{}, {"menu": "tilts:0.3"}, {"cap": 0.4}])
+def test_its_wealth_is_that_of_the_replay(lag, task):
+    env, prices = environment(lag=lag, **task), table()
+    for start in (env.unwrapped.first, 20, env.unwrapped.last):
+        (_, _, begun), *steps = play(env, options={"start": start})
+        assert len(steps) == HORIZON
+        infos = [info for _, _, info in steps]
+        decisions = np.array([info["target"] for info in infos])
+        replay = simulate(prices.values, decisions, first=start, cost=0.01, lag=lag)
+        wealth = [begun["wealth"], *(info["wealth"] for info in infos)]
+        np.testing.assert_allclose(wealth, replay.wealth, rtol=1e-12)
+        np.testing.assert_allclose([info["cost"] for info in infos], replay.cost, atol=1e-12)
+        np.testing.assert_allclose(
+            [info["turnover"] for info in infos], replay.turnover, atol=1e-12
+        )
+        rewards = [reward for _, reward, _ in steps]
+        np.testing.assert_allclose(rewards, replay.growth, atol=1e-12)
+        np.testing.assert_allclose(decisions.sum(1), 1, atol=1e-12)
+        assert decisions[:, 1:].max() <= task.get("cap", 1.0) + 1e-7
+        assert infos[-1]["date"] == str(prices.dates[start + HORIZON])[:10]
+        assert infos[-1]["return_date"] == str(prices.dates[start + HORIZON + lag])[:10]
+    assert env.unwrapped.last + HORIZON + lag == ROWS - 1
+
+
+def test_the_last_row_is_reached_but_not_passed():
+    env = environment(lag=2)
+    with pytest.raises(QfolioError, match="can start at rows 5 to 45"):
+        env.reset(options={"start": env.unwrapped.last + 1})
+    with pytest.raises(QfolioError, match="start is 4"):
+        env.reset(options={"start": 4})
+    with pytest.raises(QfolioError, match="start is '9'"):
+        env.reset(options={"start": "9"})
+
+
+def test_numbers_become_the_nearest_weights():
+    env = environment(cost=0.0)
+    for scores, weights in (
+        ([0.1, 0.2, 0.3, 0.4], [0.1, 0.2, 0.3, 0.4]),  # weights stand for themselves
+        ([0.8, 0.8, -1, -1], [0.5, 0.5, 0, 0]),
+        ([1.0, 0.4, 0, 0], [0.8, 0.2, 0, 0]),
+        ([0.0, 0, 0, 0], [0.25, 0.25, 0.25, 0.25]),
+        ([-1.0, -1, -1, 1], [0, 0, 0, 1]),
+    ):
+        env.reset(seed=0)
+        info = env.step(np.array(scores, np.float32))[-1]
+        np.testing.assert_allclose(info["target"], weights, atol=1e-7)
+    capped = environment(cap=0.4)
+    capped.reset(seed=0)
+    for scores, weights in (
+        ([0.0, 1, 0, 0], [0.2, 0.4, 0.2, 0.2]),
+        ([-1.0, 1, 0, 0], [0, 0.4, 0.3, 0.3]),
+        ([1.0, 0, 0, 0], [1, 0, 0, 0]),  # cash has no cap
+    ):
+        target = capped.step(scores)[-1]["target"]
+        np.testing.assert_allclose(target, weights, atol=1e-7)
+
+
+def test_no_order_costs_nothing():
+    env = environment(menu="tilts:0.3", cost=0.1, lag=2)
+    env.reset(seed=3)
+    env.step(2)  # equal weights
+    for _ in range(3):
+        info = env.step(0)[-1]  # no order
+        assert info["cost"] < 1e-15
+        assert info["turnover"] < 1e-14
+
+
+def test_a_seed_gives_one_episode():
+    env, other = environment(), environment()
+    first, again, different = play(env, seed=7), play(other, seed=7), play(env, seed=8)
+    assert [info["wealth"] for *_, info in first] == [info["wealth"] for *_, info in again]
+    assert first[0][2]["date"] != different[0][2]["date"]
+    starts = set()
+    env.reset(seed=0)
+    for _ in range(400):
+        starts.add(env.reset()[1]["date"])
+    assert len(starts) == env.unwrapped.last - env.unwrapped.first + 1
+
+
+def test_what_is_seen_ends_today():
+    prices = table(features=1)
+    values, features = prices.values.copy(), prices.features.copy()
+    values[31:] *= 3
+    features[31:] += 5
+    other = Prices(prices.dates, prices.assets, values, features, prices.feature_names)
+    train = prices.between(0, 30)
+    env, changed = (environment(p, scaled_by=train) for p in (prices, other))
+    seen, seen_too = (e.reset(options={"start": 30})[0] for e in (env, changed))
+    np.testing.assert_array_equal(seen["features"], seen_too["features"])
+    logs = np.diff(np.log(prices.values), axis=0)
+    scale = logs[:29].std()
+    np.testing.assert_allclose(
+        seen["features"][..., 0], logs[30 - WINDOW : 30].T / scale, rtol=1e-4
+    )
+    seen, seen_too = (e.step(CASH)[0] for e in (env, changed))
+    assert not np.array_equal(seen["features"], seen_too["features"])
+
+
+def test_rewards_by_name():
+    prices, target = table(), [0.0, 0.5, 0.5, 0.0]
+    growth = {}
+    for reward in ("log", "crra", "mean-variance"):
+        env = environment(prices, reward=reward, risk_aversion=3.0, lag=0)
+        env.reset(options={"start": 10})
+        _, growth[reward], *_, info = env.step(target)
+    moved = prices.values[11] / prices.values[10]
+    wealth = 0.99 * (moved[0] + moved[1]) / 2  # cash to assets at 1 %
+    np.testing.assert_allclose(info["wealth"], wealth, rtol=1e-12)
+    np.testing.assert_allclose(growth["log"], np.log(wealth), rtol=1e-9)
+    np.testing.assert_allclose(growth["crra"], (1 - wealth**-2) / 2, rtol=1e-9)
+    np.testing.assert_allclose(growth["mean-variance"], wealth - 1 - 1.5 * (wealth - 1) ** 2)
+
+
+def test_it_says_what_is_wrong():
+    env = environment()
+    with pytest.raises(QfolioError, match="reset"):
+        env.unwrapped.step(CASH)
+    env.reset(seed=0)
+    for action in ([1.0, 0, 0], [np.nan, 0, 0, 0], "cash", None):
+        with pytest.raises(QfolioError, match="4 finite numbers"):
+            env.unwrapped.step(action)
+    menu = environment(menu="tilts:0.1")
+    menu.reset(seed=0)
+    for action in (9, -1, 0.5):
+        with pytest.raises(QfolioError, match="from 0 to 8"):
+            menu.unwrapped.step(action)
+    with pytest.raises(QfolioError, match="did you mean window"):
+        environment(windw=5)
+    with pytest.raises(QfolioError, match="render_mode"):
+        gym.PortfolioEnv(table(), render_mode="human")
+    with pytest.raises(QfolioError, match="too few"):
+        environment(table(rows=10))
+    with pytest.raises(QfolioError, match="scaled_by"):
+        environment(scaled_by=table(features=1))
+    for _ in play(env, seed=0):
+        pass
+    with pytest.raises(QfolioError, match="over"):
+        env.unwrapped.step(CASH)
+
+
+def test_a_line_of_text():
+    env = environment(render_mode="ansi")
+    env.reset(options={"start": 10})
+    assert env.render() == "2020-01-11  wealth 1.0000  cash 100%\n"
+    env.step([0.0, 1.0, 0, 0])
+    assert "a 100%" in env.render()
+
+
+def test_without_gymnasium_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    spec = importlib.util.spec_from_file_location("without_gymnasium", gym.__file__)
+    with pytest.raises(QfolioError, match=r"pip install 'qfolio\[gym\]'"):
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))

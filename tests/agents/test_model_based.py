@@ -1,0 +1,186 @@
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.mbpo import MBPO, Model, model_loss
+from qfolio.core.errors import QfolioError
+from qfolio.core.mdp import Box, Discrete, Transition
+from qfolio.core.training import Population
+from qfolio.experiments.presets import preset
+from qfolio.experiments.run import train
+from qfolio.learning.encoders import SmoothMLP
+from qfolio.learning.replay import Experience
+from qfolio.learning.targets import unsquash
+from qfolio.portfolio.synthetic import Merton
+from qfolio.tasks.pendulum import Pendulum
+
+from probes import Aim
+
+SMALL = {
+    "hidden": (64, 64), "model_hidden": (64, 64), "environments": 4, "batch_size": 64, "members": 3,
+    "replay_capacity": 2000, "learning_starts": 200, "discount": 0.8, "target_rate": 0.05,
+    "learning_rate": 3e-3, "learning_rate_final": 0.0, "spread": 0.02, "imagined_capacity": 8000,
+    "imagined_rows": 32, "imagined_steps": 2, "model_updates": 2, "updates": 2,
+}  # fmt: skip
+
+
+class Constant(eqx.Module):
+    """Predicts the same whatever it sees."""
+
+    output: jax.Array
+
+    def __call__(self, inputs):
+        return jnp.broadcast_to(self.output, (len(inputs), *self.output.shape))
+
+
+def constant_model(actions=None):
+    """Three members: changes (1, 0), (2, 0) and (3, 0) of the range (1, 4); rewards 3, 8, 15."""
+    rows = jnp.array([[1.0, 0, 1, 0], [2, 0, 2, 0.4], [3, 0, 3, 0.6]])  # √(1 + r) − 1
+    return Model(Constant(rows), jnp.array([1.0, 4.0]), actions or Box(1, 2.0))
+
+
+def test_one_member_drawn_at_random_predicts_each_step():
+    observation = jnp.tile(jnp.array([5.0, 7.0]), (3000, 1))
+    action = jnp.zeros((3000, 1))
+    step = constant_model().imagine(observation, action, jax.random.key(0))
+    member = np.searchsorted([3.0, 8.0, 15.0], np.asarray(step.reward)) + 1
+    np.testing.assert_allclose(step.reward, (member + 1) ** 2 - 1)
+    np.testing.assert_allclose(np.bincount(member)[1:] / 3000, 1 / 3, atol=0.03)
+    np.testing.assert_allclose(step.next_observation[:, 0], 5 + member)
+    np.testing.assert_allclose(step.next_observation[:, 1], 7)
+    np.testing.assert_array_equal(step.terminal, member == 3)
+    np.testing.assert_array_equal(step.observation, observation)
+
+
+def steps(n=4, actions=None):
+    observation = jnp.stack([jnp.arange(n), jnp.arange(n)], 1).astype(jnp.float32)
+    return Experience(
+        observation=observation,
+        action=jnp.zeros((n, 1)),
+        reward=jnp.array([3.0, 15, 3, 15]),
+        next_observation=observation + jnp.array([[1.0, 4], [1, -4], [3, 4], [3, -4]]),
+        terminal=jnp.array([False, False, False, True]),
+    )
+
+
+def test_the_models_loss_by_hand():
+    """Errors in units of the batch's standard deviations, which are all 1."""
+    model, step = constant_model(), steps()
+    truth = [[1.0, 1, 1, 0], [1, -1, 3, 0], [3, 1, 1, 0], [3, -1, 3, 1]]
+    np.testing.assert_allclose(model.truth(step), truth)
+    counts = jnp.zeros((4, 3)).at[0].set(jnp.array([1.0, 0, 2])).at[3, 1].set(1.0)
+    first = 1.0 / 4  # the first step, by the first member: only the second change is wrong, by 1
+    third = (2**2 + 1 + 2**2 + 0.6**2) / 4  # the first step, by the third member
+    second = (1 + 1 + 1 + 0.6**2) / 4  # the last step, by the second member
+    loss, _ = model_loss(model, step, counts)
+    np.testing.assert_allclose(loss, (first + 2 * third + second) / 4, rtol=1e-6)
+
+
+def test_numbered_actions_are_told_apart():
+    class Echo(eqx.Module):
+        unit: jax.Array
+
+        def __call__(self, inputs):
+            return inputs * self.unit
+
+    model = Model(Echo(jnp.ones(2)), jnp.ones(1), Discrete(3))
+    seen = model(jnp.zeros((2, 1)), jnp.array([2, 0], jnp.int32))
+    np.testing.assert_allclose(seen[0], [[0, 0, 0, 1], [0, 1, 0, 0]])
+
+
+def test_the_models_gradient_against_differences():
+    with jax.enable_x64(True):
+        keys = jax.random.split(jax.random.key(1), 4)
+        members = jax.vmap(lambda key: SmoothMLP((3 + 11, 8, 3 + 2), key))(keys[:2])
+        model = Model(members, jnp.array([1.0, 1, 8]), Discrete(11))
+        step = Experience(
+            observation=jax.random.normal(keys[0], (5, 3)),
+            action=jnp.array([0, 3, 10, 5, 5]),
+            reward=jax.random.normal(keys[1], (5,)),
+            next_observation=jax.random.normal(keys[2], (5, 3)),
+            terminal=jnp.array([False, True, False, False, True]),
+        )
+        counts = jnp.array([[0.0, 1], [2, 1], [1, 0], [0, 0], [1, 3]])
+        leaves, structure = jax.tree.flatten(model.members)
+        along = [
+            jax.random.normal(jax.random.fold_in(keys[3], i), leaf.shape)
+            for i, leaf in enumerate(leaves)
+        ]
+
+        @jax.jit
+        def loss(t):
+            moved = [leaf + t * way for leaf, way in zip(leaves, along, strict=True)]
+            members = jax.tree.unflatten(structure, moved)
+            return model_loss(eqx.tree_at(lambda m: m.members, model, members), step, counts)[0]
+
+        slope = (loss(1e-6) - loss(-1e-6)) / 2e-6
+        assert abs(slope) > 1e-3
+        np.testing.assert_allclose(jax.grad(loss)(0.0), slope, rtol=1e-6)
+
+
+def test_each_member_counts_real_steps_as_often_as_chance_says():
+    agent = MBPO(**{**SMALL, "environments": 500})
+    task = Pendulum(torques=0)
+    state = jax.jit(lambda: agent.init(task, jax.random.key(0)))()
+    shape = (1, 500)
+    rollout = Transition(
+        state=None, observation=jnp.ones((*shape, 3)), action=jnp.ones((*shape, 1)),
+        reward=jnp.ones(shape), next_state=None, next_observation=jnp.ones((*shape, 3)),
+        terminated=jnp.zeros(shape, bool), truncated=jnp.zeros(shape, bool),
+    )  # fmt: skip
+    observe = jax.jit(agent.observe)
+    for _ in range(4):
+        state = observe(state, rollout)
+    counts = np.asarray(state.replay.unpack(state.replay.rows).counts)
+    for member in counts.T:
+        share = np.bincount(member.astype(int), minlength=4)[:4] / 2000
+        np.testing.assert_allclose(share, [math.exp(-1) / math.factorial(k) for k in range(4)],
+                                   atol=0.04)  # fmt: skip
+    assert abs(np.corrcoef(counts.T)[0, 1]) < 0.1
+
+
+def test_learns_values_from_imagined_steps():
+    """The probe that test_actor_critic.py explains, with few real steps."""
+    steps = 800
+    agent = MBPO(**SMALL, learning_rate_steps=2.0 * steps)
+    population = Population(Aim(), agent, [0])
+    while population.steps < steps:
+        population.advance(steps - population.steps)
+    state = jax.tree.map(lambda x: jnp.array(x[0]), population.fetch().agent)
+    states, best = jnp.array([[0.5], [-0.5]]), jnp.array([[1.0], [-1.0]])
+    np.testing.assert_allclose(agent.policy(agent.weights(state), states), best, atol=0.05)
+    change, root, terminal = jnp.split(state.model(states, best).mean(0), [1, 2], 1)
+    np.testing.assert_allclose(change, [[0], [0]], atol=0.02)
+    np.testing.assert_allclose(unsquash(root), [[1], [1]], atol=0.05)
+    np.testing.assert_allclose(terminal, [[0], [1]], atol=0.05)
+    values = state.learned.critics(states, best).mean(0)
+    np.testing.assert_allclose(values, [5, 1], rtol=0.05)  # hardly any entropy is wanted
+    imagined = state.imagined.unpack(state.imagined.rows)
+    np.testing.assert_allclose(jnp.abs(imagined.observation), 0.5, atol=0.05)
+
+
+@pytest.mark.slow
+def test_the_fast_preset_swings_the_pendulum_up_from_two_thousand_steps():
+    """A seed whose values once rose without end, to a regret of 773 %, in states never seen."""
+    fast = preset("fast", "pendulum", "mbpo")
+    run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=1, seed=302)
+    assert run.population.steps <= 2000
+    assert run.grade()["regret_per_seed"][0] <= 0.1
+
+
+@pytest.mark.parametrize("task", [Merton()])
+def test_refuses_what_is_no_row_of_numbers(task):
+    with pytest.raises(QfolioError, match="mbpo predicts observations that are one row"):
+        MBPO().init(task, jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    "settings", [{"members": 0}, {"model_hidden": ()}, {"imagined_steps": 0}, {"n_steps": 2}]
+)
+def test_refuses_what_makes_no_sense(settings):
+    with pytest.raises(QfolioError, match=next(iter(settings))):
+        MBPO(**settings)

@@ -1,0 +1,382 @@
+"""REINFORCE, A2C and PPO: formulas by hand, gradients, and values known by hand."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from qfolio.agents.a2c import A2C
+from qfolio.agents.on_policy import Batch, normalised
+from qfolio.agents.ppo import PPO, clipped, minibatches, shuffled
+from qfolio.agents.reinforce import REINFORCE
+from qfolio.core.errors import QfolioError
+from qfolio.core.mdp import Transition
+from qfolio.core.training import Population
+from qfolio.experiments.presets import preset
+from qfolio.experiments.run import train
+from qfolio.learning.targets import advantages
+from qfolio.portfolio.synthetic import Ar1, Merton
+from qfolio.tasks.pendulum import Pendulum
+
+from probes import Aim, AimWeights, Endless, OneState, RewardDelay, TwoStates
+
+DISCOUNT = 0.9
+SMALL = {"hidden": (16,), "environments": 3, "rollout": 4, "episode_steps": 4}
+AGENTS = {
+    "reinforce": REINFORCE(**SMALL),
+    "a2c": A2C(**SMALL, trace=0.8),
+    "ppo": PPO(**SMALL, batch_size=6, epochs=2, trace=0.8),
+}
+TASKS = {"choice": Pendulum(torques=3), "numbers": Pendulum(torques=0), "weights": Merton()}
+
+
+def a_rollout(agent, task, state, key):
+    """Steps from made-up observations, with actions that the agent draws and made-up outcomes."""
+    shape = (agent.rollout, agent.environments)
+    keys = jax.random.split(key, 6)
+    example = task.observe(task.reset(key))
+    draw = lambda key: jax.tree.map(  # noqa: E731
+        lambda x: jax.random.normal(key, (*shape, *x.shape)), example
+    )
+    observation = draw(keys[0])
+    act = lambda observation, key: agent.act(state, observation, key)  # noqa: E731
+    terminated = jax.random.bernoulli(keys[3], 0.2, shape)
+    return Transition(
+        state=None,
+        observation=observation,
+        action=jax.vmap(act)(observation, jax.random.split(keys[1], shape[0])),
+        reward=jax.random.normal(keys[2], shape),
+        next_state=None,
+        next_observation=draw(keys[4]),
+        terminated=terminated,
+        truncated=jax.random.bernoulli(keys[5], 0.2, shape) & ~terminated,
+    )
+
+
+def test_advantages_by_hand():
+    """Four steps of one environment; γ = ½, λ = ½: each error is r + ½ V(s') − V(s)."""
+    column = lambda *x: jnp.array(x)[:, None]  # noqa: E731
+    reward, value, following = column(1.0, 2, 3, 4), column(1.0, 1, 1, 1), column(2.0, 4, 6, 8)
+    no = column(False, False, False, False)
+
+    def of(terminated=no, truncated=no, trace=0.5):
+        found = advantages(reward, value, following, terminated, truncated, 0.5, trace)
+        return np.asarray(found)[:, 0]
+
+    errors = np.array([1, 3, 5, 7])
+    np.testing.assert_allclose(of(trace=0.0), errors)
+    expected = [1 + (3 + (5 + 7 / 4) / 4) / 4, 3 + (5 + 7 / 4) / 4, 5 + 7 / 4, 7]
+    np.testing.assert_allclose(of(), expected)
+    # Cut after the second step: its own error still looks at what would follow, and ends there.
+    cut = column(False, True, False, False)
+    np.testing.assert_allclose(of(truncated=cut), [1 + 3 / 4, 3, 5 + 7 / 4, 7])
+    # Ended after the second step: nothing follows, so that its error is 2 − 1.
+    np.testing.assert_allclose(of(terminated=cut), [1 + 1 / 4, 1, 5 + 7 / 4, 7])
+
+
+def test_with_a_trace_of_one_they_are_returns_less_values():
+    column = lambda *x: jnp.array(x)[:, None]  # noqa: E731
+    reward, value, following = column(1.0, 2, 3, 4), column(1.0, 2, 3, 4), column(2.0, 3, 4, 5)
+    no = jnp.zeros((4, 1), bool)
+    found = advantages(reward, value, following, no, no, 0.5, 1.0)
+    returns = [
+        1 + 2 / 2 + 3 / 4 + 4 / 8 + 5 / 16,
+        2 + 3 / 2 + 4 / 4 + 5 / 8,
+        3 + 4 / 2 + 5 / 4,
+        6.5,
+    ]
+    np.testing.assert_allclose(found[:, 0], np.array(returns) - [1, 2, 3, 4])
+
+
+def test_clipped_objective_by_hand():
+    ratio = jnp.array([0.5, 0.9, 1.1, 1.5, 0.5, 0.9, 1.1, 1.5])
+    advantage = jnp.array([1.0] * 4 + [-1.0] * 4)
+    # A gain stops counting where it is taken too far; a loss always counts.
+    np.testing.assert_allclose(
+        clipped(ratio, advantage, 0.2), [0.5, 0.9, 1.1, 1.2, -0.8, -0.9, -1.1, -1.5], rtol=1e-6
+    )
+    slope = jax.grad(lambda ratio: clipped(ratio, advantage, 0.2).sum())(ratio)
+    np.testing.assert_array_equal(slope, [1, 1, 1, 0, 0, -1, -1, -1])
+
+
+def test_normalised_by_hand():
+    root = np.sqrt(1.5)
+    np.testing.assert_allclose(normalised(jnp.array([1.0, 2, 3])), [-root, 0, root], rtol=1e-6)
+
+
+def test_minibatches_hold_every_row_once_and_whole():
+    row = jnp.arange(12.0)
+    batch = Batch(row[:, None], row, row, row, row)
+    first, second = (minibatches(jax.random.key(i), batch, 4) for i in range(2))
+    assert first.goal.shape == (3, 4)
+    np.testing.assert_array_equal(np.sort(first.goal, axis=None), row)
+    assert (np.asarray(first.goal).ravel() != row).any()
+    assert (first.goal != second.goal).any()
+    for part in (first.observation[..., 0], first.action, first.log_prob, first.advantage):
+        np.testing.assert_array_equal(part, first.goal)
+
+
+@pytest.mark.parametrize("n", [1, 5, 8])
+def test_every_order_is_as_likely(n):
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    orders = np.asarray(jax.vmap(lambda key: shuffled(key, n))(keys))
+    np.testing.assert_array_equal(np.sort(orders), np.broadcast_to(np.arange(n), orders.shape))
+    for place in range(n):
+        share = np.bincount(orders[:, place], minlength=n) / len(orders)
+        np.testing.assert_allclose(share, 1 / n, atol=0.012)
+
+
+def dense(mlp, x):
+    """A flat network in numpy."""
+    for weight, bias in zip(mlp.weights[:-1], mlp.biases[:-1], strict=True):
+        x = np.maximum(x @ np.asarray(weight) + np.asarray(bias), 0)
+    return x @ np.asarray(mlp.weights[-1]) + np.asarray(mlp.biases[-1])
+
+
+def plain_loss(name, agent, weights, batch):
+    """The loss of a policy over one number, step by step, by another's densities."""
+    observation, action = np.asarray(batch.observation), np.asarray(batch.action)
+    std = 2 * np.exp(float(weights.log_std[0]))  # the bound is 2
+    output = dense(weights.actor.mlp, observation)[:, 0]
+    policy = stats.norm(2 * output, std)
+    log_prob, total = policy.logpdf(action[:, 0]), 0.0
+    advantage = np.asarray(batch.advantage)
+    scaled = (advantage - advantage.mean()) / advantage.std()
+    for i in range(len(advantage)):
+        if name == "a2c":
+            total -= log_prob[i] * advantage[i]
+        elif name == "reinforce":
+            total -= log_prob[i] * scaled[i]
+        else:
+            ratio = np.exp(log_prob[i] - batch.log_prob[i])
+            bound = np.clip(ratio, 1 - agent.clip, 1 + agent.clip)
+            total -= min(ratio * scaled[i], bound * scaled[i])
+    value = dense(weights.critic.mlp, observation)[:, 0]
+    error = ((np.asarray(batch.goal) - value) ** 2).mean()
+    entropy = stats.norm(0, std).entropy()
+    beyond = np.maximum(np.abs(output) - 2, 0)
+    assert beyond.any(), "some means are to be out of reach"
+    total = total / len(advantage) + 0.1 * (beyond**2).mean()
+    return total + agent.value_weight * error - agent.entropy_weight * entropy
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("reinforce", "numbers"),
+        ("a2c", "numbers"),
+        ("ppo", "numbers"),
+        ("ppo", "choice"),
+        ("ppo", "weights"),
+    ],
+)
+def test_loss_and_gradient(name, kind):
+    """Against finite differences; where actions are numbers, against plain formulas, too."""
+    with jax.enable_x64(True):
+        agent = dataclasses.replace(AGENTS[name], entropy_weight=0.1, rollout=16)
+        task = TASKS[kind]
+        state = agent.init(task, jax.random.key(0))
+        rollout = a_rollout(agent, task, state, jax.random.key(1))
+        batch = agent.judge(state.weights, rollout, 0.8)
+        # Some way from the policy that drew the actions, so that some ratios are clipped.
+        leaves, structure = jax.tree.flatten(state.weights)
+        noise = [
+            np.random.default_rng(i).normal(0, 0.6, leaf.shape) for i, leaf in enumerate(leaves)
+        ]
+        weights = jax.tree.unflatten(structure, [x + n for x, n in zip(leaves, noise, strict=True)])
+        loss = jax.jit(lambda weights: agent.loss(weights, batch)[0])
+        if kind == "numbers":
+            assert float(loss(weights)) == pytest.approx(
+                plain_loss(name, agent, weights, batch), rel=1e-6
+            )
+        gradient = jax.grad(loss)(weights)
+        for seed in range(3):
+            draw = np.random.default_rng(seed).normal
+            direction = jax.tree.map(lambda x: draw(size=x.shape), weights)  # noqa: B023
+            along = lambda step: jax.tree.map(lambda w, d: w + step * d, weights, direction)  # noqa: B023, E731
+            expected = (loss(along(1e-6)) - loss(along(-1e-6))) / 2e-6
+            slope = sum(
+                jax.tree.leaves(jax.tree.map(lambda g, d: (g * d).sum(), gradient, direction))
+            )
+            assert float(slope) == pytest.approx(float(expected), rel=1e-4, abs=1e-7)
+
+
+def test_the_critic_is_no_part_of_the_policys_gradient():
+    agent = dataclasses.replace(AGENTS["a2c"], value_weight=0.0)
+    task = TASKS["numbers"]
+    state = agent.init(task, jax.random.key(0))
+    rollout = a_rollout(agent, task, state, jax.random.key(1))
+    loss = lambda weights: agent.loss(weights, agent.judge(state.weights, rollout, 1.0))[0]  # noqa: E731
+    gradient = jax.grad(loss)(state.weights)
+    assert all((x == 0).all() for x in jax.tree.leaves(gradient.critic))
+    assert all((x != 0).any() for x in (gradient.actor.mlp.weights[-1], gradient.log_std))
+
+
+def test_judging_is_what_the_formulas_say():
+    agent, task = AGENTS["ppo"], TASKS["numbers"]
+    agent = dataclasses.replace(agent, reward_scale=0.5)
+    state = agent.init(task, jax.random.key(0))
+    rollout = a_rollout(agent, task, state, jax.random.key(1))
+    batch = agent.judge(state.weights, rollout, 0.8)
+    value = np.asarray(jax.vmap(state.weights.value)(rollout.observation))
+    following = np.asarray(jax.vmap(state.weights.value)(rollout.next_observation))
+    for column in range(agent.environments):
+        advantage = 0.0
+        for time in reversed(range(agent.rollout)):
+            terminated = rollout.terminated[time, column]
+            if terminated or rollout.truncated[time, column]:
+                advantage = 0.0
+            reward = 0.5 * float(rollout.reward[time, column])
+            goal = reward + (0.0 if terminated else agent.discount * following[time, column])
+            error = goal - value[time, column]
+            advantage = error + agent.discount * 0.8 * advantage
+            row = time * agent.environments + column
+            assert float(batch.advantage[row]) == pytest.approx(advantage, abs=1e-5)
+            assert float(batch.goal[row]) == pytest.approx(
+                advantage + value[time, column], abs=1e-5
+            )
+            np.testing.assert_array_equal(batch.action[row], rollout.action[time, column])
+
+
+def test_one_step_of_ppo_from_its_own_policy_is_the_policy_gradient():
+    """No ratio is clipped there, and the gradient of a ratio is that of the log density."""
+    settings = {**SMALL, "gradient_norm": np.inf}
+    ppo = PPO(**settings, batch_size=12, epochs=1, trace=1.0)
+    task, key = TASKS["choice"], jax.random.key(1)
+    state = ppo.init(task, jax.random.key(0))
+    rollout = a_rollout(ppo, task, state, key)
+    after, _ = ppo.learn(task, state, rollout, key)
+    expected, _ = REINFORCE(**settings).learn(task, state, rollout, key)
+    compare = lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6)  # noqa: E731
+    jax.tree.map(compare, after.weights, expected.weights)
+    jax.tree.map(compare, after.optimizer.mu, expected.optimizer.mu)
+
+
+def learned(agent, task, steps=4000, **changes):
+    settings = {
+        "hidden": (32,), "environments": 16, "rollout": 8, "discount": DISCOUNT,
+        "learning_rate": 5e-3, "learning_rate_final": 0.0, "value_weight": 1.0, "std": 0.5,
+        "learning_rate_steps": steps / 8,
+    }  # fmt: skip
+    if agent is PPO:
+        settings |= {"batch_size": 32, "epochs": 4, "learning_rate_steps": 2 * steps}
+    agent = agent(**{**settings, **changes})
+    population = Population(task, agent, [0])
+    while population.steps < steps:
+        population.advance(steps - population.steps)
+    return jax.tree.map(lambda x: jnp.array(x[0]), population.weights())
+
+
+def test_one_state():
+    weights = learned(PPO, OneState())
+    assert jax.nn.softmax(weights.policy(jnp.ones((1, 1))).logits)[0, 1] > 0.98
+    np.testing.assert_allclose(weights.value(jnp.ones((1, 1))), 1, rtol=0.02)
+
+
+@pytest.mark.parametrize("agent", [REINFORCE, A2C, PPO])
+def test_two_states(agent):
+    weights = learned(agent, TwoStates())
+    states = jnp.array([[1.0], [-1.0]])
+    chances = jax.nn.softmax(weights.policy(states).logits)
+    assert min(chances[0, 1], chances[1, 0]) > 0.98
+    np.testing.assert_allclose(weights.value(states), 1, rtol=0.02)
+
+
+@pytest.mark.parametrize("agent", [A2C, PPO])
+def test_reward_delay(agent):
+    values = learned(agent, RewardDelay()).value(jnp.eye(2))
+    np.testing.assert_allclose(values, [DISCOUNT, 1], rtol=0.02)
+
+
+@pytest.mark.parametrize("agent", [REINFORCE, PPO])
+def test_a_time_limit_is_not_the_end(agent):
+    values = learned(agent, Endless(), steps=16_000, reward_scale=0.1).value(jnp.ones((1, 1)))
+    np.testing.assert_allclose(10 * values, 1 / (1 - DISCOUNT), rtol=0.02)
+
+
+@pytest.mark.parametrize("agent", [REINFORCE, A2C, PPO])
+def test_numbers(agent):
+    weights = learned(agent, Aim(), steps=8000)
+    mode = weights.policy(jnp.array([[0.5], [-0.5]])).mode()
+    np.testing.assert_allclose(mode, [[1], [-1]], atol=0.02)
+
+
+@pytest.mark.parametrize("agent", [A2C, PPO])
+def test_weights(agent):
+    weights = learned(agent, AimWeights(), steps=8000)
+    views = jax.vmap(AimWeights().observe)(jnp.array([0.5, -0.5]))
+    np.testing.assert_allclose(weights.policy(views).mode(), [[0.2, 0.5, 0.3]] * 2, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "network"),
+    [
+        ("ppo", Merton(), "mlp"),
+        ("a2c", Ar1(menu="tilts:0.1"), "flat"),
+        ("reinforce", Merton(menu="tilts:0.1"), "mlp"),
+    ],
+)
+def test_markets(name, task, network):
+    agent = dataclasses.replace(AGENTS[name], network=network)
+    population = Population(task, agent, [0])
+    before = population.weights()
+    population.advance(4)
+    after = population.weights()
+    for part in ("actor", "critic"):
+        pair = getattr(before, part), getattr(after, part)
+        moved = jax.tree.map(lambda a, b: (a != b).any(), *pair)
+        assert any(jax.tree.leaves(moved)), part
+
+
+def test_the_first_policy_is_the_same_everywhere():
+    state = AGENTS["ppo"].init(Merton(), jax.random.key(0))
+    views = jax.vmap(Merton().observe)(
+        jax.vmap(Merton().reset)(jax.random.split(jax.random.key(1), 3))
+    )
+    np.testing.assert_allclose(AGENTS["ppo"].policy(state.weights, views), 0.25, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("agent", "changes", "message"),
+    [
+        (PPO, {"batch_size": 100}, "must divide"),
+        (PPO, {"clip": 0.0}, "clip is 0"),
+        (PPO, {"trace": 1.1}, "trace is 1.1"),
+        (A2C, {"trace": -1.0}, "trace is -1"),
+        (A2C, {"rollout": 0}, "rollout is 0"),
+        (REINFORCE, {"std": 0.0}, "std is 0"),
+        (REINFORCE, {"network": "tree"}, "network is tree"),
+    ],
+)
+def test_wrong_settings(agent, changes, message):
+    with pytest.raises(QfolioError, match=message):
+        agent(**changes)
+
+
+def test_reinforce_wants_whole_episodes():
+    with pytest.raises(QfolioError, match="multiple of the 200 steps"):
+        REINFORCE(rollout=150).init(Pendulum(), jax.random.key(0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "seed", "limit"),
+    [
+        ("ppo", 100, 0.05),
+        ("a2c", 100, 0.10),
+        # Lost, at a regret of 457 %, before means out of reach cost anything.
+        ("a2c", 236, 0.10),
+        ("a2c", 283, 0.10),
+        ("reinforce", 100, 0.08),
+    ],
+)
+def test_presets_learn_the_pendulum(name, seed, limit):
+    """All well within public figures: A2C's −163 is a regret of 19 %, PPO's −172 one of 26 %."""
+    fast = preset("fast", "pendulum", name)
+    run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=2, seed=seed)
+    regrets = run.grade()["regret_per_seed"]
+    assert max(regrets) <= limit, regrets
+    assert min(regrets) > -0.005, "nothing beats the optimum"

@@ -1,0 +1,171 @@
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shell import TINY, qfolio
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run folder, made by the command as a user types it."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    command = [sys.executable, "-m", "qfolio", "train", "pendulum", "--episodes", "8",
+               "--seeds", "2", "--out", str(folder), *TINY]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
+
+
+def test_help_does_not_import_what_is_slow():
+    code = (
+        "import sys; sys.argv = ['qfolio', '--help']\n"
+        "from qfolio.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "slow = {'jax', 'matplotlib', 'gymnasium', 'equinox', 'PIL'} & sys.modules.keys()\n"
+        "assert not slow, slow"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_train_writes_the_whole_folder(run):
+    folder, printed = run
+    assert {path.name for path in folder.iterdir()} == {
+        "config.json", "metrics.csv", "evaluation.csv", "checkpoint.safetensors",
+        "policy.safetensors", "summary.json", "learning_curve.png", "value.png", "episode.gif",
+        "report.html", "contrast",
+    }  # fmt: skip
+    header, *rows = (folder / "metrics.csv").read_text().splitlines()
+    assert header == "seed,episode,return,epsilon,loss,max_q"
+    assert len(rows) == 16
+    assert str(folder / "report.html") in printed
+    assert re.search(r"95 % interval", printed)
+
+
+def test_evaluate_prints_json(run, monkeypatch, capsys):
+    folder, _ = run
+    assert qfolio(monkeypatch, "evaluate", folder, "--episodes", "32", "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["starts"] == 32
+    assert len(result["return_per_seed"]) == 2
+    low, high = result["return_ci95"]
+    assert low < result["return_mean"] < high
+    assert result["return_mean"] <= result["optimum"] < 0
+
+
+def test_evaluate_agrees_with_the_summary(run, monkeypatch, capsys):
+    folder, _ = run
+    assert qfolio(monkeypatch, "evaluate", folder, "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    summary = json.loads((folder / "summary.json").read_text())
+    np.testing.assert_allclose(result["return_per_seed"], summary["return_per_seed"], rtol=1e-6)
+
+
+def test_resume_goes_on(run, monkeypatch, capsys):
+    folder, _ = run
+    assert qfolio(monkeypatch, "train", "--resume", folder, "--episodes", "12") == 0
+    assert json.loads((folder / "summary.json").read_text())["episodes"] == 12
+    assert len((folder / "metrics.csv").read_text().splitlines()) == 1 + 24
+
+
+def test_watch_without_a_display_writes_a_gif(run, monkeypatch, capsys):
+    folder, _ = run
+    (folder / "episode.gif").unlink()
+    for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert qfolio(monkeypatch, "watch", folder) == 0
+    assert (folder / "episode.gif").read_bytes()[:3] == b"GIF"
+
+
+def test_watch_opens_a_window(run):
+    """In SDL's dummy driver, which draws everything and shows nothing."""
+    folder, _ = run
+    done = subprocess.run(
+        [sys.executable, "-m", "qfolio", "watch", str(folder), "--episodes", "1"],
+        capture_output=True, text=True, env={**os.environ, "SDL_VIDEODRIVER": "dummy"},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_live_shows_episodes_while_training(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "qfolio", "train", "--live", "--no-compare", "--episodes", "4",
+         "--seeds", "1", "--out", str(tmp_path / "run"), *TINY],
+        capture_output=True, text=True, env={**os.environ, "SDL_VIDEODRIVER": "dummy"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "run" / "contrast").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "pendulom"], "did you mean pendulum"),
+        (["train", "--preset", "fats"], "no preset 'fats'"),
+        (["train", "--agent", "dqm"], "did you mean dqn"),
+        (["train", "--set", "learning_rat=1"], "did you mean learning_rate"),
+        (["train", "--set", "discount=2"], "between 0 and 1"),
+        (["train", "--set", "discount"], "name=value"),
+        (["train", "--set", "torques=1"], "from 2 to 1001"),
+        (["train", "--set", "replay_capacity=99999999999"], "replay_capacity|memory"),
+        (["train", "--set", "hidden=100000,100000"], "GiB of memory"),
+        (["train", "--episodes", "0"], "episodes is 0"),
+        (["train", "--seeds", "-1"], "seeds is -1"),
+        (["train", "--seeds", "9999999999"], "seeds is 9999999999"),
+        (["train", "--set", "horizon=3e9"], "horizon is 3000000000"),
+        (["train", "--set", "learning_rate=inf"], "learning_rate is inf"),
+        (["train", "--resume", "nowhere"], "nowhere is no run"),
+        (["evaluate", "nowhere"], "nowhere is no run"),
+        (["evaluate", "nowhere", "--episodes", "0"], "at least 1"),
+        (["watch", "nowhere"], "nowhere is no run"),
+    ],
+)
+def test_wrong_input_gets_one_sentence_and_code_2(
+    monkeypatch, capsys, tmp_path, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    assert qfolio(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error)
+    assert error.count("\n") == 1
+    assert list(Path().iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [[], ["trian"], ["train", "--episodes", "many"]])
+def test_what_the_parser_refuses_is_code_2_too(monkeypatch, capsys, arguments):
+    assert qfolio(monkeypatch, *arguments) == 2
+
+
+@pytest.mark.parametrize(
+    "ignored", [["--set", "discount=0.5"], ["--seed", "7"], ["--preset", "best"], ["pendulum"]]
+)
+def test_resume_refuses_what_it_would_ignore(run, monkeypatch, capsys, ignored):
+    folder, _ = run
+    assert qfolio(monkeypatch, "train", *ignored, "--resume", folder) == 2
+    assert "--resume keeps" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("episodes", [0, -3])
+def test_resume_refuses_no_episodes_and_leaves_the_run_alone(run, monkeypatch, capsys, episodes):
+    folder, _ = run
+    before = (folder / "config.json").read_text()
+    assert qfolio(monkeypatch, "train", "--resume", folder, "--episodes", episodes) == 2
+    assert (folder / "config.json").read_text() == before
+
+
+def test_resume_finishes_a_contrast_that_was_interrupted(run, monkeypatch, capsys):
+    folder, _ = run
+    shutil.rmtree(folder / "contrast")
+    (folder / "report.html").unlink()
+    assert qfolio(monkeypatch, "train", "--resume", folder) == 0
+    assert (folder / "contrast" / "checkpoint.safetensors").exists()
+    assert (folder / "report.html").exists()
+    assert not (folder / "contrast" / "contrast").exists()

@@ -1,0 +1,74 @@
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.core.evaluation import evaluate, play, start_keys, tail_steps
+from qfolio.tasks.pendulum import Pendulum
+
+from probes import Endless, OneState
+
+
+def constant(agent, task, values):
+    """Weights whose action values are ``values`` everywhere."""
+    weights = agent.init(task, jax.random.key(0)).online
+    last = jnp.array(values) * agent.reward_scale
+    zero = jax.tree.map(jnp.zeros_like, weights)
+    zero.mlp.biases[-1] = last
+    return zero
+
+
+def test_returns_equal_gymnasiums():
+    steps = 40
+    task, agent = Pendulum(horizon=steps), DQN()
+    weights = agent.init(task, jax.random.key(3)).online
+    keys = start_keys(3)
+    returns = evaluate(task, agent, weights, keys, 0).returns
+    env = gymnasium.make("Pendulum-v1", max_episode_steps=steps)
+    for key, value in zip(keys, returns, strict=True):
+        env.reset(seed=0)
+        env.unwrapped.state = np.array(task.reset(key), float)
+        total, truncated = 0.0, False
+        observation = np.array(task.observe(task.reset(key)))
+        while not truncated:
+            action = agent.policy(weights, jnp.array(observation)[None])[0]
+            observation, reward, _, truncated, _ = env.step(np.array([task.torque(action)]))
+            total += reward
+        assert total == pytest.approx(float(value), rel=1e-4)
+
+
+def test_overestimation_by_hand():
+    agent = DQN(discount=0.5)
+    # A reward of 1 for ever is worth 2.
+    weights = constant(agent, Endless(), [3.0, 1.0])
+    greedy = evaluate(Endless(), agent, weights, start_keys(4), tail_steps(0.5))
+    np.testing.assert_allclose(greedy.overestimation, 3.0 - 2.0, rtol=0.01)
+    np.testing.assert_allclose(greedy.returns, 1.0)
+    # One step that ends the episode pays 1.
+    weights = constant(agent, OneState(), [0.0, 1.25])
+    greedy = evaluate(OneState(), agent, weights, start_keys(4), 3)
+    np.testing.assert_allclose(greedy.overestimation, 0.25, rtol=1e-5)
+    np.testing.assert_allclose(greedy.returns, 1.0)
+
+
+def test_the_tail_is_long_enough():
+    assert tail_steps(0.5) == 7
+    assert 0.99 ** tail_steps(0.99) <= 0.01
+    assert tail_steps(0.0) == 1
+    assert tail_steps(1.0) == 2000
+
+
+def test_few_starts_are_the_first_of_many():
+    few, many = (jax.random.key_data(start_keys(n)) for n in (3, 10))
+    np.testing.assert_array_equal(few, many[:3])
+
+
+def test_play_is_what_evaluate_counts():
+    task, agent = Pendulum(horizon=50), DQN()
+    weights = agent.init(task, jax.random.key(0)).online
+    episode = play(task, agent, weights, start_keys(2)[1])
+    returns = evaluate(task, agent, weights, start_keys(2), 0).returns
+    assert episode.states.theta.shape == (51,)
+    np.testing.assert_allclose(episode.rewards.sum(), returns[1], rtol=1e-5)

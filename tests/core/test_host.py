@@ -1,0 +1,359 @@
+"""Agents on environments of Gymnasium, stepped from Python."""
+
+import json
+import sys
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.agents.ppo import PPO
+from qfolio.core import registry, settings
+from qfolio.core.errors import QfolioError
+from qfolio.core.evaluation import start_keys
+from qfolio.core.host import HostPopulation
+from qfolio.core.training import Population
+from qfolio.experiments import presets
+from qfolio.experiments.run import Run
+from qfolio.tasks.gymnasium import GymnasiumTask
+
+from probes import RewardDelay
+from shell import qfolio
+
+
+class Tiny(gymnasium.Env):
+    """What a test needs of an environment, in one number of steps since the start."""
+
+    observation_space = gymnasium.spaces.Box(-10, 10, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observe(), {}
+
+    def observe(self):
+        return np.array([1.0 - self.t, self.t], np.float32)
+
+    def step(self, action):
+        self.t += 1
+        return self.observe(), *self.outcome(action), {}
+
+
+class Delay(Tiny):
+    """Two steps, of which the second pays 1: the probe ``RewardDelay``."""
+
+    def outcome(self, action):
+        return float(self.t == 2), self.t == 2, False
+
+
+class Endless(Tiny):
+    """Pays 1 for ever and is always the same, cut by the time limit or by itself."""
+
+    def __init__(self, cut=10**9):
+        self.cut = cut
+
+    def observe(self):
+        return np.ones(2, np.float32)
+
+    def outcome(self, action):
+        return 1.0, False, self.t >= self.cut
+
+
+class Numbered(Tiny):
+    """States 5 and 6, drawn at the reset; actions 7 and 8, of which the next number is right."""
+
+    observation_space = gymnasium.spaces.Discrete(2, start=5)
+    action_space = gymnasium.spaces.Discrete(2, start=7)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = int(self.np_random.integers(5, 7))
+        return self.state, {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return self.state, float(action == self.state + 2), True, False, {}
+
+
+class Aim(Tiny):
+    """Two numbers within bounds of their own: the reward says how far they are from (1, 30)."""
+
+    action_space = gymnasium.spaces.Box(np.float32([0, 10]), np.float32([4, 50]))
+
+    def outcome(self, action):
+        assert self.action_space.contains(np.float32(action)), action
+        return -abs(action[0] - 1) - abs(action[1] - 30) / 10, self.t == 2, False
+
+
+class Named(Tiny):
+    observation_space = gymnasium.spaces.Dict({"x": gymnasium.spaces.Discrete(2)})
+
+
+class Unbounded(Tiny):
+    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+
+ENVIRONMENTS = {kind: f"Test{kind.__name__}-v0" for kind in (Delay, Endless, Numbered, Aim, Named,
+                                                             Unbounded)}  # fmt: skip
+for _kind, _id in ENVIRONMENTS.items():
+    gymnasium.register(_id, entry_point=_kind, max_episode_steps=4)
+
+SMALL = DQN(
+    hidden=(8,), environments=2, batch_size=4, replay_capacity=64, learning_starts=4,
+    target_period=1, target_rate=0.1, learning_rate=3e-3, episode_steps=0,
+)  # fmt: skip
+
+
+def task(kind, **options):
+    return GymnasiumTask(ENVIRONMENTS[kind], **options)
+
+
+def trained(task, agent, seeds, steps, kind=HostPopulation):
+    population = kind(task, agent, seeds)
+    while population.steps < steps:
+        population.advance(steps - population.steps)
+    return population
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def stored(population):
+    replay = population.fetch().agent.replay
+    return replay.unpack(jnp.array(replay.rows[0]))
+
+
+def test_it_learns_what_the_compiled_loop_learns():
+    """On the same environment, from the same seeds, through another program."""
+    host = trained(task(Delay), SMALL, [3, 4], 60).fetch()
+    compiled = trained(RewardDelay(), SMALL, [3, 4], 60, Population).fetch()
+    assert host.episodes.tolist() == compiled.episodes.tolist() == [60, 60]
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5),
+        (host.agent, host.tally, host.steps),
+        (compiled.agent, compiled.tally, compiled.steps),
+    )
+
+
+def test_rollouts_are_those_of_the_compiled_loop():
+    agent = PPO(hidden=(8,), environments=2, rollout=8, batch_size=8, epochs=2, learning_rate=1e-2)
+    host = trained(task(Delay), agent, [1], 48).fetch()
+    compiled = trained(RewardDelay(), agent, [1], 48, Population).fetch()
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4),
+        (host.agent, host.tally),
+        (compiled.agent, compiled.tally),
+    )
+
+
+def test_transitions_end_before_the_reset():
+    rows = stored(trained(task(Delay), SMALL, [0], 4))
+    np.testing.assert_array_equal(rows.observation[:8, 1], [0, 0, 1, 1, 0, 0, 1, 1])
+    np.testing.assert_array_equal(rows.next_observation[:8, 1], [1, 1, 2, 2, 1, 1, 2, 2])
+    np.testing.assert_array_equal(rows.reward[:8], [0, 0, 1, 1, 0, 0, 1, 1])
+    np.testing.assert_array_equal(rows.terminal[:8], [False, False, True, True] * 2)
+
+
+@pytest.mark.parametrize("options", [{}, {"kwargs": '{"cut": 3}'}, {"horizon": 2}])
+def test_what_is_cut_is_not_the_end(options):
+    """The time limit of the registry, the environment's own, and one that is asked for."""
+    population = HostPopulation(task(Endless, **options), SMALL, [0])
+    records = population.advance(12)
+    records = population.advance(12) if not records.finished.any() else records
+    assert not stored(population).terminal.any()
+    length = {"": 4, "kwargs": 3, "horizon": 2}[next(iter(options), "")]
+    assert set(records.returns[records.finished]) == {length}
+
+
+def test_bootstraps_through_the_time_limit():
+    agent = DQN(
+        hidden=(16,), environments=4, batch_size=32, replay_capacity=1000, learning_starts=40,
+        discount=0.8, target_period=1, target_rate=0.05, learning_rate=3e-3,
+        learning_rate_final=0.0, learning_rate_steps=1400.0, episode_steps=0,
+    )  # fmt: skip
+    weights = trained(task(Endless), agent, [0], 1500).weights()
+    values = agent.action_values(jax.tree.map(lambda x: jnp.array(x[0]), weights), jnp.ones((1, 2)))
+    np.testing.assert_allclose(values, [[5.0, 5.0]], rtol=0.02)
+
+
+def test_a_seed_is_one_result_alone_and_among_others():
+    agent = DQN(hidden=(8,), environments=3, batch_size=8, learning_starts=6, replay_capacity=99)
+    together = trained(task(Numbered), agent, range(3), 150)
+    alone = trained(task(Numbered), agent, [1], 150)
+    again = trained(task(Numbered), agent, [1], 150)
+    same(alone.fetch(), again.fetch())
+    same(alone.fetch(), jax.tree.map(lambda x: x[1:2], together.fetch()))
+    rows = together.fetch().agent.replay.rows
+    assert not np.array_equal(rows[0], rows[1])
+    keys = start_keys(12)
+    same(together.evaluate(keys).returns[1:2], alone.evaluate(keys).returns)
+
+
+def test_numbers_that_do_not_begin_at_zero():
+    numbered = task(Numbered)
+    assert (numbered.states, numbered.actions.n, numbered.horizon) == (2, 2, 4)
+    agent = DQN(
+        hidden=(16,), environments=4, batch_size=32, replay_capacity=500, learning_starts=40,
+        learning_rate=1e-2, epsilon_decay=0.98, episode_steps=0,
+    )  # fmt: skip
+    population = trained(numbered, agent, [0], 300)
+    assert set(stored(population).observation.tolist()) == {0, 1}
+    np.testing.assert_array_equal(population.evaluate(start_keys(25)).returns, np.ones((1, 25)))
+
+
+def test_coordinates_reach_from_bound_to_bound():
+    facts = task(Aim).facts
+    given = facts.given(np.array([[-1, -1], [1, 1], [0, 0.5], [-9, 9]], np.float32))
+    np.testing.assert_allclose(given, [[0, 10], [4, 50], [2, 40], [0, 50]])
+    agent = PPO(
+        environments=8, rollout=16, batch_size=64, epochs=8, hidden=(16,), learning_rate=1e-2,
+        learning_rate_final=0.0, learning_rate_steps=960.0, discount=0.5, std=0.5,
+    )  # fmt: skip
+    population = trained(task(Aim), agent, [0], 16 * 60)
+    assert population.evaluate(start_keys(3)).returns.min() > -0.3  # of two steps; at first −4
+
+
+def test_every_graded_episode_is_that_of_its_seed():
+    """Fewer starts than lanes, as many, and more: the first are the same."""
+    population = trained(task(Numbered), SMALL, [0, 1], 4)
+    many = population.evaluate(start_keys(23)).returns
+    assert many.shape == (2, 23)
+    for few in (1, 10, 12):
+        same(population.evaluate(start_keys(few)).returns, many[:, :few])
+
+
+def test_it_goes_on_from_a_checkpoint_in_new_episodes(tmp_path):
+    numbered = task(Delay)
+    run = Run.create(numbered, SMALL, steps=33, seeds=2, out=tmp_path / "run")
+    run.train()
+    assert run.config["episodes"] is None
+    assert (run.done("steps"), run.population.steps) == (34, 17)  # whole steps of two environments
+    assert run.population.fetch().tally.steps.tolist() == [[1, 1], [1, 1]]
+    again = Run.open(tmp_path / "run")
+    assert again.population.fetch().tally.steps.tolist() == [[0, 0], [0, 0]]
+    same(again.population.fetch().agent, run.population.fetch().agent)
+    again.train(steps=60)
+    assert again.done("steps") == 60
+    assert again.config["steps"] == 60
+    twice = Run.open(tmp_path / "run")
+    assert twice.budget == {"steps": 60}
+    summary = twice.summary()
+    assert (summary["optimum"], summary["regret_per_seed"]) == (None, None)
+    assert summary["return_per_seed"] == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GymnasiumTask("CartPoll-v1"), "no environment 'CartPoll-v1'; did you mean CartP"),
+        (lambda: GymnasiumTask("Nowhere/X-v0"), "Nowhere"),
+        (lambda: GymnasiumTask("no_such_module:X-v0"), "no_such_module cannot be imported"),
+        (lambda: task(Named), "observations of TestNamed-v0 are Dict.*FlattenObservation"),
+        (lambda: task(Unbounded), "actions of TestUnbounded-v0 .* bounds"),
+        (lambda: task(Endless, kwargs='{"cuts": 3}'), "cannot be made with kwargs"),
+        (lambda: task(Endless, kwargs="cut=3"), "JSON object"),
+        (lambda: task(Delay, horizon=-1), "horizon is -1"),
+        (lambda: Population(task(Delay), SMALL, [0]).advance(4), "cannot be compiled"),
+        (lambda: HostPopulation(task(Aim), SMALL, [0]), "dqn"),
+    ],
+)  # fmt: skip
+def test_it_says_what_is_wrong(make, message):
+    with pytest.raises(QfolioError, match=message):
+        make()
+
+
+def test_without_gymnasium_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(QfolioError, match=r"pip install 'qfolio\[gym\]'"):
+        GymnasiumTask("Unseen-v0")
+
+
+def test_what_an_environment_needs_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "Box2D", None)
+    for name in [name for name in sys.modules if name.startswith("gymnasium.envs.box2d")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(QfolioError, match=r"pip install 'qfolio\[box2d\]'"):
+        GymnasiumTask("LunarLander-v3", kwargs='{"gravity": -9.0}')
+
+
+def test_a_folder_imports_nothing(tmp_path, monkeypatch):
+    """A run of a stranger may name a module; opening it must not run that."""
+    (tmp_path / "theirs.py").write_text("raise AssertionError('was run')")
+    monkeypatch.syspath_prepend(tmp_path)
+    Run.create(task(Delay), SMALL, steps=4, out=tmp_path / "run")
+    path = tmp_path / "run" / "config.json"
+    config = json.loads(path.read_text())
+    config["task"], config["task_settings"]["id"] = "gym:theirs:X-v0", "theirs:X-v0"
+    path.write_text(json.dumps(config))
+    with pytest.raises(QfolioError, match="module theirs"):
+        Run.open(tmp_path / "run")
+
+
+def test_names_and_presets():
+    assert registry.find("task", registry.TASKS, "gym:CartPole-v1") is GymnasiumTask
+    assert registry.name_of(registry.TASKS, task(Delay)) == "gym:TestDelay-v0"
+    with pytest.raises(QfolioError, match="gym:CartPole-v1"):
+        registry.find("task", registry.TASKS, "xyz")
+    unknown = presets.preset("fast", "gym:TestDelay-v0", "dqn")
+    assert unknown.build() == DQN()
+    assert settings.build(GymnasiumTask, unknown.task) == task(Delay)
+    for name, agent in presets.PRESETS:
+        if name.startswith(registry.GYM):
+            assert presets.preset("fast", name, agent).task["id"] == name.removeprefix("gym:")
+
+
+TINY = ["--set", "hidden=8", "environments=2", "batch_size=8", "learning_starts=16"]
+
+
+def test_the_command_trains_reports_and_goes_on(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "run"
+    start = ["train", "gym:CartPole-v1", "--agent", "dqn", "--seeds", "2", "--out", folder]
+    assert qfolio(monkeypatch, *start, "--steps", "300", "--no-compare", *TINY) == 0
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["task"], config["steps"]) == ("gym:CartPole-v1", 300)
+    report = (folder / "report.html").read_text()
+    assert "DQN on CartPole-v1" in report
+    assert "--steps 300" in report
+    assert "optimum" not in report
+    assert qfolio(monkeypatch, "train", "--resume", folder, "--steps", "400", "--no-compare") == 0
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["env_steps"] == 400
+    capsys.readouterr()
+    assert qfolio(monkeypatch, "evaluate", folder, "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["starts"] == 100
+    assert result["return_per_seed"] == summary["return_per_seed"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["gym:CartPoll-v1"], "did you mean CartPole-v1"),
+        (["gym:CartPole-v1", "--steps", "9", "--episodes", "9"], "give one of them"),
+        (["gym:CartPole-v1", "--steps", "0"], "steps is 0"),
+        (["gym:Pendulum-v1", "--agent", "dqn"], "dqn"),
+        (["gym:Blackjack-v1"], "FlattenObservation"),
+    ],
+)
+def test_wrong_input_gets_one_sentence(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert qfolio(monkeypatch, "train", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["dqn", "ppo"])
+def test_the_pole_is_balanced(agent):
+    preset = presets.preset("fast", "gym:CartPole-v1", agent)
+    run = Run.create(
+        GymnasiumTask(**preset.task), preset.build(), seeds=2, seed=100, **preset.budget
+    )
+    run.train()
+    assert run.grade()["return_per_seed"] == [500.0, 500.0]

@@ -1,0 +1,55 @@
+import math
+
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError
+
+
+def test_text_becomes_the_fields_type():
+    agent = settings.build(
+        DQN,
+        {
+            "hidden": "64,32",
+            "discount": "0.5",
+            "double": "False",
+            "batch_size": "9",
+            "huber": "inf",
+        },
+    )
+    assert (agent.hidden, agent.discount, agent.double) == ((64, 32), 0.5, False)
+    assert (agent.batch_size, agent.huber) == (9, math.inf)
+
+
+def test_describe_and_build_are_inverse():
+    agent = DQN(hidden=(7, 5), huber=math.inf, discount=0.125)
+    assert settings.build(DQN, settings.describe(agent)) == agent
+
+
+def test_parse():
+    assert settings.parse(["a=1", "learning-rate = 2"]) == {"a": "1", "learning_rate": "2"}
+
+
+@pytest.mark.parametrize("assignment", ["discount", "=1", "discount="])
+def test_parse_says_what_it_wants(assignment):
+    with pytest.raises(QfolioError, match="name=value"):
+        settings.parse([assignment])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("discount", "much"), ("discount", "nan"), ("discount", None), ("batch_size", "1.5"),
+        ("batch_size", True), ("hidden", "a,b"), ("hidden", [1.5]), ("double", "perhaps"),
+        ("batch_size", "1e999"), ("hidden", {"a": 1}),
+    ],
+)  # fmt: skip
+def test_refuses_what_does_not_fit(name, value):
+    with pytest.raises(QfolioError, match=f"^{name} is "):
+        settings.build(DQN, {name: value})
+
+
+def test_unknown_names_get_a_suggestion():
+    with pytest.raises(QfolioError, match="did you mean learning_rate"):
+        settings.build(DQN, {"learning_rat": 1})

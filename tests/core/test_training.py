@@ -1,0 +1,159 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.core.errors import QfolioError
+from qfolio.core.training import Population, advance, begin
+
+from probes import Explosive, RewardDelay
+
+
+def trained(task, agent, seeds, steps):
+    population = Population(task, agent, seeds)
+    records = []
+    for end in steps:
+        while population.steps < end:
+            records.append(population.advance(end - population.steps))
+    return population, records
+
+
+def stored(population):
+    """The first member's replay buffer."""
+    replay = population.fetch().agent.replay
+    return replay.unpack(jnp.array(replay.rows[0]))
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_a_seed_alone_equals_the_seed_among_others(task, agent):
+    together, _ = trained(task, agent, range(5), [150])
+    for seed in (0, 3):
+        alone, _ = trained(task, agent, [seed], [150])
+        same(alone.fetch(), jax.tree.map(lambda x, s=seed: x[s : s + 1], together.fetch()))
+
+
+def test_different_seeds_differ(task, agent):
+    population, _ = trained(task, agent, range(3), [60])
+    weights = agent.weights(population.fetch().agent).mlp.weights[0]
+    assert not np.array_equal(weights[0], weights[1])
+    assert not np.array_equal(weights[1], weights[2])
+
+
+def test_pauses_change_nothing(task, agent):
+    paused, _ = trained(task, agent, [0, 1], [3, 10, 11, 90, 150])
+    straight, _ = trained(task, agent, [0, 1], [150])
+    same(paused.fetch(), straight.fetch())
+
+
+def test_restoring_goes_on_bit_for_bit(task, agent):
+    first, _ = trained(task, agent, [0, 1, 2], [77])
+    second = Population(task, agent, [0, 1, 2])
+    second.restore(first.fetch())
+    straight, _ = trained(task, agent, [0, 1, 2], [150])
+    second.advance(150 - 77)
+    same(second.fetch(), straight.fetch())
+
+
+def test_transitions_end_before_the_reset():
+    """The buffer of a task whose every transition is known: 0 → 1 → end."""
+    agent = DQN(
+        hidden=(4,), environments=2, batch_size=4, replay_capacity=8, learning_starts=4,
+        episode_steps=0,
+    )  # fmt: skip
+    population, _ = trained(RewardDelay(), agent, [0], [4])
+    rows = stored(population)
+    np.testing.assert_array_equal(rows.observation[:, 1], [0, 0, 1, 1, 0, 0, 1, 1])
+    np.testing.assert_array_equal(rows.next_observation[:, 1], [1, 1, 2, 2, 1, 1, 2, 2])
+    np.testing.assert_array_equal(rows.reward, [0, 0, 1, 1, 0, 0, 1, 1])
+    np.testing.assert_array_equal(rows.terminal, [False, False, True, True] * 2)
+
+
+def test_records_are_the_finished_episodes(task, agent):
+    _, records = trained(task, agent, [0], [100])
+    finished = np.concatenate([r.finished[0, :100] for r in records])
+    assert finished.sum() == 8  # two environments, four episodes of 25 steps
+    returns = np.concatenate([r.returns[0][r.finished[0]] for r in records])
+    assert (returns < 0).all()
+    metrics = {k: v[0][records[-1].finished[0]] for k, v in records[-1].metrics.items()}
+    assert set(metrics) == {"loss", "epsilon", "max_q"}
+    assert all(np.isfinite(v).all() for v in metrics.values())
+    decayed = agent.epsilon_decay ** np.array([0, 0, 2, 2, 4, 4, 6, 6])
+    np.testing.assert_allclose(metrics["epsilon"], decayed, rtol=1e-5)
+
+
+def test_the_return_of_a_record_is_the_sum_of_rewards(task, agent):
+    """Against the rewards in the buffer, which the first episode still fills in order."""
+    population, records = trained(task, agent, [0], [25])
+    rewards = stored(population).reward[:50].reshape(25, 2)
+    last = records[-1]
+    np.testing.assert_allclose(last.returns[0][last.finished[0]], rewards.sum(0), rtol=1e-5)
+
+
+def test_training_episodes_can_be_cut_shorter(task):
+    agent = DQN(hidden=(4,), environments=2, batch_size=4, learning_starts=4, episode_steps=5)
+    population, _ = trained(task, agent, [0], [20])
+    assert population.episodes == 8
+    assert not stored(population).terminal.any()
+
+
+def test_warm_up_stores_and_does_not_learn(task, agent):
+    population = Population(task, agent, [0])
+    before = agent.weights(population.fetch().agent)
+    population.advance(1000)  # stops where learning begins
+    after = population.fetch()
+    assert after.steps == agent.warm_up() == 9
+    assert after.agent.replay.size == 18
+    same(agent.weights(after.agent), before)
+
+
+def test_steps_left_ends_with_whole_episodes(task, agent):
+    population = Population(task, agent, [0])
+    assert population.steps_left(3) == 50
+    while population.steps_left(3):
+        population.advance(population.steps_left(3))
+    assert (population.steps, population.episodes) == (50, 4)
+
+
+def test_steps_left_counts_those_of_all_environments(task, agent):
+    population = Population(task, agent, [0])
+    assert population.steps_left(steps=61) == 31
+    population.advance(population.steps_left(steps=61))  # the warm-up
+    assert population.steps_left(steps=61) == 31 - agent.warm_up()
+    population.advance(population.steps_left(steps=61))
+    assert (population.steps, population.steps_left(steps=61)) == (31, 0)
+
+
+def test_an_infinite_loss_stops_training():
+    agent = DQN(hidden=(4,), environments=2, batch_size=8, learning_starts=4, episode_steps=0)
+    population = Population(Explosive(), agent, [4, 5])
+    population.advance(1000)  # warm-up
+    with pytest.raises(QfolioError, match="seed 4, 5 is no longer finite"):
+        population.advance(1000)
+
+
+def test_hyperparameters_can_differ_between_members(task, agent):
+    """A sweep is a vmap over agents: one compiled program serves all configurations."""
+
+    def weights_after(rate):
+        varied = eqx.tree_at(lambda a: a.learning_rate, agent, rate)
+        state = begin(task, varied, jnp.array(0))
+        state, _ = advance(task, varied, state, jnp.array(15), learning=True)
+        return state.agent.online.mlp.weights[0]
+
+    slow, fast = jax.vmap(weights_after)(jnp.array([1e-3, 1e-2]))
+    assert not np.allclose(slow, fast)
+
+
+def test_lockstep_members_learn_the_same(task, agent, monkeypatch):
+    """On a GPU members are stepped in lockstep (vmap); only the rounding may differ."""
+    one_by_one, _ = trained(task, agent, [0, 1, 2], [30])
+    monkeypatch.setattr("qfolio.core.devices.LOCKSTEP", {"cpu"})
+    lockstep, _ = trained(task, agent, [0, 1, 2], [30])
+    assert lockstep._programs is not one_by_one._programs  # or this would compare like with like
+    expected, actual = (p.fetch().agent.online.mlp.weights for p in (one_by_one, lockstep))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), expected, actual)

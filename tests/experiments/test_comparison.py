@@ -1,0 +1,469 @@
+import dataclasses
+import json
+import math
+import re
+import signal
+
+import jax
+import numpy as np
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.comparison import run as comparing
+from qfolio.experiments.comparison.operations import operations_per_step
+from qfolio.experiments.comparison.ranking import (
+    Result,
+    area,
+    conclusion,
+    fewest_seeds,
+    middle_steps,
+    rank,
+    share,
+    steps_within,
+)
+from qfolio.experiments.comparison.run import Comparison, Entrant
+from qfolio.experiments.presets import PRESETS, Preset
+from qfolio.experiments.run import Run
+from qfolio.portfolio.synthetic import Kelly, Regime
+from qfolio.report.comparison import comparison_data, render_comparison, tidy
+from qfolio.report.figures import percent_tick
+from qfolio.report.rendering import THIN_SPACE
+from qfolio.tasks.pendulum import Pendulum
+
+from shell import qfolio
+
+TASK = {"horizon": 20}
+TINY = {"hidden": (8,), "environments": 2, "batch_size": 8, "replay_capacity": 200,
+        "learning_starts": 16, "episode_steps": 0}  # fmt: skip
+
+
+def tiny(seeds=3, episodes=6, **rates):
+    """Entrants that differ in their learning rate, so that they share one program."""
+    rates = rates or {"slow": 1e-3, "quick": 1e-2}
+    agents = {name: DQN(**TINY, learning_rate=rate) for name, rate in rates.items()}
+    budget = {"episodes": episodes}
+    return {name: Entrant(Pendulum(**TASK), agent, name, budget) for name, agent in agents.items()}
+
+
+def result(returns, *, curve=(-300.0, -200.0, -101.0), steps=1000, seconds=2.0, optimum=-100.0):
+    """A result with seeds that learn alike and end as given."""
+    returns = np.asarray(returns, dtype=float)
+    points = np.linspace(0, steps, len(curve)).astype(int)
+    return Result(
+        returns=returns.tolist(), optimum=optimum, starts=1024, curve_starts=64,
+        curve_steps=points.tolist(), curve_returns=[[x] * len(returns) for x in curve],
+        curve_optimum=optimum, episodes=10, env_steps=steps, seconds_train=seconds * len(returns),
+        seconds_compile=1.0, seconds_per_seed=seconds, steps_per_second=500.0,
+        operations_per_step=12_500.0, state_bytes=4_200_000, policy_bytes=1836, parameters=459,
+    )  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def short_chunks():
+    """Several looks at a short training, which all tests share the programs of."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("qfolio.core.training.CHUNK", 20)
+        yield
+
+
+GOOD, ALIKE, BAD = np.arange(8) / 8 - 102, np.arange(8) / 8 - 102.05, np.arange(8) - 140.0
+
+
+# What follows from results ----------------------------------------------------------------------
+
+
+def test_steps_until_a_curve_stays_near():
+    regrets = np.array([[2.0, 2.0, 0.05, 2.0], [0.05, 0.1, 0.05, 0.2], [0.2, 0.1, 0.0, 0.1],
+                        [0.05, 0.1, 0.1, 0.2]])  # fmt: skip
+    assert steps_within([0, 10, 20, 30], regrets, 0.1) == [30, 10, 0, None]
+    assert steps_within([0], np.array([[math.nan]]), 0.1) == [None]
+
+
+def test_seeds_that_never_arrive_are_the_slowest():
+    # Of four seeds the middle two count; the fourth, which may be anything, does not.
+    assert middle_steps([10, 40, 20, None]) == pytest.approx(30)
+    assert middle_steps([10, None, 20, None]) is None
+    assert middle_steps([None]) is None
+    # Of five: 0.75 of the second, the third, 0.75 of the fourth.
+    assert middle_steps([1, 2, 3, 4, None]) == pytest.approx((0.75 * 2 + 3 + 0.75 * 4) / 2.5)
+
+
+def test_the_area_ends_where_the_shortest_training_does():
+    # From 4 down to 2 over ten steps, then to 0 at twenty: 3 on average over the first ten,
+    # and (30 + 17.5 / 2) / 15 over fifteen.
+    values = np.array([[4.0, 8.0], [2.0, 8.0], [0.0, 8.0]])
+    np.testing.assert_allclose(area([0, 10, 20], values, 10), [3.0, 8.0])
+    np.testing.assert_allclose(area([0, 10, 20], values, 15), [(30 + 7.5) / 15, 8.0])
+
+
+def test_ranking_by_regret():
+    ranking = rank({"bad": result(BAD), "good": result(GOOD, steps=500, seconds=4.0)})
+    assert ranking["order"] == ["good", "bad"]
+    assert ranking["common_steps"] == 500
+    good = ranking["agents"]["good"]
+    # The middle half of 2 % to 1.125 % below −100.
+    assert good["final"]["iqm"] == pytest.approx(0.015625)
+    assert good["final"]["worst"] == pytest.approx(0.02)
+    low, high = good["final"]["interval"]
+    assert 0.0125 < low < 0.015625 < high < 0.02
+    # Regrets of the curve: 200 % and 100 % and 1 %, at 0, 250 and 500 steps.
+    assert good["area"]["iqm"] == pytest.approx((1.5 + 0.505) / 2)
+    near = {entry["threshold"]: entry for entry in good["within"]}
+    assert (near[0.1]["steps"], near[0.1]["seconds"], near[0.1]["reached"]) == (500, 4.0, 8)
+    (pair,) = ranking["pairs"]
+    assert (pair["first"], pair["second"], pair["probability"]) == ("good", "bad", 1.0)
+    assert pair["p"] == pytest.approx(2 / math.comb(16, 8))
+    assert pair["difference"] == pytest.approx(0.015625 - 0.365)
+    json.dumps(ranking, allow_nan=False)
+
+
+def test_ranking_by_return_where_no_optimum_is_known():
+    best = result([480.0, 500.0, 500.0, 490.0], curve=(10.0, 460.0, 500.0), optimum=None)
+    worse = result([120.0, 130.0, 110.0, 90.0], curve=(10.0, 100.0, 120.0), optimum=None)
+    ranking = rank({"worse": worse, "best": best})
+    assert (ranking["measure"], ranking["goal"]) == ("return", 500.0)
+    assert ranking["order"] == ["best", "worse"]
+    assert ranking["agents"]["best"]["final"]["worst"] == 480
+    assert ranking["agents"]["best"]["within"][2]["steps"] == 500  # 460 is within 10 % of 500
+    assert ranking["agents"]["worse"]["within"][2]["steps"] is None
+    first, second, last = conclusion(ranking)
+    assert first.startswith("best ends with the highest return: 495.0 (95 % interval ")
+    assert second == "With 4 seeds each it can be told apart from worse (115.0)."
+    assert (
+        last
+        == "Only best comes to stay within 10 % of the best return: after 500 steps and 1 s a seed."
+    )
+
+
+def test_agents_that_cannot_be_told_apart_are_said_so():
+    said = conclusion(rank({"a": result(GOOD), "b": result(ALIKE), "c": result(BAD)}))
+    assert said[0].startswith("a ends nearest to the exact optimum: its regret is 1.6 % (95 %")
+    assert said[1] == (
+        "With 8 seeds each it cannot be told apart from b (1.6 %); c (36 %) does worse."
+    )
+    assert len(said) == 3
+
+
+def test_a_best_return_of_zero_has_no_shares():
+    ranking = rank({name: result([0.0, 0.0], curve=(0.0, 0.0), optimum=None) for name in "ab"})
+    assert [entry["reached"] for entry in ranking["agents"]["a"]["within"]] == [0] * 6
+    json.dumps(ranking, allow_nan=False)
+
+
+def test_few_seeds_tell_nothing_apart():
+    # Of three against three, two of twenty ways to choose are as extreme: 10 %.
+    assert [fewest_seeds(pairs) for pairs in (1, 3, 45)] == [4, 5, 7]
+    said = conclusion(rank({"a": result(GOOD[:3]), "b": result(BAD[:3])}))
+    assert said[1] == (
+        "With 3 seeds each two agents cannot be told apart, whatever they reach; it takes 4 seeds "
+        "or more."
+    )
+    said = conclusion(rank({name: result(GOOD[:4]) for name in "abc"}))
+    assert said[1].startswith("With 4 seeds each no two of 3 agents can be told apart, whatever")
+
+
+def test_one_seed_has_no_intervals():
+    ranking = rank({"a": result([-101.0]), "b": result([-110.0])})
+    assert ranking["agents"]["a"]["final"]["interval"] is None
+    assert ranking["pairs"][0]["probability_interval"] is None
+    assert ranking["pairs"][0]["p"] == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0 %"), (2e-7, "0 %"), (-2e-7, "0 %"), (0.000193, "0.019 %"), (0.0134, "1.3 %"),
+     (0.134, "13 %"), (10.36, "1,036 %"), (-0.004, "-0.40 %"), (0.00005, "0.005 %")],
+)  # fmt: skip
+def test_shares_show_the_digits_that_matter(value, text):
+    assert share(value) == text
+
+
+# Training ---------------------------------------------------------------------------------------
+
+
+def test_operations_are_counted_by_hand():
+    def operations(**settings):
+        return operations_per_step(Pendulum(), DQN(**{**TINY, "environments": 4, **settings}))
+
+    # A network 3 → 8 → 11 has 112 weights. Acting: 4 observations. Learning from 8: forward twice,
+    # and backward to the weights of both layers and to the hidden one's values.
+    act, learn = 2 * 4 * 112, 2 * 8 * (3 * 112 + 8 * 11)
+    assert operations() == (act + learn) / 4
+    assert operations(updates=3) == (act + 3 * learn) / 4
+    assert operations(double=True) == (act + learn + 2 * 8 * 112) / 4
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A comparison that was never interrupted."""
+    run = Comparison.create(tiny(), seeds=3, out=tmp_path_factory.mktemp("whole") / "run")
+    seen = []
+    run.run(lambda name, number, now: seen.append((number, name, now and now.done)))
+    # Warm-up first; before it, that an agent begins is told.
+    assert [done for *_, done in seen] == [None, 0, 2, 4, 6] * 2
+    assert [(number, name) for number, name, _ in seen[::5]] == [(0, "slow"), (1, "quick")]
+    return run, run.finish()
+
+
+def test_a_comparison_in_its_folder(finished):
+    run, content = finished
+    assert {path.name for path in run.folder.iterdir()} == {"comparison.json", "agents"}
+    for name in ("slow", "quick"):
+        measured, kept = content["results"][name], Run.open(run.place(name))
+        assert kept.grade()["return_per_seed"] == pytest.approx(measured["returns"])
+        assert measured["env_steps"] == 6 * 20
+        assert np.shape(measured["curve_returns"])[1] == 3
+        # Policy: 3 → 8 → 11 with biases. Training: at least three times that and a replay of 200.
+        assert measured["parameters"] == 3 * 8 + 8 + 8 * 11 + 11
+        assert measured["policy_bytes"] == 4 * measured["parameters"]
+        assert measured["state_bytes"] > 4 * (4 * measured["parameters"] + 200 * 7)
+        devices = min(len(jax.devices()), 3)
+        share = measured["seconds_train"] / math.ceil(3 / devices)
+        assert measured["seconds_per_seed"] == pytest.approx(share)
+        assert measured["curve_steps"] == [0, 14, 54, 94, 120]  # warm-up first
+    assert "fewer than 10 points" in content["notes"][0]
+    again = Comparison.open(run.folder)
+    assert again.results == run.results
+    again.run(lambda *_: pytest.fail("all is trained"))
+    assert again.finish() == content
+
+
+@pytest.mark.parametrize("stop", ["ctrl-c", "crash"])
+def test_resuming_gives_the_same(finished, tmp_path, stop):
+    run = Comparison.create(tiny(), seeds=3, out=tmp_path / "run")
+
+    def interrupt(name, number, now):
+        if name == "quick" and now and now.done == 2:
+            if stop == "crash":
+                raise RuntimeError("killed")
+            signal.raise_signal(signal.SIGINT)
+
+    if stop == "crash":
+        with pytest.raises(RuntimeError, match="killed"):
+            run.run(interrupt)
+    else:
+        run.run(interrupt)
+        assert run.interrupted
+    run = Comparison.open(tmp_path / "run")
+    assert list(run.results) == ["slow"]
+    trained = set()
+    run.run(lambda name, *_: trained.add(name))
+    assert trained == {"quick"}
+    for name, expected in finished[0].results.items():
+        assert run.results[name].returns == expected.returns
+        assert run.results[name].env_steps == expected.env_steps
+
+
+def test_an_agent_that_diverges_does_not_stop_the_others(tmp_path):
+    entrants = tiny(slow=1e-3, wild=1e29, quick=1e-2)
+    run = Comparison.create(entrants, seeds=3, out=tmp_path / "run")
+    run.run()
+    content = run.finish()
+    assert content["ranking"]["order"] in (["slow", "quick"], ["quick", "slow"])
+    assert list(content["failures"]) == ["wild"]
+    assert re.match(r"wild could not be trained. The loss of seed", content["notes"][0])
+    alone = Comparison.create(tiny(wild=1e29, wilder=1e30), seeds=3, out=tmp_path / "alone")
+    alone.run()
+    with pytest.raises(QfolioError, match=r"not two agents to compare\. wild: The loss"):
+        alone.finish()
+
+
+def noted(tmp_path, first, second, steps=1000):
+    """The notes on two agents with tasks of their own, as if they were trained."""
+    agent = DQN(**TINY)
+    optimum = first.optimum().returns(comparing.start_keys()).mean()
+    other = second.optimum().returns(comparing.start_keys()).mean()
+    entrants = {
+        "a": Entrant(first, agent, None, {"episodes": 1}),
+        "b": Entrant(second, agent, None, {"episodes": 1}),
+    }
+    run = Comparison.create(entrants, seeds=8, out=tmp_path / "run")
+    run.results = {
+        "a": result(GOOD, optimum=float(optimum), curve=[-1.0] * 20),
+        "b": result(GOOD, optimum=float(other), curve=[-1.0] * 20, steps=steps),
+    }
+    return run.notes()
+
+
+def test_tasks_that_differ_are_checked(tmp_path):
+    same = noted(tmp_path / "1", Regime(menu="grid:2"), Regime(menu="grid:10"))
+    assert same == [
+        "The task is not quite the same for all: menu is grid:2 for a, grid:10 for b. Their start "
+        "states, lengths of episodes and exact optima are the same (this was checked): results "
+        "compare."
+    ]
+    (other,) = noted(tmp_path / "2", Pendulum(horizon=20), Pendulum(horizon=20, mass=2.0))
+    assert "Their exact optima differ, too: each regret is a share of the agent's own" in other
+    (longer,) = noted(tmp_path / "3", Kelly(menu="grid:2"), Kelly(menu="grid:2", horizon=50))
+    assert "Their lengths of episodes and exact optima differ" in longer
+    task = Kelly(menu="grid:2")
+    (budget,) = noted(tmp_path / "4", task, task, steps=3000)
+    assert budget.startswith("Budgets differ: from 1,000 environment steps a seed (a)")
+
+
+def test_agents_that_do_not_fit_are_refused_before_anything_is_trained(tmp_path):
+    entrants = tiny()
+    any_torque = Pendulum(**TASK, torques=0)
+    entrants["odd"] = dataclasses.replace(entrants["slow"], task=any_torque)
+    with pytest.raises(QfolioError, match=r"^odd: dqn chooses among numbered actions"):
+        Comparison.create(entrants, seeds=3, out=tmp_path / "run")
+    entrants["odd"] = dataclasses.replace(entrants["slow"], task=Kelly(menu="grid:2"))
+    with pytest.raises(QfolioError, match="has one task, and here are pendulum, market/kelly"):
+        Comparison.create(entrants, seeds=3, out=tmp_path / "run")
+    with pytest.raises(QfolioError, match="seeds is 0"):
+        Comparison.create(tiny(), seeds=0, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [({"format": 0}, "another format"), ({"kind": "backtest"}, "another format"),
+     ({"results": {"slow": {}}}, "damaged"), ({"results": {"who": None}}, "damaged"),
+     ({"agents": {"../x": {}}}, "is not described"), ({"agents": {"x": {}}}, "agent is missing")],
+)  # fmt: skip
+def test_damaged_folders(finished, tmp_path, damage, message):
+    content = json.loads((finished[0].folder / "comparison.json").read_text())
+    (tmp_path / "comparison.json").write_text(json.dumps(content | damage))
+    with pytest.raises(QfolioError, match=message):
+        Comparison.open(tmp_path)
+
+
+# The command and its report ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def presets(monkeypatch):
+    """Two tiny presets of DQN on the pendulum."""
+    settings = {"fast": {**TINY}, "bold": {**TINY, "learning_rate": 1e-2}}
+    tiny = {name: Preset("dqn", given, 6, 1, task=TASK) for name, given in settings.items()}
+    monkeypatch.setitem(PRESETS, ("pendulum", "dqn"), tiny)
+
+
+def test_the_command(presets, monkeypatch, capsys, tmp_path):
+    folder = tmp_path / "run"
+    arguments = ["compare", "pendulum", "--agents", "dqn,dqn:bold", "--seeds", 3, "--out", folder]
+    assert qfolio(monkeypatch, *arguments, "--episodes", 4) == 0
+    printed = capsys.readouterr().out
+    assert "1 of 2: dqn\n2 of 2: dqn:bold\n" in printed
+    assert "two agents cannot be told apart" in printed.replace("\n", " ")
+    assert f"Report: {folder / 'report.html'}" in printed.replace("\n", "").replace("R", "\nR")
+    assert {path.name for path in folder.iterdir()} == {
+        "comparison.json", "agents", "report.html", "learning_curves.png",
+    }  # fmt: skip
+    assert {path.name for path in (folder / "agents").iterdir()} == {"dqn", "dqn-bold"}
+    content = json.loads((folder / "comparison.json").read_text())
+    assert content["results"]["dqn"]["episodes"] == 4
+    assert content["agents"]["dqn"]["preset"] == "fast"
+    assert content["notes"][0].startswith("How long to train was set by hand")
+    assert qfolio(monkeypatch, "evaluate", folder / "agents" / "dqn-bold", "--json") == 0
+    graded = json.loads(capsys.readouterr().out)
+    assert graded["return_per_seed"] == pytest.approx(content["results"]["dqn:bold"]["returns"])
+    assert qfolio(monkeypatch, *arguments) == 2
+    assert f"go on with --resume {folder}" in capsys.readouterr().err
+    before = (folder / "comparison.json").read_text()
+    assert qfolio(monkeypatch, "compare", "--resume", folder) == 0
+    assert (folder / "comparison.json").read_text() == before
+
+
+def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, capsys, tmp_path):
+    def stop(run, listener):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Comparison, "run", stop)
+    arguments = ["compare", "--agents", "dqn,dqn:bold", "--out", tmp_path / "run"]
+    assert qfolio(monkeypatch, *arguments) == 130
+    printed = capsys.readouterr().out.replace("\n", "")
+    assert printed.endswith(f"Go on with: qfolio compare --resume {tmp_path / 'run'}")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--agents", "dqn,dqx"], "no agent 'dqx'"), (["--agents", "dqn:fst,dqn"], "preset 'fst'"),
+        (["--agents", "dqn"], "two agents or more"), ([], "two agents or more"),
+        (["--agents", "dqn,dqn:fast"], "the preset fast twice: dqn, dqn:fast"),
+        (["--agents", "dqn,pathwise"], "no preset 'fast' for pathwise"),
+        (["pendulm", "--agents", "dqn,dqn:bold"], "no task 'pendulm'"),
+        (["--agents", "dqn,dqn:bold", "--seeds", 0], "seeds is 0"),
+        (["--agents", "dqn,dqn:bold", "--episodes", 4, "--steps", 9], "give one of them"),
+        (["--agents", "dqn,dqn:bold", "--episodes", 0], "episodes is 0"),
+        (["--resume", "nowhere"], "no comparison"),
+        (["--resume", ".", "--seeds", 3], "add nothing"),
+    ],
+)  # fmt: skip
+def test_comparisons_that_are_refused(presets, monkeypatch, capsys, tmp_path, options, message):
+    monkeypatch.chdir(tmp_path)
+    out = [] if "--resume" in options else ["--out", tmp_path / "run"]
+    assert qfolio(monkeypatch, "compare", *options, *out) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert "Traceback" not in printed
+    assert not (tmp_path / "run").exists()
+
+
+def page(results, **changes):
+    """The report on results as if they had been trained."""
+    ranking = rank(results)
+    entry = {"agent": "dqn", "preset": "fast", "agent_settings": {"hidden": [8]},
+             "task_settings": {"horizon": 20}, "budget": {}}  # fmt: skip
+    content = {
+        "task": "pendulum", "seeds": 8, "seed": 0, "version": "1", "device": "cpu",
+        "command": "qfolio compare", "started": "2026-01-01T00:00:00",
+        "agents": dict.fromkeys(results, entry), "ranking": ranking,
+        "results": {name: dataclasses.asdict(x) for name, x in results.items()},
+        "conclusion": conclusion(ranking), "notes": ["Mind <b>."], **changes,
+    }  # fmt: skip
+    return render_comparison(comparison_data(content))
+
+
+def test_the_report():
+    text = page({"a": result(GOOD), "b": result(ALIKE, steps=90_000), "c": result(BAD)})
+    assert "Three agents on the pendulum" in text
+    assert "Mind &lt;b&gt;." in text
+    assert "cannot be told apart from b (1.6\N{NARROW NO-BREAK SPACE}%)" in text
+    # c is told apart from both, a and b are not: of six pairs, four are bold.
+    table = text[text.index('class="grid"') : text.index("What they took")]
+    assert len(re.findall(r"<b>(?:100|0)</b>", table)) == 4
+    assert len(re.findall(r"<td class=\"(?:win|loss)\d\">\d", table)) + 4 >= 5
+    # Offline, without scripts, and in the colours of the page.
+    assert not re.search(r"<script|https?://(?!www\.w3\.org)|url\((?!#)", text)
+    assert text.count("<svg viewBox") == 4
+    assert "var(--agent-3)" in text
+    assert "#1b7a5a" not in text.split("</style>")[1]
+
+
+def test_reports_of_hard_cases():
+    # One seed each, at the optimum and beyond.
+    exact = result([-100.0], curve=(-100.0,) * 3)
+    above = result([-99.5], curve=(-400.0, -100.0, -99.0))
+    text = page({"exact": exact, "above": above})
+    assert re.search(r"<td class=\"lead\">\N{MINUS SIGN}0.50", text)
+    assert not re.search(r"\bnan\b|\binf\b", text)
+    # More agents than colours, with budgets from ten steps to ten million.
+    many = {f"agent{i}": result(GOOD[:2] - i, steps=10**i) for i in range(1, 8)}
+    text = page(many)
+    assert text.count('stroke-dasharray="7 3"') == 4  # the seventh, in each table and list
+    assert '<th scope="col" title="agent7">7</th>' in text
+    # No optimum.
+    unknown = {
+        name: result([value, value], curve=(9.0, value / 2, value), optimum=None)
+        for name, value in (("x", 500.0), ("y", 20.0))
+    }
+    text = page(unknown)
+    assert "No exact optimum is known here" in text
+    assert "Regret" not in text
+
+
+def test_tidy_leaves_names_alone():
+    text = tidy("double-q-2 is at -0.40 % after 51,200 steps, q-learning 3,4")
+    assert text.startswith("double-q-2 is at \N{MINUS SIGN}0.40\N{NARROW NO-BREAK SPACE}% after 51")
+    assert text.endswith("q-learning 3,4")
+
+
+@pytest.mark.parametrize(
+    ("tick", "label"),
+    [(0.001, "0.1"), (0.024, "2.4"), (0.05, "5"), (0.00025, "0.025"), (5.0, "500")],
+)
+def test_ticks_have_the_digits_that_tell_them_apart(tick, label):
+    assert percent_tick(tick) == f"{label}{THIN_SPACE}%"

@@ -1,0 +1,204 @@
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.core.errors import QfolioError
+from qfolio.core.evaluation import start_keys
+from qfolio.core.training import Population
+from qfolio.experiments import continual
+from qfolio.experiments.continual import Course, Plan, compare, create, recovery, renew
+from qfolio.report.continual import render_page, verdict
+from qfolio.tasks.catch import Catch
+from qfolio.tasks.pendulum import Pendulum
+
+from shell import TINY, qfolio
+
+OLD, NEW = Pendulum(horizon=20), Pendulum(horizon=20, mass=1.5)
+AGENT = DQN(
+    hidden=(8,), environments=2, batch_size=8, replay_capacity=100, learning_starts=10,
+    learning_rate_final=0.0, learning_rate_steps=150.0,
+)  # fmt: skip
+EPISODES = 16
+
+
+def trained(task, agent, episodes=EPISODES):
+    population = Population(task, agent, [3, 4])
+    while left := population.steps_left(episodes):
+        population.advance(left)
+    return population
+
+
+PLAN = Plan(OLD, NEW, AGENT, EPISODES, seeds=2, seed=3)
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("continual") / "whole"
+    create(PLAN, folder, "qfolio continual <b>")
+    return compare(folder)
+
+
+def stop_at(way, stopping):
+    """Ctrl-C while a way, or the first training, is under way."""
+    learn = continual._learn
+
+    def interrupted(*args):
+        if args[-1].args == (way,):
+            raise KeyboardInterrupt
+        return learn(*args)
+
+    stopping.setattr(continual, "_learn", interrupted)
+
+
+def regrets(task, population):
+    best = task.optimum().returns(start_keys()).mean()
+    return (best - population.evaluate(start_keys(), tail=0).returns.mean(1)) / abs(best)
+
+
+def test_frozen_is_the_trained_policy_in_both_worlds(content):
+    course = content["courses"]["frozen"]
+    assert course["steps"] == [0]
+    first = trained(OLD, AGENT)
+    np.testing.assert_allclose(course["other"], regrets(OLD, first), rtol=1e-5)
+    there = Population(NEW, AGENT, [3, 4])
+    there.restore(first.fetch())
+    np.testing.assert_allclose(course["final"], regrets(NEW, there), rtol=1e-5)
+
+
+def test_fresh_is_a_training_in_the_changed_world(content):
+    course = content["courses"]["fresh"]
+    np.testing.assert_allclose(course["final"], regrets(NEW, trained(NEW, AGENT)), rtol=1e-5)
+    assert course["steps"][-1] == EPISODES * 20
+
+
+def test_every_way_begins_with_what_it_knows(content):
+    courses = content["courses"]
+    assert courses["going on"]["curve"][0] == courses["frozen"]["curve"][0]
+    assert courses["renewed"]["curve"][0] == courses["frozen"]["curve"][0]
+    assert courses["fresh"]["curve"][0] != courses["frozen"]["curve"][0]
+    assert courses["going on"]["steps"][-1] == EPISODES * 20
+    assert courses["renewed"]["steps"][-1] == EPISODES // 2 * 20
+
+
+def test_going_on_needs_a_learning_rate():
+    """That of the preset has fallen to zero: as it is, an agent would learn nothing."""
+    plan = Plan(OLD, NEW, AGENT, EPISODES)
+    assert plan.going_on == dataclasses.replace(AGENT, learning_rate_final=0.3)
+    first = trained(OLD, dataclasses.replace(AGENT, learning_rate_steps=100.0), 32)
+    moved = {}
+    for final in (0.0, 0.1):
+        agent = dataclasses.replace(AGENT, learning_rate_steps=100.0, learning_rate_final=final)
+        population = Population(NEW, agent, [3, 4])
+        population.restore(first.fetch())
+        population.advance(20)
+        pairs = zip(*(jax.tree.leaves(p.weights()) for p in (population, first)), strict=True)
+        moved[final] = max(np.abs(a - b).max() for a, b in pairs)
+    assert moved[0.0] == 0
+    assert moved[0.1] > 1e-4
+
+
+def test_renewed_learning_knows_everything_and_remembers_nothing():
+    plan = Plan(OLD, NEW, AGENT, EPISODES)
+    assert plan.renewed == dataclasses.replace(AGENT, learning_rate_steps=75.0, epsilon=0.3)
+    learned, fresh = trained(OLD, AGENT).fetch(), Population(NEW, AGENT, [3, 4]).fetch()
+    state = renew(AGENT, learned, fresh)
+    for name in ("online", "target"):
+        for new, old in zip(*(jax.tree.leaves(getattr(x.agent, name)) for x in (state, learned)),
+                            strict=True):  # fmt: skip
+            np.testing.assert_array_equal(new, old)
+    assert np.any(learned.agent.replay.rows)
+    assert not np.any(state.agent.replay.rows)
+    counters = (state.agent.replay.size, state.agent.episodes, state.agent.steps, state.steps,
+                *jax.tree.leaves(state.agent.optimizer))  # fmt: skip
+    assert not any(np.any(x) for x in counters)
+    assert np.any(learned.agent.episodes)
+
+
+def test_recovery_is_staying_near_the_optimum():
+    curve = [[0.5, 0.09, 0.9], [0.09, 0.11, 0.8], [0.03, 0.02, 0.7], [0.01, 0.1, 0.6]]
+    found = recovery(Course([0, 10, 20, 30], curve, [], [], 0.0))
+    assert found["per_seed"] == [10, 20, None]
+
+
+@pytest.mark.parametrize("way", ["first training", "frozen", "renewed"])
+def test_an_interrupted_comparison_goes_on_as_if_it_never_was(content, way, tmp_path):
+    create(PLAN, tmp_path / "stopped", "qfolio continual <b>")
+    with pytest.MonkeyPatch.context() as stopping:
+        stop_at(way, stopping)
+        with pytest.raises(KeyboardInterrupt):
+            compare(tmp_path / "stopped")
+    done = []
+    found = compare(tmp_path / "stopped", lambda name, share: done.append(name))
+    ways = ["first training", *continual.WAYS]
+    assert set(done) == set(ways[ways.index(way) :]) - {"frozen"}  # which does not learn
+
+    def lasting(content):
+        courses = {"training": content["training"], **content["courses"]}
+        return {**content, "started": "", "training": "", "courses": {
+            name: {**course, "seconds": 0.0} for name, course in courses.items()}}  # fmt: skip
+
+    assert lasting(found) == lasting(content)
+    assert [path.name for path in (tmp_path / "stopped").iterdir()] == ["continual.json"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (Pendulum(horizon=20, torques=5), "only numbers"),
+        (Pendulum(horizon=20), "nothing changes"),
+    ],
+)
+def test_refuses_changes_that_make_no_sense(changed, message):
+    with pytest.raises(QfolioError, match=message):
+        Plan(OLD, changed, AGENT, EPISODES)
+
+
+def test_a_task_without_numbers_cannot_change():
+    with pytest.raises(QfolioError, match="only numbers"):
+        Plan(Catch(), Catch(rows=12), AGENT, EPISODES)
+
+
+def test_the_report_says_what_happened(content):
+    page = render_page(content)
+    assert "&lt;b&gt;" in page
+    assert "mass from 1 to 1.5" in page
+    for way in continual.WAYS:
+        assert way in page
+    assert "does not come to stay" in verdict(content)
+
+
+def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
+    folder = tmp_path / "there"
+    words = ["continual", "pendulum", "--change", "mass=1.5", "--episodes", 8, "--seeds", 2]
+    with monkeypatch.context() as stopping:
+        stop_at("fresh", stopping)
+        assert qfolio(monkeypatch, *words, "--out", folder, *TINY) == 130
+    said = f"Go on with: qfolio continual --resume {folder}"
+    assert capsys.readouterr().out.splitlines()[-1].endswith(said)
+    assert qfolio(monkeypatch, *words, "--out", folder, *TINY) == 2
+    assert f"go on with --resume {folder}" in capsys.readouterr().err
+    assert qfolio(monkeypatch, "continual", "--resume", folder) == 0
+    assert {path.name for path in folder.iterdir()} == {
+        "continual.json", "report.html", "recovery.png",
+    }  # fmt: skip
+    content = json.loads((folder / "continual.json").read_text())
+    assert content["changes"] == {"mass": [1.0, 1.5]}
+    assert "--change mass=1.5" in content["command"]
+    assert "frozen" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--resume", "nowhere"], "no change of a task"),
+        (["--resume", ".", "--change", "mass=2"], "add nothing"),
+        (["--resume", ".", "--rate", 0.5], "add nothing"),
+    ],
+)
+def test_resume_refuses_what_it_would_ignore(monkeypatch, capsys, options, message):
+    assert qfolio(monkeypatch, "continual", *options) == 2
+    assert message in capsys.readouterr().err

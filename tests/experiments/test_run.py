@@ -1,0 +1,353 @@
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+import qfolio.core.files
+from qfolio.agents.dqn import DQN
+from qfolio.agents.pathwise import Pathwise
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.run import Run, train
+from qfolio.portfolio.synthetic import Ar1
+
+from probes import Explosive
+
+
+def create(task, agent, folder, episodes=12, **options):
+    return Run.create(task, agent, episodes=episodes, out=folder, **options)
+
+
+def contents(folder):
+    """Everything that a resumed run must have in common with one that was never interrupted."""
+    arrays = load_file(folder / "checkpoint.safetensors")
+    del arrays["seconds_train"]
+    return arrays, (folder / "metrics.csv").read_text(), (folder / "evaluation.csv").read_text()
+
+
+def assert_same(folder, other, same_plan=True):
+    arrays, metrics, evaluation = contents(folder)
+    expected, expected_metrics, expected_evaluation = contents(other)
+    if same_plan:  # which says when the learning curve gets its points
+        assert evaluation == expected_evaluation
+    assert arrays.keys() == expected.keys()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array, expected[name], err_msg=name)
+    assert metrics == expected_metrics
+
+
+def test_n_and_n_episodes_equal_2n(task, agent, tmp_path):
+    create(task, agent, tmp_path / "straight", episodes=24, seeds=2).train()
+    create(task, agent, tmp_path / "halves", episodes=12, seeds=2).train()
+    again = Run.open(tmp_path / "halves")
+    assert again.episodes == 12
+    again.train(24)
+    assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
+
+
+def test_steps_say_how_far_as_episodes_do(task, agent, tmp_path):
+    create(task, agent, tmp_path / "straight", episodes=None, steps=300, seeds=2).train()
+    create(task, agent, tmp_path / "halves", episodes=None, steps=133, seeds=2).train()
+    again = Run.open(tmp_path / "halves")
+    assert (again.done("steps"), again.budget) == (134, {"steps": 133})
+    seen = []
+    again.train(steps=300, listener=seen.append)
+    assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
+    assert (seen[-1].done, seen[-1].total, seen[-1].unit) == (300, 300, "steps")
+    again.train(14)  # episodes of 25 steps
+    assert again.budget == {"episodes": 14}
+    assert again.done("steps") == 350
+
+
+IN_A_MARKET = {
+    "pathwise": (Ar1(horizon=20), Pathwise(rollout=10, environments=3, hidden=(4, 4))),
+    "dqn": (
+        Ar1(horizon=20, menu="grid:2"),
+        DQN(hidden=(8,), all_actions=True, environments=2, batch_size=8, replay_capacity=100,
+            learning_starts=20, episode_steps=0, learning_rate_steps=200.0),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", IN_A_MARKET)
+def test_n_and_n_episodes_equal_2n_in_a_market(name, tmp_path):
+    task, agent = IN_A_MARKET[name]
+    create(task, agent, tmp_path / "straight", episodes=240, seeds=2).train()
+    create(task, agent, tmp_path / "halves", episodes=120, seeds=2).train()
+    Run.open(tmp_path / "halves").train(240)
+    assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
+
+
+SCRIPT = """
+import sys
+from qfolio.core import devices
+devices.configure()
+from qfolio.experiments import run as running
+from qfolio.agents.dqn import DQN
+from qfolio.tasks.pendulum import Pendulum
+running.CHECKPOINT_SECONDS = 0.0
+agent = DQN(hidden=(16,), environments=2, batch_size=8, replay_capacity=200, learning_starts=20,
+            episode_steps=0, learning_rate_steps=200.0)
+run = running.Run.create(Pendulum(horizon=25), agent, episodes={episodes}, seeds=2, out={out!r})
+print("started", flush=True)
+def wait(progress):
+    print(progress.episodes, flush=True)
+    sys.stdin.readline()
+run.train(listener=wait)
+"""
+
+
+@pytest.mark.slow
+def test_killed_at_a_random_moment(task, agent, tmp_path):
+    """SIGKILL falls anywhere, also into the writing of a checkpoint, which happens all the time.
+
+    The child asks before each chunk, so that it cannot be done before the signal comes.
+    """
+    seed = time.time_ns()
+    print("seed of the moments:", seed)  # shown if the test fails
+    moments = random.Random(seed)
+    episodes = 960
+    straight = create(task, agent, tmp_path / "straight", episodes=episodes, seeds=2)
+    straight.train()
+    for i in range(4):
+        folder = tmp_path / f"killed{i}"
+        script = SCRIPT.format(episodes=episodes, out=str(folder))
+        process = subprocess.Popen(
+            [sys.executable, "-c", script],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ,
+        )
+        assert process.stdout is not None
+        assert process.stdin is not None
+        process.stdout.readline()
+        # The first chunk only collects, and a checkpoint is written after the child has asked.
+        for _ in range(moments.randint(3, 20)):
+            process.stdout.readline()
+            process.stdin.write("go on\n")
+            process.stdin.flush()
+        time.sleep(moments.uniform(0, 0.05))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        resumed = Run.open(folder)
+        assert 0 < resumed.episodes < episodes
+        resumed.train()
+        assert_same(folder, tmp_path / "straight")
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(task, agent, tmp_path, monkeypatch):
+    run = create(task, agent, tmp_path / "run")
+    before = (tmp_path / "run" / "checkpoint.safetensors").read_bytes()
+
+    def full_disk(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(qfolio.core.files.os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        run.train()
+    assert (tmp_path / "run" / "checkpoint.safetensors").read_bytes() == before
+    leftovers = [path.name for path in (tmp_path / "run").iterdir() if path.name.startswith(".")]
+    assert leftovers == []
+
+
+def test_killed_before_the_first_checkpoint(task, agent, tmp_path):
+    """The curve's point at the start is on disk by then, and must not come twice."""
+    create(task, agent, tmp_path / "straight").train()
+    create(task, agent, tmp_path / "killed")._evaluate()
+    Run.open(tmp_path / "killed").train()
+    assert_same(tmp_path / "killed", tmp_path / "straight")
+
+
+def test_ctrl_c_stops_with_a_checkpoint(task, agent, tmp_path):
+    run = create(task, agent, tmp_path / "run", episodes=24 * 50)
+
+    def press(progress):
+        if progress.episodes >= 24:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    run.train(listener=press)
+    assert run.interrupted
+    assert 0 < run.episodes < 24 * 50
+    assert Run.open(tmp_path / "run").episodes == run.episodes
+
+
+def test_an_infinite_loss_keeps_the_last_good_checkpoint(tmp_path):
+    agent = DQN(hidden=(4,), environments=2, batch_size=8, learning_starts=4, episode_steps=0)
+    run = create(Explosive(), agent, tmp_path / "run")
+    before = (tmp_path / "run" / "checkpoint.safetensors").read_bytes()
+    with pytest.raises(QfolioError, match="no longer finite"):
+        run.train()
+    assert (tmp_path / "run" / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_rows_ahead_of_the_checkpoint_are_dropped(task, agent, tmp_path):
+    create(task, agent, tmp_path / "run", episodes=4).train()
+    metrics = tmp_path / "run" / "metrics.csv"
+    good = metrics.read_text()
+    metrics.write_text(good + "0,5,-100.0,0.1,0.9,1.0\n0,6,-1")
+    spoilt = metrics.read_text()
+    run = Run.open(tmp_path / "run")
+    assert len(run.metrics) == 4
+    assert metrics.read_text() == spoilt, "reading a run changes nothing"
+    run.train(8)
+    assert metrics.read_text().startswith(good)
+    assert [row["episode"] for row in run.metrics] == [1, 2, 3, 4, 5, 6, 7, 8]
+
+
+@pytest.mark.parametrize(
+    "text", ["seed,episode,return\ninf,1,2\n", "seed\n" + "9" * 200_000, "\x00", "a,b\n1\n"]
+)
+def test_damaged_tables_are_refused_or_skipped(task, agent, tmp_path, text):
+    create(task, agent, tmp_path / "run")
+    (tmp_path / "run" / "metrics.csv").write_text(text)
+    damaged = "9" * 1000 in text
+    with pytest.raises(QfolioError, match="metrics") if damaged else contextlib.nullcontext():
+        assert Run.open(tmp_path / "run").metrics == []
+
+
+def test_weights_that_are_not_finite_stop_training(task, tmp_path):
+    agent = DQN(hidden=(4,), environments=2, batch_size=8, learning_starts=4, learning_rate=1e30)
+    run = create(task, agent, tmp_path / "run")
+    with pytest.raises(QfolioError, match="no longer finite"):
+        run.train()
+
+
+def test_unfinished_files_of_a_killed_process_are_swept(task, agent, tmp_path):
+    run = create(task, agent, tmp_path / "run", episodes=2)
+    left = tmp_path / "run" / ".checkpoint.safetensors.1.part"
+    left.write_bytes(b"half")
+    run.train()
+    assert not left.exists()
+
+
+def test_whole_numbers_mean_the_same_as_fractions(task, tmp_path):
+    """Settings come back from config.json as floats, and must train alike."""
+    agent = DQN(
+        hidden=[8], environments=2, batch_size=8, learning_starts=4, reward_scale=3, huber=1
+    )
+    create(task, agent, tmp_path / "run", episodes=8).train()
+    create(task, agent, tmp_path / "again", episodes=4).train()
+    Run.open(tmp_path / "again").train(8)
+    assert_same(tmp_path / "run", tmp_path / "again", same_plan=False)
+
+
+def test_the_policy_file_holds_the_weights_only(task, agent, tmp_path):
+    run = create(task, agent, tmp_path / "run", seeds=2)
+    policy = load_file(tmp_path / "run" / "policy.safetensors")
+    assert {name: array.shape for name, array in policy.items()} == {
+        "mlp/weights/0": (2, 3, 16), "mlp/weights/1": (2, 16, 11),
+        "mlp/biases/0": (2, 16), "mlp/biases/1": (2, 11),
+    }  # fmt: skip
+    np.testing.assert_array_equal(policy["mlp/weights/0"][0], run.first_weights().mlp.weights[0])
+
+
+def test_summary(task, agent, tmp_path):
+    run = train(task, agent, episodes=4, seeds=2, seed=5, out=tmp_path / "run")
+    summary = run.summary()
+    assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
+    assert {
+        "task", "agent", "preset", "seeds", "episodes", "env_steps", "seconds_compile",
+        "seconds_train", "steps_per_second", "return_mean", "return_ci95", "return_per_seed",
+        "optimum", "regret_per_seed", "overestimation_per_seed",
+    } <= summary.keys()  # fmt: skip
+    assert (summary["seeds"], summary["episodes"], summary["env_steps"]) == (2, 4, 100)
+    np.testing.assert_allclose(summary["return_mean"], np.mean(summary["return_per_seed"]))
+    shortfall = summary["optimum"] - np.array(summary["return_per_seed"])
+    np.testing.assert_allclose(summary["regret_per_seed"], shortfall / abs(summary["optimum"]))
+    assert run.config["seed"] == 5
+
+
+def spoil_checkpoint(folder, how):
+    path = folder / "checkpoint.safetensors"
+    if how == "missing":
+        path.unlink()
+    elif how == "truncated":
+        path.write_bytes(path.read_bytes()[:-100])
+    elif how == "pickle":
+        path.write_bytes(b"\x80\x04cos\nsystem\n(S'touch /tmp/owned'\ntR.")
+    elif how == "foreign":
+        save_file({"a": np.zeros(3)}, path)
+    elif how == "other shapes":
+        arrays = load_file(path)
+        arrays["training/steps"] = np.zeros((5,), np.int32)
+        save_file(arrays, path)
+
+
+@pytest.mark.parametrize("how", ["missing", "truncated", "pickle", "foreign", "other shapes"])
+def test_refuses_checkpoints_that_do_not_fit(task, agent, tmp_path, how):
+    create(task, agent, tmp_path / "run")
+    spoil_checkpoint(tmp_path / "run", how)
+    with pytest.raises(QfolioError, match=r"checkpoint\.safetensors"):
+        Run.open(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": 0, "version": "0.0.1"}, "written by qfolio 0.0.1"),
+        ({"task": "os:system"}, "no task 'os:system'"),
+        ({"agent": "dqm"}, "did you mean dqn"),
+        ({"seeds": "many"}, "damaged"),
+        ({"seeds": -1}, "damaged"),
+        ({"seed": 2**32 - 1, "seeds": 2}, "damaged"),
+        ({"preset": ["x"]}, "damaged"),
+        ({"device": None}, "damaged"),
+        ({"task_settings": {"horizon": 3e9}}, "horizon"),
+        ({"agent_settings": {"hidden": [0]}}, "hidden"),
+        ({"agent_settings": {"hidden": [10**9, 10**9]}}, "memory|checkpoint"),
+    ],
+)
+def test_refuses_configurations_that_make_no_sense(task, agent, tmp_path, change, message):
+    create(task, agent, tmp_path / "run")
+    path = tmp_path / "run" / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(QfolioError, match=message):
+        Run.open(tmp_path / "run")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "\x00", "[" * 100_000, "1" * 5000])
+def test_refuses_damaged_configurations(task, agent, tmp_path, text):
+    create(task, agent, tmp_path / "run")
+    (tmp_path / "run" / "config.json").write_text(text)
+    with pytest.raises(QfolioError, match="damaged"):
+        Run.open(tmp_path / "run")
+
+
+def test_refuses_a_folder_that_is_no_run(tmp_path):
+    with pytest.raises(QfolioError, match="no run"):
+        Run.open(tmp_path)
+
+
+def test_never_overwrites_a_folder(task, agent, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(QfolioError, match="not empty"):
+        create(task, agent, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"episodes": 0}, {"seeds": 0}, {"seed": -1}, {"seed": 2**32},
+        {"steps": 9}, {"episodes": None}, {"steps": 0, "episodes": None},
+    ],
+)  # fmt: skip
+def test_refuses_counts_that_make_no_sense(task, agent, options):
+    with pytest.raises(QfolioError, match=next(iter(options))):
+        Run.create(task, agent, **{"episodes": 1, **options})
+
+
+def test_training_without_a_folder_writes_nothing(task, agent, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = train(task, agent, episodes=2)
+    assert run.episodes == 2
+    assert list(tmp_path.iterdir()) == []
+    assert jax.tree.leaves(run.first_weights())

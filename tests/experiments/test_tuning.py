@@ -1,0 +1,562 @@
+"""Searches so small that they take seconds; what they find does not matter, how they go does."""
+
+import json
+import math
+import os
+import signal
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.agents.pathwise import Pathwise
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError
+from qfolio.core.evaluation import start_keys
+from qfolio.core.training import Population
+from qfolio.experiments.presets import preset
+from qfolio.experiments.run import Run
+from qfolio.experiments.tuning import search
+from qfolio.experiments.tuning.journal import Trial, best_of, locked
+from qfolio.experiments.tuning.run import Tuning, tuning_keys
+from qfolio.experiments.tuning.search import dimension
+from qfolio.experiments.tuning.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
+from qfolio.report.tuning import Sweep, render_page, write_tuning_report
+
+from shell import TINY, qfolio
+
+EPISODES = 4
+BOOM = 1e30  # a learning rate with which weights overflow at once
+
+
+def start(folder, task, agent, *ranges, trials=4, batch=2, seeds=2):
+    space = search.parse(ranges or ["learning_rate=1e-4..1e-2", "discount=0.9..0.99"], type(agent))
+    return Tuning.create(
+        task, agent, space, trials=trials, seeds=seeds, episodes=EPISODES, batch=batch,
+        fresh_seeds=2, preset="fast", out=folder,
+    )  # fmt: skip
+
+
+def ask(work):
+    own = {dim.name: search.own_value(work.agent, dim) for dim in work.space}
+    return work.journal.ask(work.config["batch"], work.config["trials"], own)
+
+
+def trained(task, agents, seeds, steps=60):
+    population = Population(task, agents, seeds)
+    while population.steps < steps:
+        population.advance(steps - population.steps, strict=False)
+    return population
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+# The population
+
+
+def test_members_with_numbers_of_their_own_equal_each_alone(task, agent):
+    changes = [{"learning_rate": 1e-2, "input_gain": 2.0}, {"discount": 0.5, "huber": 0.3}]
+    first, second = (settings.build(DQN, settings.describe(agent) | change) for change in changes)
+    together = trained(task, [first, second, first, second], [0, 0, 1, 1])
+    greedy = together.evaluate(tuning_keys(), tail=0)
+    for index, one in enumerate((first, second)):
+        alone = trained(task, one, [0, 1])
+        pick = lambda x, i=index: x[i::2]  # noqa: E731
+        same(alone.fetch(), jax.tree.map(pick, together.fetch()))
+        # The overestimation depends on the member's own discount.
+        same(alone.evaluate(tuning_keys(), tail=0), jax.tree.map(pick, greedy))
+
+
+def test_the_tail_is_that_of_the_longest_discount(task, agent):
+    far = settings.build(DQN, settings.describe(agent) | {"discount": 0.9})
+    near = settings.build(DQN, settings.describe(agent) | {"discount": 0.5})
+    for agents in ([near, far], [far, near]):
+        assert Population(task, agents, [0, 0])._tail == 44  # 0.9^44 < 1 % < 0.9^43
+
+
+def test_agents_of_other_programs_are_refused(task, agent):
+    other = settings.build(DQN, settings.describe(agent) | {"hidden": (8,)})
+    with pytest.raises(QfolioError, match="must share all settings that shape the program"):
+        Population(task, [agent, other], [0, 0])
+
+
+def test_a_diverging_member_leaves_the_others_alone(task, agent):
+    wild = settings.build(DQN, settings.describe(agent) | {"learning_rate": BOOM})
+    together = trained(task, [agent, wild, agent, wild], [0, 0, 1, 1])
+    assert together.healthy == [True, False, True, False]
+    alone = trained(task, agent, [0, 1])
+    same(alone.fetch(), jax.tree.map(lambda x: x[::2], together.fetch()))
+    with pytest.raises(QfolioError, match="no longer finite"):
+        together.advance(10)
+
+
+# The space
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "scale"),
+    [
+        ("learning_rate", "1e-4..1e-2", "log"),
+        ("learning_rate", "1e-3..2e-3", "linear"),
+        ("learning_rate", "linear:1e-4..1e-2", "linear"),
+        ("learning_rate", "log:1e-3..2e-3", "log"),
+        ("discount", "0.9..0.99", "near-one"),
+        ("discount", "0.9..0.95", "linear"),
+        ("discount", "0.001..1", "log"),
+        ("learning_rate_final", "0..1", "linear"),
+        ("hidden", "8|8,8", "choice"),
+        ("discount", "0.9|0.99", "choice"),
+        ("double", "true|false", "choice"),
+    ],
+)
+def test_scales_and_texts(name, text, scale):
+    dim = dimension(name, text, DQN)
+    assert dim.scale == scale
+    assert dimension(name, str(dim), DQN) == dim
+    ends = dim.choices or (dim.low, dim.high)
+    for value in ends:
+        assert dim.value(dim.stored(value)) == value
+        assert dim.covers(value)
+        assert 0 <= dim.position(value) <= 1
+    if not dim.choices:
+        assert (dim.position(dim.low), dim.position(dim.high)) == pytest.approx((0, 1), abs=1e-9)
+        for place in (0.1, 0.5, 0.8):
+            assert dim.position(dim.at(place)) == pytest.approx(place, abs=1e-6)
+
+
+def test_positions_by_hand():
+    assert dimension("learning_rate", "1e-4..1e-2", DQN).position(1e-3) == pytest.approx(0.5)
+    assert dimension("discount", "0.9..0.999", DQN).position(0.99) == pytest.approx(0.5)
+    assert dimension("discount", "0.9..0.999", DQN).at(0.5) == pytest.approx(0.99)
+    assert dimension("hidden", "8|16", DQN).position("16") == 0.75
+
+
+def test_what_is_usually_searched_surrounds_the_agents_own_values():
+    agent = preset("fast").build()
+    space = {dim.name: dim for dim in search.usual(agent)}
+    assert set(space) >= {"learning_rate", "discount", "target_rate", "epsilon_decay", "huber",
+                          "reward_scale", "input_gain"}  # fmt: skip
+    for name, dim in space.items():
+        assert dim.position(getattr(agent, name)) == pytest.approx(0.5, abs=1e-6)
+    assert (space["learning_rate"].low, space["learning_rate"].high) == (3e-4, 3e-2)
+    assert (space["discount"].low, space["discount"].high) == (0.95, 0.9995)
+    # Where the own value says nothing of the scale: infinite, 0, or already 1.
+    report = {dim.name: dim for dim in search.usual(DQN())}
+    for name in ("huber", "input_gain"):
+        assert report[name] == dimension(name, search.USUAL[name], DQN)
+    assert str(report["target_rate"]) == "0.1..1.0"
+    assert {dim.name for dim in search.usual(Pathwise())} == {
+        "learning_rate", "gradient_norm", "reward_scale"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("ranges", "says"),
+    [
+        (["learning_rate"], "takes name=low..high"),
+        (["learning_rat=1..2"], "did you mean learning_rate"),
+        (["learning_rate=1e-2..1e-4"], "the first number must be below the second"),
+        (["learning_rate=a..b"], "must be a number"),
+        (["learning_rate=0..inf"], "both finite"),
+        (["learning_rate=log:0..1"], "must be above 0"),
+        (["discount=near-one:0.9..1"], "must be below 1"),
+        (["discount=cubic:0.9..1"], "no scale 'cubic'"),
+        (["discount=0.9"], "leaves nothing to search"),
+        (["discount=0.9|0.90"], "different choices"),
+        (["hidden=8|x"], "whole numbers"),
+        (["batch_size=32..64"], r"name them: batch_size=32\|64"),
+        (["discount=0.9..0.99", "discount=0.8..0.9"], "names discount twice"),
+    ],
+)
+def test_wrong_ranges(ranges, says):
+    with pytest.raises(QfolioError, match=says):
+        search.parse(ranges, DQN)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "says"),
+    [
+        (["discount=0.5..1.5"], "discount is 1.5"),
+        (["learning_starts=20|500"], "learning_starts is 500"),
+        (["hidden=1|2|3|4|5|6|7|8|9", "batch_size=1|2|3|4|5|6|7|8"], "72 programs"),
+    ],
+)
+def test_spaces_that_hold_no_agent_leave_no_folder(ranges, says, tmp_path, task, agent):
+    with pytest.raises(QfolioError, match=says):
+        start(tmp_path / "s", task, agent, *ranges)
+    assert not list(tmp_path.iterdir())
+
+
+# The search
+
+
+def test_tuning_never_sees_the_graded_starts():
+    graded, tuned = (jax.random.key_data(keys) for keys in (start_keys(), tuning_keys()))
+    assert not {tuple(k) for k in graded.tolist()} & {tuple(k) for k in tuned.tolist()}
+
+
+def test_a_search_goes_on_where_it_was_left(tmp_path, task, agent):
+    folder = tmp_path / "s"
+    progress = []
+    start(folder, task, agent).run(progress.append)
+    assert [(p.done, p.trials) for p in progress] == [(2, 2), (4, 2)]
+    again = Tuning.open(folder, trials=7, batch=2)
+    again.run()
+    trials = again.journal.trials()
+    assert [trial.number for trial in trials] == list(range(7))
+    assert len({json.dumps(trial.values) for trial in trials}) == 7
+    # Half of four trials, and of seven, are drawn at random; the first is the preset.
+    assert [trial.number for trial in trials if trial.at_random] == [1]
+    own = [trial for trial in trials if trial.is_preset]
+    assert [trial.number for trial in own] == [0]
+    assert own[0].values == {"learning_rate": agent.learning_rate, "discount": agent.discount}
+    # What it says of a trial is what training that configuration by itself gives.
+    last = trials[-1]
+    alone, _ = again.trained([again.configured(last.values)], range(2), tuning_keys())
+    np.testing.assert_array_equal(alone[0], last.returns)
+    # Everything on disk is text: nothing of it is ever unpickled.
+    for line in (folder / "journal.log").read_text().splitlines():
+        json.loads(line)
+    assert not list((folder / "processes").iterdir())
+
+
+def test_a_configuration_does_in_a_search_what_it_does_in_a_run(tmp_path, task, agent):
+    work = start(tmp_path / "s", task, agent)
+    found, _ = work.trained([agent], [7, 8], start_keys())
+    run = Run.create(task, agent, episodes=EPISODES, seeds=2, seed=7)
+    run.train()
+    np.testing.assert_array_equal(found[0], run.grade()["return_per_seed"])
+
+
+def test_the_same_search_again_is_the_same(tmp_path, task, agent):
+    first, second = (start(tmp_path / name, task, agent) for name in "ab")
+    for work in (first, second):
+        work.run()
+    strip = lambda work: [trial[:4] for trial in work.journal.trials()]  # noqa: E731
+    assert strip(first) == strip(second)
+
+
+def test_configurations_of_several_programs(tmp_path, task, agent):
+    ranges = ["hidden=16|8", "learning_rate=1e-4..5e-4"]
+    work = start(tmp_path / "s", task, agent, *ranges, trials=6, batch=1)
+    shared = [{"hidden": size, "learning_rate": 2e-4} for size in ("16", "8")]
+    together, _ = work.trained([work.configured(v) for v in shared], range(2), tuning_keys())
+    for values, row in zip(shared, together, strict=True):
+        alone, _ = work.trained([work.configured(values)], range(2), tuning_keys())
+        np.testing.assert_array_equal(alone[0], row)
+    assert not np.array_equal(*together)
+    work.run()
+    trials = work.journal.trials()
+    assert {trial.values["hidden"] for trial in trials} == {"16", "8"}
+    assert not any(trial.is_preset for trial in trials)  # its learning rate is outside
+
+
+def test_diverged_trials_are_pruned_and_never_best(tmp_path, task, agent):
+    work = start(tmp_path / "s", task, agent, f"learning_rate=0.001|{BOOM}", trials=6)
+    progress = []
+    work.run(progress.append)
+    lost = [trial for trial in work.journal.trials() if trial.values["learning_rate"] != "0.001"]
+    assert 0 < len(lost) < 6
+    assert all(trial.returns == (None, None) and math.isnan(trial.value) for trial in lost)
+    assert progress[-1].diverged == len(lost)
+    assert best_of(work.journal.trials()).values == {"learning_rate": "0.001"}
+
+
+def test_a_search_where_all_diverge_says_so(tmp_path, task, agent):
+    work = start(tmp_path / "s", task, agent, f"learning_rate=1e29|{BOOM}", trials=2)
+    work.run()
+    with pytest.raises(QfolioError, match="None of the 2 configurations kept a finite loss"):
+        work.conclude()
+
+
+def test_trials_of_a_killed_process_are_tried_anew(tmp_path, task, agent):
+    folder = tmp_path / "s"
+    dead = start(folder, task, agent)
+    assert len(ask(dead)) == 2  # and then it was killed: nothing holds its file locked
+    again = Tuning.open(folder)
+    again.run()
+    assert [trial.number for trial in again.journal.trials()] == [2, 3, 4, 5]
+    assert sum(trial.is_preset for trial in again.journal.trials()) == 1
+    assert again.journal.in_hand() == 0
+
+
+def test_processes_share_a_search(tmp_path, task, agent):
+    folder = tmp_path / "s"
+    other = start(folder, task, agent)
+    with other.journal.at_work():
+        asked = ask(other)
+        mine = Tuning.open(folder)
+        mine.run()
+        assert (len(mine.journal.trials()), mine.journal.in_hand()) == (2, 2)
+        other._train(asked)
+        assert (len(mine.journal.trials()), mine.journal.in_hand()) == (4, 0)
+        assert not ask(mine)
+
+
+def test_an_error_gives_the_batch_back(tmp_path, task, agent, monkeypatch):
+    work = start(tmp_path / "s", task, agent)
+
+    def fail(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Tuning, "trained", fail)
+    with pytest.raises(KeyboardInterrupt):
+        work.run()
+    assert (work.journal.trials(), work.journal.in_hand()) == ([], 0)
+    assert not list((work.folder / "processes").iterdir())
+
+
+def test_ctrl_c_stops_after_the_batch(tmp_path, task, agent):
+    work = start(tmp_path / "s", task, agent)
+    work.run(chunk_listener=lambda done: os.kill(os.getpid(), signal.SIGINT) if done == 1 else None)
+    assert work.interrupted
+    assert len(work.journal.trials()) == 2
+
+
+def test_a_line_that_a_crash_cut_short(tmp_path, task, agent):
+    folder = tmp_path / "s"
+    start(folder, task, agent).run()
+    journal = folder / "journal.log"
+    whole = journal.read_bytes()
+    journal.write_bytes(whole + b'{"op_code":4,"wor')
+    assert len(Tuning.open(folder).journal.trials()) == 4
+    for line in journal.read_text().splitlines():
+        json.loads(line)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("journal.log", '{"op_code": 99}\n{}\n', "journal.log is damaged"),
+        ("journal.log", "nonsense\nmore\n", "journal.log is damaged"),
+        ("study.json", '{"format": 7}', "in another format"),
+        ("study.json", '{"format": 1}', "study.json is damaged: trials is missing"),
+    ],
+)
+def test_damaged_folders(name, content, says, tmp_path, task, agent):
+    folder = tmp_path / "s"
+    start(folder, task, agent)
+    (folder / name).write_text(content)
+    with pytest.raises(QfolioError, match=says):
+        Tuning.open(folder)
+
+
+def test_a_lock_keeps_others_out(tmp_path):
+    with locked(tmp_path / "lock") as mine, locked(tmp_path / "lock", wait=False) as other:
+        assert (mine, other) == (True, False)
+    with locked(tmp_path / "lock", wait=False) as free:
+        assert free
+
+
+# What a search says
+
+
+def made_up(count=80, seed=0):
+    """Trials in which the learning rate is everything, best at 10⁻³, and the discount nothing."""
+    draw = np.random.default_rng(seed)
+    space = [
+        dimension("discount", "0.9..0.999", DQN),
+        dimension("learning_rate", "1e-4..1e-2", DQN),
+        dimension("hidden", "8|16", DQN),
+    ]
+    trials = []
+    for number in range(count):
+        place = draw.uniform(size=2)
+        values = {
+            "discount": space[0].at(place[0]),
+            "learning_rate": space[1].at(place[1]),
+            "hidden": ("8", "16")[number % 2],
+        }
+        regret = 0.02 * 10 ** (4 * abs(place[1] - 0.5)) * (1 + 0.05 * draw.normal())
+        returns = (-100 * (1 + regret),) * 2
+        trials.append(Trial(number, values, returns, number == 3, number < 40, 1.0))
+    return space, trials
+
+
+def test_sensitivity_finds_what_matters():
+    space, trials = made_up()
+    found = sensitivity(space, trials, optimum=-100.0)
+    effects = {effect.dimension.name: effect for effect in found.effects}
+    assert found.effects[0].dimension.name == "learning_rate"
+    assert effects["learning_rate"].share > 0.8
+    assert max(effects["discount"].share, effects["hidden"].share) < 0.05
+    assert found.explained > 0.8
+    # 0.02 · 10^(4 |p − 1/2|) ≤ 0.02 + 0.05 where |p − 1/2| ≤ log10(3.5)/4 = 0.136.
+    low, high = effects["learning_rate"].range
+    assert (low, high) == pytest.approx((0.364, 0.636), abs=0.05)
+    assert effects["discount"].width == 1
+    assert effects["hidden"].robust.all()
+    text = " ".join(verdicts(found, trials))
+    good = sum(-trial.value <= 107 + (-best_of(trials).value - 102) for trial in trials[:40])
+    assert f"Of 40 configurations drawn at random, {good} lost no more than 5 points" in text
+    assert "What matters most: learning_rate" in text
+    assert "hidden hardly do" in text or "hidden and discount hardly do" in text
+    assert "The narrowest is learning_rate" in text
+
+
+def test_sensitivity_admits_what_it_does_not_know():
+    space, trials = made_up(ENOUGH - 1)
+    assert sensitivity(space, trials, -100.0) is None
+    assert "trials with a finite loss are needed" in verdicts(None, trials)[0]
+    space, trials = made_up(30)
+    draw = np.random.default_rng(1)
+    noise = [trial._replace(returns=(float(draw.normal()),)) for trial in trials]
+    assert "do not tell what matters" in verdicts(sensitivity(space, noise, None), noise)[0]
+    flat = [trial._replace(returns=(-1.0,)) for trial in trials]
+    assert sensitivity(space, flat, None) is None
+
+
+def test_outcomes():
+    known = Outcome.of([-200.0, -110.0, math.nan], optimum=-100.0)
+    heights = known.height([-200.0, -110.0, math.nan, -101.0])
+    np.testing.assert_allclose(heights, [0.0, 1.0, 0.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(known.loss(heights), [1.0, 0.1, 1.0, 0.01])
+    unknown = Outcome.of([1.0, 2.0, 3.0, -1e9], optimum=None)
+    assert unknown.floor == 3 - 3 * 1.5
+    np.testing.assert_allclose(unknown.height([2.0, math.nan, -1e9]), [2.0, -1.5, -1.5])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.995, "0.995"), (0.99934, "0.99934"), (0.95, "0.95"), (3e-4, "0.0003"),
+                        (0.0123, "0.012"), (0.6, "0.6"), (60.0, "60"), (1.0, "1")]
+)  # fmt: skip
+def test_short_numbers(value, text):
+    assert short(value) == text
+
+
+# The report and the command
+
+
+def page(optimum=-100.0, **changes) -> Sweep:
+    space, trials = made_up(30)
+    trials[5] = trials[5]._replace(returns=(None, -120.0))
+    summary = {
+        "best": trials[0].values, "return_tuned_on": -102.0, "seeds": [1000, 1001],
+        "return_per_seed": [-102.0, -103.0], "preset_return_per_seed": [-110.0, -111.5],
+        "optimum": optimum, "optimum_tuned_on": optimum,
+    } | changes  # fmt: skip
+    config = {"task": "pendulum", "agent": "<dqn>", "preset": "fast", "seeds": 2,
+              "episodes": 2144, "steps": None, "batch": 16}  # fmt: skip
+    own = {"discount": 0.95, "learning_rate": 1e-3, "hidden": "32"}
+    found = sensitivity(space, trials, optimum)
+    return Sweep(config, space, trials, own, summary, found, "qfolio train\nqfolio tune")
+
+
+@pytest.mark.parametrize("optimum", [-100.0, None])
+def test_the_page(optimum, tmp_path):
+    data = page(optimum)
+    write_tuning_report(tmp_path, data)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "report.html", "sensitivity.png", "pair.png"
+    }  # fmt: skip
+    text = (tmp_path / "report.html").read_text()
+    assert "&lt;dqn&gt;" in text
+    assert "<dqn>" not in text
+    assert "://" not in text.replace("http://www.w3.org", "")
+    assert text.count("<svg") == 4
+    assert "color-mix(in srgb, var(--accent)" in text
+    assert ("regret (higher is better)" in text) == (optimum is not None)
+    assert "1 diverged" in text
+    assert "better (+8.2" in text or "better (+8.3" in text
+
+
+def test_the_page_of_few_trials(tmp_path):
+    data = page()
+    few = Sweep(**{**vars(data), "trials": data.trials[:4], "found": None})
+    assert "are needed to say what matters" in render_page(few)
+
+
+@pytest.mark.parametrize(
+    ("best", "preset", "says"),
+    [
+        ([-103.0, -101.0], [-102.0, -102.5], "no clear difference"),
+        ([-110.0, -111.0], [-102.0, -102.8], "worse"),
+        ([-110.0, None], [-102.0, -102.8], "diverged for the best"),
+        ([-110.0], [-102.0], "a single seed tells no more"),
+    ],
+)
+def test_the_comparison_is_honest(best, preset, says):
+    data = page(return_per_seed=best, preset_return_per_seed=preset)
+    assert says in data.comparison
+    assert "Best" in render_page(data)
+
+
+def test_the_preset_may_be_the_best():
+    data = page()
+    trials = list(data.trials)
+    trials[3] = trials[3]._replace(returns=(-101.0, -101.0))
+    assert (
+        "None of 30 configurations did better"
+        in Sweep(**{**vars(data), "trials": trials}).comparison
+    )
+
+
+def test_tune_from_the_command_line(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "s"
+    code = qfolio(monkeypatch, "tune", "pendulum", "--trials", 4, "--batch", 4, "--seeds", 4,
+                  "--episodes", 4, "--search", "learning_rate=1e-4..1e-2", "--out", folder,
+                  *TINY)  # fmt: skip
+    printed = capsys.readouterr().out
+    assert code == 0
+    assert "4/4" in printed
+    command = next(line for line in printed.splitlines() if line.startswith("qfolio train"))
+    best = best_of(Tuning.open(folder).journal.trials())
+    assert "--episodes 4" in command
+    assert (folder / "report.html").exists()
+    summary = json.loads((folder / "summary.json").read_text())
+    assert len(summary["return_per_seed"]) == len(summary["preset_return_per_seed"]) == 8
+    before = (folder / "summary.json").stat().st_mtime_ns
+    # The command names what was searched, to the last digit.
+    work = Tuning.open(folder)
+    words = command.split()
+    chosen = settings.parse(words[words.index("--set") + 1 :])
+    assert chosen.pop("horizon") == "20"
+    assert preset("fast").build(**chosen) == work.configured(best.values)
+    # Joining what is done only writes the report again.
+    assert qfolio(monkeypatch, "tune", "--join", folder) == 0
+    assert (folder / "summary.json").stat().st_mtime_ns == before
+
+
+def test_the_learning_rate_ends_with_the_training(tmp_path, monkeypatch, capsys):
+    def fail(self, *args):
+        raise QfolioError(f"{self.agent.learning_rate_steps}")
+
+    monkeypatch.setattr(Tuning, "run", fail)
+    for number, (more, steps) in enumerate([([], 75.0), (["learning_rate_steps=9"], 9.0)]):
+        out = tmp_path / str(number)
+        assert qfolio(monkeypatch, "tune", "--episodes", 86, "--out", out, *TINY, *more) == 2
+        said = capsys.readouterr().err
+        assert float(said.split()[-1]) == pytest.approx(steps, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["nowhere"], "there is no task 'nowhere'"),
+        (["pendulum", "--agent", "dqm"], "did you mean dqn"),
+        (["--trials", "0"], "trials is 0"),
+        (["--batch", "0"], "batch is 0"),
+        (["--episodes", "0"], "episodes is 0"),
+        (["--search", "discount=0.9..0.99", "--set", "discount=0.9"], "both set and searched"),
+        (["--join", "nowhere"], "is no search"),
+        (["--join", "nowhere", "--seeds", "3"], "keeps what the search was started with"),
+        (["--set", "torques=0"], "continuous"),
+    ],
+)
+def test_wrong_commands(arguments, says, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert qfolio(monkeypatch, "tune", *arguments) == 2
+    assert says in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_optuna(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    for name in ("qfolio.experiments.tuning.run", "qfolio.experiments.tuning.journal"):
+        monkeypatch.delitem(sys.modules, name)
+    assert qfolio(monkeypatch, "tune") == 2
+    assert "qfolio[tune]" in capsys.readouterr().err

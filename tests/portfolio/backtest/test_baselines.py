@@ -1,0 +1,199 @@
+"""Classical allocators: what they decide, that they see no future, and what they earned."""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.baselines import BASELINES, decisions, weights
+from qfolio.portfolio.backtest.simulation import simulate
+
+FITTED = [name for name, make in BASELINES.items() if make]
+
+
+class Fold(NamedTuple):
+    name: str
+    train: slice
+    decisions: slice
+
+
+def walk(rows: int, train: int, test: int, count: int | None = None) -> list[Fold]:
+    """Whole folds whose training ends with the first decision; each decision earns a return."""
+    starts = range(train, rows - test, test)[:count]
+    return [Fold(str(i), slice(s - train, s + 1), slice(s, s + test)) for i, s in enumerate(starts)]
+
+
+def prices(rows: int = 90, assets: int = 4) -> np.ndarray:
+    """Assets of volatility 1 %, 2 %, …, all of which rise."""
+    generator = np.random.default_rng(0)
+    scales = 0.01 * np.arange(1, assets + 1)
+    return np.exp((generator.normal(size=(rows, assets)) * scales + scales / 5).cumsum(0))
+
+
+FOLDS = walk(90, train=40, test=15)
+
+
+@cache
+def decided(name: str) -> np.ndarray:
+    return decisions(name, FOLDS, prices()).decisions
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_fits_each_fold_to_its_own_training(name: str) -> None:
+    rows = decided(name)
+    assert rows.shape == (45, 5)
+    assert (rows >= 0).all()
+    np.testing.assert_allclose(rows.sum(1), 1, rtol=1e-12)
+    assert (rows[:, 0] == 0).all()
+    assert (rows.reshape(3, 15, 5) == rows[::15][:, None]).all()
+    assert (rows[0] != rows[15]).any()
+    training = prices()[15:56]
+    np.testing.assert_array_equal(rows[15, 1:], weights(name, training[1:] / training[:-1] - 1)[0])
+
+
+def test_what_allocators_mean() -> None:
+    generator = np.random.default_rng(1)
+    noise = generator.normal(size=(200, 3))
+    noise = np.linalg.qr(noise - noise.mean(0))[0] * np.sqrt(199)  # of variance 1, uncorrelated
+    returns = np.array([0.001, 0.004, 0.004]) + noise * np.array([0.01, 0.02, 0.04])
+    # Without correlation weights go as 1/σ, as 1/σ², and for the ratio as mean/σ².
+    for name, expected in {
+        "equal-weight": [1, 1, 1],
+        "buy-and-hold": [1, 1, 1],
+        "inverse-volatility": [4, 2, 1],
+        "risk-budgeting": [4, 2, 1],
+        "minimum-variance": [16, 4, 1],
+        "maximum-ratio": [16, 16, 4],
+    }.items():
+        found, notes = weights(name, returns)
+        np.testing.assert_allclose(found, np.array(expected) / sum(expected), atol=2e-3)
+        assert notes == ()
+
+
+def test_equal_weight_and_buy_and_hold() -> None:
+    np.testing.assert_array_equal(decided("equal-weight"), np.tile([0, *[0.25] * 4], (45, 1)))
+    bought = decided("buy-and-hold")
+    np.testing.assert_array_equal(bought[0], [0, *[0.25] * 4])
+    assert np.isnan(bought[1:]).all()
+    result = simulate(prices(), bought, first=40, cost=0.01)
+    assert (result.turnover[1:] == 0).all()
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(40, 88), st.integers(0, 2**32 - 1))
+@pytest.mark.parametrize("name", BASELINES)
+def test_no_later_price_changes_a_decision(name: str, row: int, seed: int) -> None:
+    changed = prices()
+    later = changed[row + 1 :]
+    later *= np.random.default_rng(seed).lognormal(size=later.shape)
+    # Whatever is decided at or before the row sees prices up to the row.
+    found = decisions(name, [f for f in FOLDS if f.decisions.start <= row], changed).decisions
+    np.testing.assert_array_equal(found, decided(name)[: len(found)])
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_fits_see_their_training(name: str) -> None:
+    changed = prices()
+    changed[20:40, 0] *= np.random.default_rng(0).lognormal(sigma=0.2, size=20)
+    assert (decisions(name, FOLDS[:1], changed).decisions[0] != decided(name)[0]).any()
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_cap(name: str) -> None:
+    found = decisions(name, FOLDS[:1], prices(), cap=0.3).decisions[0]
+    assert (found[1:] <= 0.3 + 1e-12).all()
+    assert found.sum() == pytest.approx(1)
+    assert found[0] == 0
+    if name in ("inverse-volatility", "minimum-variance"):
+        assert found[1] == pytest.approx(0.3)  # would like more: the calmest
+    tight = decisions(name, FOLDS[:1], prices(), cap=0.2).decisions[0]
+    np.testing.assert_allclose(tight, 0.2)  # in cash, too
+
+
+def test_cap_keeps_proportions() -> None:
+    generator = np.random.default_rng(2)
+    returns = np.linalg.qr(generator.normal(size=(500, 4)))[0]
+    returns /= returns.std(0, ddof=1) * np.array([60, 25, 10, 5])  # weights .6, .25, .1, .05
+    np.testing.assert_allclose(
+        weights("inverse-volatility", returns)[0], [0.6, 0.25, 0.1, 0.05], rtol=1e-6
+    )
+    # The first is cut to .4; the other .6 go to .25, .1 and .05 as .375, .15 and .075. With a cap
+    # of .35 the second would have .40625 and is cut, too; .3 are left for .1 and .05.
+    np.testing.assert_allclose(
+        weights("inverse-volatility", returns, cap=0.4)[0], [0.4, 0.375, 0.15, 0.075], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        weights("inverse-volatility", returns, cap=0.35)[0], [0.35, 0.35, 0.2, 0.1], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_assets_that_join_late(name: str) -> None:
+    values = prices()
+    values[:50, 1] = np.nan  # in the training of the second fold from its middle on
+    found = decisions(name, FOLDS, values).decisions
+    assert (found[:30, 2] == 0).sum() == (1 if name == "buy-and-hold" else 30)
+    without = decisions(name, FOLDS[:2], np.delete(values, 1, axis=1)).decisions
+    np.testing.assert_array_equal(np.delete(found[:30], 2, axis=1), without)
+    chosen = decisions(name, FOLDS, prices(), tradable=[[True, False, True, True]] * 3).decisions
+    np.testing.assert_array_equal(chosen[:30], found[:30])
+    with pytest.raises(QfolioError, match="Fold 0 has no asset to hold, or one without a price"):
+        decisions(name, FOLDS, values, tradable=np.ones((3, 4)))
+
+
+def test_failures_leave_a_note_and_equal_weights() -> None:
+    values = prices()
+    values[:60, 2] = 7.0  # no variance
+    found, notes = decisions("minimum-variance", FOLDS, values)
+    np.testing.assert_array_equal(found[0], [0, *[0.25] * 4])
+    assert (found[-1] != found[0]).any()
+    assert notes[0].startswith("minimum-variance, fold 0: no solution, so weights are equal: ")
+    assert "variance" in notes[0].split("equal:")[1]
+    falling = weights("maximum-ratio", -np.abs(np.random.default_rng(0).normal(size=(50, 3))))
+    np.testing.assert_array_equal(falling[0], [1 / 3] * 3)
+    assert "no solution" in falling[1][0]
+    twins = np.random.default_rng(0).normal(size=(50, 1)).repeat(2, axis=1)
+    assert weights("minimum-variance", twins)[1][0].startswith("skfolio warns: ")
+
+
+def test_errors_say_what_and_where() -> None:
+    with pytest.raises(QfolioError, match="no baseline 'best'; there are equal-weight"):
+        decisions("best", FOLDS, prices())
+    with pytest.raises(QfolioError, match="no fold"):
+        decisions("equal-weight", [], prices())
+    with pytest.raises(QfolioError, match="Fold x trains on rows up to 41, but decides from row 4"):
+        decisions("equal-weight", [Fold("x", slice(0, 42), slice(40, 50))], prices())
+    with pytest.raises(QfolioError, match="Fold 2 decides from row 70 on, but fold 0 before row 5"):
+        decisions("equal-weight", FOLDS[::2], prices())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "sharpe"),
+    [
+        ("equal-weight", 0.926),
+        ("inverse-volatility", 0.904),
+        ("minimum-variance", 0.903),
+        ("hierarchical-risk-parity", 0.916),
+        ("risk-budgeting", 0.939),
+        ("maximum-ratio", 1.045),
+    ],
+)
+def test_sharpe_ratios_of_skfolio_on_its_own_prices(name: str, sharpe: float) -> None:
+    values = real_prices()
+    folds = walk(len(values), train=1260, test=252)
+    found, notes = decisions(name, folds, values)
+    assert notes == ()
+    returns = simulate(values, found, first=1260, cost=0.0, lag=0).returns
+    assert returns.mean() / returns.std(ddof=1) * np.sqrt(252) == pytest.approx(sharpe, abs=5e-4)
+
+
+@cache
+def real_prices() -> np.ndarray:
+    from skfolio.datasets import load_sp500_dataset
+
+    return load_sp500_dataset().to_numpy()

@@ -1,0 +1,71 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.folds import latest, parse_length, walk_forward
+
+DAYS = np.arange("2000-01-01", "2010-01-01", dtype="datetime64[D]")
+
+
+@pytest.mark.parametrize("lag", [0, 1, 3])
+@pytest.mark.parametrize("expanding", [False, True])
+def test_returns_follow_each_other_and_training_ends_before_the_first_decision(lag, expanding):
+    folds = walk_forward(DAYS, "5y", "1y", lag, expanding)
+    assert [fold.name for fold in folds] == [f"{year}-01-01" for year in range(2005, 2010)]
+    for fold in folds:
+        # The last reward in training is known when the first decision is made.
+        assert fold.train.stop - 1 == fold.decisions.start
+        first_return = fold.decisions.start + lag + 1
+        assert str(DAYS[first_return]) == fold.name
+        assert (fold.train.start == 0) == (expanding or fold is folds[0])
+    for fold, following in pairwise(folds):
+        assert fold.decisions.stop == following.decisions.start
+    # The last decision earns the last row of the table.
+    assert folds[-1].decisions.stop - 1 + lag + 1 == len(DAYS) - 1
+
+
+def test_rolling_training_keeps_its_length():
+    folds = walk_forward(DAYS, "500d", "100d", 1)
+    assert {fold.train.stop - fold.train.start for fold in folds[1:]} == {501}
+    assert {fold.decisions.stop - fold.decisions.start for fold in folds[:-1]} == {100}
+
+
+def test_calendar_lengths():
+    leap = np.array(["2000-02-29", "2000-03-31", "2001-02-28", "2001-03-01"], "datetime64[D]")
+    folds = walk_forward(leap, "1y", "1y", 0)
+    assert folds[0].name == "2001-02-28"
+    assert latest("x", DAYS, "1m").train == slice(len(DAYS) - 32, len(DAYS))
+    assert latest("x", DAYS, "1m", expanding=True).train == slice(0, len(DAYS))
+
+
+def test_folds_within_a_day_have_names_of_their_own():
+    hours = np.arange("2020-01-01T00", "2020-02-01T00", dtype="datetime64[h]")
+    folds = walk_forward(hours, "300d", "9d", 1)
+    assert len({fold.name for fold in folds}) == len(folds) > 40
+    assert folds[0].name == "2020-01-13-120000"
+
+
+def test_an_asset_is_tradable_once_the_last_stretch_covers_it():
+    values = np.ones((len(DAYS), 2))
+    values[400:, 1] = 2.0
+    values[:400, 1] = np.nan
+    for expanding in (False, True):
+        folds = walk_forward(DAYS, "365d", "100d", 1, expanding)
+        starts = [fold.recent.start for fold in folds]
+        traded = [bool(fold.tradable(values)[1]) for fold in folds]
+        assert traded == [start >= 400 for start in starts]
+        assert any(traded)
+        assert not all(traded)
+
+
+@pytest.mark.parametrize("length", ["", "y", "0y", "-1y", "5 years", "1e3d", "٣y"])
+def test_lengths_that_are_none(length):
+    with pytest.raises(QfolioError, match="like 5y"):
+        parse_length(length)
+
+
+def test_a_table_that_is_too_short():
+    with pytest.raises(QfolioError, match="nothing to test"):
+        walk_forward(DAYS, "10y", "1y", 1)

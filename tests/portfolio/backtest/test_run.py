@@ -1,0 +1,275 @@
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.baselines import BASELINES
+from qfolio.portfolio.backtest.run import LATEST, Backtest
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.policy import follow
+from qfolio.portfolio.prices.table import Prices
+
+AGENTS = {
+    "dqn": Preset(
+        "dqn",
+        {"network": "mlp", "hidden": (8, 8), "all_actions": True, "environments": 4,
+         "batch_size": 8, "learning_starts": 40, "replay_capacity": 400, "episode_steps": 0},
+        episodes=16, seeds=2, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
+    ),
+    "pathwise": Preset(
+        "pathwise", {"rollout": 10, "environments": 4, "hidden": (8, 8)},
+        episodes=24, seeds=2, task={"window": 10, "horizon": 20},
+    ),
+}  # fmt: skip
+
+
+def table(rows=260, seed=0):
+    rng = np.random.default_rng(seed)
+    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0))
+    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    return Prices(dates, ("A", "B", "<b>C"), values, note="made up")
+
+
+def create(folder=None, prices=None, agents=AGENTS, **settings):
+    options = {
+        "expanding": False,
+        "train": "100d",
+        "test": "50d",
+        "seeds": 2,
+        "cost": 0.002,
+        **settings,
+    }
+    prices = table() if prices is None else prices
+    return Backtest.create(prices, agents, out=folder, **options)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("backtests") / "run"
+    backtest = create(folder)
+    backtest.run()
+    return backtest
+
+
+def test_all_strategies_are_replayed_on_the_same_days(finished):
+    entries, _ = finished.entries()
+    agents = ["dqn", "dqn-together", "pathwise", "pathwise-together"]
+    assert list(entries) == [*agents, *BASELINES]
+    assert len(finished.folds) == 4
+    assert len(finished.dates) == 260 - 100
+    for name, entry in entries.items():
+        seeds = 2 if name in AGENTS else 1
+        assert entry.simulation.returns.shape == (seeds, 160), name
+    assessment = finished.assess(entries)
+    assert assessment.trials == 6
+    assert assessment.strategies["dqn"].to_reference.reference == "equal-weight"
+
+
+def test_costs_are_charged(finished):
+    """Each entry is what an independent replay of its decisions earns, at the cost asked for."""
+    entries, _ = finished.entries()
+    first = finished.folds[0].decisions.start
+    for name, entry in entries.items():
+        replay = {
+            cost: simulate(finished.prices.values, entry.decisions, first=first, cost=cost, lag=1)
+            for cost in (0.0, 0.002)
+        }
+        np.testing.assert_array_equal(entry.simulation.returns, replay[0.002].returns)
+        paid = np.log1p(replay[0.0].returns).sum() - np.log1p(replay[0.002].returns).sum()
+        assert paid == pytest.approx(-np.log1p(-entry.simulation.cost).sum(), rel=1e-6), name
+    assert entries["equal-weight"].simulation.cost.sum() > 0.002
+
+
+@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize("together", [False, True])
+def test_holdings_carry_over_from_fold_to_fold(finished, name, together, monkeypatch):
+    """Folds that all have one policy decide as that policy does in a single stretch."""
+    same = Backtest.open(finished.folder)
+    fold, members = same.folds[0], same._members(name, same.folds[0].name)
+    task = same._part(same.tasks[name], fold)
+    monkeypatch.setattr(same, "_members", lambda *_: members)
+    monkeypatch.setattr(same, "_part", lambda *_: task)
+    held = np.zeros((1 if together else 2, 4))
+    held[:, 0] = 1
+    agent, first = same.agents[name], fold.decisions.start
+    targets, _ = follow(task, agent, members, first, held, 160, together=together)
+    np.testing.assert_allclose(same._decide(name, together), targets, atol=1e-6)
+
+
+def test_what_is_learned_does_not_depend_on_the_group(finished, tmp_path, monkeypatch):
+    """A backtest that is resumed has other groups of folds."""
+    alone = create(tmp_path / "run", agents={"pathwise": AGENTS["pathwise"]})
+    monkeypatch.setattr(alone, "_groups", lambda name: [[job] for job in alone._jobs])
+    alone.run()
+    for fold in alone.folds:
+        one, other = (b._members("pathwise", fold.name) for b in (alone, finished))
+        for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+def test_seeds_differ_and_opening_gives_the_same(finished):
+    entries, _ = finished.entries()
+    again, _ = Backtest.open(finished.folder).entries()
+    for name in AGENTS:
+        returns = entries[name].simulation.returns
+        np.testing.assert_array_equal(again[name].simulation.returns, returns)
+        assert not np.array_equal(returns[0], returns[1])
+
+
+def test_what_was_trained_stays(finished, tmp_path, monkeypatch):
+    """A backtest that is stopped goes on behind its finished folds, and ends up the same."""
+    stopped = create(tmp_path / "run", agents={"pathwise": AGENTS["pathwise"]})
+    train, groups = Backtest._train, []
+
+    def once(self, name, group):
+        groups.append([job.name for job in group])
+        if len(groups) == 2:
+            raise KeyboardInterrupt
+        yield from train(self, name, group)
+
+    monkeypatch.setattr(Backtest, "_train", once)
+    with pytest.raises(KeyboardInterrupt):
+        stopped.run()
+    resumed = Backtest.open(tmp_path / "run")
+    with pytest.raises(QfolioError, match="not finished"):
+        resumed.policy()
+    resumed.run()
+    assert groups[1] == groups[2]  # the group that was not finished, and none before it
+    assert groups[-1][-1] == LATEST
+    for fold in (*resumed.folds, None):
+        one, other = (
+            b._members("pathwise", fold.name) if fold else b.policy("pathwise").learner
+            for b in (resumed, finished)
+        )
+        for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+def test_no_strategy_looks_ahead():
+    """Prices after t change no weight decided up to t, through training, folds and baselines."""
+    changed = table().values.copy()
+    t = 220  # within the last fold but one
+    changed[t + 1 :] *= np.exp(np.random.default_rng(5).normal(0, 0.3, changed[t + 1 :].shape))
+    decisions = []
+    for values in (table().values, changed):
+        prices = Prices(table().dates, table().assets, values)
+        backtest = create(prices=prices)
+        backtest.run()
+        entries, _ = backtest.entries()
+        decisions.append({name: entry.decisions for name, entry in entries.items()})
+    known = t - backtest.folds[0].decisions.start + 1
+    for name, before in decisions[0].items():
+        after = decisions[1][name]
+        np.testing.assert_array_equal(after[:, :known], before[:, :known], err_msg=name)
+        if name not in ("equal-weight", "buy-and-hold"):
+            assert not np.array_equal(after[:, known:], before[:, known:]), name
+
+
+def test_tables_say_what_was_replayed(finished):
+    entries, _ = finished.entries()
+    finished.write_tables(entries, finished.assess(entries))
+    lines = (finished.folder / "returns.csv").read_text().splitlines()
+    assert lines[0].split(",")[:4] == ["date", "dqn/0", "dqn/1", "dqn-together"]
+    assert len(lines) == 161
+    assert float(lines[1].split(",")[1]) == entries["dqn"].simulation.returns[0, 0]
+    assert (finished.folder / "weights.csv").read_text().startswith("date,strategy,cash,A,B,<b>C")
+    summary = json.loads((finished.folder / "summary.json").read_text())
+    assert summary["strategies"]["pathwise"]["kind"] == "agent"
+
+
+def test_an_asset_joins_at_the_first_fold_that_it_covers():
+    values = table().values.copy()
+    values[:120, 1] = np.nan
+    prices = Prices(table().dates, table().assets, values)
+    backtest = create(prices=prices, expanding=True)
+    backtest.run()
+    entries, _ = backtest.entries()
+    starts = [fold.recent.start for fold in backtest.folds]
+    first = next(i for i, start in enumerate(starts) if start >= 120)
+    day = backtest.folds[first].decisions.start - backtest.folds[0].decisions.start
+    for name, entry in entries.items():
+        held = entry.decisions[..., 2]
+        assert np.nansum(held[:, :day]) == 0, name
+    assert entries["equal-weight"].decisions[0, day, 2] == pytest.approx(1 / 3)
+
+
+def test_the_cap_holds():
+    backtest = create(cap=0.4, agents={"pathwise": AGENTS["pathwise"]})
+    backtest.run()
+    for name, entry in backtest.entries()[0].items():
+        assert np.nanmax(entry.decisions[..., 1:]) <= 0.4 + 1e-6, name
+
+
+def test_the_policy_for_tomorrow(finished):
+    policy = finished.policy("pathwise")
+    latest = finished.prices.between(-30, None)
+    weights = policy.weights(latest, {"A": 0.5})
+    assert list(weights) == ["cash", "A", "B", "<b>C"]
+    assert sum(weights.values()) == pytest.approx(1, abs=1e-5)
+    shuffled = latest.select(["<b>C", "A", "B"])
+    assert policy.weights(shuffled, {"A": 0.5}) == pytest.approx(weights, abs=1e-6)
+    for holdings, message in (({"A": 1.5}, "from 0 to 1"), ({"D": 0.5}, "does not know"),
+                              ({"A": 0.7, "B": 0.7}, "sum to")):  # fmt: skip
+        with pytest.raises(QfolioError, match=message):
+            policy.weights(latest, holdings)
+    with pytest.raises(QfolioError, match="without 'B'"):
+        policy.weights(latest.select(["A", "<b>C"]))
+    with pytest.raises(QfolioError, match="5 rows"):
+        policy.weights(latest.between(0, 5))
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
+    """The continual learning: from the rows that came since, and as if never written to disk."""
+    folder = shutil.copytree(finished.folder, tmp_path / "copy")
+    newer = table(280)
+    before = Backtest.open(folder).policy(agent)
+    after = before.update(newer)
+    Backtest.open(folder).keep(agent, after)
+    kept = Backtest.open(folder).policy(agent)
+    assert (before.learned, kept.learned) == (table().dates[-1], newer.dates[-1])
+    with pytest.raises(QfolioError, match="nothing new to learn"):
+        kept.update(newer)
+    assert (before.updates, after.updates, kept.updates) == (0, 1, 1)
+    for x, y, z in zip(*(jax.tree.leaves(p.members) for p in (before, after, kept)), strict=True):
+        assert not np.array_equal(x, y)
+        np.testing.assert_array_equal(y, z)
+    again = before.update(newer)
+    for x, y in zip(*(jax.tree.leaves(p.members) for p in (again, after)), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"train": "300d"}, "nothing to test"), ({"test": "1 year"}, "like 5y"),
+        ({"train": "25d"}, "rows are too few"), ({"cost": 0.5}, "cost is 0.5"),
+        ({"lag": -1}, "lag is -1"), ({"agents": {}}, "at least one agent"),
+    ],
+)  # fmt: skip
+def test_backtests_that_cannot_be(settings, message, tmp_path):
+    with pytest.raises(QfolioError, match=message):
+        create(tmp_path / "run", **settings)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("config.json", "{}"), ("config.json", '{"format": 2, "task": "pendulum"}'),
+        ("prices.safetensors", ""), ("config.json", None),
+    ],
+)  # fmt: skip
+def test_damaged_folders(finished, tmp_path, name, content):
+    folder = shutil.copytree(finished.folder, tmp_path / "copy")
+    if content is None:
+        config = json.loads((folder / name).read_text())
+        config["agents"] = {"../../elsewhere": config["agents"]["dqn"]}
+        content = json.dumps(config)
+    (folder / name).write_text(content)
+    with pytest.raises(QfolioError):
+        Backtest.open(folder)

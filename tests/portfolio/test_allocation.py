@@ -1,0 +1,162 @@
+"""The trades that lead from holdings to target weights."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from qfolio.commands.portfolio import allocate
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.allocation import Allocation, require_fresh
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.prices.table import Prices
+
+PRICES = Prices(
+    np.array(["2024-12-30", "2024-12-31"], "datetime64[s]"), ("A", "B"), [[10, 50], [20, 40]]
+)
+
+
+def plan(weights, shares, cash, cost=0.01, **options):
+    names = ("cash", "A", "B")
+    policy = SimpleNamespace(
+        weights=lambda prices, held: dict(zip(names, weights, strict=True)),
+        task=SimpleNamespace(cost=cost),
+    )
+    return Allocation.of(policy, PRICES, np.array(shares, float), cash, **options)
+
+
+def test_from_cash_by_hand():
+    """100 spent at 1 % buys 99; half of it each."""
+    allocation = plan([0, 0.5, 0.5], [0, 0], 100)
+    np.testing.assert_allclose(allocation.trades, [49.5 / 20, 49.5 / 40])
+    assert allocation.cost == pytest.approx(1)
+    assert allocation.cash_after == pytest.approx(0, abs=1e-9)
+
+
+def test_from_one_asset_to_the_other_by_hand():
+    """Selling 100 yields 99, which buys 98.01."""
+    allocation = plan([0, 0, 1], [5, 0], 0)
+    np.testing.assert_allclose(allocation.trades, [-5, 98.01 / 40])
+    assert allocation.cost == pytest.approx(1.99)
+    np.testing.assert_allclose(allocation.held, [0, 1, 0])
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("whole", [False, True])
+def test_money_is_neither_made_nor_lost(seed, whole):
+    rng = np.random.default_rng(seed)
+    weights, shares, cash = rng.dirichlet(np.ones(3)), rng.integers(0, 50, 2), rng.uniform(1, 1e3)
+    allocation = plan(weights, shares, cash, whole_shares=whole)
+    after = shares + allocation.trades
+    assert (after >= -1e-9).all()
+    kept = after @ allocation.prices + allocation.cash_after + allocation.cost
+    assert kept == pytest.approx(allocation.wealth)
+    assert allocation.cash_after >= 0
+    if whole:
+        np.testing.assert_array_equal(allocation.trades, np.round(allocation.trades))
+    else:  # weights are of what is left after costs
+        left = allocation.wealth - allocation.cost
+        np.testing.assert_allclose(after * allocation.prices / left, weights[1:], atol=1e-9)
+
+
+def test_what_is_wanted_and_held_is_not_traded():
+    allocation = plan([0.5, 0.25, 0.25], [25, 12.5], 1000)
+    np.testing.assert_allclose(allocation.trades, 0, atol=1e-12)
+    assert allocation.cost == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("noise", [[1, -1, 0], [-2, 1, 1], [0, 1, -1]])
+def test_noise_of_float32_is_no_order(noise, whole):
+    """A hundred thousand shares, of which 1e-8 of the wealth is a part of one."""
+    shares, cash = np.array([100_001.0, 50_000.0]), 1e6
+    wealth = shares @ [20, 40] + cash
+    held = np.append(cash, shares * [20, 40]) / wealth
+    targets = held.astype(np.float32).astype(float) + 3e-8 * np.array(noise)
+    allocation = plan(targets, shares, cash, whole_shares=whole)
+    assert allocation.trades.tolist() == [0, 0]
+    assert allocation.cost == 0
+    assert allocation.cash_after == cash
+    np.testing.assert_array_equal(allocation.weights, allocation.held)
+
+
+def test_one_order_leaves_the_noise_of_the_others_alone():
+    """Half of A's 40 % is sold without cost; B's target is off by a hundred-millionth."""
+    shares = np.array([200_000.0, 100_000.0])  # 4 million each
+    noisy = [0.4, 0.2, 0.4 - 1e-8]
+    for whole in (False, True):
+        allocation = plan(noisy, shares, 2e6, cost=0.0, whole_shares=whole)
+        np.testing.assert_allclose(allocation.trades, [-100_000, 0], atol=1e-6)
+    assert allocation.trades[1] == 0
+
+
+def test_whole_shares_by_hand():
+    """Of 19 shares of A (380), 9.5 should go for 4.75 of B: 9 are sold, and 4 bought."""
+    allocation = plan([0, 0.5, 0.5], [19, 0], 0, cost=0.0, whole_shares=True)
+    assert allocation.trades.tolist() == [-9, 4]
+    assert allocation.cash_after == 9 * 20 - 4 * 40
+
+
+def test_whole_shares_are_never_bought_on_credit():
+    """Of 4 A (80), 2.2 should go for 1.1 of B: 2 sold pay for one of B."""
+    assert plan([0, 0.45, 0.55], [4, 0], 0, 0.0, whole_shares=True).trades.tolist() == [-2, 1]
+    # Of B (40 each), 1.1 of 10 should go for 2.2 of A: one is sold, which pays for 2 of A …
+    weights = [0, 44 / 400, 356 / 400]
+    assert plan(weights, [0, 10], 0, 0.0, whole_shares=True).trades.tolist() == [2, -1]
+    # … and 0.9 for 1.8: none is sold, so there is no money for the one of A.
+    weights = [0, 36 / 400, 364 / 400]
+    allocation = plan(weights, [0, 10], 0, 0.0, whole_shares=True)
+    assert allocation.trades.tolist() == [0, 0]
+    assert allocation.cash_after == 0
+
+
+def test_fractions_that_are_held_stay_where_whole_shares_are_sold():
+    allocation = plan([1, 0, 0], [2.5, 3], 0, cost=0.0, whole_shares=True)
+    assert allocation.trades.tolist() == [-2, -3]
+    assert allocation.cash_after == 2 * 20 + 3 * 40
+
+
+def test_what_was_learned_is_kept_last(monkeypatch, tmp_path, capsys):
+    """A refused allocation keeps nothing; assets may start late, long before the last row."""
+    kept = []
+
+    def policy(updates):
+        return SimpleNamespace(
+            table=lambda prices: prices,
+            update=lambda prices: policy(updates + 1),
+            weights=lambda prices, held: {"cash": 1 / 2, "A": 1 / 4, "B": 1 / 4},
+            task=SimpleNamespace(cost=0.0),
+            updates=updates,
+        )
+
+    test_run = SimpleNamespace(
+        prices=PRICES,
+        config={"feature_names": []},
+        policy=lambda agent: policy(0),
+        keep=lambda agent, policy: kept.append((agent, policy.updates)),
+    )
+    monkeypatch.setattr(Backtest, "open", lambda folder: test_run)
+    newer = tmp_path / "newer.csv"
+    newer.write_text("date,A,B\n2025-01-01,1,\n2025-01-02,1,2\n2025-01-03,1,2\n")
+    options = {"prices": newer, "as_of": "2025-01-03", "agent": "dqn", "as_json": True}
+    with pytest.raises(QfolioError, match="nothing to allocate"):
+        allocate(tmp_path, update=True, **options)
+    assert kept == []
+    allocate(tmp_path, capital=100, **options)
+    assert kept == []
+    allocate(tmp_path, update=True, capital=100, **options)
+    assert kept == [("dqn", 1)]
+    assert capsys.readouterr().out.count("2025-01-03") == 2
+
+
+def test_nothing_to_allocate():
+    with pytest.raises(QfolioError, match="nothing to allocate"):
+        plan([1, 0, 0], [0, 0], 0)
+
+
+def test_prices_of_another_day():
+    require_fresh(PRICES, "2024-12-31")
+    require_fresh(PRICES, "2025-01-07")
+    for day, message in (("2025-01-08", "stale"), ("2024-12-30", "after"), ("x", "must be a date")):
+        with pytest.raises(QfolioError, match=message):
+            require_fresh(PRICES, day)

@@ -1,0 +1,225 @@
+"""A policy from training to disk and on."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.agents.pathwise import Pathwise
+from qfolio.core import training
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio import policy as module
+from qfolio.portfolio.policy import Policy, follow, on_table, train
+from qfolio.portfolio.prices.table import Prices
+
+ROWS, WINDOW = 80, 5
+AGENTS = {
+    "dqn": (
+        DQN(network="mlp", hidden=(8, 8), all_actions=True, environments=2, batch_size=8,
+            learning_starts=20, replay_capacity=64, learning_rate=0.01),
+        {"menu": "tilts:0.1"},
+    ),
+    "pathwise": (  # whose cosine comes to its end in training
+        Pathwise(rollout=5, environments=4, hidden=(8, 8), learning_rate=0.01,
+                 learning_rate_final=0.0, learning_rate_steps=6.0),
+        {},
+    ),
+}  # fmt: skip
+
+
+def table(rows=ROWS, seed=0, features=1):
+    rng = np.random.default_rng(seed)
+    values = 100 * np.exp(np.cumsum(rng.normal(0.003, 0.02, (rows, 3)), axis=0))
+    extra = rng.normal(3, 2, (rows, 3, features))
+    names = tuple(f"f{i}" for i in range(features))
+    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    return Prices(dates, ("a", "b", "c"), values, extra, names)
+
+
+def learned(name, agent=None, **changes):
+    chosen, task = AGENTS[name]
+    options = {"seeds": 2, "episodes": 16, "window": WINDOW, "horizon": 10, **task, **changes}
+    return train(table().between(0, 60), agent or chosen, **options)
+
+
+@pytest.fixture(scope="module", params=AGENTS)
+def policy(request):
+    return learned(request.param)
+
+
+def leaves(tree):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def same(one, two):
+    return all(np.array_equal(x, y) for x, y in zip(leaves(one), leaves(two), strict=True))
+
+
+def test_it_decides_by_the_mean_of_its_agents(policy):
+    held = np.array([0.4, 0.3, 0.2, 0.1])
+    task = on_table(policy.task, table())
+    each, _ = follow(task, policy.agent, policy.members, 70, np.tile(held, (2, 1)), 1)
+    targets, after = policy.decide(table(), 70, held, 5)
+    np.testing.assert_allclose(targets[0], each[:, 0].mean(0), atol=1e-6)
+    moved = np.append(1, table().values[71] / table().values[70])
+    np.testing.assert_allclose(after[0], targets[0] * moved / (targets[0] @ moved), atol=1e-6)
+    again, _ = policy.decide(table(), 71, after[0], 4)
+    np.testing.assert_allclose(again, targets[1:], atol=1e-5)
+    np.testing.assert_allclose(targets.sum(1), 1, atol=1e-12)
+    replayed = follow(task, policy.agent, policy.members, 70, held[None], 5, together=True)
+    for one, other in zip(replayed, (targets, after), strict=True):
+        assert one.shape == (1, 5, 4)
+        np.testing.assert_allclose(one[0], other, atol=1e-6)
+
+
+def test_it_comes_back_from_disk(policy, tmp_path):
+    policy.save(tmp_path / "kept")
+    kept = Policy.open(tmp_path / "kept")
+    assert (kept.assets, kept.features, kept.seeds, kept.rows) == (("a", "b", "c"), ("f0",), 2, 60)
+    assert kept.weights(table()) == policy.weights(table())
+    assert same(kept.learner, policy.learner)
+    assert kept.learned == policy.learned == np.datetime64("2020-02-29")
+    updated, kept_updated = (p.update(table(), 8) for p in (policy, kept))
+    assert same(updated.learner, kept_updated.learner)
+    updated.save(tmp_path / "updated")
+    assert Policy.open(tmp_path / "updated").updates == 1
+    with pytest.raises(QfolioError, match="not empty"):
+        policy.save(tmp_path / "kept")
+
+
+def test_a_damaged_folder_is_refused(policy, tmp_path):
+    policy.save(tmp_path / "kept")
+    path = tmp_path / "kept/policy.json"
+    config = json.loads(path.read_text())
+    for name, value in (
+        ("kind", "backtest"),
+        ("agent", None),
+        ("agent", "ddqn"),
+        ("assets", 3),
+        ("assets", [1, 2, 3]),
+        ("assets", ["a", "b"]),
+        ("seeds", 3),
+        ("seeds", 10**12),
+        ("rows", "many"),
+        ("learned", "some day"),
+        ("task", {"window": 0}),
+        ("task", []),
+        ("settings", {**config["settings"], "hidden": [9, 9]}),
+    ):
+        path.write_text(json.dumps({**config, name: value}))
+        with pytest.raises(QfolioError):
+            Policy.open(tmp_path / "kept")
+    path.write_text(json.dumps({k: v for k, v in config.items() if k != "learns"}))
+    with pytest.raises(QfolioError, match="damaged"):
+        Policy.open(tmp_path / "kept")
+    path.write_text(json.dumps(config))
+    (tmp_path / "kept/learning.safetensors").write_bytes(b"none")
+    with pytest.raises(QfolioError, match="safetensors"):
+        Policy.open(tmp_path / "kept")
+
+
+def test_it_goes_on_from_where_it_was(policy):
+    before, environments = policy.learner, policy.agent.environments
+    updated = policy.update(table(), 2 * environments)
+    assert updated.updates == 1
+    assert updated.rows == policy.rows
+    np.testing.assert_array_equal(updated.task.scale, policy.task.scale)
+    assert int(updated.task.first) == WINDOW
+    logs = np.diff(np.log(table().values), axis=0)[-59:]
+    np.testing.assert_allclose(updated.task.log_relatives[1:], logs, atol=1e-6)
+    if isinstance(policy.agent, DQN):
+        # 20 steps are learned from; 9 warm up the memory, and the rest of that episode is learned.
+        steps = updated.learner.optimizer.count - before.optimizer.count
+        np.testing.assert_array_equal(steps, 20 + 1)
+        np.testing.assert_array_equal(updated.learner.replay.size, 60)
+        np.testing.assert_array_equal(updated.learner.episodes, before.episodes + 6)
+    else:
+        np.testing.assert_array_equal(updated.learner.optimizer.count, before.optimizer.count + 4)
+    moved = [abs(x - y).max() for x, y in zip(leaves(policy.members), leaves(updated.members),
+             strict=True)]  # fmt: skip
+    assert 0 < max(moved) < 25 * policy.agent.learning_rate * module.UPDATE_RATE * 4
+    assert same(policy.update(table(), 2 * environments).learner, updated.learner)
+    again = updated.update(table(ROWS + 1))
+    assert again.updates == 2
+    assert not same(again.learner, updated.learner)
+
+
+def test_no_update_without_learning_state(policy):
+    bare = Policy(policy.task, policy.agent, policy.members, policy.assets, policy.features)
+    with pytest.raises(QfolioError, match="cannot go on learning"):
+        bare.update(table())
+    with pytest.raises(QfolioError, match="features"):
+        policy.update(table(features=2))
+    with pytest.raises(QfolioError, match="too few"):
+        policy.update(table().between(-12, None))
+    with pytest.raises(QfolioError, match="episodes is 0"):
+        policy.update(table(), 0)
+
+
+def test_nothing_is_learned_twice(policy):
+    with pytest.raises(QfolioError, match="up to 2020-02-29 already: there is nothing new"):
+        policy.update(table().between(0, 60))
+    updated = policy.update(table().between(0, 61))
+    assert updated.learned == np.datetime64("2020-03-01")
+    with pytest.raises(QfolioError, match="2020-03-01 already"):
+        updated.update(table().between(0, 61))
+
+
+def test_an_asset_needs_a_price_all_over_the_window(policy):
+    def joined(row):
+        new = table()
+        values = np.array(new.values)
+        values[:row, 1] = np.nan
+        return Prices(new.dates, new.assets, values, new.features, new.feature_names)
+
+    last = ROWS - 1
+    weights = policy.weights(joined(last - WINDOW))
+    assert weights == policy.weights(table())  # nothing before the window matters
+    with pytest.raises(QfolioError, match="begins on 2020-03-15, when there was no price of 'b'"):
+        policy.weights(joined(last - WINDOW + 1))
+    # What it may not hold may be younger, but needs a price to be sold at.
+    task = dataclasses.replace(policy.task, largest=policy.task.largest.at[1].set(0.0))
+    without = Policy(task, policy.agent, policy.members, policy.assets, policy.features)
+    assert without.weights(joined(last), {"b": 0.5})["b"] == 0
+    with pytest.raises(QfolioError, match="no price of 'b'"):
+        without.weights(joined(ROWS))
+
+
+def test_odd_holdings_are_refused(policy):
+    for holdings, said in (({"a": "x"}, "'x'; it must be a number"), ({"a": None}, "None; it must"),
+                           ({"a": -0.1}, "from 0 to 1"), ({"a": np.nan}, "from 0 to 1"),
+                           ({"d": 0.5}, "'d'"), ({"a": 0.7, "b": 0.7}, "sum to 1.4"),
+                           ({"a": 0.5, "cash": 0.4}, "sum to 0.9")):  # fmt: skip
+        with pytest.raises(QfolioError, match=said):
+            policy.weights(table(), holdings)
+
+
+def test_programs_that_are_used_again_learn_the_same():
+    """Members that share a program with earlier ones keep their own numbers and prices."""
+    fast = dataclasses.replace(AGENTS["pathwise"][0], learning_rate=0.1)
+    used = [learned("pathwise"), learned("pathwise", agent=fast), learned("pathwise")]
+    assert same(used[0].learner, used[2].learner)
+    assert not same(used[0].learner, used[1].learner)
+    training.programs_of.cache_clear()
+    assert same(learned("pathwise", agent=fast).learner, used[1].learner)
+
+
+def test_progress_and_settings():
+    seen = []
+    short = learned("pathwise", episodes=8, listener=seen.append)
+    assert seen == [1.0]
+    assert short.task.window == WINDOW
+    for options, said in (
+        ({"episodes": None}, "how many episodes"),
+        ({"episodes": 0}, "episodes is 0"),
+        ({"seeds": 0}, "seeds is 0"),
+        ({"seed": -1}, "seed is -1"),
+        ({"seed": 2**32 - 1}, "seed is 4294967295"),
+        ({"windw": 3}, "did you mean window"),
+        ({"agent": "dqm"}, "no preset"),
+    ):
+        with pytest.raises(QfolioError, match=said):
+            learned("pathwise", **options)

@@ -1,0 +1,204 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.agents.pathwise import Pathwise
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError
+from qfolio.core.evaluation import evaluate, start_keys
+from qfolio.core.mdp import Agent, Position, Transition
+from qfolio.core.registry import TASKS, find
+from qfolio.portfolio.costs import remainder_factor
+from qfolio.portfolio.synthetic import Ar1, GarleanuPedersen, Kelly, Merton, NoTrade, Regime
+from qfolio.solvers.followed import FollowedOptimum
+
+MARKETS = [name for name in TASKS if name.startswith("market/")]
+
+
+@pytest.fixture(params=MARKETS)
+def market(request):
+    return find("task", TASKS, request.param)(horizon=40)
+
+
+class Fixed(Agent):
+    """Plays a policy that is given, to be graded as an agent is."""
+
+    policy_of: object = None
+    environments = 1
+    episode_steps = 0
+    discount = None
+
+    def init(self, task, key): ...
+    def warm_up(self): ...
+    def act(self, state, observation, key): ...
+    def observe(self, state, rollout): ...
+    def learn(self, task, state, rollout, key): ...
+    def weights(self, state): ...
+
+    def policy(self, weights, observation):
+        return jnp.broadcast_to(weights, (observation.holding.shape[0], *weights.shape))
+
+
+def test_the_optimum_is_followed_on_the_paths_of_an_evaluation():
+    """A constant policy is graded the same as an agent and as an optimum."""
+    task = Ar1(horizon=30)
+    weights, keys = jnp.array([0.3, 0.7]), start_keys(16)
+    followed = FollowedOptimum(task, lambda state: weights).returns(keys)
+    graded = evaluate(task, Fixed(), weights, keys, 0).returns
+    np.testing.assert_allclose(followed, graded, atol=1e-6)
+
+
+def test_no_perturbed_policy_beats_the_exact_one(market):
+    """On common paths; markets differ in what a mistake costs, so only its sign is tested."""
+    best = market.optimum().policy
+    keys = start_keys(2048)
+    exact = market.optimum().returns(keys)
+    assert exact.mean() > 0
+
+    def perturbed(shift):
+        def policy(state):
+            action = best(state)
+            if isinstance(market, GarleanuPedersen):
+                return action + shift
+            risky = jnp.clip(action[1:] + shift, 0, 1)
+            risky = risky / jnp.maximum(risky.sum(), 1)
+            return jnp.concatenate([1 - risky.sum(keepdims=True), risky])
+
+        return policy
+
+    for shift in (-0.3, 0.3):
+        other = FollowedOptimum(market, perturbed(shift)).returns(keys)
+        difference = exact - other
+        error = difference.std() / np.sqrt(len(keys))
+        assert difference.mean() > -2 * error
+        if not isinstance(market, Regime):  # always in or out: a shift is often clipped away
+            assert difference.mean() > 2 * error
+
+
+def test_figures_of_the_exact_rules():
+    assert Kelly().rule(Kelly().best())["fraction"] == pytest.approx(0.6)
+    region = NoTrade().rule(NoTrade().best())
+    assert region["low"] == pytest.approx(0.4091, abs=1e-3)  # monthly; continuously 0.4010
+    assert region["high"] == pytest.approx(0.5909, abs=1e-3)
+    coefficients = GarleanuPedersen().rule(GarleanuPedersen().best())
+    assert coefficients["of the position"] == pytest.approx(0.645664384, abs=1e-5)
+    assert coefficients["of the factor"] == pytest.approx(6.139213092, abs=1e-4)
+    weights = Merton().rule(Merton().best())
+    assert weights["weight of asset 3"] == 0
+    assert weights["weight of asset 1"] > 0.3
+    regime = Regime().rule(Regime().best())
+    assert regime == {"from 0.0 in bad times": 0, "from 1.0 in bad times": 0,
+                      "from 0.0 in good times": 1, "from 1.0 in good times": 1}  # fmt: skip
+    stay_out = Regime(cost=0.03).rule(Regime(cost=0.03).best())
+    assert stay_out["from 0.0 in good times"] == 0
+
+
+def test_merton_scenarios_have_the_moments_that_are_stated():
+    logs = np.log(Merton.table())
+    np.testing.assert_allclose(logs.std(0, ddof=1), Merton.volatilities, rtol=1e-6)
+    expected = np.array(Merton.means) - np.array(Merton.volatilities) ** 2 / 2
+    np.testing.assert_allclose(logs.mean(0), expected, atol=1e-9)
+
+
+def test_the_regime_pays_what_was_seen():
+    task = Regime(cost=0.005)
+    for market, sign in ((0, -1), (1, 1)):
+        state = Position(jnp.array(market), task.hold(jnp.array([0.0, 1.0])))
+        step = task.step(state, jnp.array([0.0, 1.0]), jax.random.key(market))
+        np.testing.assert_allclose(step.reward, sign * 0.002, atol=1e-7)
+        step = task.step(state, jnp.array([1.0, 0.0]), jax.random.key(market))
+        np.testing.assert_allclose(step.reward, np.log(1 - 0.005), atol=1e-6)
+
+
+def test_no_trade_pays_expected_growth():
+    task = NoTrade()
+    state = Position(jnp.array(0.0), task.hold(jnp.array([0.5, 0.5])))
+    rewards = [task.step(state, jnp.array([0.5, 0.5]), jax.random.key(i)).reward for i in (1, 2)]
+    assert rewards[0] == rewards[1]
+    dt, half = task.dt, 0.5
+    expected = (half * task.rate - half**2 * task.volatility**2 / 2) * dt
+    np.testing.assert_allclose(rewards[0], expected, rtol=0.02)
+    traded = task.step(state, jnp.array([0.2, 0.8]), jax.random.key(1)).reward
+    cost = remainder_factor(jnp.array([0.5, 0.5]), jnp.array([0.2, 0.8]), task.cost)
+    assert traded < jnp.log(cost) + 0.001
+
+
+def test_the_stationary_signal():
+    task = Ar1()
+    signals = jax.vmap(task.reset_market)(start_keys(4000))
+    keys = jax.random.split(jax.random.key(1), 4000)
+    later = jax.vmap(task.next_market)(signals, keys)
+    for x in (signals.signal, later.signal):
+        assert float(x.std()) == pytest.approx(task.spread, rel=0.05)
+    gains = later.relative - 1 - task.drift - task.slope * signals.signal
+    assert float(gains.std()) == pytest.approx(task.volatility, rel=0.05)
+    assert float(gains.mean()) == pytest.approx(0, abs=4 * task.volatility / 4000**0.5)
+
+
+@pytest.fixture
+def double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.mark.parametrize("tail", [0, 5])
+@pytest.mark.usefixtures("double_precision")
+def test_gradient_of_a_rollout_against_finite_differences(tail):
+    """Through costs, drift and the simplex, by hand; in the tail, decisions stand as they are."""
+    task = Ar1(horizon=8, cost=0.01)
+    agent = Pathwise(rollout=8, tail=tail, environments=3, hidden=(4, 4), pull=0.0)
+    policy = agent.init(task, jax.random.key(2)).policy
+    starts = jax.vmap(task.reset)(jax.random.split(jax.random.key(5), 3))
+    markets = [starts.market]
+    for key in jax.random.split(jax.random.key(6), 8):
+        markets.append(jax.vmap(task.next_market)(markets[-1], jax.random.split(key, 3)))
+    stack = lambda trees: jax.tree.map(lambda *x: jnp.stack(x), *trees)  # noqa: E731
+    holdings = jax.tree.map(lambda x: jnp.broadcast_to(x, (8, *x.shape)), starts.holding)
+    states = Position(stack(markets[:-1]), holdings)
+    rollout = Transition(
+        states, jax.vmap(jax.vmap(task.observe))(states), jnp.zeros(8), jnp.zeros(8),
+        Position(stack(markets[1:]), holdings), None, jnp.zeros(8), jnp.zeros(8),
+    )  # fmt: skip
+
+    def with_linear(linear):
+        return eqx.tree_at(lambda p: p.network.linear, policy, linear)
+
+    def by_hand(linear):
+        holding, total = starts.holding, 0.0
+        for time in range(8):
+            acting = with_linear(linear) if time < 8 - tail else policy
+            view = jax.vmap(task.observe)(Position(markets[time], holding))
+            settle = jax.vmap(task.settle)
+            reward, holding = settle(markets[time], markets[time + 1], holding, acting(view))
+            total -= float(reward.sum()) / (3 * (8 - tail))
+        return total
+
+    linear = policy.network.linear
+    gradient = jax.grad(lambda x: agent._loss(with_linear(x), task, rollout))(linear)
+    assert abs(gradient).max() > 1e-4
+    for place in ((0, 0), (1, 1), (0, 1)):
+        bump = jnp.zeros_like(linear).at[place].set(1e-7)
+        slope = (by_hand(linear + bump) - by_hand(linear - bump)) / 2e-7
+        np.testing.assert_allclose(gradient[place], slope, rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("agent", "menu", "message"),
+    [
+        (DQN(), "", "menu of allocations"), (Pathwise(rollout=10), "grid:4", "leave menu empty"),
+        (DQN(network="mlp"), "grid:4", "menu with choices for each"),
+        (Pathwise(rollout=7), "", "rollout is 7"),
+    ],
+)  # fmt: skip
+def test_agents_that_do_not_fit(agent, menu, message):
+    task = settings.build(Regime, {"menu": menu, "horizon": 40})
+    with pytest.raises(QfolioError, match=message):
+        agent.init(task, jax.random.key(0))
+
+
+def test_all_actions_need_a_market(task):
+    with pytest.raises(QfolioError, match="all_actions needs a market"):
+        DQN(all_actions=True).init(task, jax.random.key(0))

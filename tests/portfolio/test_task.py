@@ -1,0 +1,234 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.agents.pathwise import Pathwise
+from qfolio.core.errors import QfolioError
+from qfolio.core.evaluation import start_keys
+from qfolio.core.mdp import Discrete, Position, Simplex
+from qfolio.core.training import Population
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.costs import drift
+from qfolio.portfolio.market import Menu
+from qfolio.portfolio.policy import follow
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+
+ROWS, ASSETS, WINDOW = 60, 3, 5
+
+
+def table(seed=0, rows=ROWS, features=0):
+    rng = np.random.default_rng(seed)
+    values = 100 * np.exp(np.cumsum(rng.normal(0, 0.02, (rows, ASSETS)), axis=0))
+    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    names = tuple(f"f{i}" for i in range(features))
+    extra = rng.normal(3, 2, (rows, ASSETS, features))
+    return Prices(dates, ("a", "b", "c"), values, extra, names)
+
+
+def portfolio(prices=None, **settings):
+    prices = table() if prices is None else prices
+    return Portfolio.of(prices, **{"window": WINDOW, "horizon": 10, **settings})
+
+
+@pytest.mark.parametrize("lag", [0, 1, 2])
+@pytest.mark.parametrize("menu", ["", "tilts:0.2"])
+def test_rewards_are_the_log_returns_of_the_replay(lag, menu):
+    """The task pays, in float32, what the float64 replay of the same decisions earns."""
+    task, prices = portfolio(lag=lag, menu=menu, cost=0.01), table()
+    state = Position(task.first, task.hold(jnp.array([1.0, 0, 0, 0])))
+    rng, decisions, rewards = np.random.default_rng(1), [], []
+    for _ in range(20):
+        action = jnp.array(rng.integers(task.actions.n) if menu else rng.dirichlet(np.ones(4)))
+        action = action.astype(jnp.int32 if menu else jnp.float32)
+        decisions.append(np.asarray(task.intent(state, action), float))
+        step = task.step(state, action, jax.random.key(0))
+        rewards.append(float(step.reward))
+        state = step.state
+    decisions = np.array(decisions) / np.sum(decisions, axis=1, keepdims=True)
+    replay = simulate(prices.values, decisions, first=WINDOW, cost=0.01, lag=lag)
+    np.testing.assert_allclose(rewards, replay.growth, atol=2e-6)
+
+
+def test_no_order_is_free_at_any_lag():
+    task = portfolio(menu="tilts:0.5", lag=2, cost=0.1)
+    held = task.hold(jnp.array([0.1, 0.2, 0.3, 0.4]))
+    state = Position(task.first, held)
+    reward = task.step(state, jnp.array(0), jax.random.key(0)).reward
+    moved = task.relatives(task.first, task.first + 1)
+    after = drift(held.weights, moved.waiting)
+    np.testing.assert_allclose(reward, jnp.log(after[0] + after[1:] @ moved.earning), atol=1e-6)
+
+
+def test_a_window_ends_today():
+    prices = table()
+    task = portfolio(prices)
+    logs = np.diff(np.log(prices.values), axis=0)
+    seen = task.features(jnp.array(20))[..., 0] * task.scale[0]
+    np.testing.assert_allclose(seen, logs[20 - WINDOW : 20].T, rtol=1e-4, atol=1e-7)
+
+
+def test_extra_features_are_standardised_over_the_part():
+    prices = table(features=2)
+    task = portfolio(prices).part(10, 40)
+    part = prices.features[11:41]
+    expected = (prices.features[30] - part.mean((0, 1))) / part.std((0, 1))
+    np.testing.assert_allclose(task.features(jnp.array(30))[:, -1, 1:], expected, atol=1e-4)
+
+
+def test_a_part_knows_nothing_of_the_rest():
+    """Starts, windows, rewards and scales come from the rows of the part alone."""
+    prices = table()
+    later = prices.values.copy()
+    later[41:] *= 7.0
+    later[:10] *= 5.0
+    other = Prices(prices.dates, prices.assets, later)
+    one, two = (portfolio(p, lag=1).part(10, 40) for p in (prices, other))
+    assert (int(one.first), int(one.last)) == (10 + WINDOW, 40 - 2)
+    np.testing.assert_array_equal(one.scale, two.scale)
+    for row in range(int(one.first), int(one.last) + 1):
+        np.testing.assert_array_equal(one.features(jnp.array(row)), two.features(jnp.array(row)))
+        for x, y in zip(one.relatives(row, row + 1), two.relatives(row, row + 1), strict=True):
+            np.testing.assert_array_equal(x, y)
+    starts = jax.vmap(one.reset_market)(start_keys(500))
+    assert starts.min() == one.first
+    assert starts.max() == one.last - one.horizon + 1
+
+
+AGENTS = {
+    "dqn": (DQN(network="mlp", hidden=(8, 8), all_actions=True, environments=2, batch_size=8,
+                learning_starts=20, replay_capacity=100, episode_steps=0), "tilts:0.1"),
+    "dqn-single": (DQN(network="flat", hidden=(8,), environments=2, batch_size=8,
+                       learning_starts=20, replay_capacity=100, episode_steps=0), "tilts:0.1"),
+    "pathwise": (Pathwise(rollout=5, environments=4, hidden=(8, 8), learning_rate=0.03), ""),
+    "pathwise-cnn": (Pathwise(network="cnn", rollout=5, environments=4, hidden=(8, 8)), ""),
+    "pathwise-rnn": (Pathwise(network="rnn", rollout=5, environments=4, hidden=(8, 8)), ""),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=AGENTS)
+def trained(request):
+    agent, menu = AGENTS[request.param]
+    task = portfolio(menu=menu).part(0, 40)
+    population = Population(task, agent, [0, 1])
+    while population.steps < 60:
+        population.advance(60)
+    return task, agent, population.weights()
+
+
+def test_no_agent_looks_ahead(trained):
+    """Changing every price after t changes no weight decided up to t."""
+    task, agent, members = trained
+    start = np.tile([1.0, 0, 0, 0], (2, 1))
+    targets, _ = follow(task, agent, members, 40, start, 20)
+    assert np.isfinite(targets).all()
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        t = int(rng.integers(40, ROWS - 1))
+        other = table().values.copy()
+        other[t + 1 :] *= np.exp(rng.normal(0, 0.5, other[t + 1 :].shape))
+        arrays = Portfolio.arrays(Prices(table().dates, ("a", "b", "c"), other))
+        changed = portfolio_with(task, arrays)
+        again, _ = follow(changed, agent, members, 40, start, 20)
+        np.testing.assert_array_equal(again[:, : t - 39], targets[:, : t - 39])
+        assert not np.array_equal(changed.log_relatives, task.log_relatives)
+
+
+def portfolio_with(task, arrays):
+    import equinox as eqx
+
+    return eqx.tree_at(lambda t: (t.log_relatives, t.extra), task, arrays)
+
+
+def test_weights_stay_on_the_simplex(trained):
+    task, agent, members = trained
+    targets, held = follow(task, agent, members, 40, np.tile([1.0, 0, 0, 0], (2, 1)), 20)
+    for weights in (targets, held):
+        np.testing.assert_allclose(weights.sum(-1), 1, atol=1e-5)
+        assert weights.min() >= 0
+
+
+def test_agents_do_not_depend_on_the_order_of_columns(trained):
+    task, agent, members = trained
+    if getattr(agent, "network", "") == "flat":
+        pytest.skip("a flat network reads columns in their order")
+    order = np.array([2, 0, 1])
+    shuffled = portfolio_with(task, (task.log_relatives[:, order], task.extra[:, order]))
+    start = np.tile([0.4, 0.3, 0.2, 0.1], (2, 1))
+    targets, _ = follow(task, agent, members, 40, start, 1)
+    entries = np.append(0, 1 + order)
+    again, _ = follow(shuffled, agent, members, 40, start[:, entries], 1)
+    np.testing.assert_allclose(again, targets[..., entries], atol=1e-5)
+
+
+def test_limits():
+    values = table().values.copy()
+    values[:30, 1] = np.nan
+    task = portfolio(Prices(table().dates, ("a", "b", "c"), values), cap=0.4)
+    np.testing.assert_allclose(task.limits, [0.4, 0, 0.4])
+    target = task.target(jnp.array([1.0, 0, 0, 0]), jnp.array([0.1, 0.5, 0.3, 0.1]))
+    np.testing.assert_allclose(target, [0.5, 0.4, 0, 0.1], atol=1e-6)
+    assert task.part(30, 59).limits.min() == pytest.approx(0.4)
+
+
+def test_menus():
+    grid = Menu("grid:4", jnp.ones(1))
+    assert grid.actions == Discrete(5)
+    np.testing.assert_allclose(grid.weights(jnp.array([1.0, 0]), jnp.array(3)), [0.25, 0.75])
+    tilts = Menu("tilts:0.1", jnp.ones(2))
+    assert tilts.actions == Discrete(7, pooled=3, each=2)
+    held = jnp.array([0.5, 0.3, 0.2])
+    choices = [tilts.weights(held, jnp.array(i)) for i in range(7)]
+    expected = [held, [1, 0, 0], [0, 0.5, 0.5], [0, 1, 0], [0, 0, 1], [0.45, 0.37, 0.18],
+                [0.45, 0.27, 0.28]]  # fmt: skip
+    np.testing.assert_allclose(choices, np.array(expected), atol=1e-6)
+    some = Menu("tilts:0.1", jnp.array([0.5, 0.0, 0.5]))
+    np.testing.assert_allclose(some.weights(jnp.ones(4) / 4, jnp.array(2)), [0, 0.5, 0, 0.5])
+    over = Menu("overweight:0.1", jnp.ones(2))
+    assert over.actions == Discrete(5, pooled=3, each=1)
+    choices = [over.weights(held, jnp.array(i)) for i in (0, 2, 3, 4)]
+    expected = [held, [0, 0.5, 0.5], [0, 0.55, 0.45], [0, 0.45, 0.55]]
+    np.testing.assert_allclose(choices, np.array(expected), atol=1e-6)
+    assert portfolio().actions == Simplex(3)
+
+
+@pytest.mark.parametrize("menu", ["grid", "grid:0", "grid:1.5", "tilts:1", "tilts:x", "grid:400"])
+def test_menus_that_are_none(menu):
+    with pytest.raises(QfolioError, match="menu"):
+        _ = portfolio(menu=menu).actions
+
+
+def test_utilities_by_hand():
+    growth, moments = jnp.array(1.02), jnp.array([0.001, 4e-4])
+    utility = lambda **settings: portfolio(**settings).utility(growth, moments)  # noqa: E731
+    np.testing.assert_allclose(utility()[0], np.log(1.02), rtol=1e-5)
+    np.testing.assert_allclose(
+        utility(reward="crra", risk_aversion=3.0)[0], (1.02**-2 - 1) / -2, rtol=1e-4
+    )
+    np.testing.assert_allclose(
+        utility(reward="crra", risk_aversion=1.0)[0], np.log(1.02), rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        utility(reward="mean-variance", risk_aversion=3.0)[0], 0.02 - 1.5 * 0.02**2, rtol=1e-4
+    )
+    # Moody & Saffell (1998): (B ΔA − ½ A ΔB) / (B − A²)^1.5
+    ratio, after = utility(reward="differential-sharpe", sharpe_rate=0.1)
+    change = np.array([0.02 - 0.001, 0.02**2 - 4e-4])
+    expected = (4e-4 * change[0] - 0.5 * 0.001 * change[1]) / (4e-4 - 1e-6) ** 1.5
+    np.testing.assert_allclose(ratio, expected, rtol=1e-3)
+    np.testing.assert_allclose(after, np.array(moments) + 0.1 * change, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"window": 0}, "window is 0"), ({"lag": -1}, "lag is -1"), ({"cost": 0.5}, "cost is 0.5"),
+        ({"reward": "profit"}, "reward is profit"), ({"cap": 0.0}, "cap is 0"),
+        ({"window": 58}, "60 rows are too few"),
+    ],
+)  # fmt: skip
+def test_settings_that_do_not_fit(settings, message):
+    with pytest.raises(QfolioError, match=message):
+        portfolio(**settings)

@@ -1,0 +1,18 @@
+"""The command line as a test types it."""
+
+import sys
+
+import pytest
+
+from qfolio.cli import main
+
+TINY = ["--set", "hidden=8", "environments=2", "batch_size=8", "learning_starts=16",
+        "episode_steps=0", "horizon=20"]  # fmt: skip
+
+
+def qfolio(monkeypatch, *arguments):
+    """The command's exit code; what it printed is in capsys."""
+    monkeypatch.setattr(sys, "argv", ["qfolio", *map(str, arguments)])
+    with pytest.raises(SystemExit) as exit:
+        main()
+    return exit.value.code
