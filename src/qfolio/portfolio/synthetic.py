@@ -20,7 +20,12 @@ from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Box, ExogenousTask, Policy, Position, View
 from qfolio.portfolio.costs import drift, remainder_factor
 from qfolio.portfolio.market import Holding, Market, Relatives
-from qfolio.solvers import markets as exact
+from qfolio.solvers.ar1 import ar1
+from qfolio.solvers.garleanu_pedersen import garleanu_pedersen
+from qfolio.solvers.kelly import kelly
+from qfolio.solvers.merton import growth_optimal
+from qfolio.solvers.no_trade import NoTradeRegion, no_trade_region_discrete
+from qfolio.solvers.regime import regime
 from qfolio.solvers.followed import FollowedOptimum
 
 
@@ -89,7 +94,7 @@ class Kelly(OneAsset):
         return Relatives(jnp.ones(1), next_market[None], next_market[None])
 
     def best(self) -> Policy:
-        fraction, _ = exact.kelly(self.up, self.down, self.probability)
+        fraction, _ = kelly(self.up, self.down, self.probability)
         return lambda state: jnp.array([1 - fraction, fraction], jnp.float32)
 
     def rule(self, policy: Policy) -> dict[str, float]:
@@ -146,7 +151,7 @@ class Merton(Market, Synthetic):
 
     def best(self) -> Policy:
         scenarios = np.column_stack([np.ones(self.scenarios), self.table()])
-        weights = jnp.asarray(exact.growth_optimal(scenarios).weights, jnp.float32)
+        weights = jnp.asarray(growth_optimal(scenarios).weights, jnp.float32)
         return lambda state: weights
 
     def rule(self, policy: Policy) -> dict[str, float]:
@@ -189,7 +194,7 @@ class Regime(OneAsset):
         return Relatives(jnp.ones(1), moved, moved)
 
     def best(self) -> Policy:
-        solution = exact.regime(
+        solution = regime(
             (self.stay, self.stay), (-self.mean, self.mean), -np.log1p(-self.cost)
         )
         table = jnp.asarray(solution.policy)
@@ -267,7 +272,7 @@ class Ar1(OneAsset):
 
     def best(self) -> Policy:
         levels = np.linspace(0, 1, self.levels)
-        solution = exact.ar1(
+        solution = ar1(
             self.rho, self.noise, self.drift, self.slope, self.volatility, self.cost, levels,
             self.optimum_discount,
         )  # fmt: skip
@@ -352,9 +357,9 @@ class NoTrade(OneAsset):
         moved = jnp.exp(next_market)[None]
         return jnp.log(remainder) + growth, self.hold(drift(target, moved))
 
-    def region(self) -> exact.NoTradeRegion:
+    def region(self) -> NoTradeRegion:
         """The exact region, for steps of ``dt``."""
-        return exact.no_trade_region_discrete(self.rate, self.volatility, self.cost, self.dt)
+        return no_trade_region_discrete(self.rate, self.volatility, self.cost, self.dt)
 
     def best(self) -> Policy:
         low, high, _ = self.region()
@@ -434,7 +439,7 @@ class GarleanuPedersen(Synthetic):
         return market.weight * ((1 - self.rho) * gain - cost), action
 
     def best(self) -> Policy:
-        of_position, of_factor, *_ = exact.garleanu_pedersen(
+        of_position, of_factor, *_ = garleanu_pedersen(
             self.phi, self.risk_aversion, self.cost_scale, self.loading, self.variance, self.rho
         )
         return lambda state: of_position * state.holding + of_factor * state.market.factor

@@ -1,0 +1,163 @@
+"""A return that an AR(1) signal predicts, with proportional costs: dynamic programming."""
+
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from qfolio.core.errors import QfolioError
+
+from qfolio.solvers.shared import log_remainder, gauss, require
+
+
+LEVELS = tuple(i / 10 for i in range(11))
+"""The weights to choose from in the market ``ar1``."""
+
+
+@dataclass(frozen=True)
+class Ar1Optimum:
+    """The solved market of ``ar1``; shapes name signal s, holding h and level a."""
+
+    signals: Float[np.ndarray, " s"]
+    holdings: Float[np.ndarray, " h"]
+    """Weights before the decision."""
+    levels: Float[np.ndarray, " a"]
+    """Weights to choose from."""
+    value: Float[np.ndarray, "s h"]
+    """Discounted log growth, net of costs, by signal seen and weight held."""
+    after: Float[np.ndarray, "s a"]
+    """The same once the level is reached and the cost is paid."""
+    actions: Int[np.ndarray, "s h"]
+    """Best level, as an index."""
+    growth: float
+    """Of the best policy, a year."""
+    cost: float
+    growth_of: Callable[[Int[np.ndarray, "s h"]], float]
+    """Stationary growth a year of any table of actions."""
+
+    def policy(self, x: ArrayLike, weight: ArrayLike) -> Int[np.ndarray, "..."]:
+        """Index of the best level at any signal x and weight held; both broadcast."""
+        x, weight = np.broadcast_arrays(np.asarray(x, float), np.asarray(weight, float))
+        after = np.stack([np.interp(x, self.signals, column) for column in self.after.T], -1)
+        trade = log_remainder(weight[..., None], self.levels, self.cost)
+        return np.asarray((trade + after).argmax(-1))
+
+
+def ar1(
+    rho: float = 0.95,
+    noise: float = 0.3122,
+    drift: float = 0.0002,
+    slope: float = 0.004,
+    volatility: float = 0.01,
+    cost: float = 0.002,
+    levels: ArrayLike = LEVELS,
+    discount: float = 0.97,
+    drifting: bool = True,
+    signal_points: int = 201,
+    holding_parts: int = 4,
+    steps_per_year: int = 252,
+) -> Ar1Optimum:
+    """The best weights of one asset whose mean return follows a signal, with trading costs.
+
+    At each step the agent sees the signal x and the weight it holds and names a level b. It pays
+    the remainder factor from weight to level, then earns log(1 + b r), where
+    r = drift + slope·x + volatility·η is a simple return with the mean of the signal *seen*; then
+    x' = rho·x + noise·ε. With ``drifting`` the weight moves with the price, to
+    b(1 + r)/(1 + b r), and is brought back at a cost; without, it stays at its level.
+
+    Value iteration on (signal, weight): the expectation over x' is a sum over equally spaced
+    signals within five standard deviations (exact to rounding for smooth functions), that over η
+    Gauss–Hermite quadrature; weights between the grid's are interpolated. Values are exact to
+    about 1e-6, growth to about 2e-5 a year at the default grids.
+
+    Args:
+        rho, noise: Of the signal; |rho| < 1, noise > 0.
+        drift, slope, volatility: Of the return, per step.
+        cost: One way, at least 0 and below 1.
+        levels: Ascending weights in [0, 1] to choose from.
+        discount: Per step, from 0 to 0.9999.
+        drifting: Whether prices move the weights.
+        signal_points: Size of the signal's grid.
+        holding_parts: Cells of the grid of held weights between two levels.
+        steps_per_year: Turns growth per step into growth a year.
+
+    Raises:
+        QfolioError: A parameter is out of range, or returns below −100 % are too likely.
+    """
+    b = np.asarray(levels, dtype=float)
+    numbers = np.array([rho, noise, drift, slope, volatility, cost, discount])
+    require(bool(np.all(np.isfinite(numbers))), f"parameters must be finite; not {numbers}")
+    require(abs(rho) < 1 and noise > 0, f"the signal needs |rho| < 1, noise > 0; not {rho, noise}")
+    require(0 <= cost < 1, f"cost must be at least 0 and below 1; not {cost}")
+    require(0 <= discount <= 0.9999, f"discount must lie in [0, 0.9999]; not {discount}")
+    require(
+        b.ndim == 1 and b.size > 1 and b[0] >= 0 and b[-1] <= 1 and bool(np.all(np.diff(b) > 0)),
+        "levels must be two or more ascending weights between 0 and 1",
+    )
+    require(signal_points >= 11 and holding_parts >= 1, "the grids are too coarse")
+    spread = noise / math.sqrt(1 - rho**2)
+    x = np.linspace(-5 * spread, 5 * spread, signal_points)
+    transition = np.exp(-0.5 * ((x - rho * x[:, None]) / noise) ** 2)
+    transition /= transition.sum(1, keepdims=True)
+    nodes, chances = gauss(9)
+    returns = (drift + slope * x)[:, None, None] + volatility * nodes  # (s, 1, q)
+    require(
+        float(returns.min()) > -1,
+        "returns below −100 % are too likely; lower slope, noise or volatility",
+    )
+    grown = 1 + b[:, None] * returns  # (s, a, q)
+    reward = np.log(grown) @ chances
+    ends = np.union1d([0.0, 1.0], b)
+    places = np.arange((len(ends) - 1) * holding_parts + 1) / holding_parts
+    holdings = np.interp(places, np.arange(len(ends)), ends) if drifting else b
+    later = b[:, None] * ((1 + returns) / grown if drifting else np.ones_like(grown))
+    cell = np.clip(np.searchsorted(holdings, later, side="right") - 1, 0, len(holdings) - 2)
+    share = np.clip((later - holdings[cell]) / (holdings[cell + 1] - holdings[cell]), 0, 1)
+    row = np.arange(len(x))[:, None, None]
+    trade = log_remainder(holdings[:, None], b, cost)  # (h, a)
+
+    def look_ahead(value: np.ndarray) -> np.ndarray:
+        """Reward and discounted value by signal and level."""
+        then = transition @ value
+        mean = (1 - share) * then[row, cell] + share * then[row, cell + 1]
+        return np.asarray(reward + discount * (mean @ chances))
+
+    value = np.zeros((len(x), len(holdings)))
+    while True:
+        after = look_ahead(value)
+        change = (trade + after[:, None, :]).max(-1) - value
+        value = value + change
+        # What is left of the sum of changes lies between these multiples (MacQueen 1966).
+        low, high = (discount / (1 - discount) * float(end) for end in (change.min(), change.max()))
+        if high - low < 1e-9:
+            break
+    value += (low + high) / 2
+    after = look_ahead(value)
+    actions = (trade + after[:, None, :]).argmax(-1)
+
+    def growth_of(actions: Int[np.ndarray, "s h"]) -> float:
+        """Stationary growth a year, starting in cash, by following the distribution of states."""
+        states = np.zeros((len(x), len(holdings)))
+        states[:, 0] = np.exp(-((x / spread) ** 2) / 2)
+        states /= states.sum()
+        s, h = np.indices(states.shape)
+        earned = trade[h, actions] + reward[s, actions]
+        places = (row * len(holdings) + np.stack([cell, cell + 1])).ravel()
+        shares = np.stack([1 - share, share])
+        for _ in range(100_000):
+            chosen = np.bincount((s * len(b) + actions).ravel(), states.ravel(), reward.size)
+            mass = chosen.reshape(reward.shape)[..., None] * chances
+            moved = np.bincount(places, (mass * shares).ravel(), states.size)
+            before, states = states, transition.T @ moved.reshape(states.shape)
+            if np.abs(states - before).max() < 1e-12:
+                break
+        return steps_per_year * float((states * earned).sum())
+
+    growth = growth_of(actions)
+    return Ar1Optimum(x, holdings, b, value, after, actions, growth, cost, growth_of)

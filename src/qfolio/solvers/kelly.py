@@ -1,0 +1,43 @@
+"""Kelly's bet: the fraction of wealth to stake on a repeated two-point bet."""
+
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from qfolio.core.errors import QfolioError
+
+from qfolio.solvers.shared import require
+
+
+def kelly(up: float, down: float, probability: float) -> tuple[float, float]:
+    """The fraction of wealth to bet when a stake becomes ``up`` or ``down`` times itself.
+
+    Source: J. L. Kelly, "A New Interpretation of Information Rate" (1956). Long only: the fraction
+    is clipped to [0, 1].
+
+    Args:
+        up: Relative with the given probability, above 1.
+        down: Relative otherwise, at least 0 and below 1.
+        probability: Of ``up``.
+
+    Returns:
+        The fraction and the growth per bet.
+
+    Raises:
+        QfolioError: A parameter is out of range, so that one side of the bet is never worse.
+    """
+    from scipy.special import xlogy
+
+    require(0 <= down < 1 < up < math.inf, f"a bet needs 0 ≤ down < 1 < up; not {down} and {up}")
+    require(0 <= probability <= 1, f"a probability lies between 0 and 1; not at {probability}")
+    fraction = probability / (1 - down) - (1 - probability) / (up - 1)
+    fraction = min(max(fraction, 0.0), 1.0)
+    win, lose = 1 + fraction * (up - 1), 1 - fraction * (1 - down)
+    return fraction, float(xlogy(probability, win) + xlogy(1 - probability, lose))

@@ -1,0 +1,216 @@
+"""The growth-optimal portfolio on the simplex, and Merton's for returns in continuous time."""
+
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from qfolio.core.errors import QfolioError
+
+from qfolio.solvers.shared import gauss, require
+
+
+class GrowthOptimum(NamedTuple):
+    weights: Float[np.ndarray, " asset"]
+    growth: float
+    """Expected log relative per step."""
+    violation: float
+    """Worst violation of the optimality conditions; growth is optimal to within this number."""
+
+
+def growth_optimal(
+    relatives: ArrayLike, probabilities: ArrayLike | None = None, tol: float = 1e-9
+) -> GrowthOptimum:
+    """The weights b on the simplex that maximise E log(b·x) over finitely many scenarios.
+
+    On the rows of a price history this is the best constant-rebalanced portfolio. Since
+    b·∇E log(b·x) = 1, the maximum of E log(b·x) − Σb over b ≥ 0 lies on the simplex by itself, and
+    b is optimal exactly if E[x_i/(b·x)] ≤ 1 for all i, with equality where b_i > 0 (T. Cover, "An
+    Algorithm for Maximizing Expected Log Investment Return", 1984, theorem 1). Cover's iteration
+    starts, a primal-dual interior-point method follows, and Newton's method on the assets held
+    takes it to rounding error.
+
+    Args:
+        relatives: Shape (scenario, asset), at least 0; cash, if wanted, is a column of ones.
+        probabilities: Shape (scenario,), summing to 1; equal ones by default.
+        tol: Largest violation of the conditions that is accepted.
+
+    Raises:
+        QfolioError: The arguments are no scenarios, every asset is worth nothing in one of them,
+            or the tolerance is out of reach.
+    """
+    x = np.asarray(relatives, dtype=float)
+    require(
+        x.ndim == 2 and x.size > 0 and bool(np.all(np.isfinite(x) & (x >= 0))),
+        "relatives must be a table (scenario, asset) of finite numbers that are not negative",
+    )
+    p = np.full(len(x), 1 / len(x)) if probabilities is None else np.asarray(probabilities, float)
+    require(
+        p.shape == (len(x),) and bool(np.all(p >= 0)) and abs(p.sum() - 1) < 1e-9,
+        f"probabilities must be {len(x)} numbers, not negative, that sum to 1",
+    )
+    x, p = x[p > 0], p[p > 0]
+    best = x.max(1, keepdims=True)
+    require(bool(np.all(best > 0)), "in one scenario every asset is worth nothing; add cash")
+    y = x / best  # changes neither the weights nor the conditions, and keeps numbers near 1
+    b = np.full(y.shape[1], 1 / y.shape[1])
+    for _ in range(10):
+        b = b * _marginal(y, p, b)
+    b = _newton_on_support(y, p, *_interior_point(y, p, b), tol)
+    slope = _marginal(y, p, b) - 1
+    violation = float(np.max(np.where(b > 0, np.abs(slope), slope)))
+    require(
+        violation <= tol,
+        f"the growth-optimal weights violate the optimality conditions by {violation:.1g}, more "
+        f"than tol={tol:.1g}; give a larger tolerance",
+    )
+    return GrowthOptimum(b, float(p @ np.log(x @ b)), max(violation, 0.0))
+
+
+def _marginal(
+    x: Float[np.ndarray, "s n"], p: Float[np.ndarray, " s"], b: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """E[x_i / (b·x)]"""
+    return np.asarray((p / (x @ b)) @ x)
+
+
+def _curvature(
+    x: Float[np.ndarray, "s n"], p: Float[np.ndarray, " s"], b: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n n"]:
+    """E[x x'/(b·x)²], minus the Hessian"""
+    scaled = x * (np.sqrt(p) / (x @ b))[:, None]
+    return np.asarray(scaled.T @ scaled)
+
+
+def _interior_point(
+    x: Float[np.ndarray, "s n"], p: Float[np.ndarray, " s"], b: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Weights b > 0 and multipliers z > 0 with E[x/(b·x)] − 1 + z = 0 and b z = 0, nearly."""
+    b = np.maximum(b, 1e-6)
+    z = np.full_like(b, 0.1)
+
+    def residual(b: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, float]:
+        balance = _marginal(x, p, b) - 1 + z
+        return balance, math.hypot(float(np.linalg.norm(balance)), float(np.linalg.norm(b * z)))
+
+    balance, error = residual(b, z)
+    for _ in range(200):
+        target = 0.1 * float(b @ z) / len(b)
+        if error < 1e-13:
+            break
+        system = _curvature(x, p, b) + np.diag(z / b)
+        step_b = np.linalg.solve(system, balance - z + target / b)
+        step_z = (target - z * step_b) / b - z
+        length = 1.0
+        for value, step in ((b, step_b), (z, step_z)):
+            falling = step < 0
+            length = min(length, 0.99 * float(np.min(-value[falling] / step[falling], initial=2)))
+        while length > 1e-12:
+            tried = b + length * step_b, z + length * step_z
+            balance, moved = residual(*tried)
+            if moved <= (1 - 0.01 * length) * error:
+                break
+            length /= 2
+        else:
+            break  # rounding: no step improves any more
+        (b, z), error = tried, moved
+    return b, z
+
+
+def _newton_on_support(
+    x: Float[np.ndarray, "s n"],
+    p: Float[np.ndarray, " s"],
+    b: Float[np.ndarray, " n"],
+    z: Float[np.ndarray, " n"],
+    tol: float,
+) -> Float[np.ndarray, " n"]:
+    """Sets what is not held to exactly 0, and the conditions on the rest to equality."""
+    held = b > z
+    b = np.where(held, b, 0.0)
+    for _ in range(50):
+        b /= b.sum()
+        slope = _marginal(x, p, b) - 1
+        if np.max(np.where(held, np.abs(slope), slope)) <= tol / 1000:
+            break
+        wanted = held | (slope > tol)
+        # Assets that repeat others leave the step open; the shortest one will do.
+        step = np.linalg.lstsq(_curvature(x[:, wanted], p, b[wanted]), slope[wanted], rcond=1e-13)[
+            0
+        ]
+        b[wanted] = np.maximum(b[wanted] + step, 0.0)
+        held = b > 0
+    return b
+
+
+def merton(
+    drift: ArrayLike, covariance: ArrayLike, risk_aversion: float = 1.0, rate: float = 0.0
+) -> Float[np.ndarray, " asset"]:
+    """Weights Σ⁻¹(μ − r)/γ of the assets; the rest is cash. Not restricted to the simplex.
+
+    Source: R. C. Merton, "Lifetime Portfolio Selection under Uncertainty" (1969). Prices follow
+    dS/S = μ dt + dB with covariance Σ, utility has constant relative risk aversion γ (1 is log).
+
+    Args:
+        drift: Shape (asset,), a year.
+        covariance: Shape (asset, asset), a year, positive definite.
+        risk_aversion: γ > 0.
+        rate: Of cash, a year.
+
+    Raises:
+        QfolioError: γ is not positive, or the shapes or the covariance are no market's.
+    """
+    mean, sigma = drift_and_covariance(drift, covariance)
+    require(0 < risk_aversion < math.inf, f"risk aversion must be positive; not {risk_aversion}")
+    return np.asarray(np.linalg.solve(sigma, mean - rate) / risk_aversion)
+
+
+def lognormal_scenarios(
+    drift: ArrayLike, covariance: ArrayLike, dt: float, points: int = 12
+) -> tuple[Float[np.ndarray, "scenario column"], Float[np.ndarray, " scenario"]]:
+    """Merton's market over one step of ``dt`` years as scenarios for ``growth_optimal``.
+
+    Gauss–Hermite nodes of log relatives with mean (μ − diag(Σ)/2) dt and covariance Σ dt, so that
+    there are points**assets of them. With dt → 0 their optimum tends to ``merton``'s weights where
+    those lie within the simplex.
+
+    Args:
+        drift: μ over cash, shape (asset,), a year.
+        covariance: Σ, shape (asset, asset), a year, positive definite.
+        dt: Years in a step.
+        points: Nodes per asset.
+
+    Returns:
+        Relatives of shape (scenario, 1 + asset) with cash first, and probabilities.
+
+    Raises:
+        QfolioError: The shapes or the covariance are no market's, or there are too many scenarios.
+    """
+    mean, sigma = drift_and_covariance(drift, covariance)
+    require(0 < dt < math.inf, f"dt must be positive; not {dt}")
+    assets = len(mean)
+    require(points**assets <= 1_000_000, f"{points}**{assets} scenarios are too many")
+    nodes, weights = gauss(points)
+    z = np.stack(np.meshgrid(*[nodes] * assets, indexing="ij"), -1).reshape(-1, assets)
+    chances = np.stack(np.meshgrid(*[weights] * assets, indexing="ij"), -1).reshape(-1, assets)
+    logs = (mean - np.diag(sigma) / 2) * dt + math.sqrt(dt) * z @ np.linalg.cholesky(sigma).T
+    return np.column_stack([np.ones(len(z)), np.exp(logs)]), chances.prod(1)
+
+
+def drift_and_covariance(drift: ArrayLike, covariance: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    mean, sigma = np.asarray(drift, dtype=float), np.asarray(covariance, dtype=float)
+    require(
+        mean.ndim == 1 and mean.size > 0 and sigma.shape == (mean.size, mean.size),
+        f"covariance must be (asset, asset) for drift (asset,); not {sigma.shape}, {mean.shape}",
+    )
+    require(
+        bool(np.all(np.isfinite(mean)) and np.all(np.isfinite(sigma)))
+        and bool(np.allclose(sigma, sigma.T) and np.all(np.linalg.eigvalsh(sigma) > 0)),
+        "covariance must be symmetric and positive definite, else risk-free profit has no optimum",
+    )
+    return mean, sigma

@@ -1,0 +1,66 @@
+"""Two regimes, all in or all out, with a cost for every switch: the exact policy."""
+
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from qfolio.core.errors import QfolioError
+
+from qfolio.solvers.shared import require
+
+
+class RegimeOptimum(NamedTuple):
+    policy: Int[np.ndarray, "2 2"]
+    """Position (0 or 1) to take, by (regime, position held)."""
+    gain: float
+    """Long-run log growth per step."""
+    advantage: Float[np.ndarray, " 2"]
+    """Log wealth that holding the asset before the decision is worth, by regime; in [−κ, κ]."""
+
+
+def regime(stay: ArrayLike, means: ArrayLike, cost_log: float) -> RegimeOptimum:
+    """The best way to be in or out of an asset whose mean follows a two-state Markov chain.
+
+    In each step the agent sees the regime s and its position, chooses the position for this step,
+    pays ``cost_log`` if that is a switch, and earns position × means[s], the mean of the regime it
+    *saw*; then the regime changes. It maximises the average reward. Only the advantage Δ of being
+    in rather than out matters (an optimal stopping problem): u = m + P Δ, Δ = clip(u, −κ, κ). The
+    agent enters where u > κ, leaves where u < −κ, and gains Σ π_s (u_s − κ)⁺ a step. Of the nine
+    ways to clip, the one that agrees with itself is found by linear solves.
+
+    Args:
+        stay: Shape (2,), the probability that each regime lasts another step; below 1.
+        means: Shape (2,), log reward per step while in.
+        cost_log: κ = −log(1 − c) ≥ 0, paid at each switch, in or out.
+
+    Raises:
+        QfolioError: The parameters are out of range, or a regime never ends.
+    """
+    last, m = np.asarray(stay, dtype=float), np.asarray(means, dtype=float)
+    require(last.shape == m.shape == (2,), "stay and means must have two numbers, one per regime")
+    require(
+        bool(np.all((last >= 0) & (last < 1))), f"stay must be at least 0 and below 1; not {last}"
+    )
+    require(bool(np.all(np.isfinite(m))), f"means must be finite numbers; not {m}")
+    require(0 <= cost_log < math.inf, f"cost_log must be finite, not negative; not {cost_log}")
+    transition = np.array([[last[0], 1 - last[0]], [1 - last[1], last[1]]])
+    stationary = np.array([1 - last[1], 1 - last[0]]) / (2 - last.sum())
+    tie = 1e-12 * max(cost_log, float(np.abs(m).max()))
+    for clipped in itertools.product((0, 1, -1), repeat=2):
+        side = np.array(clipped)
+        system = np.eye(2) - transition * (side == 0)[:, None]
+        advantage = np.linalg.lstsq(system, np.where(side == 0, m, side * cost_log))[0]
+        worth = m + transition @ advantage
+        if np.abs(np.clip(worth, -cost_log, cost_log) - advantage).max() <= tie:
+            break
+    enter, leave = worth > cost_log + tie, worth < -cost_log - tie
+    policy = np.where(enter[:, None], 1, np.where(leave[:, None], 0, [0, 1]))
+    gain = float(stationary @ np.where(enter, worth - cost_log, 0.0))
+    return RegimeOptimum(policy, gain, advantage)
