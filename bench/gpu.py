@@ -15,7 +15,7 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from qfolio.core.evaluation import start_keys  # noqa: E402
-from qfolio.core.training import Population  # noqa: E402
+from qfolio.core.population import Population  # noqa: E402
 from workload import EPISODES, bytes_moved, operations, report  # noqa: E402
 
 TARGET = 180.0

@@ -37,7 +37,8 @@ from jax import lax  # noqa: E402
 
 import replay  # noqa: E402
 from qfolio.core.host import HostPopulation  # noqa: E402
-from qfolio.core.training import CHUNK, Population  # noqa: E402
+from qfolio.core.population import Population  # noqa: E402
+from qfolio.core.training import CHUNK  # noqa: E402
 from qfolio.experiments.presets import preset  # noqa: E402
 from qfolio.tasks.gymnasium import GymnasiumTask  # noqa: E402
 from qfolio.tasks.pendulum import Pendulum  # noqa: E402

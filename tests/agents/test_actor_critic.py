@@ -14,14 +14,15 @@ from qfolio.agents.sac import SAC
 from qfolio.agents.td3 import TD3
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Box, Discrete, Simplex, Transition
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
 from qfolio.learning.distributions import Gaussian, LogisticNormal, Squashed
 from qfolio.learning.exploration import uniform
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import Scale, squash, unsquash
-from qfolio.portfolio.synthetic import GarleanuPedersen, Merton
+from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
+from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
 from probes import Aim, AimWeights, OneState

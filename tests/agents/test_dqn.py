@@ -10,7 +10,7 @@ from qfolio.agents.dqn import DQN
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_tree, write_tree
 from qfolio.core.mdp import Transition
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.learning import heads
 from qfolio.learning.distributional import (
@@ -32,7 +32,8 @@ from qfolio.learning.targets import (
     possible_values,
     td_target,
 )
-from qfolio.portfolio.synthetic import Ar1, Merton
+from qfolio.portfolio.synthetic.ar1 import Ar1
+from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
 VALUES, ROOTS = Scale(roots=False), Scale(roots=True)

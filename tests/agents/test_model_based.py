@@ -9,13 +9,13 @@ import pytest
 from qfolio.agents.mbpo import MBPO, Model, model_loss
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Box, Discrete, Transition
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
 from qfolio.learning.encoders import SmoothMLP
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import unsquash
-from qfolio.portfolio.synthetic import Merton
+from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
 from probes import Aim

@@ -14,11 +14,12 @@ from qfolio.agents.ppo import PPO, clipped, minibatches, shuffled
 from qfolio.agents.reinforce import REINFORCE
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Transition
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
 from qfolio.learning.targets import advantages
-from qfolio.portfolio.synthetic import Ar1, Merton
+from qfolio.portfolio.synthetic.ar1 import Ar1
+from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
 from probes import Aim, AimWeights, Endless, OneState, RewardDelay, TwoStates

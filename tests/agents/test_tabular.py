@@ -8,7 +8,7 @@ from qfolio.agents.dyna_q import Counts, DynaQ
 from qfolio.agents.tabular import DoubleQ, ExpectedSarsa, Move, QLearning, Sarsa, step_share
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Transition
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
 from qfolio.tasks.finite import Cliff, FiniteMDP, FrozenLake, Garnet

@@ -15,7 +15,7 @@ from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.host import HostPopulation
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.experiments import presets
 from qfolio.experiments.run import Run
 from qfolio.tasks.gymnasium import GymnasiumTask

@@ -6,7 +6,8 @@ import pytest
 
 from qfolio.agents.dqn import DQN
 from qfolio.core.errors import QfolioError
-from qfolio.core.training import Population, advance, begin
+from qfolio.core.population import Population
+from qfolio.core.training import advance, begin
 
 from probes import Explosive, RewardDelay
 

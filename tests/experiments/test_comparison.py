@@ -25,9 +25,10 @@ from qfolio.experiments.comparison.ranking import (
 from qfolio.experiments.comparison.run import Comparison, Entrant
 from qfolio.experiments.presets import PRESETS, Preset
 from qfolio.experiments.run import Run
-from qfolio.portfolio.synthetic import Kelly, Regime
+from qfolio.portfolio.synthetic.kelly import Kelly
+from qfolio.portfolio.synthetic.regime import Regime
 from qfolio.report.comparison import comparison_data, render_comparison, tidy
-from qfolio.report.figures import percent_tick
+from qfolio.report.figures.style import percent_tick
 from qfolio.report.rendering import THIN_SPACE
 from qfolio.tasks.pendulum import Pendulum
 

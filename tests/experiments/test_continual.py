@@ -8,7 +8,7 @@ import pytest
 from qfolio.agents.dqn import DQN
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.experiments import continual
 from qfolio.experiments.continual import Course, Plan, compare, create, recovery, renew
 from qfolio.report.continual import render_page, verdict

@@ -17,7 +17,7 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.run import Run, train
-from qfolio.portfolio.synthetic import Ar1
+from qfolio.portfolio.synthetic.ar1 import Ar1
 
 from probes import Explosive
 

@@ -15,7 +15,7 @@ from qfolio.agents.pathwise import Pathwise
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import Run
 from qfolio.experiments.tuning import search

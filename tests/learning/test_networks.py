@@ -10,7 +10,7 @@ from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.mdp import Step, View
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.experiments import presets
 from qfolio.learning import networks
 from qfolio.learning.encoders import CNN, LSTM, RNN

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 
 from probes import Endless, OneState, RewardDelay, TwoStates
 

@@ -12,7 +12,12 @@ from qfolio.core.evaluation import evaluate, start_keys
 from qfolio.core.mdp import Agent, Position, Transition
 from qfolio.core.registry import TASKS, find
 from qfolio.portfolio.costs import remainder_factor
-from qfolio.portfolio.synthetic import Ar1, GarleanuPedersen, Kelly, Merton, NoTrade, Regime
+from qfolio.portfolio.synthetic.ar1 import Ar1
+from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
+from qfolio.portfolio.synthetic.kelly import Kelly
+from qfolio.portfolio.synthetic.merton import Merton
+from qfolio.portfolio.synthetic.no_trade import NoTrade
+from qfolio.portfolio.synthetic.regime import Regime
 from qfolio.solvers.followed import FollowedOptimum
 
 MARKETS = [name for name in TASKS if name.startswith("market/")]

@@ -8,7 +8,7 @@ from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.mdp import Discrete, Position, Simplex
-from qfolio.core.training import Population
+from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.costs import drift
 from qfolio.portfolio.market import Menu

@@ -21,15 +21,9 @@ from PIL import Image
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.assessment import Strategy, assess
-from qfolio.report.backtest import (
-    AREAS,
-    NAMED,
-    POINTS,
-    BacktestData,
-    StrategySeries,
-    render_backtest,
-    write_backtest_report,
-)
+from qfolio.report.backtest.data import BacktestData, StrategySeries
+from qfolio.report.backtest.page import render_backtest, write_backtest_report
+from qfolio.report.backtest.payload import AREAS, NAMED, POINTS
 from qfolio.report.rendering import source
 
 ATTACK = "</script><script>hacked = 1</script><img src=x onerror='hacked = 1'>"

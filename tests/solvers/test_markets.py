@@ -9,8 +9,8 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.solvers.ar1 import Ar1Optimum, ar1
 from qfolio.solvers.garleanu_pedersen import garleanu_pedersen
-from qfolio.solvers.merton import growth_optimal, lognormal_scenarios, merton
 from qfolio.solvers.kelly import kelly
+from qfolio.solvers.merton import growth_optimal, lognormal_scenarios, merton
 from qfolio.solvers.no_trade import no_trade_growth, no_trade_region, no_trade_region_discrete
 from qfolio.solvers.regime import regime
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from qfolio.portfolio.backtest import run as backtesting
     from qfolio.portfolio.backtest.assessment import Assessment
     from qfolio.portfolio.backtest.run import Backtest
-    from qfolio.portfolio.prices.checks import Finding
+    from qfolio.portfolio.prices.findings import Finding
 
 console = Console(highlight=False)
 

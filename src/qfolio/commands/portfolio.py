@@ -260,7 +260,7 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
 
 def _report(run: "Backtest", folder: Path) -> None:
     from qfolio.commands import console
-    from qfolio.report.backtest import write_backtest_report
+    from qfolio.report.backtest.page import write_backtest_report
     from qfolio.report.collect import backtest_data
 
     with console.console.status("Replaying all strategies, drawing histories, writing the report"):

@@ -244,7 +244,7 @@ def _contrast(run: "Run", folder: Path) -> "Run | None":
 def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
     from qfolio.commands.console import console, print_result, print_rule, say
     from qfolio.report.collect import report_data
-    from qfolio.report.page import write_report
+    from qfolio.report.training import write_report
 
     starts = run.population.starts
     with console.status(f"Grading on {starts:,} start states and writing the report"):

@@ -19,15 +19,14 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from qfolio.core.evaluation import Greedy
 from qfolio.core.mdp import Agent, Task, Transition
+from qfolio.core.population import Population, programs_of
 from qfolio.core.training import (
     Episodes,
-    Population,
     TrainingState,
     absorb,
     begin,
     episode_steps,
     healthy,
-    programs_of,
     step_keys,
 )
 

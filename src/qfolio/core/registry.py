@@ -13,12 +13,12 @@ TASKS = {
     "finite/random": "qfolio.tasks.finite:Garnet",
     "pendulum/hidden": "qfolio.tasks.hidden_pendulum:HiddenPendulum",
     "catch": "qfolio.tasks.catch:Catch",
-    "market/kelly": "qfolio.portfolio.synthetic:Kelly",
-    "market/merton": "qfolio.portfolio.synthetic:Merton",
-    "market/regime": "qfolio.portfolio.synthetic:Regime",
-    "market/ar1": "qfolio.portfolio.synthetic:Ar1",
-    "market/no-trade": "qfolio.portfolio.synthetic:NoTrade",
-    "market/garleanu-pedersen": "qfolio.portfolio.synthetic:GarleanuPedersen",
+    "market/kelly": "qfolio.portfolio.synthetic.kelly:Kelly",
+    "market/merton": "qfolio.portfolio.synthetic.merton:Merton",
+    "market/regime": "qfolio.portfolio.synthetic.regime:Regime",
+    "market/ar1": "qfolio.portfolio.synthetic.ar1:Ar1",
+    "market/no-trade": "qfolio.portfolio.synthetic.no_trade:NoTrade",
+    "market/garleanu-pedersen": "qfolio.portfolio.synthetic.garleanu_pedersen:GarleanuPedersen",
 }
 AGENTS = {
     "dqn": "qfolio.agents.dqn:DQN",

@@ -35,8 +35,9 @@ from qfolio.core.files import (
     write_tree,
 )
 from qfolio.core.mdp import Agent, Task
+from qfolio.core.population import Population
 from qfolio.core.registry import AGENTS, TASKS, name_of
-from qfolio.core.training import Population, TrainingState
+from qfolio.core.training import TrainingState
 from qfolio.core.version import __version__
 from qfolio.experiments.comparison.ranking import middle_steps, regret, steps_within
 from qfolio.experiments.run import check_counts, configured_agent, configured_task

@@ -39,9 +39,10 @@ from qfolio.core.files import (
 )
 from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Optimum, Task
+from qfolio.core.population import Population
 from qfolio.core.registry import AGENTS, TASKS, find, name_of
 from qfolio.core.statistics import mean_interval
-from qfolio.core.training import Episodes, Population
+from qfolio.core.training import Episodes
 from qfolio.core.version import __version__
 from qfolio.solvers.followed import FollowedOptimum
 

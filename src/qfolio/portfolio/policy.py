@@ -22,12 +22,13 @@ from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import new_folder, read_json, read_tree, write_json, write_tree
 from qfolio.core.mdp import Agent, View
+from qfolio.core.population import Population
 from qfolio.core.registry import AGENTS, find, name_of
-from qfolio.core.training import Population, episode_steps
+from qfolio.core.training import episode_steps
 from qfolio.experiments.presets import Preset, preset
 from qfolio.experiments.run import check_counts
 from qfolio.portfolio.costs import drift
-from qfolio.portfolio.prices.checks import day
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 

@@ -16,8 +16,10 @@ from qfolio.experiments.run import Run
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.run import Backtest, Entry
 from qfolio.portfolio.market import Market
-from qfolio.portfolio.synthetic import Ar1, NoTrade, OneAsset, Synthetic
-from qfolio.report.backtest import BacktestData, StrategySeries
+from qfolio.portfolio.synthetic.ar1 import Ar1
+from qfolio.portfolio.synthetic.base import OneAsset, Synthetic
+from qfolio.portfolio.synthetic.no_trade import NoTrade
+from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
 from qfolio.report.words import AGENTS, words_of
 from qfolio.solvers.followed import FollowedOptimum

@@ -25,7 +25,7 @@ from qfolio.experiments.comparison.ranking import (
 )
 from qfolio.report import palette, rendering
 from qfolio.report.data import Floats
-from qfolio.report.figures import (
+from qfolio.report.figures.style import (
     LEAD,
     NARROW,
     WIDE,

@@ -13,7 +13,15 @@ import numpy as np
 from qfolio.core.statistics import bootstrap_interval, interquartile_mean
 from qfolio.experiments.continual import WAYS
 from qfolio.report import palette
-from qfolio.report.figures import LEAD, NARROW, new_figure, percent_axis, save_png, short_tick, svgs
+from qfolio.report.figures.style import (
+    LEAD,
+    NARROW,
+    new_figure,
+    percent_axis,
+    save_png,
+    short_tick,
+    svgs,
+)
 from qfolio.report.rendering import amount, duration, number, percent, render, setting_groups
 
 if TYPE_CHECKING:

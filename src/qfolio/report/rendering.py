@@ -18,8 +18,8 @@ _NUMBER_WORDS = (
 
 
 def source(name: str) -> str:
-    """Return the text of a file that lies beside this module."""
-    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
+    """Return the text of a file in ``templates``."""
+    return resources.files(__package__).joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def render(template: str, **context: Any) -> str:

@@ -19,7 +19,7 @@ from qfolio.experiments.tuning.search import Dimension, Value
 from qfolio.experiments.tuning.sensitivity import Effect, Sensitivity, sensitivity, short, verdicts
 from qfolio.report import palette
 from qfolio.report.data import decimals
-from qfolio.report.figures import LEAD, NARROW, WIDE, new_figure, save_png, svgs
+from qfolio.report.figures.style import LEAD, NARROW, WIDE, new_figure, save_png, svgs
 from qfolio.report.rendering import THIN_SPACE, counted, number, percent, render, setting_groups
 from qfolio.report.words import AGENTS, words_of
 

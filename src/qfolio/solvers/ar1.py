@@ -1,20 +1,14 @@
 """A return that an AR(1) signal predicts, with proportional costs: dynamic programming."""
 
-
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from qfolio.core.errors import QfolioError
-
-from qfolio.solvers.shared import log_remainder, gauss, require
-
+from qfolio.solvers.shared import gauss, log_remainder, require
 
 LEVELS = tuple(i / 10 for i in range(11))
 """The weights to choose from in the market ``ar1``."""

@@ -1,17 +1,11 @@
 """Gârleanu & Pedersen (2013): trading on decaying signals with quadratic costs."""
 
-
-import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import ArrayLike
-
-from qfolio.core.errors import QfolioError
 
 from qfolio.solvers.shared import require
 

@@ -1,17 +1,6 @@
 """Kelly's bet: the fraction of wealth to stake on a repeated two-point bet."""
 
-
-import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
-
-import numpy as np
-from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
-
-from qfolio.core.errors import QfolioError
 
 from qfolio.solvers.shared import require
 

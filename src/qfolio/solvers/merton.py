@@ -1,17 +1,11 @@
 """The growth-optimal portfolio on the simplex, and Merton's for returns in continuous time."""
 
-
-import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import ArrayLike
-
-from qfolio.core.errors import QfolioError
 
 from qfolio.solvers.shared import gauss, require
 

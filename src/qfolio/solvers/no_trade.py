@@ -1,17 +1,12 @@
 """The no-trade region of a log investor who pays proportional costs."""
 
-
-import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import ArrayLike
-
-from qfolio.core.errors import QfolioError
 
 from qfolio.solvers.shared import log_remainder, require
 

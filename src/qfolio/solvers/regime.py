@@ -1,17 +1,12 @@
 """Two regimes, all in or all out, with a cost for every switch: the exact policy."""
 
-
 import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-
-from qfolio.core.errors import QfolioError
 
 from qfolio.solvers.shared import require
 

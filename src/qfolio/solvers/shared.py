@@ -1,27 +1,17 @@
 """What the solvers of markets share: quadrature, checks and the cost of a trade in logs.
 
 In all of them, relatives are price ratios over one step and cash has relative 1; costs are
-proportional and one way (0.001 is 10 basis points); growth is the expected logarithm of the wealth's
-ratio. Everything is float64.
+proportional and one way (0.001 is 10 basis points); growth is the expected logarithm of the
+ratio of wealth. Everything is float64.
 
 A rebalancing of one asset and cash from weight w to weight b leaves the share (1 − c w)/(1 − c b)
 of the wealth when it sells and (1 − c + c w)/(1 − c + c b) when it buys: a price that is cut by c
 for the seller and divided by 1 − c for the buyer.
 """
 
-
-import itertools
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import numpy as np
-from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 from qfolio.core.errors import QfolioError
-
 
 
 def log_remainder(before: np.ndarray, after: np.ndarray, cost: float) -> np.ndarray:

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.prices.checks import Finding
+from qfolio.portfolio.prices.findings import Finding
 from qfolio.portfolio.prices.table import Prices, check, describe, load
 
 DAYS = ["2020-01-02", "2020-01-03", "2020-01-06", "2020-01-07", "2020-01-08"]

@@ -1,6 +1,7 @@
 """What a whole backtest shows, and how much of it may be luck: numbers, intervals and sentences.
 
-``performance.py`` says what each number is. In JSON, infinite and undefined numbers are null.
+``measures.py``, ``bootstrap.py`` and ``sharpe.py`` say what each number is. In JSON, infinite and
+undefined numbers are null.
 """
 
 import dataclasses
@@ -13,22 +14,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.statistics import mean_interval
-from qfolio.portfolio.backtest.performance import (
+from qfolio.portfolio.backtest.bootstrap import (
     LEVEL,
+    block_length,
+    bootstrap_measures,
+    percentile_interval,
+)
+from qfolio.portfolio.backtest.measures import (
     MEASURES,
     Floats,
     Range,
-    block_length,
-    bootstrap_measures,
     checked_dates,
     checked_track,
-    deflated_sharpe,
-    expected_maximum_sharpe,
     log_growth,
     measures,
-    minimum_track_record,
     paired_difference,
-    percentile_interval,
+)
+from qfolio.portfolio.backtest.sharpe import (
+    deflated_sharpe,
+    expected_maximum_sharpe,
+    minimum_track_record,
     probabilistic_sharpe,
     skewness_and_kurtosis,
 )

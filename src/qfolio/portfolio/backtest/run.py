@@ -36,8 +36,8 @@ from qfolio.core.files import (
     write_tree,
 )
 from qfolio.core.mdp import Agent
+from qfolio.core.population import Population
 from qfolio.core.registry import AGENTS, find
-from qfolio.core.training import Population
 from qfolio.core.version import __version__
 from qfolio.experiments.presets import Preset
 from qfolio.experiments.run import FORMAT, check_counts, interruptible

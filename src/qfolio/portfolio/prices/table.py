@@ -14,15 +14,10 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.prices import reading as tables
-from qfolio.portfolio.prices.checks import (
-    Finding,
-    day,
-    every_day,
-    examine,
-    hint,
-    spacing,
-    text_columns,
-)
+from qfolio.portfolio.prices.checks import examine
+from qfolio.portfolio.prices.findings import Finding, day, hint
+from qfolio.portfolio.prices.layout import text_columns
+from qfolio.portfolio.prices.plausibility import every_day, spacing
 from qfolio.portfolio.prices.reading import quote
 
 DEFAULT_SOURCE = "skfolio: 20 US stocks"

@@ -10,9 +10,10 @@ import numpy as np
 from PIL import Image
 
 from qfolio.core.statistics import interquartile_mean
-from qfolio.report import figures
 from qfolio.report.animation import pendulum_gif
 from qfolio.report.data import MarketData, ReportData, decimals
+from qfolio.report.figures import curves, pendulum, policies
+from qfolio.report.figures.style import LEAD, WIDE, svgs
 from qfolio.report.rendering import (
     THIN_SPACE,
     amount,
@@ -41,10 +42,10 @@ def write_report(folder: Path, data: ReportData) -> None:
         ValueError: The shapes of the episode do not fit together.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    figures.learning_curve(folder / "learning_curve.png", data)
+    curves.learning_curve(folder / "learning_curve.png", data)
     for name, draw, applies in (
-        ("value.png", figures.value, data.maps is not None),
-        ("policy.png", figures.policy, _has_policy(data)),
+        ("value.png", pendulum.value, data.maps is not None),
+        ("policy.png", policies.policy, _has_policy(data)),
     ):
         if applies:
             draw(folder / name, data)
@@ -64,7 +65,7 @@ def render_page(data: ReportData, gif: bytes | None = None) -> str:
     """Return the text of the page, with the bytes of the animation if there is one."""
     biases = _biases(data)
     return render(
-        "template.html",
+        "training.html",
         data=data,
         summary=data.summary,
         market=data.market,
@@ -79,12 +80,10 @@ def render_page(data: ReportData, gif: bytes | None = None) -> str:
         settings=setting_groups(data.config),
         gif=None if gif is None else _data_uri("image/gif", gif),
         still=None if gif is None else _data_uri("image/png", _first_frame(gif)),
-        learning=figures.svgs(figures.draw_learning_curve, data, figures.LEAD),
-        value=None if data.maps is None else figures.svgs(figures.draw_value, data, figures.WIDE),
-        policy=figures.svgs(figures.draw_policy, data, figures.WIDE) if _has_policy(data) else None,
-        overestimation=figures.svgs(figures.draw_overestimation, data, figures.WIDE)
-        if biases
-        else None,
+        learning=svgs(curves.draw_learning_curve, data, LEAD),
+        value=None if data.maps is None else svgs(pendulum.draw_value, data, WIDE),
+        policy=svgs(policies.draw_policy, data, WIDE) if _has_policy(data) else None,
+        overestimation=svgs(curves.draw_overestimation, data, WIDE) if biases else None,
     )
 
 

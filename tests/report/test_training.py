@@ -21,13 +21,17 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.mdp import Position, View
 from qfolio.experiments.run import Run
-from qfolio.portfolio.synthetic import GarleanuPedersen, NoTrade, Regime
+from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
+from qfolio.portfolio.synthetic.no_trade import NoTrade
+from qfolio.portfolio.synthetic.regime import Regime
 from qfolio.report import Curve, Episode, Maps, ReportData, write_report
 from qfolio.report.animation import FADE_FRAMES, SIZE, pendulum_frames, pendulum_gif
 from qfolio.report.collect import constant_weights, report_data, responses
 from qfolio.report.data import MarketData, Responses, Weights, decimals
-from qfolio.report.figures import draw_learning_curve, draw_policy, overestimation, policy, value
-from qfolio.report.page import (
+from qfolio.report.figures.curves import draw_learning_curve, overestimation
+from qfolio.report.figures.pendulum import value
+from qfolio.report.figures.policies import draw_policy, policy
+from qfolio.report.training import (
     amount,
     duration,
     number,

@@ -7,21 +7,20 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest import performance
+from qfolio.portfolio.backtest import bootstrap
 from qfolio.portfolio.backtest.assessment import Strategy, assess, luck, verdict
-from qfolio.portfolio.backtest.performance import (
-    MEASURES,
+from qfolio.portfolio.backtest.bootstrap import (
     block_length,
     bootstrap_measures,
-    deflated_sharpe,
-    drawdown,
-    expected_maximum_sharpe,
-    measures,
-    minimum_track_record,
-    monthly,
     percentile_interval,
-    probabilistic_sharpe,
     stationary_bootstrap_indices,
+)
+from qfolio.portfolio.backtest.measures import MEASURES, drawdown, measures, monthly
+from qfolio.portfolio.backtest.sharpe import (
+    deflated_sharpe,
+    expected_maximum_sharpe,
+    minimum_track_record,
+    probabilistic_sharpe,
 )
 
 
@@ -232,7 +231,7 @@ def test_bootstrap_measures_are_the_measures_of_the_resampled_days(
     returns, turnover, cost = rng.random((3, 2, 30)) / 10
     returns -= 0.05
     returns[1, 7] = -1  # some histories are ruined, others are not
-    monkeypatch.setattr(performance, "_CHUNK", 90)  # three histories at a time
+    monkeypatch.setattr(bootstrap, "_CHUNK", 90)  # three histories at a time
     drawn = bootstrap_measures(returns, turnover, cost, 252, 4, 7, np.random.default_rng(5))
     again = np.random.default_rng(5)
     picks = np.concatenate([stationary_bootstrap_indices(30, 4, n, again) for n in (3, 3, 1)])

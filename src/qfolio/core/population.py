@@ -1,0 +1,238 @@
+"""Members trained side by side: one seed of one agent on one task each, in one compiled program."""
+
+from collections.abc import Callable, Hashable, Sequence
+from functools import lru_cache, partial
+from time import perf_counter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key, PyTree
+
+from qfolio.core.devices import Members, require_memory
+from qfolio.core.errors import QfolioError
+from qfolio.core.evaluation import CURVE_STARTS, STARTS, Greedy, evaluate, tail_steps
+from qfolio.core.mdp import Agent, Task
+from qfolio.core.training import Episodes, TrainingState, advance, begin, chunk_steps, episode_steps
+
+
+class Population:
+    """Members trained side by side, and the programs that do it.
+
+    tasks, agents: one for all members, or one for each, which may differ in numbers and arrays.
+    state: the members' TrainingState, with a leading member axis.
+    starts, curve_starts: on how many starts policies are graded, and along the learning curve.
+    """
+
+    starts, curve_starts = STARTS, CURVE_STARTS
+
+    def __init__(
+        self, tasks: Task | Sequence[Task], agents: Agent | Sequence[Agent], seeds: Sequence[int]
+    ) -> None:
+        self.seeds = list(seeds)
+        tasks = [tasks] * len(self.seeds) if isinstance(tasks, Task) else list(tasks)
+        agents = [agents] * len(self.seeds) if isinstance(agents, Agent) else list(agents)
+        if len({jax.tree.structure(agent) for agent in agents}) > 1:
+            raise QfolioError(
+                "members of one population must share all settings that shape the program; train "
+                "agents that differ in them in populations of their own."
+            )
+        # What is asked of the first holds for all: it does not depend on numbers.
+        self.task, self.agent = task, agent = tasks[0], agents[0]
+        self._tail = max(tail_steps(agent.discount) for agent in agents)
+        self.seconds_compile = 0.0
+        first = jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))
+        require_memory(first, len(self.seeds))
+        own, self._shared, self._join, form = _split(list(zip(tasks, agents, strict=True)))
+        self._begin(own, form)
+
+    def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
+        """Members before their first step; ``own`` and ``form`` are those of ``_split``."""
+        self._members = Members(len(self.seeds))
+        self._own = self._members.place(own)
+        # Nothing else may change what is compiled under a name.
+        rows = chunk_steps(self.task, self.agent)
+        self._programs = programs_of((form, len(self.seeds), self._members.one_by_one, rows))
+        seeds = self._members.place(np.array(self.seeds, np.uint32))
+        self.state: TrainingState = self._run(
+            "begin", lambda task, agent, seed: begin(task, agent, seed), seeds
+        )
+
+    @property
+    def steps(self) -> int:
+        """Steps of each environment so far."""
+        return int(self._fetch(lambda state: state.steps)[0])
+
+    @property
+    def member_episodes(self) -> list[int]:
+        """Finished episodes of each member."""
+        return self._fetch(lambda state: state.episodes).tolist()
+
+    @property
+    def episodes(self) -> int:
+        """Finished episodes of the member that has finished fewest."""
+        return min(self.member_episodes)
+
+    @property
+    def healthy(self) -> list[bool]:
+        """Whether the losses and weights of each member have been finite so far."""
+        return self._fetch(lambda state: state.healthy).tolist()
+
+    def steps_left(self, episodes: int | None = None, *, steps: int | None = None) -> int:
+        """Steps of each environment until each member has done what is given; 0 if done.
+
+        episodes: finished by each member, if none ends early. steps: of all its environments.
+        """
+        if steps is not None:
+            return max(0, -(-steps // self.agent.environments) - self.steps)
+        missing = (episodes or 0) - self.episodes
+        if missing <= 0:
+            return 0
+        rounds = -(-missing // self.agent.environments)
+        under_way = int(self._fetch(lambda state: state.tally.steps).max())
+        return max(1, rounds * episode_steps(self.task, self.agent) - under_way)
+
+    def advance(self, steps: int, *, strict: bool = True) -> Episodes:
+        """At most one chunk; returns the records as numpy arrays (member, time, environment).
+
+        Raises QfolioError, and leaves ``state`` undefined, if a loss is not finite; unless
+        ``strict``, the others go on, and ``healthy`` tells.
+        """
+        steps, learning = self._plan(steps, chunk_steps(self.task, self.agent))
+
+        def program(
+            task: Task, agent: Agent, state: TrainingState, steps: Array
+        ) -> tuple[TrainingState, Episodes]:
+            return advance(task, agent, state, steps, learning=learning)
+
+        name = "learn" if learning else "collect"
+        self.state, episodes = self._run(name, program, self.state, np.int32(steps), donate=True)
+        if strict:
+            self._require_healthy()
+        return self._members.fetch(episodes)
+
+    def _plan(self, steps: int, most: int) -> tuple[int, bool]:
+        """How many steps to go now, in whole rollouts, and whether they learn."""
+        length = self.agent.rollout_steps
+        warm_up = -(-self.agent.warm_up() // length) * length - self.steps
+        steps = min(steps, most, warm_up if warm_up > 0 else most)
+        return -(-steps // length) * length, warm_up <= 0
+
+    def _require_healthy(self) -> None:
+        healthy = self.healthy
+        if not all(healthy):
+            bad = {str(s): None for s, ok in zip(self.seeds, healthy, strict=True) if not ok}
+            raise QfolioError(
+                f"The loss of seed {', '.join(bad)} is no longer finite after {self.steps} steps; "
+                "lower learning_rate, or bound the gradient (huber or gradient_norm, whichever the "
+                "agent has)."
+            )
+
+    def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
+        """Greedy returns (member, start) and overestimation (member,) of the policies so far.
+
+        tail: steps beyond the horizon that the overestimation counts; those that matter if None.
+        """
+        tail = self._tail if tail is None else tail
+
+        def program(task: Task, agent: Agent, weights: PyTree, keys: Array) -> Greedy:
+            return evaluate(task, agent, weights, keys, tail)
+
+        weights = self.agent.weights(self.state.agent)
+        greedy = self._run(f"evaluate {len(keys)} {tail}", program, weights, keys)
+        return self._members.fetch(greedy)
+
+    def weights(self) -> PyTree:
+        """The members' learned weights as numpy arrays."""
+        return self._fetch(lambda state: self.agent.weights(state.agent))
+
+    def fetch(self) -> TrainingState:
+        """The members' states as numpy arrays, with a leading member axis."""
+        return self._fetch(lambda state: state)
+
+    def restore(self, state: TrainingState) -> None:
+        """Goes on from what ``fetch`` gave."""
+        self.state = self._members.place(state)
+
+    def _fetch(self, where: Callable[[TrainingState], PyTree]) -> PyTree:
+        """Parts of the members' states as numpy arrays, with a leading member axis."""
+        return self._members.fetch(where(self.state))
+
+    def _run(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        members: Any,
+        *args: Any,
+        donate: bool = False,
+    ) -> Any:
+        """Runs ``function(task, agent, member, *args)`` for all members as one program."""
+        start = partial(self._start, name, function, members, self._own)
+        return jax.block_until_ready(start(*args, donate=donate))
+
+    def _start(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        member: Any,
+        own: Any,
+        *args: Any,
+        donate: bool = False,
+    ) -> Any:
+        """The same without waiting for the result; compiled at the first use of the name.
+
+        own: the numbers of the member's agent and task.
+        """
+
+        def one(member: Any, own: Any, shared: Any, *args: Any) -> Any:
+            return function(*self._join(own, shared), member, *args)
+
+        args = (member, own, self._shared, *args)
+        if name not in self._programs:
+            start = perf_counter()
+            self._programs[name] = self._compile(one, *args, donate=donate)
+            self.seconds_compile += perf_counter() - start
+        return self._programs[name](*args)
+
+    def _compile(self, one: Callable[..., Any], *args: Any, donate: bool) -> Any:
+        """A program from arguments shaped like these; the first one's memory may be reused."""
+        return self._members.compile(one, *args, split=2, donate=donate)
+
+
+@lru_cache(maxsize=8)
+def programs_of(form: Hashable) -> dict[str, Any]:
+    """Compiled programs by name, for all populations of one form: compiling takes long."""
+    return {}
+
+
+def _split(
+    members: Sequence[PyTree],
+) -> tuple[list[np.ndarray], list[Array], Callable[[Any, Any], PyTree], Hashable]:
+    """Parts the members' numbers and arrays into each one's own and those that all share.
+
+    Numbers are each one's own, so that one program serves them all; an array is shared if it is
+    the same object in all. Returns the own with a leading member axis, the shared, a function that
+    puts one member together again, and what a program for them depends on.
+    """
+    columns = list(zip(*(jax.tree.leaves(member) for member in members), strict=True))
+    structure = jax.tree.structure(members[0])
+    is_own = [
+        isinstance(column[0], float) or any(leaf is not column[0] for leaf in column)
+        for column in columns
+    ]
+    own = [
+        np.stack([np.asarray(x, np.float32 if isinstance(x, float) else None) for x in column])
+        for column, mine in zip(columns, is_own, strict=True)
+        if mine
+    ]
+    shared = [column[0] for column, mine in zip(columns, is_own, strict=True) if not mine]
+
+    def join(own: list[Array], shared: list[Array]) -> PyTree:
+        mine, common = iter(own), iter(shared)
+        return jax.tree.unflatten(structure, [next(mine if m else common) for m in is_own])
+
+    shapes = tuple(
+        (np.shape(column[0]), getattr(column[0], "dtype", type(column[0]))) for column in columns
+    )
+    return own, shared, join, (structure, tuple(is_own), shapes)

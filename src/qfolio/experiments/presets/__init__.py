@@ -1,0 +1,40 @@
+"""Hyperparameters that belong together: what was tuned for which task."""
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.registry import GYM
+from qfolio.experiments.presets import finite, gymnasium, markets, pendulum, portfolio
+from qfolio.experiments.presets.preset import Preset, Presets
+
+__all__ = ["PRESETS", "Preset", "default_agent", "preset", "presets_of"]
+
+PRESETS: Presets = {
+    **pendulum.PRESETS,
+    **finite.PRESETS,
+    **markets.PRESETS,
+    **gymnasium.PRESETS,
+    **portfolio.PRESETS,
+}
+"""By task and agent."""
+
+
+def default_agent(task: str) -> str:
+    """The first agent that has presets for a task, which may be none that there is."""
+    default = "ppo" if task.startswith(GYM) else "dqn"
+    return next((agent for name, agent in PRESETS if name == task), default)
+
+
+def presets_of(task: str, agent: str) -> dict[str, Preset]:
+    """By name; for any environment of Gymnasium there are at least the agent's own defaults."""
+    known = PRESETS.get((task, agent), {})
+    if task.startswith(GYM) and not known:
+        return {"fast": gymnasium.of_any(task.removeprefix(GYM), agent, 100_000)}
+    return known
+
+
+def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
+    """The preset of that name; raises QfolioError where there is none."""
+    presets = presets_of(task, agent)
+    if name not in presets:
+        there = f"there is {', '.join(presets)}" if presets else "there is none at all"
+        raise QfolioError(f"there is no preset {name!r} for {agent} on {task}; {there}.")
+    return presets[name]

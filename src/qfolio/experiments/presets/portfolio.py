@@ -1,0 +1,53 @@
+"""Presets for portfolios of real assets."""
+
+
+from qfolio.experiments.presets.preset import Preset, Presets
+
+_TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
+
+
+_DQN = {
+    "network": "mlp",
+    "hidden": (16, 16),
+    "all_actions": True,
+    "market_baseline": True,
+    "environments": 8,
+    "batch_size": 64,
+    "replay_capacity": 8192,
+    "learning_starts": 3200,
+    "target_period": 1,
+    "target_rate": 0.05,
+    "discount": 0.99,
+    "learning_rate": 3e-4,
+    "learning_rate_final": 0.0,
+    "learning_rate_steps": 600.0,
+    "reward_scale": 100.0,
+}
+
+
+_PATHWISE = {
+    "hidden": (16, 16),
+    "rollout": 25,
+    "environments": 16,
+    "learning_rate": 5e-4,
+    "learning_rate_final": 0.0,
+    "learning_rate_steps": 100.0,
+    "reward_scale": 100.0,
+    "gradient_norm": 1.0,
+}
+
+
+PRESETS: Presets = {
+    ("portfolio", "dqn"): {
+        "fast": Preset(
+            "dqn",
+            _DQN,
+            episodes=160,
+            seeds=5,
+            task={**_TASK, "menu": "overweight:0.1"},
+        ),
+    },
+    ("portfolio", "pathwise"): {
+        "fast": Preset("pathwise", _PATHWISE, episodes=800, seeds=5, task=_TASK)
+    },
+}

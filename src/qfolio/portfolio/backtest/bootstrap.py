@@ -1,0 +1,143 @@
+"""The stationary bootstrap of track records: what another stretch of the same market would show."""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qfolio.portfolio.backtest.measures import (
+    MEASURES,
+    Floats,
+    checked_track,
+    deepest_drawdown,
+    deviations,
+    from_moments,
+    log_growth,
+    per_period,
+    ratio_or_zero,
+)
+
+LEVEL = 0.95
+"""Coverage of every interval here, and the level a probability must reach to count as evidence."""
+
+_CHUNK = 2_000_000  # resampled days held at a time: tens of megabytes, whatever the resamples
+
+
+# Resampling time -----------------------------------------------------------------------------
+
+
+def block_length(series: ArrayLike) -> float:
+    """Choose the mean block length of the stationary bootstrap from a series' autocorrelation.
+
+    Politis & White (2004), "Automatic block-length selection for the dependent bootstrap", with
+    the correction of Patton, Politis & White (2009): b = (2 G² / D · n)^⅓ with D = 2 g(0)², where
+    g(0) and G sum R(k) and |k| R(k) under a flat-top window. The window ends at twice the lag
+    after which five autocorrelations in a row stay within ±2 √(log10 n / n).
+
+    Args:
+        series: Numbers of shape (n,).
+
+    Returns:
+        The length, from 1 (independent days) to min(3 √n, n / 3).
+    """
+    values = np.asarray(series, dtype=float)
+    count = values.size
+    longest = max(1.0, math.ceil(min(3 * math.sqrt(count), count / 3)))
+    centred = deviations(values)
+    if count < 3 or not centred.any():
+        return 1.0
+    run = max(5, math.ceil(math.sqrt(math.log10(count))))
+    lags = min(math.ceil(math.sqrt(count)) + run, count - 1)
+    covariance = np.array([centred[k:] @ centred[: count - k] for k in range(lags + 1)]) / count
+    small = np.abs(covariance) < 2 * math.sqrt(math.log10(count) / count) * covariance[0]
+    quiet = (m for m in range(lags - run + 1) if small[m + 1 : m + 1 + run].all())
+    window = min(2 * max(next(quiet, lags), 1), lags)
+    k = np.arange(1, window + 1)
+    weights = 2 * np.minimum(1, 2 * (1 - k / window)) * covariance[1 : window + 1]
+    spectrum = covariance[0] + weights.sum()  # g(0)
+    slope = k @ weights  # G
+    return float(np.clip((ratio_or_zero(slope, spectrum) ** 2 * count) ** (1 / 3), 1, longest))
+
+
+def stationary_bootstrap_indices(
+    periods: int, block: float, resamples: int, rng: np.random.Generator
+) -> NDArray[np.int32]:
+    """Draw the days of resampled histories: blocks of geometric length, in a circle.
+
+    Politis & Romano (1994), "The stationary bootstrap": each day follows the one before with
+    probability 1 − 1/block, and is any day otherwise; the first day follows the last.
+
+    Args:
+        periods: How many days there are.
+        block: The mean length of a block, at least 1; at 1 the days are independent draws.
+        resamples: How many histories to draw.
+        rng: Source of randomness.
+
+    Returns:
+        Indices of shape (resamples, periods).
+    """
+    shape = (resamples, periods)
+    day = np.arange(periods, dtype=np.int32)
+    jump = rng.random(shape, dtype=np.float32) * np.float32(block) < 1
+    begun = np.maximum.accumulate(
+        np.where(jump, day, 0), axis=1
+    )  # when the block began; the first at 0
+    # Where a block began we draw its distance from the calendar; within the block it stays.
+    shift = np.take_along_axis(rng.integers(periods, size=shape, dtype=np.int32), begun, axis=1)
+    shift += day
+    return np.where(shift >= periods, shift - np.int32(periods), shift)
+
+
+def bootstrap_measures(
+    returns: ArrayLike,
+    turnover: ArrayLike,
+    cost: ArrayLike,
+    periods_per_year: float,
+    block: float,
+    resamples: int,
+    rng: np.random.Generator,
+) -> dict[str, Floats]:
+    """Compute ``measures`` on histories drawn again by the stationary bootstrap.
+
+    The same days are drawn for all series. Averages over a resampled history need only how often
+    each day was drawn, so they are one matrix product; the drawdown alone follows the order.
+
+    Args:
+        returns, turnover, cost: As in ``measures``, shape (series, periods), at least two periods.
+        periods_per_year: As in ``measures``.
+        block, resamples, rng: As in ``stationary_bootstrap_indices``.
+
+    Returns:
+        One array of shape (resamples, series) for each name in ``MEASURES``.
+    """
+    track = checked_track(returns, turnover, cost)
+    series, periods = track[0].shape
+    centre = track[0].mean(axis=-1)
+    features = per_period(track, centre).reshape(-1, periods).T
+    steps = np.ascontiguousarray(log_growth(track[0]).T)
+    chunk = max(1, _CHUNK // periods)
+    parts = []
+    for start in range(0, resamples, chunk):
+        size = min(chunk, resamples - start)
+        days = stationary_bootstrap_indices(periods, block, size, rng)
+        cells = days + periods * np.arange(size)[:, None]
+        counts = np.bincount(cells.ravel(), minlength=size * periods).reshape(size, periods)
+        moments = (counts.astype(float) @ features / periods).reshape(size, -1, series)
+        parts.append(
+            from_moments(
+                moments.swapaxes(0, 1),
+                deepest_drawdown(steps, days),
+                centre,
+                periods,
+                periods_per_year,
+            )
+        )
+    return {name: np.concatenate([part[name] for part in parts]) for name in MEASURES}
+
+
+def percentile_interval(samples: Floats, level: float = LEVEL) -> tuple[Floats, Floats]:
+    """Return the middle part of the samples along the first axis, bounded by two of them."""
+    count = len(samples)
+    tail = max(math.floor((count + 1) * (1 - level) / 2), 1)
+    ordered = np.sort(samples, axis=0)  # no interpolation: an end may be infinite
+    return ordered[tail - 1], ordered[count - tail]

@@ -1,0 +1,235 @@
+"""The measures of track records: growth, volatility, ratios, drawdown, turnover, cost drag."""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qfolio.core.errors import QfolioError
+
+Floats = NDArray[np.float64]
+Range = tuple[float, float]
+
+MEASURES = (
+    *("growth", "volatility", "sharpe", "sortino"),
+    *("drawdown", "calmar", "turnover", "cost_drag"),
+)
+
+
+# Measures ------------------------------------------------------------------------------------
+
+
+def measures(
+    returns: ArrayLike, turnover: ArrayLike, cost: ArrayLike, periods_per_year: float
+) -> dict[str, Floats]:
+    """Describe track records by the usual measures, all of them per year.
+
+    Args:
+        returns: Simple returns net of costs, shape (..., periods), each at least −1.
+        turnover: Value bought plus value sold as a share of the wealth, same shape.
+        cost: Share of the wealth that a period's trade cost, at least 0 and below 1, same shape.
+        periods_per_year: For example 252 for days of trading.
+
+    Returns:
+        One array of shape (...) for each name in ``MEASURES``:
+
+        - growth: geometric mean, as a simple annual rate; a total loss gives −1;
+        - volatility: standard deviation (n − 1) of the returns;
+        - sharpe: mean over standard deviation, the risk-free rate taken as 0;
+        - sortino: mean over the downside deviation, the root mean square of min(return, 0);
+        - drawdown: the deepest fall below an earlier peak (or the start), between 0 and 1;
+        - calmar: growth over drawdown;
+        - turnover: mean times periods per year;
+        - cost_drag: growth without costs minus growth with them, where a return without costs is
+          (1 + return) / (1 − cost) − 1.
+
+    Raises:
+        QfolioError: The shapes differ, or a number is missing, infinite or out of range.
+    """
+    track = checked_track(returns, turnover, cost)
+    deepest = drawdown(track[0]).max(axis=-1)
+    centre = track[0].mean(axis=-1)
+    moments = per_period(track, centre).mean(axis=-1)
+    return from_moments(moments, deepest, centre, track[0].shape[-1], periods_per_year)
+
+
+def drawdown(returns: ArrayLike) -> Floats:
+    """Return how far the wealth lies below its peak so far, as a share of the peak.
+
+    Args:
+        returns: Simple returns of shape (..., periods).
+
+    Returns:
+        Numbers between 0 (at the peak) and 1 (all is lost), same shape; the start is a peak.
+
+    Raises:
+        QfolioError: A return is missing, infinite or below −1, or there are none.
+    """
+    wealth = np.cumsum(log_growth(_checked_series("returns", returns)), axis=-1)
+    peak = np.maximum(np.maximum.accumulate(wealth, axis=-1), 0)
+    return np.abs(np.expm1(wealth - peak))
+
+
+def monthly(returns: ArrayLike, dates: ArrayLike) -> tuple[list[int], Floats]:
+    """Compound returns by calendar month.
+
+    Args:
+        returns: Simple returns of shape (..., periods).
+        dates: Days on which the returns were earned, shape (periods,), strictly increasing.
+
+    Returns:
+        The years from first to last, and a table of shape (..., years, 12), NaN where there is no
+        return in a month.
+
+    Raises:
+        QfolioError: Returns and dates do not fit together, or are missing or out of range.
+    """
+    values = _checked_series("returns", returns)
+    days = checked_dates(dates, values.shape[-1])
+    months = days.astype("datetime64[M]").astype(int)  # since January 1970
+    first = np.flatnonzero(np.diff(months, prepend=months[0] - 1))
+    years = range(1970 + months[0] // 12, 1970 + months[-1] // 12 + 1)
+    table = np.full((*values.shape[:-1], 12 * len(years)), np.nan)
+    place = months[first] - 12 * (years[0] - 1970)
+    table[..., place] = np.expm1(np.add.reduceat(log_growth(values), first, axis=-1))
+    return list(years), table.reshape(*values.shape[:-1], len(years), 12)
+
+
+def per_period(track: Floats, centre: Floats) -> Floats:
+    """What has to be averaged over time for every measure but the drawdown: (7, ..., periods)."""
+    returns, turnover, cost = track
+    deviation = returns - centre[..., None]  # centred, or the variance would lose its digits
+    ruined = returns == -1
+    log_net = np.log1p(np.where(ruined, 0, returns))
+    log_free = log_net - np.log1p(-cost)
+    downside = np.minimum(returns, 0) ** 2
+    return np.stack([deviation, deviation**2, downside, log_net, log_free, ruined, turnover])
+
+
+def from_moments(
+    moments: Floats, deepest: Floats, centre: Floats, periods: int, periods_per_year: float
+) -> dict[str, Floats]:
+    deviation, square, downside, log_net, log_free, ruined, turnover = moments
+    mean = centre + deviation
+    variance = square - deviation**2
+    rounding = 1e-14 * square + 1e-24 * mean**2  # what remains of equal returns
+    variance = np.where(variance > rounding, variance, 0)
+    bessel = periods / (periods - 1) if periods > 1 else math.nan
+    with np.errstate(over="ignore", invalid="ignore"):
+        growth, free = (
+            np.where(ruined > 0, -1, np.expm1(periods_per_year * log))
+            for log in (log_net, log_free)
+        )
+        drag = free - growth
+    annual = math.sqrt(periods_per_year)
+    spread = np.sqrt(bessel * variance)
+    return {
+        "growth": growth,
+        "volatility": annual * spread,
+        "sharpe": annual * ratio_or_zero(mean, spread),
+        "sortino": annual * ratio_or_zero(mean, np.sqrt(downside)),
+        "drawdown": deepest,
+        "calmar": ratio_or_zero(growth, deepest),
+        "turnover": periods_per_year * turnover,
+        "cost_drag": drag,
+    }
+
+
+def ratio_or_zero(above: ArrayLike, below: ArrayLike) -> Floats:
+    above, below = np.broadcast_arrays(above, below)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((above == 0) & (below == 0), 0.0, np.divide(above, below))
+
+
+def paired_difference(first: Floats, second: Floats) -> Floats:
+    """First less second; 0 where both lost everything or rounding cannot tell them apart."""
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isclose(first, second, rtol=0, atol=1e-12), 0.0, first - second)
+
+
+def deviations(values: Floats) -> Floats:
+    """Deviations from the mean over the last axis, exactly 0 where all values are equal."""
+    scale = np.abs(values).max(axis=-1, keepdims=True)
+    deviation = values - values.mean(axis=-1, keepdims=True)
+    return np.where(np.abs(deviation) > 1e-12 * scale, deviation, 0)
+
+
+def log_growth(returns: Floats) -> Floats:
+    """Of simple returns; −∞ for a total loss."""
+    with np.errstate(divide="ignore"):
+        return np.log1p(returns)
+
+
+def deepest_drawdown(steps: Floats, days: NDArray[np.int32]) -> Floats:
+    """The maximum drawdown of every resampled history.
+
+    Goes through time once, for all histories and series at a time, and keeps no history: below
+    its peak, log wealth follows depth ← min(depth + log return, 0).
+
+    Args:
+        steps: Log returns of shape (periods, series).
+        days: Of shape (resamples, periods).
+    """
+    depth = np.zeros((len(days), steps.shape[1]))
+    deepest, step = np.zeros_like(depth), np.empty_like(depth)
+    for today in np.ascontiguousarray(days.T):
+        np.take(steps, today, axis=0, out=step, mode="clip")
+        depth += step
+        np.minimum(depth, 0, out=depth)
+        np.minimum(deepest, depth, out=deepest)
+    return np.abs(np.expm1(deepest))
+
+
+# Checks --------------------------------------------------------------------------------------
+
+
+def checked_track(
+    returns: ArrayLike, turnover: ArrayLike, cost: ArrayLike, who: str = "the track record"
+) -> Floats:
+    """Returns, turnover and cost stacked: (3, ..., periods), or a QfolioError."""
+    series = {"returns": returns, "turnover": turnover, "cost": cost}
+    arrays = [_checked_series(name, values, who) for name, values in series.items()]
+    if len({array.shape for array in arrays}) > 1:
+        raise QfolioError(
+            f"Returns, turnover and cost of {who} must have the same shape; "
+            f"theirs are {', '.join(str(array.shape) for array in arrays)}."
+        )
+    return np.stack(arrays)
+
+
+# The least and the greatest value; rounding may leave a turnover or a cost a hair below zero.
+_BOUNDS = {"returns": (-1.0, 1e100), "turnover": (-1e-9, 1e100), "cost": (-1e-9, 1 - 1e-9)}
+
+
+def _checked_series(name: str, values: ArrayLike, who: str = "the track record") -> Floats:
+    """Numbers within their bounds, at least one along the last axis, or a QfolioError."""
+    try:
+        array = np.asarray(values, dtype=float)
+    except (ValueError, TypeError):
+        raise QfolioError(f"The {name} of {who} must be a table of numbers.") from None
+    if array.ndim == 0 or array.size == 0:
+        raise QfolioError(f"The {name} of {who} are empty; at least one period is needed.")
+    if not np.isfinite(array).all():
+        raise QfolioError(f"The {name} of {who} hold missing or infinite numbers; remove them.")
+    low, high = _BOUNDS[name]
+    if array.min() < low or array.max() > high:
+        raise QfolioError(
+            f"The {name} of {who} range from {array.min():g} to {array.max():g}; returns must be "
+            f"at least −1, turnover at least 0, cost at least 0 and below 1."
+        )
+    return array
+
+
+def checked_dates(dates: ArrayLike, periods: int) -> NDArray[np.datetime64]:
+    try:
+        days = np.asarray(dates, dtype="datetime64[s]")
+    except (ValueError, TypeError):
+        raise QfolioError("The dates must be days such as 2004-12-31.") from None
+    if days.shape != (periods,) or periods == 0:
+        raise QfolioError(
+            f"There are {periods} returns and dates of shape {days.shape}; "
+            f"each return needs its date."
+        )
+    if np.isnat(days).any() or (days[1:] <= days[:-1]).any():
+        raise QfolioError("The dates must be given for every return and increase strictly.")
+    return days

@@ -1,0 +1,102 @@
+"""Sharpe ratios against luck: probabilistic, deflated, and the track record they need."""
+
+import math
+
+import numpy as np
+
+from qfolio.portfolio.backtest.bootstrap import LEVEL
+from qfolio.portfolio.backtest.measures import Floats, deviations, ratio_or_zero
+
+# Sharpe ratios and luck ----------------------------------------------------------------------
+#
+# Every Sharpe ratio in these formulas is per period, never annual: an annual one would count each
+# period as a whole year of evidence.
+
+
+def probabilistic_sharpe(
+    sharpe: float, periods: int, skewness: float, kurtosis: float, benchmark: float = 0.0
+) -> float:
+    """Return the probability that the true Sharpe ratio exceeds a benchmark.
+
+    Bailey & López de Prado (2012), "The Sharpe ratio efficient frontier":
+    Φ((SR − SR*) √(n − 1) / √(1 − γ₃ SR + (γ₄ − 1)/4 SR²)).
+
+    Args:
+        sharpe: Observed Sharpe ratio per period, not annual.
+        periods: How many returns it was computed from.
+        skewness: γ₃ of the returns, 0 for normal ones.
+        kurtosis: γ₄ of the returns, 3 for normal ones.
+        benchmark: SR*, per period.
+    """
+    from scipy.special import ndtr
+
+    if math.isinf(sharpe):
+        return float(sharpe > 0)
+    error = math.sqrt(max(_sharpe_variance(sharpe, skewness, kurtosis), 0))
+    return float(ndtr(ratio_or_zero((sharpe - benchmark) * math.sqrt(periods - 1), error)))
+
+
+def minimum_track_record(
+    sharpe: float, skewness: float, kurtosis: float, benchmark: float = 0.0, level: float = LEVEL
+) -> float:
+    """Return how many periods it takes until the probabilistic Sharpe ratio reaches a level.
+
+    Bailey & López de Prado (2012): 1 + (1 − γ₃ SR + (γ₄ − 1)/4 SR²) (z / (SR − SR*))², infinite
+    where the Sharpe ratio does not exceed the benchmark. Arguments as in ``probabilistic_sharpe``.
+    """
+    from scipy.special import ndtri
+
+    if not sharpe > benchmark:
+        return math.inf
+    if math.isinf(sharpe):
+        return 1.0
+    variance = _sharpe_variance(sharpe, skewness, kurtosis)
+    return float(1 + variance * (ndtri(level) / (sharpe - benchmark)) ** 2)
+
+
+def expected_maximum_sharpe(trials: int, variance: float) -> float:
+    """Return the Sharpe ratio expected of the best of several trials without any skill.
+
+    Bailey & López de Prado (2014), "The deflated Sharpe ratio":
+    √V ((1 − γ) Φ⁻¹(1 − 1/N) + γ Φ⁻¹(1 − 1/(N e))) with the Euler–Mascheroni constant γ; 0 for one
+    trial, which nobody has picked.
+
+    Args:
+        trials: N, every attempt whose result might have been reported.
+        variance: V of the trials' Sharpe ratios; per period if the result is to be so.
+    """
+    from scipy.special import ndtri
+
+    if trials < 2:
+        return 0.0
+    tail, further = ndtri(1 - 1 / trials), ndtri(1 - 1 / (trials * math.e))
+    return float(math.sqrt(variance) * ((1 - np.euler_gamma) * tail + np.euler_gamma * further))
+
+
+def deflated_sharpe(
+    sharpe: float, periods: int, skewness: float, kurtosis: float, trials: int, variance: float
+) -> float:
+    """Return the probability that a Sharpe ratio exceeds what the best of N trials owes to luck.
+
+    Bailey & López de Prado (2014): the probabilistic Sharpe ratio against the expected maximum.
+    Arguments as in ``probabilistic_sharpe`` and ``expected_maximum_sharpe``, all per period.
+    """
+    benchmark = expected_maximum_sharpe(trials, variance)
+    return probabilistic_sharpe(sharpe, periods, skewness, kurtosis, benchmark)
+
+
+def _sharpe_variance(sharpe: float, skewness: float, kurtosis: float) -> float:
+    """Times n − 1: the variance of an estimated Sharpe ratio (Mertens 2002)."""
+    return 1 - skewness * sharpe + (kurtosis - 1) / 4 * sharpe**2
+
+
+def skewness_and_kurtosis(returns: Floats) -> tuple[float, float]:
+    """Skewness and kurtosis, averaged over the rows; those of a normal where nothing varies."""
+    centred = deviations(returns)
+    spread = np.sqrt((centred**2).mean(axis=-1))
+    still = spread == 0
+    score = centred / np.where(still, 1, spread)[..., None]
+    return (
+        float((score**3).mean(axis=-1).mean()),
+        float(np.where(still, 3, (score**4).mean(axis=-1)).mean()),
+    )

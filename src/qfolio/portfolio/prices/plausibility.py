@@ -1,0 +1,155 @@
+"""Whether prices can be right: odd cells, impossible moves, unadjusted splits, gaps in time."""
+
+from typing import Any
+
+import numpy as np
+
+from qfolio.portfolio.prices import reading as tables
+from qfolio.portfolio.prices.findings import LISTED, Block, Findings, Grid, amount, day
+from qfolio.portfolio.prices.gaps import Rest
+from qfolio.portfolio.prices.reading import quote
+
+FEWEST_ROWS, FEW_ROWS = 3, 60
+LEAST_JUMP = 0.3  # in log; the smallest split, 3/2, is 0.41
+LARGEST_MOVE = 1e6  # within one row; beyond it relatives and their products leave float32
+SPLITS = (1.5, 2, 3, 4, 5, 6, 7, 8, 10, 15, 20, 25, 30, 50, 100, 1000)
+
+
+# Checks and choices on the grid.
+
+
+def check_cells(grid: Grid, findings: Findings) -> None:
+    table = grid.table
+    if not grid.assets:
+        findings.error("there is no asset", advice="Give a column of prices for each asset.")
+    for name in grid.assets:
+        if name.strip().lower() == "cash":
+            findings.error(
+                f"the asset {quote(name)} has the name of the money that is not invested",
+                advice="Rename or remove its column." if not grid.long else "Rename or remove it.",
+            )
+    if len(grid.dates) < FEWEST_ROWS:
+        findings.error(
+            f"the table has {amount(len(grid.dates), 'row')}; at least {FEWEST_ROWS} are needed",
+            advice="Give a longer history.",
+        )
+    advice = "Write numbers as 1234.5, and leave a cell empty where there is none."
+    for block in (grid.prices, *grid.features):
+        texts = block.wrong.any(axis=0) & (block.wrong | np.isnan(block.values)).all(axis=0)
+        texts &= not grid.long
+        for j in np.flatnonzero(texts)[:LISTED].tolist():
+            said = _complaint(grid, block, int(block.wrong[:, j].argmax()), j)
+            findings.error(
+                f"there are no numbers: {said}", column=table.names[block.columns[j]],
+                advice="Remove the column.",
+            )  # fmt: skip
+        if (rest := int(texts.sum()) - LISTED) > 0:
+            findings.error(f"and {amount(rest, 'more column')} without numbers", count=rest)
+
+        def said_of(i: int, j: int, block: Block = block) -> str:
+            return _complaint(grid, block, i, j)
+
+        findings.cells(grid, block, block.wrong & ~texts, said_of, advice)
+        findings.cells(grid, block, np.isinf(block.values), "is infinite", advice)
+    values = grid.prices.values
+    findings.cells(
+        grid, grid.prices, values == 0, "is zero",
+        "Leave the cell empty where there was no trade; a worthless asset must be dropped.",
+    )  # fmt: skip
+    findings.cells(
+        grid, grid.prices, np.isfinite(values) & (values < 0), "is negative",
+        "Give prices, not returns.",
+    )  # fmt: skip
+
+
+def _complaint(grid: Grid, block: Block, i: int, j: int) -> str:
+    cell = grid.table.columns[block.columns[j]][int(grid.lines[i, j])]
+    return tables.no_number(cell, grid.table.decimal)
+
+
+def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
+    """Moves that no market makes, and moves that look like a split which was not adjusted."""
+    values = np.where(np.isfinite(rest.values) & (rest.values > 0), rest.values, np.nan)
+    with np.errstate(over="ignore", divide="ignore", under="ignore"):
+        relatives = values[1:] / values[:-1]
+        moves = np.log(relatives)
+    sizes = np.abs(moves)
+
+    def spot(i: int, j: int) -> dict[str, Any]:
+        return grid.spot(grid.prices, rest.head + i + 1, int(rest.assets[j]))
+
+    wild = np.argwhere(sizes > np.log(LARGEST_MOVE))  # NaN compares false
+    for i, j in wild[:LISTED].tolist():
+        findings.error(
+            f"{grid.subject(grid.prices, int(rest.assets[j]))} goes from {values[i, j]:.6g} to "
+            f"{values[i + 1, j]:.6g} in one row",
+            advice="Check the units of both prices.", **spot(i, j),
+        )  # fmt: skip
+    if (more := len(wild) - LISTED) > 0:
+        findings.error(f"and {amount(more, 'more price')} that change by such factors", count=more)
+    ratios = np.log(np.array(SPLITS))
+    splits = []
+    for j in np.flatnonzero((sizes > LEAST_JUMP).any(axis=0)).tolist():
+        # The usual move: a median is not misled by the jumps that are looked for.
+        usual = float(np.median(sizes[:, j][sizes[:, j] > 0])) / 0.6745
+        for i in np.flatnonzero(sizes[:, j] > max(LEAST_JUMP, 6 * usual)).tolist():
+            distances = np.abs(ratios - sizes[i, j])
+            if distances.min() < min(0.1, max(0.02, 2 * usual)):
+                splits.append((i, j, _ratio(SPLITS[distances.argmin()], moves[i, j] > 0)))
+    for i, j, ratio in sorted(splits)[:LISTED]:
+        findings.warn(
+            f"{grid.subject(grid.prices, int(rest.assets[j]))} is {relatives[i, j]:.4g} times the "
+            f"one before, close to {ratio}: a split that is not adjusted?",
+            advice="Use adjusted prices.", **spot(i, j),
+        )  # fmt: skip
+    if (more := len(splits) - LISTED) > 0:
+        findings.warn(
+            f"and {amount(more, 'more move')} like splits that are not adjusted", count=more
+        )
+
+
+def _ratio(split: float, up: bool) -> str:
+    over, under = (3, 2) if split == 1.5 else (int(split), 1)
+    over, under = (over, under) if up else (under, over)
+    return str(over) if under == 1 else f"{over}/{under}"
+
+
+def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:
+    dates = grid.dates[rest.head :]
+    if len(dates) < FEWEST_ROWS:
+        findings.error(
+            f"the table keeps {amount(len(dates), 'row')}; at least {FEWEST_ROWS} are needed",
+            advice="Choose another late= (--late), or give a longer history.",
+        )
+        return
+    if len(dates) < FEW_ROWS:
+        findings.warn(f"the table has {amount(len(dates), 'row')} only, too few to learn from")
+    if len(rest.assets) == 1:
+        findings.warn(f"there is one asset only, {quote(grid.assets[rest.assets[0]])}")
+    steps, usual = spacing(dates)
+    closed = 0.0 if every_day(dates) else 7.0  # markets with weekends have holidays, too
+    long = np.flatnonzero(steps > 3 * usual + closed)
+    for k in long[:LISTED].tolist():
+        findings.warn(
+            f"the row before is that of {day(dates[k])}, {steps[k]:.4g} days earlier "
+            f"(usual: {usual:.4g})",
+            row=None if grid.long else grid.spot(grid.prices, rest.head + int(k) + 1, 0)["row"],
+            date=day(dates[k + 1]),
+        )
+    if (more := len(long) - LISTED) > 0:
+        findings.warn(f"and {amount(more, 'more gap')} between dates", count=more)
+
+
+# Dates and names.
+
+
+def spacing(dates: np.ndarray) -> tuple[np.ndarray, float]:
+    """The days from each of two or more rows to the next, and their (lower) median."""
+    steps = np.diff(dates).astype(np.int64) / 86400.0
+    return steps, float(np.sort(steps)[(len(steps) - 1) // 2])
+
+
+def every_day(dates: np.ndarray) -> bool:
+    """True where weekends have rows as other days have."""
+    weekday = (dates.astype("datetime64[D]").astype(np.int64) + 3) % 7  # 1970-01-01: Thursday
+    return float((weekday >= 5).mean()) > 0.1 if len(dates) else False

@@ -1,0 +1,53 @@
+"""What the markets with known answers share: an exact policy, and scenes to draw it in.
+
+``rule`` reads the few numbers that say what a policy does (a fraction, the edges of a no-trade
+region, a trading rate), so that a learned policy can be set beside the exact one.
+"""
+
+import abc
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from qfolio.core.fields import require
+from qfolio.core.mdp import ExogenousTask, Policy, Position
+from qfolio.portfolio.market import Market
+from qfolio.solvers.followed import FollowedOptimum
+
+
+class Synthetic(ExogenousTask):
+    """A market with a known best policy: from a state to target weights, or to a position."""
+
+    def __check_init__(self) -> None:
+        require(self, "horizon", lambda x: 1 <= x <= 100_000, "from 1 to 100,000")
+
+    @abc.abstractmethod
+    def best(self) -> Policy:
+        """The exact policy."""
+
+    @abc.abstractmethod
+    def scenes(self) -> list[tuple[str, Any]]:
+        """Market states to draw a policy in, with what to call them."""
+
+    def optimum(self) -> FollowedOptimum:
+        continuous = dataclasses.replace(self, menu="") if hasattr(self, "menu") else self
+        return FollowedOptimum(continuous, self.best())
+
+
+def require_cost(task: Any) -> None:
+    require(task, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
+
+
+class OneAsset(Market, Synthetic):
+    """Cash and one asset."""
+
+    @property
+    def limits(self) -> Float[Array, " asset"]:
+        return jnp.ones(1)
+
+    def weight(self, policy: Policy, market: Any, weight: float) -> float:
+        """The asset's target weight for a holder of ``weight``."""
+        held = jnp.array([1 - weight, weight], jnp.float32)
+        return float(policy(Position(market, self.hold(held)))[1])

@@ -1,0 +1,74 @@
+"""Merton's market on the simplex; ``solvers/merton.py`` solves it."""
+
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from qfolio.core.fields import static
+from qfolio.core.mdp import Policy, Position
+from qfolio.portfolio.market import Market, Relatives
+from qfolio.portfolio.synthetic.base import Synthetic
+from qfolio.solvers.merton import growth_optimal
+
+
+class Merton(Market, Synthetic):
+    """Three assets whose returns are drawn from a fixed set of log-normal scenarios, with cash.
+
+    The best weights maximise E log(b·x) over the simplex (Merton 1969; with the constraint, the
+    conditions of Cover 1984); one asset is not worth holding.
+    """
+
+    menu: str = static("")
+    horizon: int = static(100)
+
+    cost = 0.0
+    means = (0.010, 0.006, 0.001)
+    volatilities = (0.12, 0.08, 0.10)
+    correlation = 0.3
+    scenarios = 500
+
+    @property
+    def limits(self) -> Float[Array, " asset"]:
+        return jnp.ones(3)
+
+    @staticmethod
+    @cache
+    def table() -> np.ndarray:
+        """Relatives of each scenario, shape (scenario, asset), with just the moments stated."""
+        normal = np.random.default_rng(1969).standard_normal((Merton.scenarios, 3))
+        normal -= normal.mean(0)
+        normal = np.linalg.solve(np.linalg.cholesky(np.cov(normal.T)), normal.T)
+        sigma = np.array(Merton.volatilities)
+        correlations = np.full((3, 3), Merton.correlation) + (1 - Merton.correlation) * np.eye(3)
+        shocks = np.linalg.cholesky(correlations) @ normal * sigma[:, None]
+        return np.exp(np.array(Merton.means) - sigma**2 / 2 + shocks.T)
+
+    def reset_market(self, key: PRNGKeyArray) -> Int[Array, ""]:
+        return jnp.array(0, jnp.int32)
+
+    def next_market(self, market: Array, key: PRNGKeyArray) -> Int[Array, ""]:
+        return jax.random.randint(key, (), 0, self.scenarios, jnp.int32)
+
+    def features(self, market: Array) -> Float[Array, "asset time channel"]:
+        return jnp.eye(3)[:, None, :]  # which asset it is: nothing else tells them apart
+
+    def relatives(self, market: Array, next_market: Array) -> Relatives:
+        moved = jnp.asarray(self.table(), jnp.float32)[next_market]
+        return Relatives(jnp.ones(3), moved, moved)
+
+    def best(self) -> Policy:
+        scenarios = np.column_stack([np.ones(self.scenarios), self.table()])
+        weights = jnp.asarray(growth_optimal(scenarios).weights, jnp.float32)
+        return lambda state: weights
+
+    def rule(self, policy: Policy) -> dict[str, float]:
+        state = Position(jnp.array(0), self.hold(jnp.full(4, 0.25)))
+        weights = policy(state)
+        return {f"weight of asset {i}": float(weights[i]) for i in (1, 2, 3)}
+
+    def scenes(self) -> list[tuple[str, Any]]:
+        return []

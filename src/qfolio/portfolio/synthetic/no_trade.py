@@ -1,0 +1,93 @@
+"""One asset with costs and no signal; ``solvers/no_trade.py`` solves it."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import constant, number, require, static
+from qfolio.core.mdp import Policy, Position
+from qfolio.portfolio.costs import drift, remainder_factor
+from qfolio.portfolio.market import Holding, Relatives
+from qfolio.portfolio.synthetic.base import OneAsset, require_cost
+from qfolio.solvers.no_trade import NoTradeRegion, no_trade_region_discrete
+
+
+class NoTrade(OneAsset):
+    """One asset with constant drift over cash; proportional costs make it best not to trade within
+    a region. The reward is the *expected* log growth of each step, net of costs.
+
+    Rates are a year; ``dt`` years pass in a step.
+    """
+
+    rate: float = number(0.02)
+    volatility: float = number(0.2)
+    cost: float = constant(0.01)
+    dt: float = number(1 / 12)
+    menu: str = static("")
+    horizon: int = static(480)
+
+    NODES = 5
+
+    def __check_init__(self) -> None:
+        require(self, "volatility", lambda x: 0.01 <= x <= 2, "from 0.01 to 2")
+        require(self, "dt", lambda x: 0.001 <= x <= 1, "from 0.001 to 1 years")
+        require_cost(self)
+        if not 0.01 <= self.rate / self.volatility**2 <= 0.99:
+            raise QfolioError(
+                f"The best weight without costs is {self.rate / self.volatility**2:.3g}; rate and "
+                "volatility must leave it between 0.01 and 0.99."
+            )
+
+    def reset_market(self, key: PRNGKeyArray) -> Float[Array, ""]:
+        return jnp.array(0.0)
+
+    def next_market(self, market: Array, key: PRNGKeyArray) -> Float[Array, ""]:
+        return self._log_relative(jax.random.normal(key))
+
+    def _log_relative(self, shock: Array) -> Array:
+        mean = (self.rate - self.volatility**2 / 2) * self.dt
+        return mean + self.volatility * self.dt**0.5 * shock
+
+    def features(self, market: Array) -> Float[Array, "asset time channel"]:
+        return jnp.ones((1, 1, 1))
+
+    def relatives(self, market: Array, next_market: Array) -> Relatives:
+        moved = jnp.exp(next_market)[None]
+        return Relatives(jnp.ones(1), moved, moved)
+
+    def settle(
+        self, market: Array, next_market: Array, holding: Holding, action: Array
+    ) -> tuple[Float[Array, ""], Holding]:
+        target = self.target(holding.weights, action)
+        remainder = remainder_factor(holding.weights, target, self.cost)
+        nodes, chances = np.polynomial.hermite_e.hermegauss(self.NODES)
+        gains = jnp.expm1(self._log_relative(jnp.asarray(nodes, jnp.float32)))
+        weights = jnp.asarray(chances / chances.sum(), jnp.float32)
+        growth = (weights * jnp.log1p(target[1] * gains)).sum()
+        moved = jnp.exp(next_market)[None]
+        return jnp.log(remainder) + growth, self.hold(drift(target, moved))
+
+    def region(self) -> NoTradeRegion:
+        """The exact region, for steps of ``dt``."""
+        return no_trade_region_discrete(self.rate, self.volatility, self.cost, self.dt)
+
+    def best(self) -> Policy:
+        low, high, _ = self.region()
+
+        def policy(state: Position) -> Array:
+            weight = jnp.clip(state.holding.weights[1], low, high)
+            return jnp.stack([1 - weight, weight])
+
+        return policy
+
+    def rule(self, policy: Policy) -> dict[str, float]:
+        """The edges: where a holder of too little, and of too much, stops trading."""
+        quiet = jnp.array(0.0)
+        return {"low": self.weight(policy, quiet, 0.1), "high": self.weight(policy, quiet, 0.9)}
+
+    def scenes(self) -> list[tuple[str, Any]]:
+        return [("at any time", jnp.array(0.0))]

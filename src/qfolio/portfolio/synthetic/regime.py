@@ -1,0 +1,68 @@
+"""A market of two regimes; ``solvers/regime.py`` solves it."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from qfolio.core.fields import constant, number, require, static
+from qfolio.core.mdp import Policy, Position
+from qfolio.portfolio.market import Relatives
+from qfolio.portfolio.synthetic.base import OneAsset, require_cost
+from qfolio.solvers.regime import regime
+
+
+class Regime(OneAsset):
+    """One asset that grows by ``mean`` a step in good times and loses it in bad ones.
+
+    Each regime lasts another step with probability ``stay``; it is seen, and earns at once.
+    """
+
+    stay: float = number(0.95)
+    mean: float = number(0.002)
+    cost: float = constant(0.005)
+    menu: str = static("")
+    horizon: int = static(250)
+
+    def __check_init__(self) -> None:
+        require(self, "stay", lambda x: 0 <= x < 1, "at least 0 and below 1")
+        require(self, "mean", lambda x: 0 < x <= 0.5, "above 0 and at most 0.5")
+        require_cost(self)
+
+    def reset_market(self, key: PRNGKeyArray) -> Int[Array, ""]:
+        return jax.random.bernoulli(key).astype(jnp.int32)
+
+    def next_market(self, market: Array, key: PRNGKeyArray) -> Int[Array, ""]:
+        return jnp.where(jax.random.uniform(key) < self.stay, market, 1 - market)
+
+    def features(self, market: Array) -> Float[Array, "asset time channel"]:
+        return (2.0 * market - 1.0).reshape(1, 1, 1)
+
+    def relatives(self, market: Array, next_market: Array) -> Relatives:
+        moved = jnp.exp(self.mean * (2.0 * market - 1.0))[None]
+        return Relatives(jnp.ones(1), moved, moved)
+
+    def best(self) -> Policy:
+        solution = regime((self.stay, self.stay), (-self.mean, self.mean), -np.log1p(-self.cost))
+        table = jnp.asarray(solution.policy)
+
+        def policy(state: Position) -> Array:
+            # Costs and rewards are linear in the weight: each part of it is a position by itself.
+            enters, stays = table[state.market, 0], table[state.market, 1]
+            weight = state.holding.weights[1]
+            weight = stays * weight + enters * (1 - weight)
+            return jnp.stack([1 - weight, weight])
+
+        return policy
+
+    def rule(self, policy: Policy) -> dict[str, float]:
+        return {
+            f"from {held} in {name} times": self.weight(policy, market, held)
+            for name, market in self.scenes()
+            for held in (0.0, 1.0)
+        }
+
+    def scenes(self) -> list[tuple[str, Any]]:
+        return [("bad", jnp.array(0, jnp.int32)), ("good", jnp.array(1, jnp.int32))]

@@ -1,0 +1,92 @@
+"""What the report of a backtest shows, as arrays and settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.assessment import Assessment
+from qfolio.report.data import Floats
+
+if TYPE_CHECKING:
+    pass
+
+
+@dataclass(frozen=True)
+class StrategySeries:
+    """What one strategy did on D days of the test, with S seeds (1 for a baseline) and N assets.
+
+    Attributes:
+        kind: 'agent' or 'baseline'.
+        returns: Simple returns net of costs, shape (S, D).
+        turnover: Value bought plus value sold as a share of the wealth, shape (S, D).
+        cost: Share of the wealth that each day's trade cost, shape (S, D).
+        weights: Weights after the trade, cash first, the mean over the seeds, shape (D, N + 1).
+    """
+
+    kind: str
+    returns: Floats
+    turnover: Floats
+    cost: Floats
+    weights: Floats
+
+
+@dataclass(frozen=True)
+class BacktestData:
+    """Everything the report of a backtest shows.
+
+    Attributes:
+        title: Heading of the page.
+        command: Command line that repeats the backtest; may have several lines.
+        assessment: The statistics of these strategies on these days.
+        dates: Days on which the returns were earned, shape (D,), strictly increasing.
+        assets: Names of the N assets, in the order of the weights.
+        strategies: By the names that the assessment has, too.
+        prices: Where the prices come from: source, rows, assets, first and last (dates), note
+            (what has to be said wherever a result on them is shown, such as survivorship; may be
+            empty) and digest.
+        config: All settings, a nested dictionary. Where it has cost (one way, a fraction), lag
+            (in rows), cap, train, test (lengths) and expanding, the page also says them in words.
+        folds: For each fold name, train_first, train_last, test_first and test_last (ISO dates).
+        notes: What did not go as planned, in sentences.
+    """
+
+    title: str
+    command: str
+    assessment: Assessment
+    dates: NDArray[np.datetime64]
+    assets: tuple[str, ...]
+    strategies: dict[str, StrategySeries]
+    prices: dict[str, Any]
+    config: dict[str, Any]
+    folds: list[dict[str, Any]]
+    notes: list[str]
+
+
+# What is drawn -------------------------------------------------------------------------------
+
+
+def require_fit(data: BacktestData) -> None:
+    if set(data.strategies) != set(data.assessment.strategies):
+        raise QfolioError(
+            "The series are of other strategies than the statistics; report those of one backtest."
+        )
+    days = (len(data.dates),)
+    for name, series in data.strategies.items():
+        shape = series.returns.shape
+        fits = shape[1:] == days and series.turnover.shape == series.cost.shape == shape
+        if not fits or series.weights.shape != (*days, len(data.assets) + 1):
+            raise QfolioError(
+                f"The series of {name} do not fit {days[0]} dates and {len(data.assets)} assets."
+            )
+
+
+def shown_order(data: BacktestData) -> list[str]:
+    """Agents first, then the baselines they are compared with, then the others."""
+    test = data.assessment
+    agents = [name for name, series in data.strategies.items() if series.kind == "agent"]
+    return list(dict.fromkeys([*agents, test.reference, test.best_baseline, *data.strategies]))

@@ -1,0 +1,104 @@
+"""Writing the report of a backtest: one self-contained page with live charts, and one picture.
+
+The page holds plotly.js, its data and its own script, and its Content-Security-Policy names these
+scripts by their hashes: nothing else can run in it, and nothing is loaded from anywhere. All words
+that a user can choose (titles, names of strategies and assets, settings) are escaped by the
+template or set as plain text; plotly, which reads markup in names, gets only numbers.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jinja2.utils import htmlsafe_json_dumps
+from markupsafe import Markup
+
+from qfolio.report import palette
+from qfolio.report.figures.style import LEAD, save_png
+from qfolio.report.rendering import render, setting_groups, source
+
+if TYPE_CHECKING:
+    pass
+
+from qfolio.report.backtest.data import BacktestData, require_fit, shown_order
+from qfolio.report.backtest.payload import AREAS, chart_data, days_per_point, looks_of
+from qfolio.report.backtest.prose import (
+    HEADINGS,
+    account,
+    difference_rows,
+    fold_rows,
+    key_facts,
+    latest_values,
+    luck_rows,
+    month_tables,
+    statistics_rows,
+    unit_of,
+    verdict_rows,
+)
+from qfolio.report.backtest.wealth import draw_wealth
+
+
+def write_backtest_report(folder: Path, data: BacktestData) -> None:
+    """Write report.html and wealth.png into a folder.
+
+    Args:
+        folder: Where to write; made if missing.
+        data: What to report.
+
+    Raises:
+        OSError: A file cannot be written.
+        QfolioError: Strategies, assessment, dates and assets do not fit together.
+    """
+    page = render_backtest(data)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_png(folder / "wealth.png", draw_wealth, data, LEAD)
+    # Bytes, because scripts whose line ends are changed no longer have the hash that lets them run.
+    (folder / "report.html").write_bytes(page.encode("utf-8"))
+
+
+def render_backtest(data: BacktestData) -> str:
+    """Return the text of the page; see ``write_backtest_report``."""
+    from plotly.offline import get_plotlyjs
+
+    require_fit(data)
+    names = shown_order(data)
+    looks = looks_of(names, data)
+    payload = chart_data(names, looks, data)
+    scripts = [get_plotlyjs().replace("\r\n", "\n"), source("backtest.js").replace("\r\n", "\n")]
+    return render(
+        "backtest.html",
+        data=data,
+        test=data.assessment,
+        scripts=[Markup(script) for script in scripts],
+        hashes=[_hash(script) for script in scripts],
+        payload=htmlsafe_json_dumps(payload, separators=(",", ":"), allow_nan=False),
+        strategies=[(name, data.strategies[name].kind, looks[name]) for name in names],
+        markers=palette.MARKER_PATHS,
+        verdicts=verdict_rows(names, data),
+        facts=key_facts(data),
+        latest={
+            name: latest_values(lines)
+            for name, lines in zip(names, payload["strategies"], strict=True)
+        },
+        headings=HEADINGS,
+        statistics=[(name, statistics_rows(name, data)) for name in names],
+        differences=[(name, difference_rows(name, data)) for name in names],
+        luck=luck_rows(names, data),
+        months=month_tables(names, data),
+        folds=fold_rows(data.folds),
+        fold_names=any(fold["name"] != fold["test_first"] for fold in data.folds),
+        said=account(data),
+        settings=setting_groups(data.config),
+        thinned=days_per_point(len(data.dates)),
+        averaged=math.ceil(len(data.dates) / AREAS),
+        unit=unit_of(data.assessment.periods_per_year),
+    )
+
+
+def _hash(script: str) -> str:
+    digest = hashlib.sha256(script.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"

@@ -1,0 +1,67 @@
+"""The picture of a backtest: wealth and drawdown."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from qfolio.report import palette
+from qfolio.report.figures.style import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+from qfolio.report.backtest.data import BacktestData, shown_order
+from qfolio.report.backtest.payload import across_seeds, fall_below_peak, looks_of, wealth_paths
+
+
+def draw_wealth(data: BacktestData, width: float) -> Figure:
+    """Draw wealth on a log axis and the fall below its peak, in the light scheme."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentFormatter
+
+    figure = new_figure(width, 5.4)
+    axes = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
+    days = data.dates.astype("datetime64[s]")
+    names = shown_order(data)
+    looks = looks_of(names, data)
+    handles = []
+    for name in reversed(names):
+        look, series = looks[name], data.strategies[name]
+        colour = palette.LIGHT[look.colour]
+        middle, low, high = across_seeds(wealth_paths(series))
+        style: dict[str, Any] = {
+            "color": colour,
+            "linewidth": 0.75 * look.width,
+            # Lengths are in widths of the line.
+            "linestyle": (0, tuple(float(part) / look.width for part in look.dash.split()))
+            if look.dash
+            else "solid",
+        }
+        if look.symbol is not None:
+            start = (0.03 + 0.05 * look.symbol) % 0.14
+            marker: dict[str, Any] = {
+                "marker": palette.MARKERS[look.symbol],
+                "markersize": 5.5,
+                "markeredgecolor": palette.PAPER,
+                "markevery": (round(start * len(days)), max(1, len(days) // 7)),
+            }
+            if len(series.returns) > 1:
+                axes[0].fill_between(days, low, high, color=colour, alpha=0.15, linewidth=0)
+        else:
+            marker = {}
+        handles += axes[0].plot(days, middle, **style, **marker, label=name)
+        axes[1].plot(days, -fall_below_peak(series), **{**style, "linewidth": 0.5 * look.width})
+    axes[0].set_yscale("log")
+    axes[0].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes[0].yaxis.set_major_formatter(FuncFormatter(lambda tick, _: f"{tick:g}"))
+    axes[0].yaxis.set_minor_formatter(NullFormatter())
+    axes[0].tick_params(axis="y", which="minor", length=0)
+    axes[0].set_title("Wealth, from 1 (log scale)")
+    axes[1].set_title("Below the peak so far")
+    axes[1].yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    for panel in axes:
+        panel.grid(axis="y")
+        panel.margins(x=0)
+    figure.legend(
+        handles=handles[::-1], loc="outside right upper", labelcolor=palette.INK, handlelength=2.6
+    )
+    return figure
