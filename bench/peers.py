@@ -42,7 +42,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "net_arch": [256, 256],
     },
     "ppo": {
-        "environments": 4,
+        "num_envs": 4,
         "n_steps": 1024,
         "n_epochs": 10,
         "batch_size": 64,
@@ -67,7 +67,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "net_arch": [64, 64],
     },
     "ppo-cartpole": {
-        "environments": 8,
+        "num_envs": 8,
         "n_steps": 128,
         "n_epochs": 10,
         "batch_size": 64,

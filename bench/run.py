@@ -282,7 +282,7 @@ def trained(population: Population) -> Contestant:
         before = population.steps
         population.advance(CHUNK)
         steps = population.steps - before
-        return steps * population.agent.environments * len(population.seeds)
+        return steps * population.agent.num_envs * len(population.seeds)
 
     advance()  # may observe only
     advance()

@@ -29,12 +29,12 @@ def families() -> dict[str, Agent]:
     """Other algorithms on the pendulum with continuous torques; peers.py has the same settings."""
     off_policy = {
         "hidden": (256, 256), "batch_size": 256, "replay_capacity": 50_000,
-        "learning_starts": 256, "learning_rate": 1e-3, "target_rate": 0.005, "discount": 0.99,
+        "learning_starts": 256, "learning_rate": 1e-3, "tau": 0.005, "discount": 0.99,
     }  # fmt: skip
     return {
         "ppo": PPO(
-            environments=4, rollout=1024, epochs=10, batch_size=64, hidden=(64, 64),
-            discount=0.9, trace=0.95, learning_rate=1e-3, entropy_weight=0.0,
+            num_envs=4, rollout_length=1024, epochs=10, batch_size=64, hidden=(64, 64),
+            discount=0.9, gae_lambda=0.95, learning_rate=1e-3, entropy_coef=0.0,
         ),
         "sac": SAC(**off_policy),
         "td3": TD3(**off_policy),
@@ -47,11 +47,11 @@ def hosted() -> dict[str, Agent]:
     return {
         "dqn": DQN(
             hidden=(64, 64), batch_size=64, replay_capacity=50_000, learning_starts=1000,
-            target_period=200, learning_rate=1e-3, discount=0.99,
+            target_update_interval=200, learning_rate=1e-3, discount=0.99,
         ),
         "ppo": PPO(
-            environments=8, rollout=128, epochs=10, batch_size=64, hidden=(64, 64),
-            discount=0.99, trace=0.95, learning_rate=1e-3, entropy_weight=0.0,
+            num_envs=8, rollout_length=128, epochs=10, batch_size=64, hidden=(64, 64),
+            discount=0.99, gae_lambda=0.95, learning_rate=1e-3, entropy_coef=0.0,
         ),
     }  # fmt: skip
 

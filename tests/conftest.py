@@ -26,6 +26,6 @@ def task() -> Pendulum:
 def agent() -> DQN:
     """Small enough that compiling it is most of its cost."""
     return DQN(
-        hidden=(16,), environments=2, batch_size=8, replay_capacity=200, learning_starts=20,
+        hidden=(16,), num_envs=2, batch_size=8, replay_capacity=200, learning_starts=20,
         episode_steps=0, learning_rate_steps=200.0,
     )  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 
 from qfolio.cli import main
 
-TINY = ["--set", "hidden=8", "environments=2", "batch_size=8", "learning_starts=16",
+TINY = ["--set", "hidden=8", "num_envs=2", "batch_size=8", "learning_starts=16",
         "episode_steps=0", "horizon=20"]  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.costs import drift, remainder_factor
 
 WINDOW, TRAIN = 5, 40
-TINY = {"hidden": (8,), "environments": 4, "rollout": 5, "horizon": 10, "learning_rate": 0.03,
+TINY = {"hidden": (8,), "num_envs": 4, "rollout_length": 5, "horizon": 10, "learning_rate": 0.03,
         "learning_rate_final": 1.0}  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def test_its_portfolio_can_be_sent_and_copied_but_not_scaled():
 def test_it_goes_on_learning_day_by_day(agent):
     x = returns()
     settings = TINY if agent == "pathwise" else {
-        "hidden": (8,), "environments": 4, "batch_size": 8, "learning_starts": 20,
+        "hidden": (8,), "num_envs": 4, "batch_size": 8, "learning_starts": 20,
         "replay_capacity": 64, "horizon": 10,
     }  # fmt: skip
     learner = model(agent=agent, episodes=16, update_episodes=8, settings=settings)

@@ -32,8 +32,8 @@ ANY = [-jnp.inf, jnp.inf]  # rewards that allow every value
 STATES = jnp.array([[0.5], [-0.5]])
 BEST = jnp.array([[1.0], [-1.0]])
 SMALL = {
-    "hidden": (64, 64), "environments": 4, "batch_size": 64, "replay_capacity": 4000,
-    "learning_starts": 400, "discount": DISCOUNT, "target_rate": 0.05, "learning_rate": 3e-3,
+    "hidden": (64, 64), "num_envs": 4, "batch_size": 64, "replay_capacity": 4000,
+    "learning_starts": 400, "discount": DISCOUNT, "tau": 0.05, "learning_rate": 3e-3,
     "learning_rate_final": 0.0,
 }  # fmt: skip
 
@@ -89,8 +89,8 @@ def batch_of(n=6, actions=None):
 
 @pytest.mark.parametrize(("kind", "rescale"), [(DDPG, False), (DDPG, True), (TD3, False)])
 def test_a_deterministic_actor_finds_the_best_action_and_its_value(kind, rescale):
-    noise = {"target_noise": 0.2, "target_clip": 0.1} if kind is TD3 else {}
-    end = learned(Aim(), kind(**SMALL, exploration=0.2, rescale_values=rescale, **noise))
+    noise = {"target_noise": 0.2, "target_noise_clip": 0.1} if kind is TD3 else {}
+    end = learned(Aim(), kind(**SMALL, exploration_noise=0.2, value_rescaling=rescale, **noise))
     np.testing.assert_allclose(end.actor(STATES), BEST, atol=0.08)  # 2 % of the range
     values = end.critics(STATES, BEST).mean(0)
     # Noise on the target's actions takes its variance off each later step.
@@ -102,7 +102,7 @@ def test_a_deterministic_actor_finds_the_best_action_and_its_value(kind, rescale
 def test_returns_over_steps_lead_to_the_same_policy():
     """Rewards between now and the value that follows are those of actions with noise."""
     noise = 0.2
-    end = learned(Aim(horizon=50), DDPG(**SMALL, exploration=noise, n_steps=3))
+    end = learned(Aim(horizon=50), DDPG(**SMALL, exploration_noise=noise, n_steps=3))
     np.testing.assert_allclose(end.actor(STATES), BEST, atol=0.16)  # 4 %: returns vary more
     later = sum(DISCOUNT**k * (1 - noise**2 * (k % 3 > 0)) for k in range(1, 100))
     np.testing.assert_allclose(end.critics(STATES, BEST)[0], [1 + later, 1], rtol=0.02)
@@ -118,7 +118,7 @@ def clipped_variance(scale, clip):
 
 def test_a_soft_actor_finds_the_best_distribution_its_value_and_its_temperature():
     """For a reward of −(a/2)² the best soft policy is normal with variance 2α."""
-    end = learned(Aim(math.inf), SAC(**SMALL, spread=1.0, temperature=0.2))
+    end = learned(Aim(math.inf), SAC(**SMALL, spread=1.0, initial_temperature=0.2))
     entropy = math.log(2)  # that of a number uniform on ±1
     temperature = math.exp(2 * entropy) / (4 * math.pi * math.e)
     np.testing.assert_allclose(jnp.exp(end.log_temperature), temperature, rtol=0.03)
@@ -133,7 +133,7 @@ def test_a_soft_actor_finds_the_best_distribution_its_value_and_its_temperature(
 
 @pytest.mark.parametrize("rescale", [False, True])
 def test_a_soft_choice_among_numbered_actions(rescale):
-    agent = SAC(**SMALL, spread=0.5, rescale_values=rescale)
+    agent = SAC(**SMALL, spread=0.5, value_rescaling=rescale)
     end = learned(OneState(), agent, 1500)
     values = agent.action_values(sac.Policy(end.actor, end.critics), jnp.ones((1, 1)))
     np.testing.assert_allclose(values, [[0, 1]], atol=0.02)
@@ -144,7 +144,7 @@ def test_a_soft_choice_among_numbered_actions(rescale):
     np.testing.assert_allclose(chosen, p, rtol=0.02)
 
 
-@pytest.mark.parametrize("agent", [DDPG(**SMALL, exploration=0.1), SAC(**SMALL, spread=0.02)])
+@pytest.mark.parametrize("agent", [DDPG(**SMALL, exploration_noise=0.1), SAC(**SMALL, spread=0.02)])
 def test_weights_on_a_simplex(agent):
     end = learned(AimWeights(), agent)
     weights = sac.Policy(end.actor, None) if isinstance(agent, SAC) else end.actor
@@ -156,7 +156,7 @@ def test_weights_on_a_simplex(agent):
 
 
 def test_the_targets_action_is_smoothed_and_the_smaller_value_taken():
-    agent = TD3(hidden=(8,), target_noise=0.5, target_clip=0.1)
+    agent = TD3(hidden=(8,), target_noise=0.5, target_noise_clip=0.1)
     start = begun(agent)
     # An actor on the upper bound: noise beyond it is cut off, and below it is clipped at 0.1 · 2.
     actor = eqx.tree_at(lambda a: a.network.mlp.biases[-1], start.target_actor, jnp.full(1, 50.0))
@@ -206,7 +206,7 @@ def actor_slope(actions, critics, output):
 
 
 def test_actor_and_targets_wait_for_the_critics():
-    agent = TD3(hidden=(8,), policy_delay=3, target_rate=0.25)
+    agent = TD3(hidden=(8,), policy_delay=3, tau=0.25)
     now, moved = begun(agent), []
     for _ in range(6):
         before, now = now, updated(agent, now, batch_of())
@@ -224,12 +224,12 @@ def test_the_actors_step_leaves_the_critics_alone_and_targets_follow(agent):
     other = begun(agent, seed=4)
     start = eqx.tree_at(lambda x: x.target_critics, start, other.critics)
     start = eqx.tree_at(lambda x: x.critic_adam.count, start, jnp.array(1, jnp.int32))
-    still = updated(dataclasses.replace(agent, actor_rate=0.0), start, batch_of())
+    still = updated(dataclasses.replace(agent, actor_learning_rate_ratio=0.0), start, batch_of())
     after = updated(agent, start, batch_of())
     assert eqx.tree_equal(still.critics, after.critics)
     assert eqx.tree_equal(still.actor, start.actor)
     assert not eqx.tree_equal(after.actor, start.actor)
-    rate = agent.target_rate
+    rate = agent.tau
     follow = lambda target, online: (1 - rate) * target + rate * online  # noqa: E731
     expected = jax.tree.map(follow, start.target_critics, after.critics)
     assert_close(after.target_critics, expected, 1e-6)
@@ -267,7 +267,7 @@ def test_critics_learn_roots_of_values():
     values, roots = jnp.array([0.0, 3.0, -8.0, 99.0]), jnp.array([0.0, 1.0, -2.0, 9.0])
     np.testing.assert_allclose(squash(values), roots, atol=1e-6)
     np.testing.assert_allclose(unsquash(roots), values, atol=1e-6)
-    plain, rescaled = begun(DDPG(hidden=(8,))), begun(DDPG(hidden=(8,), rescale_values=True))
+    plain, rescaled = begun(DDPG(hidden=(8,))), begun(DDPG(hidden=(8,), value_rescaling=True))
     batch = batch_of()
     output = plain.critics(batch.observation, batch.action)
     np.testing.assert_allclose(
@@ -280,7 +280,7 @@ def test_critics_learn_roots_of_values():
 
 
 def test_all_rewards_count_however_old():
-    agent = DDPG(hidden=(8,), environments=2, replay_capacity=2, learning_starts=2)
+    agent = DDPG(hidden=(8,), num_envs=2, replay_capacity=2, learning_starts=2)
     state = agent.init(Aim(), jax.random.key(0))
     for reward in ([0.5, -3.0], [2.0, 0.0], [0.0, 0.0]):
         state = agent.observe(state, rollout_of(jnp.array([reward])))
@@ -312,7 +312,7 @@ def test_gradients_against_differences():
         batch = double(batch_of())
         goal = jnp.linspace(-1.0, 1.0, 6)
         deterministic, soft = double(begun(DDPG(hidden=(8, 8)))), double(begun(SAC(hidden=(8, 8))))
-        rescaled = double(begun(DDPG(hidden=(8, 8), rescale_values=True)))
+        rescaled = double(begun(DDPG(hidden=(8, 8), value_rescaling=True)))
         weighed = SAC(hidden=(8, 8))
         view = jax.vmap(AimWeights().observe)(batch.observation[:, 0])
         view_of_one = jax.tree.map(lambda x: x[0], view)
@@ -379,7 +379,7 @@ def test_soft_values_by_hand():
 
 def test_the_soft_goal_counts_the_next_steps_entropy():
     """The critics' first step goes towards r + γ (min Q' + α H)."""
-    agent = SAC(hidden=(8,), discount=0.9, learning_rate=0.01, temperature=0.7)
+    agent = SAC(hidden=(8,), discount=0.9, learning_rate=0.01, initial_temperature=0.7)
     task = OneState()
     start = begin(agent, task, jnp.zeros(1), jax.random.key(3))
     batch = batch_of(actions=Discrete(2))
@@ -450,7 +450,7 @@ def test_noise_stays_among_the_actions():
 
 
 def test_warm_up_explores_at_random_and_learning_by_the_actor():
-    agent = DDPG(hidden=(8,), environments=500, learning_starts=1000, exploration=0.0)
+    agent = DDPG(hidden=(8,), num_envs=500, learning_starts=1000, exploration_noise=0.0)
     state = agent.init(Pendulum(torques=0), jax.random.key(0))
     observation = jnp.ones((500, 3))
     random = agent.act(state, observation, jax.random.key(1))
@@ -489,7 +489,7 @@ def test_numbered_actions_are_refused(kind):
 @pytest.mark.parametrize("task", [Merton(), GarleanuPedersen()])
 def test_fits_markets(kind, network, task):
     agent = kind(
-        network=network, hidden=(8,), environments=3, batch_size=4, replay_capacity=30,
+        network=network, hidden=(8,), num_envs=3, batch_size=4, replay_capacity=30,
         learning_starts=3,
     )  # fmt: skip
     key = jax.random.key(0)
@@ -509,8 +509,8 @@ def test_fits_markets(kind, network, task):
 @pytest.mark.parametrize(
     ("kind", "settings"),
     [
-        (DDPG, {"exploration": -0.1}), (DDPG, {"batch_size": 0}), (TD3, {"policy_delay": 0}),
-        (TD3, {"target_noise": -1.0}), (SAC, {"spread": 0.0}), (SAC, {"temperature": 0.0}),
+        (DDPG, {"exploration_noise": -0.1}), (DDPG, {"batch_size": 0}), (TD3, {"policy_delay": 0}),
+        (TD3, {"target_noise": -1.0}), (SAC, {"spread": 0.0}), (SAC, {"initial_temperature": 0.0}),
         (SAC, {"discount": 1.5}), (SAC, {"learning_starts": 100, "replay_capacity": 50}),
         (SAC, {"network": "mpl"}), (SAC, {"hidden": ()}),
     ],

@@ -40,7 +40,7 @@ VALUES, ROOTS = Scale(roots=False), Scale(roots=True)
 
 
 def rollout(agent, observation=1.0, reward=1.0, terminated=False, truncated=False):
-    shape = (1, agent.environments)
+    shape = (1, agent.num_envs)
     return Transition(
         state=None,
         observation=jnp.full((*shape, 3), observation),
@@ -103,7 +103,7 @@ def test_observing_learns_nothing(task, agent):
     state = agent.init(task, jax.random.key(0))
     after = agent.observe(state, rollout(agent))
     jax.tree.map(np.testing.assert_array_equal, after.online, state.online)
-    assert after.replay.size == agent.environments
+    assert after.replay.size == agent.num_envs
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_observing_learns_nothing(task, agent):
     [(False, True, False, False), (False, True, True, True), (True, False, False, True)],
 )
 def test_what_counts_as_the_end(task, terminated, truncated, wrong, expected):
-    agent = DQN(environments=2, time_limit_terminal=wrong, episode_steps=0)
+    agent = DQN(num_envs=2, time_limit_terminal=wrong, episode_steps=0)
     state = agent.init(task, jax.random.key(0))
     state = agent.observe(state, rollout(agent, terminated=terminated, truncated=truncated))
     assert state.replay.unpack(state.replay.rows).terminal[:2].tolist() == [expected] * 2
@@ -127,7 +127,7 @@ def test_the_gradient_reaches_the_online_network_only(task, agent):
 @pytest.mark.parametrize("values", ["expected", "categorical", "quantile"])
 def test_selecting_and_evaluating_have_no_gradient(task, agent, values):
     """With γ = 0 what follows does not matter, and nor may its gradient with γ > 0."""
-    changes = {"values": values, "double": True, "dueling": True, "atoms": 7, "huber": 1.0}
+    changes = {"values": values, "double": True, "dueling": True, "atoms": 7, "huber_delta": 1.0}
     changes |= {"v_min": -1000.0, "v_max": 1000.0}
     agent = dataclasses.replace(agent, **changes, discount=0.9)
     state = agent.init(task, jax.random.key(0))
@@ -154,7 +154,7 @@ def test_selecting_and_evaluating_have_no_gradient(task, agent, values):
 
 def test_the_target_network_is_copied_every_period(task):
     agent = DQN(
-        hidden=(8,), environments=1, batch_size=4, target_period=3, target_rate=1.0,
+        hidden=(8,), num_envs=1, batch_size=4, target_update_interval=3, tau=1.0,
         learning_rate=1e-2,
     )  # fmt: skip
     state = agent.init(task, jax.random.key(0))
@@ -169,11 +169,11 @@ def test_the_report_presets_copies_come_at_the_end_of_each_episode():
     """Every hyperparameter of the report, and the step at which it copies: 200, 400, …"""
     agent, task = preset("report").build(), Pendulum()
     assert agent == DQN(
-        hidden=(256, 256), environments=1, episode_steps=0, batch_size=64, updates=1,
+        hidden=(256, 256), num_envs=1, episode_steps=0, batch_size=64, gradient_steps=1,
         replay_capacity=50_000, learning_starts=64, double=False, time_limit_terminal=False,
-        target_period=200, target_rate=1.0, discount=0.99, learning_rate=1e-3,
-        learning_rate_final=1.0, epsilon=1.0, epsilon_end=0.01, epsilon_decay=0.995,
-        huber=float("inf"), reward_scale=1.0, input_gain=0.0,
+        target_update_interval=200, tau=1.0, discount=0.99, learning_rate=1e-3,
+        learning_rate_final=1.0, epsilon_start=1.0, epsilon_end=0.01, epsilon_decay=0.995,
+        huber_delta=float("inf"), reward_scale=1.0, input_gain=0.0,
     )  # fmt: skip
     population = Population(task, agent, [0])
     copied = []
@@ -186,7 +186,7 @@ def test_the_report_presets_copies_come_at_the_end_of_each_episode():
 
 
 def test_the_target_network_follows_softly(task):
-    agent = DQN(hidden=(8,), environments=1, batch_size=4, target_period=1, target_rate=0.25)
+    agent = DQN(hidden=(8,), num_envs=1, batch_size=4, target_update_interval=1, tau=0.25)
     before = agent.init(task, jax.random.key(0))
     after, _ = agent.learn(Pendulum(), before, rollout(agent), jax.random.key(1))
     expected = 0.75 * before.target.mlp.weights[0] + 0.25 * after.online.mlp.weights[0]
@@ -194,7 +194,7 @@ def test_the_target_network_follows_softly(task):
 
 
 def test_epsilon_decays_with_finished_episodes(task):
-    agent = DQN(environments=1, epsilon=1.0, epsilon_end=0.5, epsilon_decay=0.9)
+    agent = DQN(num_envs=1, epsilon_start=1.0, epsilon_end=0.5, epsilon_decay=0.9)
     state = agent.init(task, jax.random.key(0))
     values = []
     for _ in range(8):
@@ -206,7 +206,7 @@ def test_epsilon_decays_with_finished_episodes(task):
 
 @pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
 def test_explores_with_probability_epsilon(task, epsilon):
-    agent = DQN(environments=1, epsilon=epsilon, epsilon_end=epsilon)
+    agent = DQN(num_envs=1, epsilon_start=epsilon, epsilon_end=epsilon)
     state = agent.init(task, jax.random.key(0))
     n, actions = 20_000, task.actions.n
     observation = jnp.ones((n, 3))
@@ -226,7 +226,7 @@ def test_the_learning_rate_falls_along_a_cosine():
 
 def test_adam_equals_its_formula(task):
     """One update against Adam written out (Kingma & Ba 2015, algorithm 1)."""
-    agent = DQN(hidden=(8,), environments=1, batch_size=4, learning_rate=0.01)
+    agent = DQN(hidden=(8,), num_envs=1, batch_size=4, learning_rate=0.01)
     before = agent.init(task, jax.random.key(0))
     after, _ = agent.learn(Pendulum(), before, rollout(agent), jax.random.key(1))
     replay = agent.observe(before, rollout(agent)).replay
@@ -244,10 +244,12 @@ def test_adam_equals_its_formula(task):
     "settings",
     [
         {"discount": 1.5}, {"learning_rate": 0.0}, {"batch_size": 0}, {"hidden": ()},
-        {"epsilon": -0.1}, {"huber": 0.0}, {"learning_starts": 100, "replay_capacity": 50},
-        {"n_steps": 0}, {"n_steps": 30, "environments": 4, "replay_capacity": 100},
+        {"epsilon_start": -0.1}, {"huber_delta": 0.0},
+        {"learning_starts": 100, "replay_capacity": 50},
+        {"n_steps": 0}, {"n_steps": 30, "num_envs": 4, "replay_capacity": 100},
         {"priority_exponent": 1.1}, {"values": "means"}, {"atoms": 1, "values": "categorical"},
-        {"v_max": -10.0, "values": "categorical"}, {"huber": float("inf"), "values": "quantile"},
+        {"v_max": -10.0, "values": "categorical"},
+        {"huber_delta": float("inf"), "values": "quantile"},
         {"noise_scale": -1.0}, {"persistence": 1.5},
     ],
 )  # fmt: skip
@@ -257,8 +259,8 @@ def test_refuses_what_makes_no_sense(settings):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"values": "quantile", "huber": 1.0}, {"n_steps": 2}, {"prioritised": True},
-                {"noisy": True}, {"persistence": 0.5}, {"rescale_values": True}],
+    "changes", [{"values": "quantile", "huber_delta": 1.0}, {"n_steps": 2}, {"prioritized": True},
+                {"noisy": True}, {"persistence": 0.5}, {"value_rescaling": True}],
 )  # fmt: skip
 def test_all_actions_refuses_what_moves_do_not_give(changes):
     with pytest.raises(QfolioError, match=f"take {next(iter(changes))}="):
@@ -400,7 +402,7 @@ def test_noise_is_factorised_and_of_the_size_that_it_starts_with():
 
 
 def test_noise_is_drawn_anew_for_each_act_and_explores(task):
-    agent = DQN(hidden=(8, 8), noisy=True, epsilon=0.0, epsilon_end=0.0)
+    agent = DQN(hidden=(8, 8), noisy=True, epsilon_start=0.0, epsilon_end=0.0)
     state = agent.init(task, jax.random.key(0))
     observation = jnp.ones((1, 3))
     act = lambda key: agent.act(state, observation, key)[0]  # noqa: E731
@@ -414,7 +416,7 @@ def test_noise_is_drawn_anew_for_each_act_and_explores(task):
 
 def test_exploring_goes_on_with_the_last_action(task):
     """With ε = 1 and full persistence every action is the last one of its environment."""
-    agent = DQN(hidden=(8,), environments=3, replay_capacity=7, persistence=1.0, learning_starts=3)
+    agent = DQN(hidden=(8,), num_envs=3, replay_capacity=7, persistence=1.0, learning_starts=3)
     state = agent.init(task, jax.random.key(0))
     for turn in range(5):  # the ring of 9 rows begins anew
         last = jnp.array([turn, 1, 2]) % 3
@@ -464,9 +466,9 @@ def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):
     """Written out: β = 0.4 at the first update, priorities (|error| + 10⁻⁶)^α afterwards."""
     agent = DQN(
         hidden=(8,),
-        environments=4,
+        num_envs=4,
         batch_size=6,
-        prioritised=True,
+        prioritized=True,
         replay_capacity=16,
         learning_starts=8,
     )
@@ -495,7 +497,7 @@ def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):
 
 
 def test_learning_waits_for_the_steps_that_a_return_needs():
-    agent = DQN(environments=8, n_steps=5, learning_starts=8)
+    agent = DQN(num_envs=8, n_steps=5, learning_starts=8)
     assert agent.warm_up() == 4
 
 
@@ -503,10 +505,10 @@ def learned_abstractly(agent, task, state):
     """Shapes after acting and learning; types are checked on the way."""
 
     def step(state):
-        states = jax.vmap(task.reset)(jax.random.split(jax.random.key(0), agent.environments))
+        states = jax.vmap(task.reset)(jax.random.split(jax.random.key(0), agent.num_envs))
         observation = jax.vmap(task.observe)(states)
         action = agent.act(state, observation, jax.random.key(1))
-        no = jnp.zeros(agent.environments, bool)
+        no = jnp.zeros(agent.num_envs, bool)
         step = (states, observation, action, jnp.zeros(len(no)), states, observation, no, no)
         rollout = Transition(*jax.tree.map(lambda x: x[None], step))
         return agent.learn(task, state, rollout, jax.random.key(2))[0]
@@ -519,9 +521,9 @@ def test_every_option_fits_a_market(network):
     """Values of a menu with choices for each asset keep their order with several numbers each."""
     market = Merton(menu="tilts:0.1")
     agent = DQN(
-        network=network, hidden=(8, 8, 8), environments=4, batch_size=8, learning_starts=16,
-        replay_capacity=64, double=True, dueling=True, n_steps=2, prioritised=True, noisy=True,
-        values="quantile", atoms=3, huber=1.0,
+        network=network, hidden=(8, 8, 8), num_envs=4, batch_size=8, learning_starts=16,
+        replay_capacity=64, double=True, dueling=True, n_steps=2, prioritized=True, noisy=True,
+        values="quantile", atoms=3, huber_delta=1.0,
     )  # fmt: skip
     state = agent.init(market, jax.random.key(0))
     assert jax.tree.structure(learned_abstractly(agent, market, state)) == jax.tree.structure(state)
@@ -541,7 +543,7 @@ def test_every_option_fits_a_market(network):
 def test_all_actions_can_duel():
     market = Ar1(menu="grid:10")
     agent = DQN(
-        hidden=(8, 8), environments=4, batch_size=8, learning_starts=16, replay_capacity=64,
+        hidden=(8, 8), num_envs=4, batch_size=8, learning_starts=16, replay_capacity=64,
         dueling=True, double=True, all_actions=True, market_baseline=True,
     )  # fmt: skip
     state = agent.init(market, jax.random.key(0))
@@ -549,10 +551,10 @@ def test_all_actions_can_duel():
 
 
 def test_priorities_are_part_of_what_is_saved(task, agent, tmp_path):
-    agent = dataclasses.replace(agent, prioritised=True)
+    agent = dataclasses.replace(agent, prioritized=True)
     fresh = agent.init(task, jax.random.key(0))
     state = jax.tree.map(np.asarray, agent.observe(fresh, rollout(agent)))
     write_tree(tmp_path / "state", state)
     again = read_tree(tmp_path / "state", fresh)
-    assert again.replay.priorities.levels[-1].sum() == agent.environments
+    assert again.replay.priorities.levels[-1].sum() == agent.num_envs
     jax.tree.map(np.testing.assert_array_equal, again, state)

@@ -21,10 +21,12 @@ from qfolio.tasks.pendulum import Pendulum
 from probes import Aim
 
 SMALL = {
-    "hidden": (64, 64), "model_hidden": (64, 64), "environments": 4, "batch_size": 64, "members": 3,
-    "replay_capacity": 2000, "learning_starts": 200, "discount": 0.8, "target_rate": 0.05,
-    "learning_rate": 3e-3, "learning_rate_final": 0.0, "spread": 0.02, "imagined_capacity": 8000,
-    "imagined_rows": 32, "imagined_steps": 2, "model_updates": 2, "updates": 2,
+    "hidden": (64, 64), "model_hidden": (64, 64), "num_envs": 4, "batch_size": 64,
+    "ensemble_size": 3,
+    "replay_capacity": 2000, "learning_starts": 200, "discount": 0.8, "tau": 0.05,
+    "learning_rate": 3e-3, "learning_rate_final": 0.0, "spread": 0.02,
+    "model_replay_capacity": 8000,
+    "model_rollout_batch": 32, "model_rollout_length": 2, "model_updates": 2, "gradient_steps": 2,
 }  # fmt: skip
 
 
@@ -123,7 +125,7 @@ def test_the_models_gradient_against_differences():
 
 
 def test_each_member_counts_real_steps_as_often_as_chance_says():
-    agent = MBPO(**{**SMALL, "environments": 500})
+    agent = MBPO(**{**SMALL, "num_envs": 500})
     task = Pendulum(torques=0)
     state = jax.jit(lambda: agent.init(task, jax.random.key(0)))()
     shape = (1, 500)
@@ -179,7 +181,8 @@ def test_refuses_what_is_no_row_of_numbers(task):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"members": 0}, {"model_hidden": ()}, {"imagined_steps": 0}, {"n_steps": 2}]
+    "settings",
+    [{"ensemble_size": 0}, {"model_hidden": ()}, {"model_rollout_length": 0}, {"n_steps": 2}],
 )
 def test_refuses_what_makes_no_sense(settings):
     with pytest.raises(QfolioError, match=next(iter(settings))):

@@ -25,18 +25,18 @@ from qfolio.tasks.pendulum import Pendulum
 from probes import Aim, AimWeights, Endless, OneState, RewardDelay, TwoStates
 
 DISCOUNT = 0.9
-SMALL = {"hidden": (16,), "environments": 3, "rollout": 4, "episode_steps": 4}
+SMALL = {"hidden": (16,), "num_envs": 3, "rollout_length": 4, "episode_steps": 4}
 AGENTS = {
     "reinforce": REINFORCE(**SMALL),
-    "a2c": A2C(**SMALL, trace=0.8),
-    "ppo": PPO(**SMALL, batch_size=6, epochs=2, trace=0.8),
+    "a2c": A2C(**SMALL, gae_lambda=0.8),
+    "ppo": PPO(**SMALL, batch_size=6, epochs=2, gae_lambda=0.8),
 }
 TASKS = {"choice": Pendulum(torques=3), "numbers": Pendulum(torques=0), "weights": Merton()}
 
 
 def a_rollout(agent, task, state, key):
     """Steps from made-up observations, with actions that the agent draws and made-up outcomes."""
-    shape = (agent.rollout, agent.environments)
+    shape = (agent.rollout_length, agent.num_envs)
     keys = jax.random.split(key, 6)
     example = task.observe(task.reset(key))
     draw = lambda key: jax.tree.map(  # noqa: E731
@@ -63,12 +63,12 @@ def test_advantages_by_hand():
     reward, value, following = column(1.0, 2, 3, 4), column(1.0, 1, 1, 1), column(2.0, 4, 6, 8)
     no = column(False, False, False, False)
 
-    def of(terminated=no, truncated=no, trace=0.5):
+    def of(terminated=no, truncated=no, gae_lambda=0.5):
         found = advantages(reward, value, following, terminated, truncated, 0.5, trace)
         return np.asarray(found)[:, 0]
 
     errors = np.array([1, 3, 5, 7])
-    np.testing.assert_allclose(of(trace=0.0), errors)
+    np.testing.assert_allclose(of(gae_lambda=0.0), errors)
     expected = [1 + (3 + (5 + 7 / 4) / 4) / 4, 3 + (5 + 7 / 4) / 4, 5 + 7 / 4, 7]
     np.testing.assert_allclose(of(), expected)
     # Cut after the second step: its own error still looks at what would follow, and ends there.
@@ -153,7 +153,7 @@ def plain_loss(name, agent, weights, batch):
             total -= log_prob[i] * scaled[i]
         else:
             ratio = np.exp(log_prob[i] - batch.log_prob[i])
-            bound = np.clip(ratio, 1 - agent.clip, 1 + agent.clip)
+            bound = np.clip(ratio, 1 - agent.clip_range, 1 + agent.clip_range)
             total -= min(ratio * scaled[i], bound * scaled[i])
     value = dense(weights.critic.mlp, observation)[:, 0]
     error = ((np.asarray(batch.goal) - value) ** 2).mean()
@@ -161,7 +161,7 @@ def plain_loss(name, agent, weights, batch):
     beyond = np.maximum(np.abs(output) - 2, 0)
     assert beyond.any(), "some means are to be out of reach"
     total = total / len(advantage) + 0.1 * (beyond**2).mean()
-    return total + agent.value_weight * error - agent.entropy_weight * entropy
+    return total + agent.value_coef * error - agent.entropy_coef * entropy
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def plain_loss(name, agent, weights, batch):
 def test_loss_and_gradient(name, kind):
     """Against finite differences; where actions are numbers, against plain formulas, too."""
     with jax.enable_x64(True):
-        agent = dataclasses.replace(AGENTS[name], entropy_weight=0.1, rollout=16)
+        agent = dataclasses.replace(AGENTS[name], entropy_coef=0.1, rollout_length=16)
         task = TASKS[kind]
         state = agent.init(task, jax.random.key(0))
         rollout = a_rollout(agent, task, state, jax.random.key(1))
@@ -206,7 +206,7 @@ def test_loss_and_gradient(name, kind):
 
 
 def test_the_critic_is_no_part_of_the_policys_gradient():
-    agent = dataclasses.replace(AGENTS["a2c"], value_weight=0.0)
+    agent = dataclasses.replace(AGENTS["a2c"], value_coef=0.0)
     task = TASKS["numbers"]
     state = agent.init(task, jax.random.key(0))
     rollout = a_rollout(agent, task, state, jax.random.key(1))
@@ -224,9 +224,9 @@ def test_judging_is_what_the_formulas_say():
     batch = agent.judge(state.weights, rollout, 0.8)
     value = np.asarray(jax.vmap(state.weights.value)(rollout.observation))
     following = np.asarray(jax.vmap(state.weights.value)(rollout.next_observation))
-    for column in range(agent.environments):
+    for column in range(agent.num_envs):
         advantage = 0.0
-        for time in reversed(range(agent.rollout)):
+        for time in reversed(range(agent.rollout_length)):
             terminated = rollout.terminated[time, column]
             if terminated or rollout.truncated[time, column]:
                 advantage = 0.0
@@ -234,7 +234,7 @@ def test_judging_is_what_the_formulas_say():
             goal = reward + (0.0 if terminated else agent.discount * following[time, column])
             error = goal - value[time, column]
             advantage = error + agent.discount * 0.8 * advantage
-            row = time * agent.environments + column
+            row = time * agent.num_envs + column
             assert float(batch.advantage[row]) == pytest.approx(advantage, abs=1e-5)
             assert float(batch.goal[row]) == pytest.approx(
                 advantage + value[time, column], abs=1e-5
@@ -244,8 +244,8 @@ def test_judging_is_what_the_formulas_say():
 
 def test_one_step_of_ppo_from_its_own_policy_is_the_policy_gradient():
     """No ratio is clipped there, and the gradient of a ratio is that of the log density."""
-    settings = {**SMALL, "gradient_norm": np.inf}
-    ppo = PPO(**settings, batch_size=12, epochs=1, trace=1.0)
+    settings = {**SMALL, "max_grad_norm": np.inf}
+    ppo = PPO(**settings, batch_size=12, epochs=1, gae_lambda=1.0)
     task, key = TASKS["choice"], jax.random.key(1)
     state = ppo.init(task, jax.random.key(0))
     rollout = a_rollout(ppo, task, state, key)
@@ -258,8 +258,8 @@ def test_one_step_of_ppo_from_its_own_policy_is_the_policy_gradient():
 
 def learned(agent, task, steps=4000, **changes):
     settings = {
-        "hidden": (32,), "environments": 16, "rollout": 8, "discount": DISCOUNT,
-        "learning_rate": 5e-3, "learning_rate_final": 0.0, "value_weight": 1.0, "std": 0.5,
+        "hidden": (32,), "num_envs": 16, "rollout_length": 8, "discount": DISCOUNT,
+        "learning_rate": 5e-3, "learning_rate_final": 0.0, "value_coef": 1.0, "initial_std": 0.5,
         "learning_rate_steps": steps / 8,
     }  # fmt: skip
     if agent is PPO:
@@ -344,11 +344,11 @@ def test_the_first_policy_is_the_same_everywhere():
     ("agent", "changes", "message"),
     [
         (PPO, {"batch_size": 100}, "must divide"),
-        (PPO, {"clip": 0.0}, "clip is 0"),
-        (PPO, {"trace": 1.1}, "trace is 1.1"),
-        (A2C, {"trace": -1.0}, "trace is -1"),
-        (A2C, {"rollout": 0}, "rollout is 0"),
-        (REINFORCE, {"std": 0.0}, "std is 0"),
+        (PPO, {"clip_range": 0.0}, "clip_range is 0"),
+        (PPO, {"gae_lambda": 1.1}, "gae_lambda is 1.1"),
+        (A2C, {"gae_lambda": -1.0}, "gae_lambda is -1"),
+        (A2C, {"rollout_length": 0}, "rollout_length is 0"),
+        (REINFORCE, {"initial_std": 0.0}, "initial_std is 0"),
         (REINFORCE, {"network": "tree"}, "network is tree"),
     ],
 )
@@ -359,7 +359,7 @@ def test_wrong_settings(agent, changes, message):
 
 def test_reinforce_wants_whole_episodes():
     with pytest.raises(QfolioError, match="multiple of the 200 steps"):
-        REINFORCE(rollout=150).init(Pendulum(), jax.random.key(0))
+        REINFORCE(rollout_length=150).init(Pendulum(), jax.random.key(0))
 
 
 @pytest.mark.slow

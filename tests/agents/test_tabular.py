@@ -98,7 +98,7 @@ def test_nothing_follows_the_end(kind):
 
 
 def test_expected_sarsa_by_hand():
-    agent = ExpectedSarsa(discount=0.9, learning_rate=0.1, epsilon=0.2)
+    agent = ExpectedSarsa(discount=0.9, learning_rate=0.1, epsilon_start=0.2)
     mean = 0.8 * 31 + 0.2 * 30.5
     assert after(agent, transition())[0][0, 1, 0] == pytest.approx(10 + 0.1 * (2 + 0.9 * mean - 10))
 
@@ -114,7 +114,7 @@ def test_sarsa_by_hand():
 
 
 def test_sarsa_at_the_end_of_an_episode():
-    agent = Sarsa(discount=0.9, learning_rate=0.1, epsilon=0.0)
+    agent = Sarsa(discount=0.9, learning_rate=0.1, epsilon_start=0.0)
     fresh = transition(state=0, action=0)
     tables, _ = after(agent, transition(terminated=True), fresh)
     assert tables[0, 1, 0] == pytest.approx(10 + 0.1 * (2 - 10))
@@ -160,13 +160,13 @@ def test_environments_that_visit_the_same_entry():
     rate = jnp.full(4, 0.1)
     share = step_share(jnp.array([5, 2, 5, 5]), rate)
     np.testing.assert_allclose(share, [(1 - 0.9**3) / 3, 0.1, *[(1 - 0.9**3) / 3] * 2], rtol=1e-5)
-    state = QLearning(environments=2, discount=0.0, learning_rate=0.5).init(
+    state = QLearning(num_envs=2, discount=0.0, learning_rate=0.5).init(
         Garnet(5, 2, 2), jax.random.key(0)
     )
     two = jnp.array([1, 1])
     never = jnp.zeros(2, bool)
     move = Move(two, two, jnp.array([2.0, 4.0]), two, never, never)
-    agent = QLearning(environments=2, discount=0.0, learning_rate=0.5)
+    agent = QLearning(num_envs=2, discount=0.0, learning_rate=0.5)
     state = agent.update(state, move, jnp.zeros(2))
     assert state.tables[0, 1, 1] == pytest.approx(0.75 * 3)
     assert state.cells[0, 1, 1, 1] == 2
@@ -202,13 +202,13 @@ def test_values_of_a_process_without_chance_are_exact(kind, environments):
     """Cut after five steps, from anywhere: the end, the cut and the coin are all in it."""
     moves = np.eye(4)[[[1, 0], [2, 0], [3, 1], [0, 0]]]
     task = FiniteMDP(moves, [[0, 1], [0, 0], [5, 0], [0, 0]], terminal=[3], horizon=5)
-    agent = kind(environments=environments, discount=DISCOUNT, learning_rate=0.5,
-                 epsilon=0.3, epsilon_end=0.3)  # fmt: skip
+    agent = kind(num_envs=environments, discount=DISCOUNT, learning_rate=0.5,
+                 epsilon_start=0.3, epsilon_end=0.3)  # fmt: skip
     soft = 0.3 if kind in (Sarsa, ExpectedSarsa) else 0.0
     exact = task.optimum().action_values(DISCOUNT, soft)
     if kind is Sarsa:  # the next action is chance
-        agent = Sarsa(environments=environments, discount=DISCOUNT, learning_rate=1.0,
-                      learning_rate_decay=0.1, epsilon=0.3, epsilon_end=0.3)  # fmt: skip
+        agent = Sarsa(num_envs=environments, discount=DISCOUNT, learning_rate=1.0,
+                      learning_rate_decay=0.1, epsilon_start=0.3, epsilon_end=0.3)  # fmt: skip
     values = trained(task, agent, 30_000 if kind is Sarsa else 4000)
     np.testing.assert_allclose(values[0], exact, rtol=0.02 if kind is Sarsa else 1e-4)
 
@@ -216,8 +216,8 @@ def test_values_of_a_process_without_chance_are_exact(kind, environments):
 def process(kind, **changes):
     """An agent for values of stochastic processes; ε is 0.5 where it is part of what is learned."""
     epsilon = 0.5 if kind in (Sarsa, ExpectedSarsa) else 1.0
-    settings = {"environments": 32, "discount": DISCOUNT, "learning_rate": 1.0}
-    return kind(**{**settings, "epsilon": epsilon, "epsilon_end": epsilon, **changes})
+    settings = {"num_envs": 32, "discount": DISCOUNT, "learning_rate": 1.0}
+    return kind(**{**settings, "epsilon_start": epsilon, "epsilon_end": epsilon, **changes})
 
 
 @pytest.mark.parametrize(
@@ -239,7 +239,7 @@ def process(kind, **changes):
 def test_values_within_a_hundredth(task, kind, steps, decay):
     agent = process(kind, learning_rate_decay=decay)
     values = trained(anywhere(task), agent, int(steps) // 32)
-    exact = task.optimum().action_values(DISCOUNT, 0.5 if agent.epsilon < 1 else 0.0)
+    exact = task.optimum().action_values(DISCOUNT, 0.5 if agent.epsilon_start < 1 else 0.0)
     assert error(task, values, exact).max() < 0.01
 
 
@@ -249,7 +249,7 @@ def test_planning_saves_real_steps():
     exact = task.optimum().action_values(DISCOUNT)
 
     def worst(kind, steps):
-        agent = process(kind, environments=1, learning_rate_decay=0.1)
+        agent = process(kind, num_envs=1, learning_rate_decay=0.1)
         return error(task, trained(anywhere(task), agent, steps, (100, 101)), exact).max()
 
     assert worst(DynaQ, 5000) < worst(QLearning, 15_000)
@@ -297,7 +297,7 @@ def test_double_q_learning_against_the_bias_of_a_maximum():
     moves[1, :, 2] = moves[1, :, 3] = 0.5
     pay[1, :, 2], pay[1, :, 3] = 0.9, -1.1
     task = FiniteMDP(moves, pay, start=[1, 0, 0, 0, 0], terminal=[2, 3, 4], horizon=3)
-    settings = {"discount": 1.0, "learning_rate": 0.1, "epsilon": 1.0, "epsilon_end": 1.0}
+    settings = {"discount": 1.0, "learning_rate": 0.1, "epsilon_start": 1.0, "epsilon_end": 1.0}
     worth = lambda kind: trained(task, kind(**settings), 4000, (100, 101))[:, 0, ::2].mean()  # noqa: E731
     assert worth(QLearning) > 0.1  # it is −0.1
     assert worth(DoubleQ) < 0.0
@@ -313,10 +313,10 @@ def test_tasks_without_numbers_are_refused(kind):
     ("kind", "changes", "message"),
     [
         (QLearning, {"learning_rate": 1.5}, "learning_rate is 1.5"),
-        (QLearning, {"environments": 0}, "environments is 0"),
-        (Sarsa, {"epsilon": -0.1}, "epsilon is -0.1"),
+        (QLearning, {"num_envs": 0}, "num_envs is 0"),
+        (Sarsa, {"epsilon_start": -0.1}, "epsilon_start is -0.1"),
         (DoubleQ, {"learning_rate_decay": -1.0}, "learning_rate_decay is -1"),
-        (DynaQ, {"planning": 0}, "planning is 0; .* q-learning"),
+        (DynaQ, {"planning_steps": 0}, "planning_steps is 0; .* q-learning"),
         (DynaQ, {"discount": 1.1}, "discount is 1.1"),
     ],
 )
@@ -331,8 +331,8 @@ def test_a_network_learns_on_numbered_states():
         np.eye(3)[[[1, 0], [2, 0], [2, 2]]], [[0, 0.5], [1, 0], [0, 0]], terminal=[2], horizon=6
     )
     agent = DQN(
-        hidden=(32,), environments=4, batch_size=32, replay_capacity=1000, learning_starts=100,
-        discount=DISCOUNT, target_period=1, target_rate=0.05, learning_rate=3e-3,
+        hidden=(32,), num_envs=4, batch_size=32, replay_capacity=1000, learning_starts=100,
+        discount=DISCOUNT, target_update_interval=1, tau=0.05, learning_rate=3e-3,
         learning_rate_steps=1500.0, learning_rate_final=0.0, epsilon_end=0.5,
     )  # fmt: skip
     population = Population(task, agent, [0])

@@ -6,7 +6,7 @@ import pytest
 
 from shell import qfolio
 
-TINY = ["--set", "window=10", "horizon=20", "hidden=8,8", "environments=4", "rollout=10"]
+TINY = ["--set", "window=10", "horizon=20", "hidden=8,8", "num_envs=4", "rollout_length=10"]
 AS_OF = ["--as-of", "2020-09-16"]
 
 

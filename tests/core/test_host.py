@@ -103,8 +103,8 @@ for _kind, _id in ENVIRONMENTS.items():
     gymnasium.register(_id, entry_point=_kind, max_episode_steps=4)
 
 SMALL = DQN(
-    hidden=(8,), environments=2, batch_size=4, replay_capacity=64, learning_starts=4,
-    target_period=1, target_rate=0.1, learning_rate=3e-3, episode_steps=0,
+    hidden=(8,), num_envs=2, batch_size=4, replay_capacity=64, learning_starts=4,
+    target_update_interval=1, tau=0.1, learning_rate=3e-3, episode_steps=0,
 )  # fmt: skip
 
 
@@ -141,7 +141,9 @@ def test_it_learns_what_the_compiled_loop_learns():
 
 
 def test_rollouts_are_those_of_the_compiled_loop():
-    agent = PPO(hidden=(8,), environments=2, rollout=8, batch_size=8, epochs=2, learning_rate=1e-2)
+    agent = PPO(
+        hidden=(8,), num_envs=2, rollout_length=8, batch_size=8, epochs=2, learning_rate=1e-2
+    )
     host = trained(task(Delay), agent, [1], 48).fetch()
     compiled = trained(RewardDelay(), agent, [1], 48, Population).fetch()
     jax.tree.map(
@@ -172,8 +174,8 @@ def test_what_is_cut_is_not_the_end(options):
 
 def test_bootstraps_through_the_time_limit():
     agent = DQN(
-        hidden=(16,), environments=4, batch_size=32, replay_capacity=1000, learning_starts=40,
-        discount=0.8, target_period=1, target_rate=0.05, learning_rate=3e-3,
+        hidden=(16,), num_envs=4, batch_size=32, replay_capacity=1000, learning_starts=40,
+        discount=0.8, target_update_interval=1, tau=0.05, learning_rate=3e-3,
         learning_rate_final=0.0, learning_rate_steps=1400.0, episode_steps=0,
     )  # fmt: skip
     weights = trained(task(Endless), agent, [0], 1500).weights()
@@ -182,7 +184,7 @@ def test_bootstraps_through_the_time_limit():
 
 
 def test_a_seed_is_one_result_alone_and_among_others():
-    agent = DQN(hidden=(8,), environments=3, batch_size=8, learning_starts=6, replay_capacity=99)
+    agent = DQN(hidden=(8,), num_envs=3, batch_size=8, learning_starts=6, replay_capacity=99)
     together = trained(task(Numbered), agent, range(3), 150)
     alone = trained(task(Numbered), agent, [1], 150)
     again = trained(task(Numbered), agent, [1], 150)
@@ -198,7 +200,7 @@ def test_numbers_that_do_not_begin_at_zero():
     numbered = task(Numbered)
     assert (numbered.states, numbered.actions.n, numbered.horizon) == (2, 2, 4)
     agent = DQN(
-        hidden=(16,), environments=4, batch_size=32, replay_capacity=500, learning_starts=40,
+        hidden=(16,), num_envs=4, batch_size=32, replay_capacity=500, learning_starts=40,
         learning_rate=1e-2, epsilon_decay=0.98, episode_steps=0,
     )  # fmt: skip
     population = trained(numbered, agent, [0], 300)
@@ -211,7 +213,7 @@ def test_coordinates_reach_from_bound_to_bound():
     given = facts.given(np.array([[-1, -1], [1, 1], [0, 0.5], [-9, 9]], np.float32))
     np.testing.assert_allclose(given, [[0, 10], [4, 50], [2, 40], [0, 50]])
     agent = PPO(
-        environments=8, rollout=16, batch_size=64, epochs=8, hidden=(16,), learning_rate=1e-2,
+        num_envs=8, rollout_length=16, batch_size=64, epochs=8, hidden=(16,), learning_rate=1e-2,
         learning_rate_final=0.0, learning_rate_steps=960.0, discount=0.5, std=0.5,
     )  # fmt: skip
     population = trained(task(Aim), agent, [0], 16 * 60)
@@ -307,7 +309,7 @@ def test_names_and_presets():
             assert presets.preset("fast", name, agent).task["id"] == name.removeprefix("gym:")
 
 
-TINY = ["--set", "hidden=8", "environments=2", "batch_size=8", "learning_starts=16"]
+TINY = ["--set", "hidden=8", "num_envs=2", "batch_size=8", "learning_starts=16"]
 
 
 def test_the_command_trains_reports_and_goes_on(tmp_path, monkeypatch, capsys):

@@ -15,15 +15,15 @@ def test_text_becomes_the_fields_type():
             "discount": "0.5",
             "double": "False",
             "batch_size": "9",
-            "huber": "inf",
+            "huber_delta": "inf",
         },
     )
     assert (agent.hidden, agent.discount, agent.double) == ((64, 32), 0.5, False)
-    assert (agent.batch_size, agent.huber) == (9, math.inf)
+    assert (agent.batch_size, agent.huber_delta) == (9, math.inf)
 
 
 def test_describe_and_build_are_inverse():
-    agent = DQN(hidden=(7, 5), huber=math.inf, discount=0.125)
+    agent = DQN(hidden=(7, 5), huber_delta=math.inf, discount=0.125)
     assert settings.build(DQN, settings.describe(agent)) == agent
 
 

@@ -63,7 +63,7 @@ def test_restoring_goes_on_bit_for_bit(task, agent):
 def test_transitions_end_before_the_reset():
     """The buffer of a task whose every transition is known: 0 → 1 → end."""
     agent = DQN(
-        hidden=(4,), environments=2, batch_size=4, replay_capacity=8, learning_starts=4,
+        hidden=(4,), num_envs=2, batch_size=4, replay_capacity=8, learning_starts=4,
         episode_steps=0,
     )  # fmt: skip
     population, _ = trained(RewardDelay(), agent, [0], [4])
@@ -96,7 +96,7 @@ def test_the_return_of_a_record_is_the_sum_of_rewards(task, agent):
 
 
 def test_training_episodes_can_be_cut_shorter(task):
-    agent = DQN(hidden=(4,), environments=2, batch_size=4, learning_starts=4, episode_steps=5)
+    agent = DQN(hidden=(4,), num_envs=2, batch_size=4, learning_starts=4, episode_steps=5)
     population, _ = trained(task, agent, [0], [20])
     assert population.episodes == 8
     assert not stored(population).terminal.any()
@@ -130,7 +130,7 @@ def test_steps_left_counts_those_of_all_environments(task, agent):
 
 
 def test_an_infinite_loss_stops_training():
-    agent = DQN(hidden=(4,), environments=2, batch_size=8, learning_starts=4, episode_steps=0)
+    agent = DQN(hidden=(4,), num_envs=2, batch_size=8, learning_starts=4, episode_steps=0)
     population = Population(Explosive(), agent, [4, 5])
     population.advance(1000)  # warm-up
     with pytest.raises(QfolioError, match="seed 4, 5 is no longer finite"):

@@ -35,7 +35,7 @@ from qfolio.tasks.pendulum import Pendulum
 from shell import qfolio
 
 TASK = {"horizon": 20}
-TINY = {"hidden": (8,), "environments": 2, "batch_size": 8, "replay_capacity": 200,
+TINY = {"hidden": (8,), "num_envs": 2, "batch_size": 8, "replay_capacity": 200,
         "learning_starts": 16, "episode_steps": 0}  # fmt: skip
 
 
@@ -185,13 +185,13 @@ def test_shares_show_the_digits_that_matter(value, text):
 
 def test_operations_are_counted_by_hand():
     def operations(**settings):
-        return operations_per_step(Pendulum(), DQN(**{**TINY, "environments": 4, **settings}))
+        return operations_per_step(Pendulum(), DQN(**{**TINY, "num_envs": 4, **settings}))
 
     # A network 3 → 8 → 11 has 112 weights. Acting: 4 observations. Learning from 8: forward twice,
     # and backward to the weights of both layers and to the hidden one's values.
     act, learn = 2 * 4 * 112, 2 * 8 * (3 * 112 + 8 * 11)
     assert operations() == (act + learn) / 4
-    assert operations(updates=3) == (act + 3 * learn) / 4
+    assert operations(gradient_steps=3) == (act + 3 * learn) / 4
     assert operations(double=True) == (act + learn + 2 * 8 * 112) / 4
 
 

@@ -19,7 +19,7 @@ from shell import TINY, qfolio
 
 OLD, NEW = Pendulum(horizon=20), Pendulum(horizon=20, mass=1.5)
 AGENT = DQN(
-    hidden=(8,), environments=2, batch_size=8, replay_capacity=100, learning_starts=10,
+    hidden=(8,), num_envs=2, batch_size=8, replay_capacity=100, learning_starts=10,
     learning_rate_final=0.0, learning_rate_steps=150.0,
 )  # fmt: skip
 EPISODES = 16
@@ -103,7 +103,7 @@ def test_going_on_needs_a_learning_rate():
 
 def test_renewed_learning_knows_everything_and_remembers_nothing():
     plan = Plan(OLD, NEW, AGENT, EPISODES)
-    assert plan.renewed == dataclasses.replace(AGENT, learning_rate_steps=75.0, epsilon=0.3)
+    assert plan.renewed == dataclasses.replace(AGENT, learning_rate_steps=75.0, epsilon_start=0.3)
     learned, fresh = trained(OLD, AGENT).fetch(), Population(NEW, AGENT, [3, 4]).fetch()
     state = renew(AGENT, learned, fresh)
     for name in ("online", "target"):

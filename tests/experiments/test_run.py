@@ -68,10 +68,10 @@ def test_steps_say_how_far_as_episodes_do(task, agent, tmp_path):
 
 
 IN_A_MARKET = {
-    "pathwise": (Ar1(horizon=20), Pathwise(rollout=10, environments=3, hidden=(4, 4))),
+    "pathwise": (Ar1(horizon=20), Pathwise(rollout_length=10, num_envs=3, hidden=(4, 4))),
     "dqn": (
         Ar1(horizon=20, menu="grid:2"),
-        DQN(hidden=(8,), all_actions=True, environments=2, batch_size=8, replay_capacity=100,
+        DQN(hidden=(8,), all_actions=True, num_envs=2, batch_size=8, replay_capacity=100,
             learning_starts=20, episode_steps=0, learning_rate_steps=200.0),
     ),
 }  # fmt: skip
@@ -94,7 +94,7 @@ from qfolio.experiments import run as running
 from qfolio.agents.dqn import DQN
 from qfolio.tasks.pendulum import Pendulum
 running.CHECKPOINT_SECONDS = 0.0
-agent = DQN(hidden=(16,), environments=2, batch_size=8, replay_capacity=200, learning_starts=20,
+agent = DQN(hidden=(16,), num_envs=2, batch_size=8, replay_capacity=200, learning_starts=20,
             episode_steps=0, learning_rate_steps=200.0)
 run = running.Run.create(Pendulum(horizon=25), agent, episodes={episodes}, seeds=2, out={out!r})
 print("started", flush=True)
@@ -181,7 +181,7 @@ def test_ctrl_c_stops_with_a_checkpoint(task, agent, tmp_path):
 
 
 def test_an_infinite_loss_keeps_the_last_good_checkpoint(tmp_path):
-    agent = DQN(hidden=(4,), environments=2, batch_size=8, learning_starts=4, episode_steps=0)
+    agent = DQN(hidden=(4,), num_envs=2, batch_size=8, learning_starts=4, episode_steps=0)
     run = create(Explosive(), agent, tmp_path / "run")
     before = (tmp_path / "run" / "checkpoint.safetensors").read_bytes()
     with pytest.raises(QfolioError, match="no longer finite"):
@@ -215,7 +215,7 @@ def test_damaged_tables_are_refused_or_skipped(task, agent, tmp_path, text):
 
 
 def test_weights_that_are_not_finite_stop_training(task, tmp_path):
-    agent = DQN(hidden=(4,), environments=2, batch_size=8, learning_starts=4, learning_rate=1e30)
+    agent = DQN(hidden=(4,), num_envs=2, batch_size=8, learning_starts=4, learning_rate=1e30)
     run = create(task, agent, tmp_path / "run")
     with pytest.raises(QfolioError, match="no longer finite"):
         run.train()
@@ -232,7 +232,7 @@ def test_unfinished_files_of_a_killed_process_are_swept(task, agent, tmp_path):
 def test_whole_numbers_mean_the_same_as_fractions(task, tmp_path):
     """Settings come back from config.json as floats, and must train alike."""
     agent = DQN(
-        hidden=[8], environments=2, batch_size=8, learning_starts=4, reward_scale=3, huber=1
+        hidden=[8], num_envs=2, batch_size=8, learning_starts=4, reward_scale=3, huber_delta=1
     )
     create(task, agent, tmp_path / "run", episodes=8).train()
     create(task, agent, tmp_path / "again", episodes=4).train()

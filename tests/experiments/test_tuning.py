@@ -59,7 +59,7 @@ def same(a, b):
 
 
 def test_members_with_numbers_of_their_own_equal_each_alone(task, agent):
-    changes = [{"learning_rate": 1e-2, "input_gain": 2.0}, {"discount": 0.5, "huber": 0.3}]
+    changes = [{"learning_rate": 1e-2, "input_gain": 2.0}, {"discount": 0.5, "huber_delta": 0.3}]
     first, second = (settings.build(DQN, settings.describe(agent) | change) for change in changes)
     together = trained(task, [first, second, first, second], [0, 0, 1, 1])
     greedy = together.evaluate(tuning_keys(), tail=0)
@@ -138,7 +138,7 @@ def test_positions_by_hand():
 def test_what_is_usually_searched_surrounds_the_agents_own_values():
     agent = preset("fast").build()
     space = {dim.name: dim for dim in search.usual(agent)}
-    assert set(space) >= {"learning_rate", "discount", "target_rate", "epsilon_decay", "huber",
+    assert set(space) >= {"learning_rate", "discount", "tau", "epsilon_decay", "huber_delta",
                           "reward_scale", "input_gain"}  # fmt: skip
     for name, dim in space.items():
         assert dim.position(getattr(agent, name)) == pytest.approx(0.5, abs=1e-6)
@@ -146,11 +146,11 @@ def test_what_is_usually_searched_surrounds_the_agents_own_values():
     assert (space["discount"].low, space["discount"].high) == (0.95, 0.9995)
     # Where the own value says nothing of the scale: infinite, 0, or already 1.
     report = {dim.name: dim for dim in search.usual(DQN())}
-    for name in ("huber", "input_gain"):
+    for name in ("huber_delta", "input_gain"):
         assert report[name] == dimension(name, search.USUAL[name], DQN)
-    assert str(report["target_rate"]) == "0.1..1.0"
+    assert str(report["tau"]) == "0.1..1.0"
     assert {dim.name for dim in search.usual(Pathwise())} == {
-        "learning_rate", "gradient_norm", "reward_scale"
+        "learning_rate", "max_grad_norm", "reward_scale"
     }  # fmt: skip
 
 

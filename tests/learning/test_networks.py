@@ -154,8 +154,8 @@ class Recall(TwoStates):
 
 
 LEARNER = {
-    "environments": 4, "batch_size": 32, "replay_capacity": 1000, "learning_starts": 100,
-    "target_period": 1, "target_rate": 0.05, "learning_rate": 3e-3, "learning_rate_steps": 800.0,
+    "num_envs": 4, "batch_size": 32, "replay_capacity": 1000, "learning_starts": 100,
+    "target_update_interval": 1, "tau": 0.05, "learning_rate": 3e-3, "learning_rate_steps": 800.0,
     "learning_rate_final": 0.0, "epsilon_end": 0.2,
 }  # fmt: skip
 
@@ -177,7 +177,7 @@ def test_an_agent_recalls_what_it_saw_first(kind):
 
 def test_an_agent_learns_to_catch_what_it_sees():
     agent = DQN(
-        **{**LEARNER, "network": "cnn", "hidden": (64,), "environments": 32, "batch_size": 64,
+        **{**LEARNER, "network": "cnn", "hidden": (64,), "num_envs": 32, "batch_size": 64,
            "replay_capacity": 16_384, "learning_starts": 1024, "discount": 0.97,
            "learning_rate": 1e-3, "learning_rate_steps": 1500.0, "epsilon_decay": 0.999},
     )  # fmt: skip

@@ -11,19 +11,19 @@ from probes import Endless, OneState, RewardDelay, TwoStates
 DISCOUNT = 0.9
 
 CATEGORICAL = {"values": "categorical", "atoms": 21, "v_min": -2.0, "v_max": 2.0}
-QUANTILE = {"values": "quantile", "atoms": 16, "huber": 1.0}
+QUANTILE = {"values": "quantile", "atoms": 16, "huber_delta": 1.0}
 RAINBOW = {
-    "double": True, "dueling": True, "n_steps": 3, "prioritised": True, "noisy": True,
+    "double": True, "dueling": True, "n_steps": 3, "prioritized": True, "noisy": True,
 }  # fmt: skip
 OPTIONS = {
     "dueling": {"dueling": True},
     "n_steps": {"n_steps": 3},
-    "prioritised": {"prioritised": True},
+    "prioritized": {"prioritized": True},
     "categorical": CATEGORICAL,
     "quantile": QUANTILE,
-    "roots": {"rescale_values": True},
-    "roots categorical": {**CATEGORICAL, "rescale_values": True},
-    "roots quantile": {**QUANTILE, "rescale_values": True},
+    "roots": {"value_rescaling": True},
+    "roots categorical": {**CATEGORICAL, "value_rescaling": True},
+    "roots quantile": {**QUANTILE, "value_rescaling": True},
     "noisy": {"noisy": True},
     "rainbow categorical": {**RAINBOW, **CATEGORICAL},
     "rainbow quantile": {**RAINBOW, **QUANTILE},
@@ -32,8 +32,8 @@ OPTIONS = {
 
 def learned_values(task, observations, steps=1500, **changes):
     settings = {
-        "hidden": (32,), "environments": 4, "batch_size": 32, "replay_capacity": 1000,
-        "learning_starts": 100, "discount": DISCOUNT, "target_period": 1, "target_rate": 0.05,
+        "hidden": (32,), "num_envs": 4, "batch_size": 32, "replay_capacity": 1000,
+        "learning_starts": 100, "discount": DISCOUNT, "target_update_interval": 1, "tau": 0.05,
         "learning_rate": 3e-3, "learning_rate_steps": 1500.0, "reward_scale": 1.0,
         "epsilon_end": 0.2, "learning_rate_final": 0.0,
     }  # fmt: skip
@@ -65,11 +65,12 @@ def test_reward_delay(changes):
     np.testing.assert_allclose(values, [[DISCOUNT] * 2, [1, 1]], rtol=0.02)
 
 
-@pytest.mark.parametrize("changes", [{}, {"target_rate": 1.0, "target_period": 10}])
+@pytest.mark.parametrize("changes", [{}, {"tau": 1.0, "target_update_interval": 10}])
 def test_a_time_limit_is_not_the_end(changes):
     values = learned_values(Endless(), [[1.0]], steps=3000, learning_rate_steps=3000.0,
-                            target_rate=changes.get("target_rate", 0.2),
-                            target_period=changes.get("target_period", 1))  # fmt: skip
+                            tau=changes.get("tau", 0.2),
+                            target_update_interval=changes.get("target_update_interval", 1),
+                            )  # fmt: skip
     np.testing.assert_allclose(values, 1 / (1 - DISCOUNT), rtol=0.02)
 
 
@@ -77,7 +78,7 @@ def test_a_time_limit_is_not_the_end(changes):
 @pytest.mark.parametrize("horizon", [1, 2])
 def test_returns_over_steps_bootstrap_through_a_time_limit(name, horizon):
     """Where the episode is cut before the three steps are over, by the right power of γ."""
-    changes = {**OPTIONS[name], "target_rate": 0.2, "learning_rate_steps": 3000.0}
+    changes = {**OPTIONS[name], "tau": 0.2, "learning_rate_steps": 3000.0}
     if "v_max" in changes:
         changes |= {"v_min": 0.0, "v_max": 12.0}
     values = learned_values(Endless(horizon), [[1.0]], steps=3000, **changes)
@@ -89,15 +90,17 @@ def test_a_time_limit_taken_for_the_end():
     np.testing.assert_allclose(values, 1.0, rtol=0.02)
 
 
-@pytest.mark.parametrize("changes", [{"huber": 0.1}, CATEGORICAL, {**QUANTILE, "huber": 0.1}])
+@pytest.mark.parametrize(
+    "changes", [{"huber_delta": 0.1}, CATEGORICAL, {**QUANTILE, "huber_delta": 0.1}]
+)
 def test_scaled_rewards_leave_the_values_alone(changes):
     values = learned_values(RewardDelay(), [[1.0, 0.0]], reward_scale=0.5, **changes)
     np.testing.assert_allclose(values, DISCOUNT, rtol=0.02)
 
 
-@pytest.mark.parametrize("prioritised", [False, True])
-def test_several_updates_a_step(prioritised):
+@pytest.mark.parametrize("prioritized", [False, True])
+def test_several_updates_a_step(prioritized):
     values = learned_values(
-        TwoStates(), [[1.0]], steps=500, updates=3, prioritised=prioritised, n_steps=2
+        TwoStates(), [[1.0]], steps=500, gradient_steps=3, prioritized=prioritized, n_steps=2
     )
     np.testing.assert_allclose(values, [[-1, 1]], atol=0.02)

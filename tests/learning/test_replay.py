@@ -55,11 +55,11 @@ def test_rows_come_back_as_they_were():
         assert again[name].dtype == array.dtype
 
 
-@pytest.mark.parametrize("prioritised", [False, True])
+@pytest.mark.parametrize("prioritized", [False, True])
 @pytest.mark.parametrize("writes", [3, 4, 5, 9, 10])
-def test_only_rows_with_steps_after_them_are_drawn(prioritised, writes):
+def test_only_rows_with_steps_after_them_are_drawn(prioritized, writes):
     """Of 2 × 5 rows, all but the newest two writes, and those equally often."""
-    replay = filled(10, writes, steps=3, prioritised=prioritised)
+    replay = filled(10, writes, steps=3, prioritized=prioritized)
     drawn = np.asarray(replay.sample(jax.random.key(2), 2000))
     ready = np.arange(2 * max(0, writes - 5), 2 * (writes - 2))
     counts = np.bincount(drawn, minlength=2 * writes)
@@ -180,7 +180,7 @@ def test_no_row_of_zero_is_drawn_whatever_rounding_does():
 
 
 def test_new_rows_have_the_highest_priority_there_was():
-    replay = filled(8, 2, prioritised=True)
+    replay = filled(8, 2, prioritized=True)
     priorities = replay.priorities.set(jnp.array([0, 1]), jnp.array([5.0, 0.5]))
     priorities = priorities.set(jnp.array([0]), jnp.array([0.1]))
     replay = Replay(replay.rows, replay.position, replay.size, priorities, replay.like, 2, 1)

@@ -9,7 +9,7 @@ import pytest
 
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
-from qfolio.core import training
+from qfolio.core import population
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio import policy as module
 from qfolio.portfolio.policy import Policy, follow, on_table, train
@@ -18,12 +18,12 @@ from qfolio.portfolio.prices.table import Prices
 ROWS, WINDOW = 80, 5
 AGENTS = {
     "dqn": (
-        DQN(network="mlp", hidden=(8, 8), all_actions=True, environments=2, batch_size=8,
+        DQN(network="mlp", hidden=(8, 8), all_actions=True, num_envs=2, batch_size=8,
             learning_starts=20, replay_capacity=64, learning_rate=0.01),
         {"menu": "tilts:0.1"},
     ),
     "pathwise": (  # whose cosine comes to its end in training
-        Pathwise(rollout=5, environments=4, hidden=(8, 8), learning_rate=0.01,
+        Pathwise(rollout_length=5, num_envs=4, hidden=(8, 8), learning_rate=0.01,
                  learning_rate_final=0.0, learning_rate_steps=6.0),
         {},
     ),
@@ -122,7 +122,7 @@ def test_a_damaged_folder_is_refused(policy, tmp_path):
 
 
 def test_it_goes_on_from_where_it_was(policy):
-    before, environments = policy.learner, policy.agent.environments
+    before, environments = policy.learner, policy.agent.num_envs
     updated = policy.update(table(), 2 * environments)
     assert updated.updates == 1
     assert updated.rows == policy.rows
@@ -203,7 +203,7 @@ def test_programs_that_are_used_again_learn_the_same():
     used = [learned("pathwise"), learned("pathwise", agent=fast), learned("pathwise")]
     assert same(used[0].learner, used[2].learner)
     assert not same(used[0].learner, used[1].learner)
-    training.programs_of.cache_clear()
+    population.programs_of.cache_clear()
     assert same(learned("pathwise", agent=fast).learner, used[1].learner)
 
 

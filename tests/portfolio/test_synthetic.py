@@ -154,7 +154,7 @@ def double_precision():
 def test_gradient_of_a_rollout_against_finite_differences(tail):
     """Through costs, drift and the simplex, by hand; in the tail, decisions stand as they are."""
     task = Ar1(horizon=8, cost=0.01)
-    agent = Pathwise(rollout=8, tail=tail, environments=3, hidden=(4, 4), pull=0.0)
+    agent = Pathwise(rollout_length=8, tail=tail, num_envs=3, hidden=(4, 4), simplex_penalty=0.0)
     policy = agent.init(task, jax.random.key(2)).policy
     starts = jax.vmap(task.reset)(jax.random.split(jax.random.key(5), 3))
     markets = [starts.market]
@@ -193,9 +193,10 @@ def test_gradient_of_a_rollout_against_finite_differences(tail):
 @pytest.mark.parametrize(
     ("agent", "menu", "message"),
     [
-        (DQN(), "", "menu of allocations"), (Pathwise(rollout=10), "grid:4", "leave menu empty"),
+        (DQN(), "", "menu of allocations"),
+        (Pathwise(rollout_length=10), "grid:4", "leave menu empty"),
         (DQN(network="mlp"), "grid:4", "menu with choices for each"),
-        (Pathwise(rollout=7), "", "rollout is 7"),
+        (Pathwise(rollout_length=7), "", "rollout_length is 7"),
     ],
 )  # fmt: skip
 def test_agents_that_do_not_fit(agent, menu, message):

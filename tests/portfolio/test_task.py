@@ -98,13 +98,13 @@ def test_a_part_knows_nothing_of_the_rest():
 
 
 AGENTS = {
-    "dqn": (DQN(network="mlp", hidden=(8, 8), all_actions=True, environments=2, batch_size=8,
+    "dqn": (DQN(network="mlp", hidden=(8, 8), all_actions=True, num_envs=2, batch_size=8,
                 learning_starts=20, replay_capacity=100, episode_steps=0), "tilts:0.1"),
-    "dqn-single": (DQN(network="flat", hidden=(8,), environments=2, batch_size=8,
+    "dqn-single": (DQN(network="flat", hidden=(8,), num_envs=2, batch_size=8,
                        learning_starts=20, replay_capacity=100, episode_steps=0), "tilts:0.1"),
-    "pathwise": (Pathwise(rollout=5, environments=4, hidden=(8, 8), learning_rate=0.03), ""),
-    "pathwise-cnn": (Pathwise(network="cnn", rollout=5, environments=4, hidden=(8, 8)), ""),
-    "pathwise-rnn": (Pathwise(network="rnn", rollout=5, environments=4, hidden=(8, 8)), ""),
+    "pathwise": (Pathwise(rollout_length=5, num_envs=4, hidden=(8, 8), learning_rate=0.03), ""),
+    "pathwise-cnn": (Pathwise(network="cnn", rollout_length=5, num_envs=4, hidden=(8, 8)), ""),
+    "pathwise-rnn": (Pathwise(network="rnn", rollout_length=5, num_envs=4, hidden=(8, 8)), ""),
 }  # fmt: skip
 
 

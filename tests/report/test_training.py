@@ -538,8 +538,8 @@ def test_decimals() -> None:
     assert decimals(0.0034, 2, least=2) == 4
 
 
-PATHWISE = Pathwise(environments=2, rollout=5, hidden=(4, 4))
-CHOOSER = DQN(environments=2, hidden=(4,), all_actions=True)
+PATHWISE = Pathwise(num_envs=2, rollout_length=5, hidden=(4, 4))
+CHOOSER = DQN(num_envs=2, hidden=(4,), all_actions=True)
 
 
 def test_a_market_is_collected() -> None:

@@ -15,12 +15,12 @@ from qfolio.core.mdp import Metrics, Task, Transition
 class A2C(OnPolicy):
     """Advantage actor-critic."""
 
-    rollout: int = static(5)
-    trace: float = number(1.0)  # λ of the advantages: 0 trusts the critic, 1 the rewards
+    rollout_length: int = static(5)
+    gae_lambda: float = number(1.0)  # λ of the advantages: 0 trusts the critic, 1 the rewards
     learning_rate: float = number(7e-4)
 
     def __check_init__(self) -> None:
-        require(self, "trace", lambda x: 0 <= x <= 1, "between 0 and 1")
+        require(self, "gae_lambda", lambda x: 0 <= x <= 1, "between 0 and 1")
 
     def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
         return log_prob * batch.advantage
@@ -28,4 +28,4 @@ class A2C(OnPolicy):
     def learn(
         self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        return self.descend(state, self.judge(state.weights, rollout, self.trace))
+        return self.descend(state, self.judge(state.weights, rollout, self.gae_lambda))

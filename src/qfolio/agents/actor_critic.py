@@ -96,30 +96,30 @@ class ActorCritic(Agent):
 
     network: str = static("flat")  # the actor's: over everything observed; mlp, cnn, rnn: by asset
     hidden: tuple[int, ...] = sizes(256, 256)  # of actor and critics
-    environments: int = static(1)  # stepped side by side
+    num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     batch_size: int = static(256)
-    updates: int = static(1)  # gradient steps per step of all environments
+    gradient_steps: int = static(1)  # gradient steps per step of all environments
     n_steps: int = static(1)  # whose rewards a target adds up
     replay_capacity: int = static(100_000)  # transitions
     learning_starts: int = static(1000)  # transitions by random actions before learning
-    target_rate: float = number(0.005)  # how far targets go towards the online networks each time
+    tau: float = number(0.005)  # how far targets go towards the online networks each time
     discount: float = number(0.99)
     learning_rate: float = number(1e-3)
     learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
-    actor_rate: float = number(0.3)  # the actor's learning rate, as a share of the critics'
+    actor_learning_rate_ratio: float = number(0.3)  # the actor's, as a share of the critics'
     reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
-    huber: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
-    rescale_values: bool = static(False)  # critics learn roots of values: small ones weigh more
+    huber_delta: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
+    value_rescaling: bool = static(False)  # critics learn roots of values: small ones weigh more
 
     def __check_init__(self) -> None:
         require_replay(self)
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
-        require(self, "actor_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
-        require(self, "discount target_rate", lambda x: 0 <= x <= 1, "between 0 and 1")
+        require(self, "actor_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
+        require(self, "discount tau", lambda x: 0 <= x <= 1, "between 0 and 1")
         optimizer.require_schedule(self)
         networks.require_network(self)
 
@@ -140,7 +140,7 @@ class ActorCritic(Agent):
         action = uniform(task.actions, key, 1)[0]
         row = Experience.like(observation, action, with_last=self.n_steps > 1)
         learned = self.begin(task, observation, key)
-        replay = Replay.empty(row, self.replay_capacity, self.environments, self.n_steps)
+        replay = Replay.empty(row, self.replay_capacity, self.num_envs, self.n_steps)
         none = jnp.array([jnp.inf, -jnp.inf])
         return ActorCriticState(learned, replay, jnp.array(0, jnp.int32), none)
 
@@ -149,7 +149,7 @@ class ActorCritic(Agent):
 
     def act(self, state: ActorCriticState, observation: PyTree, key: PRNGKeyArray) -> Array:
         random_key, key = jax.random.split(key)
-        random = uniform(state.learned.actor.actions, random_key, self.environments)
+        random = uniform(state.learned.actor.actions, random_key, self.num_envs)
         action = self.explore(state.learned, observation, key)
         return jnp.where(state.steps < self.warm_up(), random, action)
 
@@ -186,7 +186,7 @@ class ActorCritic(Agent):
             batch = Batch(*join(replay, index, self.discount), rewards)
             return self.update(learned, batch, key)
 
-        learned, metrics = optimizer.repeat(update, learned, self.updates, key)
+        learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         return learned, {**metrics, "q": metrics["q"] / self.reward_scale}
 
     def carry_over(self, state: ActorCriticState, fresh: ActorCriticState) -> ActorCriticState:
@@ -241,4 +241,4 @@ class ActorCritic(Agent):
         gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
         gains = jnp.append(gain, jnp.full(action.shape, 1 / task.actions.unit))
         make = lambda key: Flat((observation, action), self.hidden, 1, key, gains)  # noqa: E731
-        return Critics(make, count, Scale(self.rescale_values), key)
+        return Critics(make, count, Scale(self.value_rescaling), key)

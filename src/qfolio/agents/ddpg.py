@@ -84,12 +84,12 @@ def actor_loss(
 class DDPG(ActorCritic):
     """A deterministic actor and a critic, both with targets that follow them."""
 
-    exploration: float = number(0.1)  # standard deviation of the noise, in units of the bound
+    exploration_noise: float = number(0.1)  # standard deviation of the noise, in units of the bound
 
     critics: ClassVar[int] = 1
 
     def __check_init__(self) -> None:
-        require(self, "exploration", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "exploration_noise", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
 
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
         if isinstance(task.actions, Discrete):
@@ -113,7 +113,7 @@ class DDPG(ActorCritic):
         self, learned: Learned, observation: PyTree, key: PRNGKeyArray
     ) -> Float[Array, "batch entry"]:
         action = learned.actor(observation)
-        noise = self.exploration * jax.random.normal(key, action.shape)
+        noise = self.exploration_noise * jax.random.normal(key, action.shape)
         return learned.actor.perturb(action, noise)
 
     def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
@@ -128,7 +128,13 @@ class DDPG(ActorCritic):
         goal = self.goal(batch, following)
         rate = optimizer.learning_rate(self, learned.critic_adam.count)
         critics, adam, metrics = self.descend(
-            critic_loss, learned.critics, learned.critic_adam, rate, batch.steps, goal, self.huber
+            critic_loss,
+            learned.critics,
+            learned.critic_adam,
+            rate,
+            batch.steps,
+            goal,
+            self.huber_delta,
         )
         learned = eqx.tree_at(lambda x: (x.critics, x.critic_adam), learned, (critics, adam))
         return learned, metrics
@@ -141,10 +147,12 @@ class DDPG(ActorCritic):
 
     def improve(self, learned: Learned, batch: Experience) -> Learned:
         """A step of the actor up the critics; then the targets follow."""
-        rate = self.actor_rate * optimizer.learning_rate(self, learned.critic_adam.count)
+        rate = self.actor_learning_rate_ratio * optimizer.learning_rate(
+            self, learned.critic_adam.count
+        )
         actor, adam, _ = self.descend(
             actor_loss, learned.actor, learned.actor_adam, rate, learned.critics, batch.observation
         )
         targets = (learned.target_actor, learned.target_critics)
-        targets = follow(targets, (actor, learned.critics), self.target_rate)
+        targets = follow(targets, (actor, learned.critics), self.tau)
         return Learned(actor, learned.critics, *targets, adam, learned.critic_adam)

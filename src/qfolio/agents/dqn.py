@@ -5,7 +5,7 @@ and transitions go into a replay buffer. Training: it regresses, on batches from
 r + γ max_a Q'(s', a), where Q' is a target network that follows it slowly.
 
 Options, which together are Rainbow (Hessel et al. 2018): double Q-learning (van Hasselt et
-al. 2016), dueling networks (Wang et al. 2016), returns over n steps, prioritised replay (Schaul et
+al. 2016), dueling networks (Wang et al. 2016), returns over n steps, prioritized replay (Schaul et
 al. 2016), noisy networks (Fortunato et al. 2018), and distributions of returns in place of their
 means (Bellemare et al. 2017; Dabney et al. 2018). Besides, a network may learn roots of values
 (after Pohlen et al. 2018), and in an exogenous task ``all_actions`` learns from one move of the
@@ -65,16 +65,16 @@ class DQN(Agent):
 
     network: str = static("flat")  # over everything observed; or one of networks.KINDS
     hidden: tuple[int, ...] = sizes(256, 256)
-    environments: int = static(1)  # stepped side by side
+    num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     batch_size: int = static(64)
-    updates: int = static(1)  # gradient steps per step of all environments
+    gradient_steps: int = static(1)  # gradient steps per step of all environments
     replay_capacity: int = static(50_000)  # transitions
     learning_starts: int = static(64)  # transitions stored before learning
     double: bool = static(False)
     dueling: bool = static(False)  # a stream for the state's value and one for advantages
     n_steps: int = static(1)  # whose rewards a target adds up
-    prioritised: bool = static(False)  # transitions are drawn by how far off their values were
+    prioritized: bool = static(False)  # transitions are drawn by how far off their values were
     priority_exponent: float = number(0.6)  # α
     importance_exponent: float = number(0.4)  # β at the start; 1 after learning_rate_steps
     values: str = static("expected")  # what is learned of a return: expected, categorical, quantile
@@ -86,30 +86,30 @@ class DQN(Agent):
     all_actions: bool = static(False)  # learn every action at once, from re-drawn holdings
     market_baseline: bool = static(False)  # with all_actions: rewards above those of other holdings
     time_limit_terminal: bool = static(False)  # wrong, but often done
-    target_period: int = static(200)  # steps between target updates
-    target_rate: float = number(1.0)  # how far each goes towards the online network; 1 copies it
+    target_update_interval: int = static(200)  # steps between target updates
+    tau: float = number(1.0)  # how far each goes towards the online network; 1 copies it
     discount: float = number(0.99)
     learning_rate: float = number(1e-3)
     learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
-    epsilon: float = number(1.0)
+    epsilon_start: float = number(1.0)
     epsilon_end: float = number(0.01)
     epsilon_decay: float = number(0.995)  # factor per finished episode
     persistence: float = constant(0.0)  # share of exploring steps that repeat the last action
-    huber: float = number(math.inf)  # |TD error| beyond which the loss is linear; inf: squared
+    huber_delta: float = number(math.inf)  # |TD error| beyond which the loss is linear
     reward_scale: float = number(1.0)  # the network learns values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
-    rescale_values: bool = static(False)  # learn roots of values: small ones weigh more
+    value_rescaling: bool = static(False)  # learn roots of values: small ones weigh more
 
     def __check_init__(self) -> None:
         require_replay(self)
         require_network(self)
         optimizer.require_schedule(self)
-        require(self, "target_period", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "target_update_interval", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "huber", lambda x: x >= 1e-30, "greater than 0")
-        fractions = "discount target_rate epsilon epsilon_end epsilon_decay persistence"
+        require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
+        fractions = "discount tau epsilon_start epsilon_end epsilon_decay persistence"
         exponents = " priority_exponent importance_exponent"
         require(self, fractions + exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
         distributional.require_values(self)
@@ -153,7 +153,7 @@ class DQN(Agent):
             target=online,
             optimizer=optimizer.begin(online),
             replay=Replay.empty(
-                row, self.replay_capacity, self.environments, self.n_steps, self.prioritised
+                row, self.replay_capacity, self.num_envs, self.n_steps, self.prioritized
             ),
             episodes=zero,
             steps=zero,
@@ -213,10 +213,10 @@ class DQN(Agent):
         state = self.observe(state, rollout)
         update = partial(self._update, task, state.replay, state.target)
         learned = (state.online, state.optimizer, state.replay.priorities)
-        learned, metrics = optimizer.repeat(update, learned, self.updates, key)
+        learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         online, adam, priorities = learned
-        due = state.steps % self.target_period == 0
-        rate = self.target_rate if self.target_period == 1 else jnp.where(due, self.target_rate, 0)
+        due = state.steps % self.target_update_interval == 0
+        rate = self.tau if self.target_update_interval == 1 else jnp.where(due, self.tau, 0)
         target = follow(state.target, online, rate)
         replay = dataclasses.replace(state.replay, priorities=priorities)
         return DQNState(online, target, adam, replay, state.episodes, state.steps), metrics
@@ -278,5 +278,5 @@ class DQN(Agent):
         assert isinstance(task, ExogenousTask)
         q = partial(self._q, online), partial(self._q, target)
         error, values = hindsight.errors(self, task, moves, key, *q)
-        each = huber_loss(error, self.huber)
+        each = huber_loss(error, self.huber_delta)
         return Losses(each, None, values.max(1).mean() / self.reward_scale)

@@ -97,11 +97,13 @@ class DynaState(TableState):
 class DynaQ(Tabular):
     """Q-learning from real steps and imagined ones."""
 
-    planning: int = static(10)  # imagined steps after each step of all environments
+    planning_steps: int = static(10)  # imagined steps after each step of all environments
     outcomes: int = static(8)  # next states that the model holds of each state and action
 
     def __check_init__(self) -> None:
-        require(self, "planning", lambda x: 1 <= x <= 4096, "from 1 to 4096; without, q-learning")
+        require(
+            self, "planning_steps", lambda x: 1 <= x <= 4096, "from 1 to 4096; without, q-learning"
+        )
         require(self, "outcomes", lambda x: 1 <= x <= 4096, "from 1 to 4096")
 
     def init(self, task: Task, key: PRNGKeyArray) -> DynaState:
@@ -123,7 +125,7 @@ class DynaQ(Tabular):
         outcome = jnp.where(move.terminated, shape[0], move.next_state)
         model = state.model.add(entry, outcome, move.reward)
         state = eqx.tree_at(lambda s: s.model, state, model)
-        state = self._update(state, model.imagine(self.planning, (shape[0], shape[1]), key))
+        state = self._update(state, model.imagine(self.planning_steps, (shape[0], shape[1]), key))
         return self.observe(state, rollout), {}
 
     def _update(self, state: DynaState, move: Move) -> DynaState:

@@ -38,8 +38,8 @@ class Move(NamedTuple):
 def require_plain(agent: Any) -> None:
     """Raises QfolioError where an agent wants what moves and holdings drawn anew do not give."""
     plain: dict[str, Any] = {
-        "values": "expected", "n_steps": 1, "prioritised": False, "noisy": False,
-        "persistence": 0.0, "rescale_values": False,
+        "values": "expected", "n_steps": 1, "prioritized": False, "noisy": False,
+        "persistence": 0.0, "value_rescaling": False,
     }  # fmt: skip
     for name, value in plain.items():
         if getattr(agent, name) != value:

@@ -99,19 +99,19 @@ class MBPOState(ActorCriticState):
 class MBPO(SAC):
     """Soft actor-critic that learns from a learned model's steps alone."""
 
-    members: int = static(5)  # networks in the ensemble
+    ensemble_size: int = static(5)  # networks in the ensemble
     model_hidden: tuple[int, ...] = sizes(128, 128)
     model_updates: int = static(4)  # gradient steps of the model per step of all environments
-    model_rate: float = number(1.0)  # its learning rate, as a share of the critics'
-    imagined_rows: int = static(64)  # real observations that imagination starts from each time
-    imagined_steps: int = static(5)  # how far it goes
-    imagined_capacity: int = static(100_000)  # steps
+    model_learning_rate_ratio: float = number(1.0)  # its learning rate, as a share of the critics'
+    model_rollout_batch: int = static(64)  # real observations that rollouts of the model start from
+    model_rollout_length: int = static(5)  # steps of each
+    model_replay_capacity: int = static(100_000)  # steps of the model that are kept
 
     def __check_init__(self) -> None:
-        counts = "members model_updates imagined_rows imagined_steps"
+        counts = "ensemble_size model_updates model_rollout_batch model_rollout_length"
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        require(self, "imagined_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
-        require(self, "model_rate", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "model_replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
+        require(self, "model_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "n_steps", lambda x: x == 1, "1: imagined steps stand alone")
         require_sizes(self, "model_hidden")
 
@@ -128,27 +128,27 @@ class MBPO(SAC):
         layers = (observation.size + entries, *self.model_hidden, observation.size + 2)
         make = lambda key: SmoothMLP(layers, key, GAIN)  # noqa: E731
         model = Model(
-            jax.vmap(make)(jax.random.split(model_key, self.members)),
+            jax.vmap(make)(jax.random.split(model_key, self.ensemble_size)),
             jnp.broadcast_to(jnp.array(task.observation_scale), observation.shape),
             actions,
         )
         start = super().init(task, key)
         step = jax.tree.map(lambda x: x[0], start.replay.unpack(start.replay.rows[:1]))
-        rows = Remembered(step, jnp.ones(self.members))
-        width = self.imagined_rows * self.imagined_steps
+        rows = Remembered(step, jnp.ones(self.ensemble_size))
+        width = self.model_rollout_batch * self.model_rollout_length
         return MBPOState(
             learned=start.learned,
-            replay=Replay.empty(rows, self.replay_capacity, self.environments),
+            replay=Replay.empty(rows, self.replay_capacity, self.num_envs),
             steps=start.steps,
             rewards=start.rewards,
             model=model,
             model_adam=optimizer.begin(model.members),
-            imagined=Replay.empty(step, self.imagined_capacity, width),
+            imagined=Replay.empty(step, self.model_replay_capacity, width),
         )
 
     def row(self, step: Experience, steps: Int[Array, ""]) -> Remembered:
         key = jax.random.fold_in(jax.random.key(0), steps)
-        counts = jax.random.poisson(key, 1.0, (len(step.reward), self.members))
+        counts = jax.random.poisson(key, 1.0, (len(step.reward), self.ensemble_size))
         return Remembered(step, counts.astype(jnp.float32))
 
     def learn(
@@ -169,7 +169,7 @@ class MBPO(SAC):
     ) -> tuple[Model, optimizer.Optimizer, Metrics]:
         """Gradient steps of the model on real transitions."""
         done = state.learned.critic_adam.count
-        rate = self.model_rate * optimizer.learning_rate(self, done)
+        rate = self.model_learning_rate_ratio * optimizer.learning_rate(self, done)
 
         def update(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, Metrics]:
             members, adam = carry
@@ -188,7 +188,7 @@ class MBPO(SAC):
     def _imagine(self, model: Model, state: MBPOState, key: PRNGKeyArray) -> Replay:
         """The buffer of imagined steps, with those of the present policy and model."""
         start_key, key = jax.random.split(key)
-        starts = state.replay.sample(start_key, self.imagined_rows).step.observation
+        starts = state.replay.sample(start_key, self.model_rollout_batch).step.observation
 
         def step(
             observation: Float[Array, "batch seen"], key: PRNGKeyArray
@@ -198,7 +198,7 @@ class MBPO(SAC):
             step = model.imagine(observation, action, key)
             return jnp.where(step.terminal[:, None], starts, step.next_observation), step
 
-        _, steps = lax.scan(step, starts, jax.random.split(key, self.imagined_steps))
+        _, steps = lax.scan(step, starts, jax.random.split(key, self.model_rollout_length))
         return state.imagined.add(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps))
 
     def carry_over(self, state: MBPOState, fresh: MBPOState) -> MBPOState:

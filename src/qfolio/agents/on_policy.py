@@ -61,33 +61,33 @@ class OnPolicy(Agent):
 
     network: str = static("flat")  # over everything observed; or mlp, cnn, rnn, shared by assets
     hidden: tuple[int, ...] = sizes(64, 64)  # of the actor, and of the critic
-    environments: int = static(8)  # stepped side by side
-    rollout: int = static(128)  # steps of each environment that are learned from at once
+    num_envs: int = static(8)  # stepped side by side
+    rollout_length: int = static(128)  # steps of each environment that are learned from at once
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     discount: float = number(0.99)
     learning_rate: float = number(3e-4)
     learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
-    gradient_norm: float = number(0.5)  # longer gradients are cut to it
-    value_weight: float = number(0.5)  # of the critic's mean squared error in the loss
-    entropy_weight: float = number(0.0)  # of the policy's entropy, which the loss rewards
-    std: float = number(1.0)  # at the start, in units of the bound, or of the logits of weights
+    max_grad_norm: float = number(0.5)  # longer gradients are cut to it
+    value_coef: float = number(0.5)  # of the critic's mean squared error in the loss
+    entropy_coef: float = number(0.0)  # of the policy's entropy, which the loss rewards
+    initial_std: float = number(1.0)  # in units of the bound, or of the logits of weights
     reward_scale: float = number(1.0)  # the critic learns values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
 
     def __check_init__(self) -> None:
-        require(self, "environments rollout", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "num_envs rollout_length", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "discount", lambda x: 0 <= x <= 1, "between 0 and 1")
-        require(self, "gradient_norm", lambda x: x > 0, "greater than 0")
-        require(self, "value_weight entropy_weight", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "std", lambda x: 1e-9 <= x <= 1e9, "from 10⁻⁹ to 10⁹")
+        require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
+        require(self, "value_coef entropy_coef", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "initial_std", lambda x: 1e-9 <= x <= 1e9, "from 10⁻⁹ to 10⁹")
         optimizer.require_schedule(self)
         networks.require_network(self)
 
     @property
     def rollout_steps(self) -> int:
-        return self.rollout
+        return self.rollout_length
 
     def init(self, task: Task, key: PRNGKeyArray) -> OnPolicyState:
         actor_key, critic_key, start_key = jax.random.split(key, 3)
@@ -100,7 +100,7 @@ class OnPolicy(Agent):
 
         weights = PolicyAndValue(
             actor=_quiet(build(outputs_of(task.actions), actor_key)),
-            log_std=jnp.full(_coordinates(task.actions), jnp.log(self.std)),
+            log_std=jnp.full(_coordinates(task.actions), jnp.log(self.initial_std)),
             critic=build(Outputs(1), critic_key),
             actions=task.actions,
         )
@@ -122,11 +122,11 @@ class OnPolicy(Agent):
         return state
 
     def judge(
-        self, weights: PolicyAndValue, rollout: Transition, trace: Float[Array, ""] | float
+        self, weights: PolicyAndValue, rollout: Transition, gae_lambda: Float[Array, ""] | float
     ) -> Batch:
         """Compares a rollout that these weights made with what they expect.
 
-        trace: λ of the advantages, from 0, which trusts the critic, to 1, which trusts the rewards.
+        gae_lambda: λ of the advantages, from 0 (trust the critic) to 1 (trust the rewards).
         """
         step = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout)
         value = weights.value(step.observation)
@@ -138,7 +138,7 @@ class OnPolicy(Agent):
             rollout.terminated,
             rollout.truncated,
             self.discount,
-            trace,
+            gae_lambda,
         ).reshape(-1)
         return Batch(
             observation=step.observation,
@@ -159,14 +159,14 @@ class OnPolicy(Agent):
         loss = -self.objective(policy.log_prob(batch.action), batch).mean()
         value_loss = ((batch.goal - weights.value(batch.observation)) ** 2).mean()
         entropy = policy.entropy().mean()
-        total = loss + self.value_weight * value_loss - self.entropy_weight * entropy
+        total = loss + self.value_coef * value_loss - self.entropy_coef * entropy
         total += networks.saturation(weights.actions, output, REACH)
         return total, {"loss": loss, "value_loss": value_loss, "entropy": entropy}
 
     def descend(self, state: OnPolicyState, batch: Batch) -> tuple[OnPolicyState, Metrics]:
         """One gradient step."""
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.weights, batch)
-        gradient = optimizer.clip(gradient, self.gradient_norm)
+        gradient = optimizer.clip(gradient, self.max_grad_norm)
         weights, adam = optimizer.descend(self, state.weights, gradient, state.optimizer)
         return OnPolicyState(weights, adam), metrics
 

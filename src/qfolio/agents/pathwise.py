@@ -89,31 +89,33 @@ class Pathwise(Agent):
 
     network: str = static("mlp")  # mlp, cnn or rnn, shared by all assets
     hidden: tuple[int, ...] = sizes(32, 32)
-    environments: int = static(64)  # paths in a batch
-    rollout: int = static(50)  # steps of each path that a gradient goes through
+    num_envs: int = static(64)  # paths in a batch
+    rollout_length: int = static(50)  # steps of each path that a gradient goes through
     tail: int = static(0)  # of these, the last ones only show what followed
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    updates: int = static(1)  # gradient steps per rollout
+    gradient_steps: int = static(1)  # gradient steps per rollout
     learning_rate: float = number(1e-3)
     learning_rate_final: float = number(1.0)  # share left at the end of the cosine
     learning_rate_steps: float = number(1e4)  # gradient steps of the cosine
-    gradient_norm: float = number(math.inf)  # longer gradients are cut to it
+    max_grad_norm: float = number(math.inf)  # longer gradients are cut to it
     reward_scale: float = number(1.0)
-    pull: float = number(0.01)  # back to the simplex, where the gradient of what is off it is zero
+    simplex_penalty: float = number(0.01)  # on what is off the simplex: its own gradient is zero
 
     def __check_init__(self) -> None:
         if self.network not in SHARED:
             raise QfolioError(
                 f"network is {self.network!r}; it must be one of {', '.join(SHARED)}."
             )
-        require(self, "environments rollout updates", lambda x: x >= 1, "at least 1")
+        require(self, "num_envs rollout_length gradient_steps", lambda x: x >= 1, "at least 1")
         require(self, "episode_steps tail", lambda x: x >= 0, "at least 0")
-        require(self, "gradient_norm", lambda x: x > 0, "greater than 0")
+        require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         optimizer.require_schedule(self)
         require_sizes(self)
-        if self.tail >= self.rollout:
-            raise QfolioError(f"tail is {self.tail}; it must be less than rollout, {self.rollout}.")
+        if self.tail >= self.rollout_length:
+            raise QfolioError(
+                f"tail is {self.tail}; it must be less than rollout_length, {self.rollout_length}."
+            )
 
     @property
     def discount(self) -> None:
@@ -121,7 +123,7 @@ class Pathwise(Agent):
 
     @property
     def rollout_steps(self) -> int:
-        return self.rollout
+        return self.rollout_length
 
     def init(self, task: Task, key: PRNGKeyArray) -> PathwiseState:
         if not isinstance(task, ExogenousTask) or isinstance(task.actions, Discrete):
@@ -130,10 +132,10 @@ class Pathwise(Agent):
                 f"{type(task).__name__} is none (in a market, leave menu empty)."
             )
         episode = min(self.episode_steps or task.horizon, task.horizon)
-        if episode % self.rollout:
+        if episode % self.rollout_length:
             raise QfolioError(
-                f"rollout is {self.rollout}; it must divide the {episode} steps of an episode "
-                "(episode_steps, or the task's horizon)."
+                f"rollout_length is {self.rollout_length}; it must divide the {episode} steps of "
+                "an episode (episode_steps, or the task's horizon)."
             )
         view = task.observe(task.reset(key))
         network = Shared(self.network, view, self.hidden, pooled=0, each=2, key=key)
@@ -172,11 +174,11 @@ class Pathwise(Agent):
         def update(carry: Any, _: None) -> Any:
             policy, adam = carry
             loss, gradient = jax.value_and_grad(self._loss)(policy, task, rollout)
-            gradient = optimizer.clip(gradient, self.gradient_norm)
+            gradient = optimizer.clip(gradient, self.max_grad_norm)
             return optimizer.descend(self, policy, gradient, adam), loss
 
         carry = (state.policy, state.optimizer)
-        (policy, adam), losses = lax.scan(update, carry, None, length=self.updates)
+        (policy, adam), losses = lax.scan(update, carry, None, length=self.gradient_steps)
         return PathwiseState(policy, adam, state.steps + 1), {"loss": losses.mean()}
 
     def _loss(self, policy: Band, task: ExogenousTask, rollout: Transition) -> Float[Array, ""]:
@@ -200,11 +202,11 @@ class Pathwise(Agent):
             )
 
         start = jax.tree.map(lambda x: x[0], rollout.state.holding)
-        cut = self.rollout - self.tail
+        cut = self.rollout_length - self.tail
         holding, (rewards, off) = follow(policy, start, slice(None, cut))
         total = rewards.sum()
         if self.tail:
             # A trade near the end would be paid for without earning what it was made for.
             _, (later, _) = follow(lax.stop_gradient(policy), holding, slice(cut, None))
             total += later.sum()
-        return self.pull * off.mean() - self.reward_scale * total / rewards.size
+        return self.simplex_penalty * off.mean() - self.reward_scale * total / rewards.size

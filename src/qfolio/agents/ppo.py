@@ -20,30 +20,32 @@ from qfolio.core.mdp import Metrics, Task, Transition
 class PPO(OnPolicy):
     """Proximal policy optimisation with the clipped objective."""
 
-    environments: int = static(1)
-    rollout: int = static(2048)
+    num_envs: int = static(1)
+    rollout_length: int = static(2048)
     epochs: int = static(10)
     batch_size: int = static(64)
-    trace: float = number(0.95)  # λ of the advantages: 0 trusts the critic, 1 the rewards
-    clip: float = number(0.2)  # how far the objective follows a change of probability
+    gae_lambda: float = number(0.95)  # λ of the advantages: 0 trusts the critic, 1 the rewards
+    clip_range: float = number(0.2)  # how far the objective follows a change of probability
 
     def __check_init__(self) -> None:
         require(self, "epochs batch_size", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        require(self, "trace", lambda x: 0 <= x <= 1, "between 0 and 1")
-        require(self, "clip", lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")
-        if self.environments * self.rollout % self.batch_size:
+        require(self, "gae_lambda", lambda x: 0 <= x <= 1, "between 0 and 1")
+        require(self, "clip_range", lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")
+        if self.num_envs * self.rollout_length % self.batch_size:
             raise QfolioError(
                 f"batch_size is {self.batch_size}; it must divide the rollout of "
-                f"{self.environments} environments × {self.rollout} steps."
+                f"{self.num_envs} environments × {self.rollout_length} steps."
             )
 
     def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
-        return clipped(jnp.exp(log_prob - batch.log_prob), normalised(batch.advantage), self.clip)
+        return clipped(
+            jnp.exp(log_prob - batch.log_prob), normalised(batch.advantage), self.clip_range
+        )
 
     def learn(
         self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        batch = self.judge(state.weights, rollout, self.trace)
+        batch = self.judge(state.weights, rollout, self.gae_lambda)
 
         def epoch(state: OnPolicyState, key: PRNGKeyArray) -> tuple[OnPolicyState, Metrics]:
             descend = lambda state, batch: self.descend(state, batch)  # noqa: E731

@@ -17,14 +17,14 @@ from qfolio.core.mdp import Metrics, Task, Transition
 class REINFORCE(OnPolicy):
     """REINFORCE with a learned baseline."""
 
-    rollout: int = static(200)  # whole episodes
+    rollout_length: int = static(200)  # whole episodes
 
     def init(self, task: Task, key: PRNGKeyArray) -> OnPolicyState:
         episode = min(self.episode_steps or task.horizon, task.horizon)
-        if self.rollout % episode:
+        if self.rollout_length % episode:
             raise QfolioError(
-                f"rollout is {self.rollout}; it must be a multiple of the {episode} steps of an "
-                "episode (episode_steps, or the task's horizon)."
+                f"rollout_length is {self.rollout_length}; it must be a multiple of the {episode} "
+                "steps of an episode (episode_steps, or the task's horizon)."
             )
         return super().init(task, key)
 
@@ -34,4 +34,4 @@ class REINFORCE(OnPolicy):
     def learn(
         self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        return self.descend(state, self.judge(state.weights, rollout, trace=1.0))
+        return self.descend(state, self.judge(state.weights, rollout, gae_lambda=1.0))

@@ -128,23 +128,25 @@ class SAC(ActorCritic):
     """A stochastic actor, two critics with targets, and a temperature."""
 
     spread: float = number(0.184)  # target entropy, as share of the actions; Haarnoja's is e⁻¹/2
-    temperature: float = number(1.0)  # at the start
+    initial_temperature: float = number(1.0)  # at the start
 
     def __check_init__(self) -> None:
-        require(self, "spread temperature", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        require(
+            self, "spread initial_temperature", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30"
+        )
 
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
         actor_key, critic_key = jax.random.split(key)
         outputs = outputs_of(task.actions)
         if isinstance(task.actions, Discrete):
             make = partial(self.build, task, observation, outputs)
-            critics = Critics(make, 2, Scale(self.rescale_values), critic_key)
+            critics = Critics(make, 2, Scale(self.value_rescaling), critic_key)
         else:
             critics = self.build_critics(task, observation, 2, critic_key)
             weights = isinstance(task.actions, Simplex)  # cash needs no standard deviation
             outputs = Outputs(1, 2) if weights else Outputs(2 * outputs.pooled)
         actor = Actor(self.build(task, observation, outputs, actor_key), task.actions)
-        log_temperature = jnp.log(jnp.asarray(self.temperature, float))
+        log_temperature = jnp.log(jnp.asarray(self.initial_temperature, float))
         begin = optimizer.begin
         return Learned(
             actor, critics, critics, log_temperature,
@@ -181,17 +183,23 @@ class SAC(ActorCritic):
         wanted = target_entropy(learned.actor.actions, self.spread)
         goal = self.goal(batch, value, temperature * wanted)
         critics, critic_adam, metrics = self.descend(
-            critic_loss, learned.critics, learned.critic_adam, rate, batch.steps, goal, self.huber
+            critic_loss,
+            learned.critics,
+            learned.critic_adam,
+            rate,
+            batch.steps,
+            goal,
+            self.huber_delta,
         )
         actor, actor_adam, more = self.descend(
-            actor_loss, learned.actor, learned.actor_adam, self.actor_rate * rate,
+            actor_loss, learned.actor, learned.actor_adam, self.actor_learning_rate_ratio * rate,
             critics, temperature, batch.steps.observation, key,
         )  # fmt: skip
         excess = more["entropy"] - wanted
         log_temperature, temperature_adam, last = self.descend(
             temperature_loss, learned.log_temperature, learned.temperature_adam, rate, excess
         )
-        target_critics = follow(learned.target_critics, critics, self.target_rate)
+        target_critics = follow(learned.target_critics, critics, self.tau)
         learned = Learned(
             actor, critics, target_critics, log_temperature,
             actor_adam, critic_adam, temperature_adam,

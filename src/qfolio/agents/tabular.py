@@ -69,22 +69,22 @@ State = TypeVar("State", bound=TableState)
 class Tabular(Agent):
     """A table of action values and ε-greedy actions; the agents below say how it learns."""
 
-    environments: int = static(1)  # stepped side by side
+    num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     discount: float = number(0.99)
     learning_rate: float = number(0.1)  # α
     learning_rate_decay: float = number(0.0)  # d: after n updates of an entry, α/(1 + d n)
     initial_value: float = number(0.0)  # of every entry; above what can be true: optimism
-    epsilon: float = number(1.0)
+    epsilon_start: float = number(1.0)
     epsilon_end: float = number(0.01)
     epsilon_decay: float = number(0.995)  # factor per finished episode
 
     count = 1  # of tables
 
     def __check_init__(self) -> None:
-        require(self, "environments", lambda x: 1 <= x <= 4096, "from 1 to 4096")
+        require(self, "num_envs", lambda x: 1 <= x <= 4096, "from 1 to 4096")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
-        fractions = "discount learning_rate epsilon epsilon_end epsilon_decay"
+        fractions = "discount learning_rate epsilon_start epsilon_end epsilon_decay"
         require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "learning_rate_decay", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "initial_value", lambda x: abs(x) <= 1e30, "from −1e30 to 1e30")
@@ -193,7 +193,7 @@ class DoubleQ(Tabular):
         self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[TableState, Metrics]:
         move = Move.of(rollout)
-        batch = jnp.arange(self.environments)
+        batch = jnp.arange(self.num_envs)
         learner = jax.random.bernoulli(key, shape=batch.shape).astype(jnp.int32)
         values = state.tables[:, move.next_state]
         following = bootstrap(values[1 - learner, batch], selector=values[learner, batch])
@@ -216,7 +216,7 @@ class Sarsa(Tabular):
 
     def init(self, task: Task, key: PRNGKeyArray) -> SarsaState:
         state = super().init(task, key)
-        zeros = jnp.zeros(self.environments, jnp.int32)
+        zeros = jnp.zeros(self.num_envs, jnp.int32)
         never = zeros.astype(bool)
         # At first none waits: what is learned of a state that does not exist goes nowhere.
         nowhere = jnp.full_like(zeros, state.tables.shape[1])

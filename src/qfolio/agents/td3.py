@@ -23,13 +23,13 @@ class TD3(DDPG):
     """DDPG with two critics, a smoothed target and a delayed actor."""
 
     target_noise: float = number(0.2)  # of the target's action, in units of the bound
-    target_clip: float = number(0.5)  # the largest such noise
+    target_noise_clip: float = number(0.5)  # the largest such noise
     policy_delay: int = static(2)  # critics' steps for one of the actor and the targets
 
     critics: ClassVar[int] = 2
 
     def __check_init__(self) -> None:
-        require(self, "target_noise target_clip", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "target_noise target_noise_clip", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "policy_delay", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
 
     def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
@@ -44,6 +44,6 @@ class TD3(DDPG):
         """min Q'(s', a') at a' = π'(s') with clipped noise (eq. 14 and 15)."""
         action = learned.target_actor(observation)
         noise = self.target_noise * jax.random.normal(key, action.shape)
-        noise = jnp.clip(noise, -self.target_clip, self.target_clip)
+        noise = jnp.clip(noise, -self.target_noise_clip, self.target_noise_clip)
         action = learned.target_actor.perturb(action, noise)
         return learned.target_critics(observation, action).min(0)

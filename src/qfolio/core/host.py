@@ -174,7 +174,7 @@ class HostPopulation(Population):
 
     def _make(self, seed: int) -> Environments:
         """A member's environments; all their randomness derives from its seed and step."""
-        limit, count = episode_steps(self.task, self.agent), self.agent.environments
+        limit, count = episode_steps(self.task, self.agent), self.agent.num_envs
         environments = Environments(self.task, limit, count)
         for i in range(count):
             entropy = np.random.SeedSequence((seed, i, self.steps))
@@ -253,7 +253,7 @@ class HostPopulation(Population):
 
     def _blank(self, state: TrainingState) -> Episodes:
         """Records of a chunk in which no episode has ended yet."""
-        shape = (self._rows, self.agent.environments)
+        shape = (self._rows, self.agent.num_envs)
         monitored = jax.eval_shape(self.agent.monitor, state.agent)
         zeros: Any = np.zeros(shape, np.float32)
         never: Any = np.zeros(shape, bool)

@@ -199,7 +199,7 @@ Metrics = dict[str, Array]
 class Agent(eqx.Module):
     """An algorithm: hyperparameters are its fields, everything it learns lives in its state."""
 
-    environments: eqx.AbstractVar[int]  # stepped side by side
+    num_envs: eqx.AbstractVar[int]  # stepped side by side
     episode_steps: eqx.AbstractVar[int]  # training episodes are cut here; 0: the task's horizon
     discount: eqx.AbstractVar[Any]  # of the action values; None where it estimates none
 

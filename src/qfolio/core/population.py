@@ -85,11 +85,11 @@ class Population:
         episodes: finished by each member, if none ends early. steps: of all its environments.
         """
         if steps is not None:
-            return max(0, -(-steps // self.agent.environments) - self.steps)
+            return max(0, -(-steps // self.agent.num_envs) - self.steps)
         missing = (episodes or 0) - self.episodes
         if missing <= 0:
             return 0
-        rounds = -(-missing // self.agent.environments)
+        rounds = -(-missing // self.agent.num_envs)
         under_way = int(self._fetch(lambda state: state.tally.steps).max())
         return max(1, rounds * episode_steps(self.task, self.agent) - under_way)
 
@@ -125,8 +125,8 @@ class Population:
             bad = {str(s): None for s, ok in zip(self.seeds, healthy, strict=True) if not ok}
             raise QfolioError(
                 f"The loss of seed {', '.join(bad)} is no longer finite after {self.steps} steps; "
-                "lower learning_rate, or bound the gradient (huber or gradient_norm, whichever the "
-                "agent has)."
+                "lower learning_rate, or bound the gradient (huber_delta or max_grad_norm, "
+                "whichever the agent has)."
             )
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:

@@ -55,7 +55,7 @@ def begin(task: Task, agent: Agent, seed: Int[Array, ""]) -> TrainingState:
     """A member before its first step; all its randomness derives from ``seed``."""
     agent_key, task_key, key = jax.random.split(jax.random.key(seed), 3)
     state = agent.init(task, agent_key)
-    environments = agent.environments
+    environments = agent.num_envs
     zeros = jnp.zeros(environments)
     count = jnp.zeros(environments, jnp.int32)
     zero = jnp.array(0, jnp.int32)

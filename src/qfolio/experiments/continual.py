@@ -123,8 +123,8 @@ class Plan:
         """The agent, whose schedules take a part of their time, and that explores less."""
         steps = self.renewal * _setting(self.agent, "steps")
         agent = self._set(learning_rate_steps=steps)
-        if isinstance(epsilon := getattr(agent, "epsilon", None), float):
-            agent = dataclasses.replace(agent, epsilon=min(epsilon, self.epsilon))
+        if isinstance(epsilon := getattr(agent, "epsilon_start", None), float):
+            agent = dataclasses.replace(agent, epsilon_start=min(epsilon, self.epsilon))
         return agent
 
     def _set(self, **changes: float) -> Agent:
@@ -320,7 +320,7 @@ def _learn(
         seconds += perf_counter() - start - (population.seconds_compile - compiled)
         left = population.steps_left(end)
         done = population.steps - begun
-        steps.append(done * population.agent.environments)
+        steps.append(done * population.agent.num_envs)
         curve.append(here.regrets(population, population.curve_starts))
         tell(done / (done + left))
     final, other = (world.regrets(population, population.starts) for world in (here, there))

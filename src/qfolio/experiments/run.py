@@ -46,7 +46,7 @@ from qfolio.core.training import Episodes
 from qfolio.core.version import __version__
 from qfolio.solvers.followed import FollowedOptimum
 
-FORMAT = 3
+FORMAT = 4
 """Of the run folder; raised whenever an older folder can no longer be read."""
 
 EVALUATIONS = 20
@@ -160,7 +160,7 @@ class Run:
     def done(self, unit: str) -> int:
         """Episodes or environment steps of each seed so far."""
         if unit == "steps":
-            return self.population.steps * self.agent.environments
+            return self.population.steps * self.agent.num_envs
         return self.episodes
 
     def train(
@@ -320,7 +320,7 @@ class Run:
             unit=unit,
             mean_return=float(np.mean(returns)) if returns else math.nan,
             epsilon=records[-1].get("epsilon", math.nan) if records else math.nan,
-            steps_per_second=rate * self.agent.environments * len(self.population.seeds),
+            steps_per_second=rate * self.agent.num_envs * len(self.population.seeds),
             seconds_left=steps_left / rate,
             greedy_return=greedy,
         )

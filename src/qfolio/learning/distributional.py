@@ -23,7 +23,7 @@ class Expected(NamedTuple):
     """The expected return alone (Mnih et al. 2015)."""
 
     scale: Scale
-    huber: Float[Array, ""] | float
+    huber_delta: Float[Array, ""] | float
 
     @property
     def atoms(self) -> int:
@@ -42,7 +42,7 @@ class Expected(NamedTuple):
         following: Float[Array, "batch 1"],
     ) -> Losses:
         error = (self.scale.outputs(goal) - z)[:, 0]
-        return huber_loss(error, self.huber), jnp.abs(error)
+        return huber_loss(error, self.huber_delta), jnp.abs(error)
 
 
 class Categorical(NamedTuple):
@@ -81,7 +81,7 @@ class Quantile(NamedTuple):
 
     scale: Scale
     atoms: int
-    huber: Float[Array, ""] | float
+    huber_delta: Float[Array, ""] | float
 
     def mean(self, z: Float[Array, "*batch atom"]) -> Float[Array, "*batch"]:
         return self.scale.values(z).mean(-1)
@@ -96,7 +96,7 @@ class Quantile(NamedTuple):
         following: Float[Array, "batch atom"],
     ) -> Losses:
         off = jnp.abs(goal.mean(-1) - self.mean(z))
-        return quantile_huber_loss(z, self.scale.outputs(goal), self.huber), off
+        return quantile_huber_loss(z, self.scale.outputs(goal), self.huber_delta), off
 
 
 Values = Expected | Categorical | Quantile
@@ -106,12 +106,12 @@ KINDS = ("expected", "categorical", "quantile")
 
 def values_of(agent: Any) -> Values:
     """What the settings of an agent ask for."""
-    scale = Scale(agent.rescale_values)
+    scale = Scale(agent.value_rescaling)
     if agent.values == "categorical":
         return Categorical(scale, agent.atoms, agent.v_min, agent.v_max)
     if agent.values == "quantile":
-        return Quantile(scale, agent.atoms, agent.huber)
-    return Expected(scale, agent.huber)
+        return Quantile(scale, agent.atoms, agent.huber_delta)
+    return Expected(scale, agent.huber_delta)
 
 
 def require_values(agent: Any) -> None:
@@ -122,7 +122,7 @@ def require_values(agent: Any) -> None:
     if agent.values == "categorical":
         require(agent, "v_max", lambda x: x > agent.v_min, f"above v_min ({agent.v_min})")
     if agent.values == "quantile":
-        require(agent, "huber", math.isfinite, "finite for quantiles, such as 1")
+        require(agent, "huber_delta", math.isfinite, "finite for quantiles, such as 1")
 
 
 def project(

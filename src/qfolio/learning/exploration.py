@@ -11,7 +11,7 @@ from qfolio.core.mdp import Actions, Discrete, Simplex
 
 def epsilon_now(agent: Any, episodes: Int[Array, ""]) -> Float[Array, ""]:
     """ε of the agent's settings after so many finished episodes: it falls with each of them."""
-    return jnp.maximum(agent.epsilon_end, agent.epsilon * agent.epsilon_decay**episodes)
+    return jnp.maximum(agent.epsilon_end, agent.epsilon_start * agent.epsilon_decay**episodes)
 
 
 def epsilon_greedy(

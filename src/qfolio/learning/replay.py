@@ -71,7 +71,7 @@ class Replay(eqx.Module):
 
     @staticmethod
     def empty(
-        row: PyTree, capacity: int, width: int, steps: int = 1, prioritised: bool = False
+        row: PyTree, capacity: int, width: int, steps: int = 1, prioritized: bool = False
     ) -> "Replay":
         """Room for ``capacity`` rows shaped like ``row``, written ``width`` at a time.
 
@@ -81,7 +81,7 @@ class Replay(eqx.Module):
         like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), row)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(like))
         zero = jnp.array(0, jnp.int32)
-        priorities = Priorities.empty(capacity) if prioritised else None
+        priorities = Priorities.empty(capacity) if prioritized else None
         return Replay(jnp.zeros((capacity, numbers)), zero, zero, priorities, like, width, steps)
 
     def add(self, rows: PyTree) -> "Replay":
@@ -180,11 +180,11 @@ def join(
 
 def require_replay(agent: Any) -> None:
     """Raises QfolioError where the settings of an agent's buffer make no sense."""
-    counts = "environments batch_size updates n_steps"
+    counts = "num_envs batch_size gradient_steps n_steps"
     require(agent, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
     require(agent, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
     require(agent, "learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
-    joined = agent.n_steps * agent.environments
+    joined = agent.n_steps * agent.num_envs
     if max(agent.learning_starts, joined) > agent.replay_capacity:
         raise QfolioError(
             f"learning_starts is {agent.learning_starts} and n_steps × environments is {joined}, "
@@ -195,4 +195,4 @@ def require_replay(agent: Any) -> None:
 
 def warm_up(agent: Any) -> int:
     """Steps of all environments before an agent's buffer has enough to learn from."""
-    return max(agent.n_steps, math.ceil(agent.learning_starts / agent.environments)) - 1
+    return max(agent.n_steps, math.ceil(agent.learning_starts / agent.num_envs)) - 1

@@ -110,9 +110,9 @@ def advantages(
     terminated: Bool[Array, "time environment"],
     truncated: Bool[Array, "time environment"],
     discount: Float[Array, ""] | float,
-    trace: Float[Array, ""] | float,
+    gae_lambda: Float[Array, ""] | float,
 ) -> Float[Array, "time environment"]:
-    """Generalised advantage estimates (Schulman et al. 2016, eq. 16; ``trace`` is λ).
+    """Generalised advantage estimates (Schulman et al. 2016, eq. 16; ``gae_lambda`` is λ).
 
     ``next_value`` is that of the true next observation, so that a truncation is bootstrapped
     through while the sum of what follows stops there.
@@ -121,7 +121,7 @@ def advantages(
 
     def back(following: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         error, goes_on = step
-        now = error + discount * trace * goes_on * following
+        now = error + discount * gae_lambda * goes_on * following
         return now, now
 
     goes_on = 1.0 - (terminated | truncated)

@@ -164,7 +164,7 @@ class Policy:
                 "This policy was kept without its learning state and cannot go on learning; train "
                 "it anew."
             )
-        wanted = self.agent.environments if episodes is None else episodes
+        wanted = self.agent.num_envs if episodes is None else episodes
         check_counts(wanted, self.seeds, 0)
         table = self.table(prices, **options)
         if table.dates[-1] <= self.learned:
@@ -182,7 +182,7 @@ class Policy:
         )
         draws = [np.random.SeedSequence((i, self.updates + 1)) for i in range(self.seeds)]
         seeds = [int(draw.generate_state(1)[0]) for draw in draws]
-        unlearned = -(-agent.warm_up() // episode_steps(task, agent)) * agent.environments
+        unlearned = -(-agent.warm_up() // episode_steps(task, agent)) * agent.num_envs
         population = Population(task, agent, seeds)
         state = population.fetch()
         learner = agent.carry_over(self.learner, state.agent)

@@ -16,12 +16,12 @@ from qfolio.portfolio.prices.table import Prices
 AGENTS = {
     "dqn": Preset(
         "dqn",
-        {"network": "mlp", "hidden": (8, 8), "all_actions": True, "environments": 4,
+        {"network": "mlp", "hidden": (8, 8), "all_actions": True, "num_envs": 4,
          "batch_size": 8, "learning_starts": 40, "replay_capacity": 400, "episode_steps": 0},
         episodes=16, seeds=2, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
     ),
     "pathwise": Preset(
-        "pathwise", {"rollout": 10, "environments": 4, "hidden": (8, 8)},
+        "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (8, 8)},
         episodes=24, seeds=2, task={"window": 10, "horizon": 20},
     ),
 }  # fmt: skip

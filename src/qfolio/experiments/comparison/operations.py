@@ -25,7 +25,7 @@ def operations_per_step(task: Task, agent: Agent) -> float | None:
     except QfolioError:
         return None
     # The loop over rollouts has no fixed length, so that its body counts once.
-    return _operations(program.jaxpr) / (agent.rollout_steps * agent.environments)
+    return _operations(program.jaxpr) / (agent.rollout_steps * agent.num_envs)
 
 
 def _operations(program: Any) -> float:

@@ -8,7 +8,7 @@ _CLIFF = {"epsilon_end": 0.1}
 
 
 _LAKE = {
-    "environments": 8,
+    "num_envs": 8,
     "learning_rate": 0.5,
     "learning_rate_decay": 0.02,
     "initial_value": 1.0,
@@ -18,7 +18,7 @@ _LAKE = {
 
 
 _RANDOM = {
-    "environments": 8,
+    "num_envs": 8,
     "discount": 0.95,
     "learning_rate": 0.5,
     "learning_rate_decay": 0.02,
@@ -28,17 +28,17 @@ _RANDOM = {
 
 
 _GRID_PENDULUM = {
-    "environments": 16,
+    "num_envs": 16,
     "episode_steps": 40,
     "discount": 0.995,
     "learning_rate": 0.5,
     "learning_rate_decay": 0.01,
-    "epsilon": 0.2,
+    "epsilon_start": 0.2,
     "epsilon_end": 0.2,
 }
 
 
-_SARSA = {"epsilon": 0.05, "epsilon_end": 0.05}  # what SARSA learns counts its exploration
+_SARSA = {"epsilon_start": 0.05, "epsilon_end": 0.05}  # what SARSA learns counts its exploration
 
 
 def _tables(task: str, settings: dict[str, Any], episodes: int) -> dict[tuple[str, str], Any]:
@@ -59,6 +59,6 @@ PRESETS: Presets = {
         "fast": Preset("expected-sarsa", {**_GRID_PENDULUM, **_SARSA}, 100_000, seeds=8)
     },
     ("pendulum/grid", "dyna-q"): {
-        "fast": Preset("dyna-q", {**_GRID_PENDULUM, "planning": 16}, episodes=25_024, seeds=8)
+        "fast": Preset("dyna-q", {**_GRID_PENDULUM, "planning_steps": 16}, episodes=25_024, seeds=8)
     },
 }

@@ -11,28 +11,28 @@ _DQN = {
     "dueling": True,
     "double": True,
     "n_steps": 4,
-    "environments": 8,
+    "num_envs": 8,
     "batch_size": 256,
     "replay_capacity": 65_536,
     "learning_starts": 1000,
-    "target_period": 1,
-    "target_rate": 0.03,
+    "target_update_interval": 1,
+    "tau": 0.03,
     "learning_rate": 2e-3,
     "learning_rate_final": 0.0,
     "epsilon_decay": 0.99,
     "epsilon_end": 0.02,
-    "huber": 1.0,
+    "huber_delta": 1.0,
     "reward_scale": 0.1,
 }
 
 
 _PPO: dict[str, Any] = {
-    "environments": 8,
-    "rollout": 32,
+    "num_envs": 8,
+    "rollout_length": 32,
     "batch_size": 256,
     "epochs": 20,
     "discount": 0.98,
-    "trace": 0.8,
+    "gae_lambda": 0.8,
     "learning_rate": 1e-3,
     "learning_rate_final": 0.0,
     "learning_rate_steps": 7800.0,
@@ -46,7 +46,7 @@ def of_any(id: str, agent: str, steps: int, **changes: Any) -> Preset:
 def _dqn(id: str, steps: int, **changes: Any) -> dict[str, Preset]:
     """DQN whose learning rate has fallen to zero at the end."""
     settings = {**_DQN, **changes}
-    settings["learning_rate_steps"] = float(steps // settings["environments"])
+    settings["learning_rate_steps"] = float(steps // settings["num_envs"])
     return {"fast": of_any(id, "dqn", steps, **settings)}
 
 
@@ -64,7 +64,7 @@ PRESETS: Presets = {
         dueling=False,
         n_steps=1,
         discount=0.98,
-        environments=16,
+        num_envs=16,
         replay_capacity=262_144,
         persistence=0.9,
         reward_scale=0.03,

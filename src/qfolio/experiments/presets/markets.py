@@ -11,11 +11,11 @@ _DQN = {
     "hidden": (32,),
     "all_actions": True,
     "double": True,
-    "environments": 1024,
+    "num_envs": 1024,
     "replay_capacity": 524_288,
     "learning_starts": 1024,
-    "target_period": 1,
-    "target_rate": 0.05,
+    "target_update_interval": 1,
+    "tau": 0.05,
     "discount": 0.97,
     "learning_rate": 3e-2,
     "learning_rate_final": 0.0,
@@ -26,7 +26,7 @@ _DQN = {
 
 def _pathwise(episodes: int, **changes: Any) -> dict[str, Preset]:
     """An episode is a rollout, so that each starts from a holding drawn anew."""
-    changes["episode_steps"] = changes["rollout"]
+    changes["episode_steps"] = changes["rollout_length"]
     return {"fast": Preset("pathwise", {**_PATHWISE, **changes}, episodes, seeds=5)}
 
 
@@ -37,34 +37,39 @@ def _all_actions(episodes: int, **changes: Any) -> dict[str, Preset]:
 
 PRESETS: Presets = {
     ("market/kelly", "pathwise"): _pathwise(
-        307_200, environments=1024, rollout=5, learning_rate_steps=300.0, reward_scale=10.0
+        307_200, num_envs=1024, rollout_length=5, learning_rate_steps=300.0, reward_scale=10.0
     ),
     ("market/merton", "pathwise"): _pathwise(
-        153_600, environments=512, rollout=5, learning_rate_steps=300.0, reward_scale=10.0
+        153_600, num_envs=512, rollout_length=5, learning_rate_steps=300.0, reward_scale=10.0
     ),
     ("market/regime", "pathwise"): _pathwise(
-        12_800, environments=64, rollout=50, learning_rate_steps=200.0, reward_scale=100.0
+        12_800, num_envs=64, rollout_length=50, learning_rate_steps=200.0, reward_scale=100.0
     ),
     ("market/regime", "dqn"): _all_actions(2048, batch_size=512, learning_rate_steps=500.0),
     ("market/ar1", "pathwise"): _pathwise(
-        25_600, environments=64, rollout=63, tail=21, learning_rate_steps=400.0, reward_scale=100.0
+        25_600,
+        num_envs=64,
+        rollout_length=63,
+        tail=21,
+        learning_rate_steps=400.0,
+        reward_scale=100.0,
     ),
     ("market/ar1", "dqn"): _all_actions(8192, batch_size=1024, learning_rate_steps=2016.0),
     ("market/no-trade", "pathwise"): _pathwise(
         19_200,
-        environments=64,
-        rollout=120,
+        num_envs=64,
+        rollout_length=120,
         tail=60,
         learning_rate_steps=300.0,
         reward_scale=1000.0,
     ),
     ("market/garleanu-pedersen", "pathwise"): _pathwise(
         25_600,
-        environments=64,
-        rollout=50,
+        num_envs=64,
+        rollout_length=50,
         tail=20,
         learning_rate_steps=400.0,
         reward_scale=10.0,
-        gradient_norm=0.3,
+        max_grad_norm=0.3,
     ),
 }

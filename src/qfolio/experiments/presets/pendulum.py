@@ -8,19 +8,19 @@ from qfolio.experiments.presets.preset import Preset, Presets
 _FAST = {
     "hidden": (128, 128),
     "input_gain": 6.0,
-    "environments": 32,
+    "num_envs": 32,
     "episode_steps": 28,
     "batch_size": 256,
     "replay_capacity": 65_536,
     "learning_starts": 1024,
-    "target_period": 1,
-    "target_rate": 0.03,
+    "target_update_interval": 1,
+    "tau": 0.03,
     "discount": 0.995,
     "learning_rate": 3e-3,
     "learning_rate_final": 0.0,
     "learning_rate_steps": 7500.0,
     "epsilon_decay": 0.995,
-    "huber": 0.3,
+    "huber_delta": 0.3,
     "reward_scale": 0.3,
     "v_min": -100.0,
     "v_max": 100.0,
@@ -42,12 +42,12 @@ _RAINBOW = {
     "double": True,
     "dueling": True,
     "n_steps": 2,
-    "prioritised": True,
+    "prioritized": True,
     "values": "quantile",
     "atoms": 8,
     "noisy": True,
     "noise_scale": 0.1,
-    "updates": 2,
+    "gradient_steps": 2,
     "learning_rate_steps": 15_000.0,
 }
 
@@ -55,13 +55,13 @@ _RAINBOW = {
 _CATEGORICAL = {
     **_FAST,
     "values": "categorical",
-    "rescale_values": True,
+    "value_rescaling": True,
     "reward_scale": 1.0,
     "v_min": -400.0,
     "v_max": 400.0,
     "n_steps": 2,
-    "target_rate": 0.02,
-    "updates": 2,
+    "tau": 0.02,
+    "gradient_steps": 2,
     "learning_rate_steps": 15_000.0,
 }
 
@@ -72,12 +72,12 @@ _HIDDEN = {**_FAST, "network": "lstm", "hidden": (64, 128), "input_gain": 12.0}
 _CATCH = {
     "network": "cnn",
     "hidden": (128,),
-    "environments": 32,
+    "num_envs": 32,
     "batch_size": 64,
     "replay_capacity": 32_768,
     "learning_starts": 1024,
-    "target_period": 1,
-    "target_rate": 0.05,
+    "target_update_interval": 1,
+    "tau": 0.05,
     "discount": 0.97,
     "learning_rate": 1e-3,
     "learning_rate_final": 0.0,
@@ -97,33 +97,33 @@ _ON_POLICY = {
 
 _PPO = {
     **_ON_POLICY,
-    "environments": 64,
-    "rollout": 64,
+    "num_envs": 64,
+    "rollout_length": 64,
     "batch_size": 512,
     "discount": 0.99,
-    "trace": 0.9,
+    "gae_lambda": 0.9,
     "learning_rate": 3e-3,
     "learning_rate_steps": 19_520.0,
-    "entropy_weight": 0.02,
+    "entropy_coef": 0.02,
 }
 
 
 _A2C = {
     **_ON_POLICY,
-    "environments": 8,
-    "rollout": 8,
-    "trace": 0.95,
+    "num_envs": 8,
+    "rollout_length": 8,
+    "gae_lambda": 0.95,
     "discount": 0.99,
     "learning_rate": 1e-3,
     "learning_rate_steps": 15_616.0,
-    "entropy_weight": 0.02,
+    "entropy_coef": 0.02,
 }
 
 
 _REINFORCE = {
     **_ON_POLICY,
-    "environments": 16,
-    "rollout": 64,
+    "num_envs": 16,
+    "rollout_length": 64,
     "discount": 0.99,
     "learning_rate": 2e-3,
     "learning_rate_steps": 3906.0,
@@ -133,37 +133,37 @@ _REINFORCE = {
 _TORQUE = {
     "hidden": (128, 128),
     "input_gain": 6.0,
-    "environments": 12,
+    "num_envs": 12,
     "episode_steps": 28,
     "batch_size": 256,
     "n_steps": 2,
     "replay_capacity": 131_072,
     "learning_starts": 1024,
-    "target_rate": 0.02,
+    "tau": 0.02,
     "discount": 0.995,
     "learning_rate": 3e-3,
     "learning_rate_final": 0.0,
     "learning_rate_steps": 8000.0,
-    "actor_rate": 0.6,
-    "huber": 0.3,
-    "rescale_values": True,
+    "actor_learning_rate_ratio": 0.6,
+    "huber_delta": 0.3,
+    "value_rescaling": True,
 }
 
 
 _MODEL = {  # 2,000 real steps, with 4 gradient steps of SAC for each behind the first 200
     **_TORQUE,
-    "environments": 1,
+    "num_envs": 1,
     "episode_steps": 40,
     "n_steps": 1,
     "replay_capacity": 2048,
     "learning_starts": 200,
-    "target_rate": 0.03,
+    "tau": 0.03,
     "discount": 0.99,
     "learning_rate_steps": 7200.0,
-    "huber": math.inf,
-    "updates": 4,
+    "huber_delta": math.inf,
+    "gradient_steps": 4,
     "model_updates": 2,
-    "members": 3,
+    "ensemble_size": 3,
     "spread": 0.05,
 }
 
@@ -171,7 +171,7 @@ _MODEL = {  # 2,000 real steps, with 4 gradient steps of SAC for each behind the
 def _torque(agent: str, **changes: Any) -> dict[str, Preset]:
     """The pendulum with any torque; 8,000 steps of all environments."""
     changes = {**_TORQUE, **changes}
-    episodes = 289 * changes["environments"]
+    episodes = 289 * changes["num_envs"]
     return {"fast": Preset(agent, changes, episodes, seeds=8, task={"torques": 0})}
 
 
@@ -207,14 +207,14 @@ PRESETS: Presets = {
     },
     ("pendulum", "ddpg"): _torque(
         "ddpg",
-        environments=32,
+        num_envs=32,
         replay_capacity=262_144,
-        updates=2,
+        gradient_steps=2,
         learning_rate_steps=16_000.0,
-        exploration=0.3,
-        actor_rate=0.3,
+        exploration_noise=0.3,
+        actor_learning_rate_ratio=0.3,
     ),
-    ("pendulum", "td3"): _torque("td3", policy_delay=1, target_noise=0.05, exploration=0.3),
+    ("pendulum", "td3"): _torque("td3", policy_delay=1, target_noise=0.05, exploration_noise=0.3),
     ("pendulum", "sac"): _torque("sac", spread=0.05),
     ("pendulum", "mbpo"): {"fast": Preset("mbpo", _MODEL, 50, seeds=8, task={"torques": 0})},
 }

@@ -1,6 +1,5 @@
 """Presets for portfolios of real assets."""
 
-
 from qfolio.experiments.presets.preset import Preset, Presets
 
 _TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
@@ -11,12 +10,12 @@ _DQN = {
     "hidden": (16, 16),
     "all_actions": True,
     "market_baseline": True,
-    "environments": 8,
+    "num_envs": 8,
     "batch_size": 64,
     "replay_capacity": 8192,
     "learning_starts": 3200,
-    "target_period": 1,
-    "target_rate": 0.05,
+    "target_update_interval": 1,
+    "tau": 0.05,
     "discount": 0.99,
     "learning_rate": 3e-4,
     "learning_rate_final": 0.0,
@@ -27,13 +26,13 @@ _DQN = {
 
 _PATHWISE = {
     "hidden": (16, 16),
-    "rollout": 25,
-    "environments": 16,
+    "rollout_length": 25,
+    "num_envs": 16,
     "learning_rate": 5e-4,
     "learning_rate_final": 0.0,
     "learning_rate_steps": 100.0,
     "reward_scale": 100.0,
-    "gradient_norm": 1.0,
+    "max_grad_norm": 1.0,
 }
 
 

@@ -231,7 +231,7 @@ class Tuning:
         if found is None:
             raise QfolioError(
                 f"None of the {len(trials)} configurations kept a finite loss; search lower "
-                "learning rates, or bound the gradient (huber or gradient_norm, whichever the "
+                "learning rates, or bound the gradient (huber or max_grad_norm, whichever the "
                 "agent has)."
             )
         path = self.folder / "summary.json"

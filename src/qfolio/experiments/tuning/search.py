@@ -23,17 +23,17 @@ Value = float | str
 USUAL = {
     "learning_rate": "1e-4..1e-2",
     "discount": "0.9..0.999",
-    "target_rate": "1e-3..1",
+    "tau": "1e-3..1",
     "epsilon_decay": "0.9..0.999",
-    "huber": "0.1..10",
+    "huber_delta": "0.1..10",
     "reward_scale": "0.01..10",
     "input_gain": "0.5..50",
-    "gradient_norm": "0.1..10",
-    "trace": "0.8..0.99",
-    "entropy_weight": "1e-4..0.1",
-    "clip": "0.05..0.5",
-    "exploration": "0.01..1",
-    "temperature": "0.01..1",
+    "max_grad_norm": "0.1..10",
+    "gae_lambda": "0.8..0.99",
+    "entropy_coef": "1e-4..0.1",
+    "clip_range": "0.05..0.5",
+    "exploration_noise": "0.01..1",
+    "initial_temperature": "0.01..1",
 }
 """Searched unless told otherwise, of the numbers that an agent has; ranges for where its own value
 is 0, 1 or infinite and so says nothing about the scale."""
