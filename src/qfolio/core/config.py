@@ -1,0 +1,69 @@
+"""The settings in a folder, as types: written as JSON, and checked when they are read."""
+
+import re
+from pathlib import Path
+from typing import ClassVar, TypeVar
+
+import msgspec
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import read_json, write_json
+from qfolio.core.version import __version__
+
+
+class Config(msgspec.Struct, kw_only=True, frozen=True):
+    """What a folder is configured with; each kind of folder has a subclass.
+
+    Annotated fields say what a file must hold: ``seeds: Annotated[int, msgspec.Meta(ge=1)]``. What
+    types cannot say is checked in ``__post_init__``, which raises ValueError or QfolioError.
+    """
+
+    kind: ClassVar[str]
+    """What the folder is, as messages call it: "backtest"."""
+
+    format: ClassVar[int]
+    """Raised whenever an older folder can no longer be read."""
+
+    version: str = __version__
+    """Of the qfolio that wrote it."""
+
+
+C = TypeVar("C", bound=Config)
+
+
+def write_config(path: Path, config: Config) -> None:
+    """Writes the settings with their kind and the number of their format."""
+    head = {"kind": config.kind, "format": config.format}
+    write_json(path, {**head, **msgspec.to_builtins(config)})
+
+
+def read_config(path: Path, kind: type[C]) -> C:
+    """The settings in a file.
+
+    Raises QfolioError where the file is missing, belongs to a folder of another kind, was written
+    in another format, or holds values that do not fit.
+    """
+    if not path.is_file():
+        raise QfolioError(f"{path.parent} is no {kind.kind}: it has no {path.name}.")
+    content = read_json(path)
+    found = content.pop("kind", None)
+    if isinstance(found, str) and found != kind.kind:
+        raise QfolioError(f"{path.parent} is a {found}, not a {kind.kind}.")
+    if found != kind.kind or content.pop("format", None) != kind.format:
+        raise QfolioError(
+            f"{path.parent} was written by qfolio {content.get('version', '(unknown version)')} in "
+            f"another format; this is {__version__}: use that version, or start anew."
+        )
+    try:
+        return msgspec.convert(content, kind)
+    except (msgspec.ValidationError, QfolioError) as error:
+        reason = _readable(str(error)).rstrip(".")
+        raise QfolioError(f"{path} is damaged ({reason}); restore it, or start anew.") from None
+
+
+def _readable(message: str) -> str:
+    """msgspec's message with the place first: "agents.dqn.seeds: expected int, got str"."""
+    text, _, place = message.replace("`", "").partition(" - at $")
+    if missing := re.fullmatch(r"Object missing required field (\w+)", text):
+        return f"{place}.{missing[1]} is missing".lstrip(".")
+    return f"{place.lstrip('.')}: {text[:1].lower()}{text[1:]}" if place else text
