@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from qfolio.cli import main
+from qfolio.cli import run
 
 TINY = ["--set", "hidden=8", "num_envs=2", "batch_size=8", "learning_starts=16",
         "episode_steps=0", "horizon=20"]  # fmt: skip
@@ -14,5 +14,5 @@ def qfolio(monkeypatch, *arguments):
     """The command's exit code; what it printed is in capsys."""
     monkeypatch.setattr(sys, "argv", ["qfolio", *map(str, arguments)])
     with pytest.raises(SystemExit) as exit:
-        main()
+        run()
     return exit.value.code

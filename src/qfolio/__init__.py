@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from qfolio.agents.sac import SAC as SAC
     from qfolio.agents.td3 import TD3 as TD3
     from qfolio.core.errors import QfolioError as QfolioError
+    from qfolio.experiments.budget import Budget as Budget
+    from qfolio.experiments.fit import Listener as Listener
     from qfolio.experiments.presets import preset as preset
     from qfolio.experiments.run import Run as Run
     from qfolio.experiments.run import train as train
@@ -40,9 +42,11 @@ if TYPE_CHECKING:
 _HOMES = {
     "A2C": "qfolio.agents.a2c:A2C",
     "Backtest": "qfolio.portfolio.backtest.run:Backtest",
+    "Budget": "qfolio.experiments.budget:Budget",
     "DDPG": "qfolio.agents.ddpg:DDPG",
     "DQN": "qfolio.agents.dqn:DQN",
     "FiniteMDP": "qfolio.tasks.finite:FiniteMDP",
+    "Listener": "qfolio.experiments.fit:Listener",
     "PPO": "qfolio.agents.ppo:PPO",
     "MBPO": "qfolio.agents.mbpo:MBPO",
     "Pathwise": "qfolio.agents.pathwise:Pathwise",

@@ -17,6 +17,7 @@ from qfolio.core.evaluation import start_keys
 from qfolio.core.host import HostPopulation
 from qfolio.core.population import Population
 from qfolio.experiments import presets
+from qfolio.experiments.budget import Budget
 from qfolio.experiments.run import Run
 from qfolio.tasks.gymnasium import GymnasiumTask
 
@@ -233,17 +234,17 @@ def test_it_goes_on_from_a_checkpoint_in_new_episodes(tmp_path):
     numbered = task(Delay)
     run = Run.create(numbered, SMALL, steps=33, seeds=2, out=tmp_path / "run")
     run.train()
-    assert run.config["episodes"] is None
+    assert run.config.episodes is None
     assert (run.done("steps"), run.population.steps) == (34, 17)  # whole steps of two environments
     assert run.population.fetch().tally.steps.tolist() == [[1, 1], [1, 1]]
     again = Run.open(tmp_path / "run")
     assert again.population.fetch().tally.steps.tolist() == [[0, 0], [0, 0]]
     same(again.population.fetch().agent, run.population.fetch().agent)
-    again.train(steps=60)
+    again.train(Budget(steps=60))
     assert again.done("steps") == 60
-    assert again.config["steps"] == 60
+    assert again.config.steps == 60
     twice = Run.open(tmp_path / "run")
-    assert twice.budget == {"steps": 60}
+    assert twice.budget == Budget(steps=60)
     summary = twice.summary()
     assert (summary["optimum"], summary["regret_per_seed"]) == (None, None)
     assert summary["return_per_seed"] == [1.0, 1.0]
@@ -355,7 +356,7 @@ def test_wrong_input_gets_one_sentence(tmp_path, monkeypatch, capsys, arguments,
 def test_the_pole_is_balanced(agent):
     preset = presets.preset("fast", "gym:CartPole-v1", agent)
     run = Run.create(
-        GymnasiumTask(**preset.task), preset.build(), seeds=2, seed=100, **preset.budget
+        GymnasiumTask(**preset.task), preset.build(), seeds=2, seed=100, budget=preset.budget
     )
     run.train()
     assert run.grade()["return_per_seed"] == [500.0, 500.0]

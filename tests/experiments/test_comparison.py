@@ -1,15 +1,17 @@
+import contextlib
 import dataclasses
 import json
 import math
 import re
-import signal
 
 import jax
 import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
+from qfolio.commands.progress import BarProgress
 from qfolio.core.errors import QfolioError
+from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
 from qfolio.experiments.comparison.operations import operations_per_step
 from qfolio.experiments.comparison.ranking import (
@@ -23,6 +25,7 @@ from qfolio.experiments.comparison.ranking import (
     steps_within,
 )
 from qfolio.experiments.comparison.run import Comparison, Entrant
+from qfolio.experiments.fit import Listener
 from qfolio.experiments.presets import PRESETS, Preset
 from qfolio.experiments.run import Run
 from qfolio.portfolio.synthetic.kelly import Kelly
@@ -32,6 +35,7 @@ from qfolio.report.figures.style import percent_tick
 from qfolio.report.rendering import THIN_SPACE
 from qfolio.tasks.pendulum import Pendulum
 
+from listeners import Interrupt, Tell
 from shell import qfolio
 
 TASK = {"horizon": 20}
@@ -43,7 +47,7 @@ def tiny(seeds=3, episodes=6, **rates):
     """Entrants that differ in their learning rate, so that they share one program."""
     rates = rates or {"slow": 1e-3, "quick": 1e-2}
     agents = {name: DQN(**TINY, learning_rate=rate) for name, rate in rates.items()}
-    budget = {"episodes": episodes}
+    budget = Budget(episodes)
     return {name: Entrant(Pendulum(**TASK), agent, name, budget) for name, agent in agents.items()}
 
 
@@ -200,10 +204,13 @@ def finished(tmp_path_factory):
     """A comparison that was never interrupted."""
     run = Comparison.create(tiny(), seeds=3, out=tmp_path_factory.mktemp("whole") / "run")
     seen = []
-    run.run(lambda name, number, now: seen.append((number, name, now and now.done)))
-    # Warm-up first; before it, that an agent begins is told.
-    assert [done for *_, done in seen] == [None, 0, 2, 4, 6] * 2
-    assert [(number, name) for number, name, _ in seen[::5]] == [(0, "slow"), (1, "quick")]
+
+    def listen(name):
+        return Tell(lambda training, rows: seen.append((name, training.population.episodes)))
+
+    run.run(listen)
+    episodes = [0, 2, 4, 6]  # warm-up first
+    assert seen == [("slow", n) for n in episodes] + [("quick", n) for n in episodes]
     return run, run.finish()
 
 
@@ -234,23 +241,19 @@ def test_a_comparison_in_its_folder(finished):
 def test_resuming_gives_the_same(finished, tmp_path, stop):
     run = Comparison.create(tiny(), seeds=3, out=tmp_path / "run")
 
-    def interrupt(name, number, now):
-        if name == "quick" and now and now.done == 2:
-            if stop == "crash":
-                raise RuntimeError("killed")
-            signal.raise_signal(signal.SIGINT)
+    def crash(training, rows):
+        if training.population.episodes == 2:
+            raise RuntimeError("killed")
 
-    if stop == "crash":
-        with pytest.raises(RuntimeError, match="killed"):
-            run.run(interrupt)
-    else:
-        run.run(interrupt)
-        assert run.interrupted
+    at = {"crash": Tell(crash), "ctrl-c": Interrupt(lambda now: now.population.episodes == 2)}
+    with pytest.raises(RuntimeError) if stop == "crash" else contextlib.nullcontext():
+        run.run(lambda name: at[stop] if name == "quick" else Listener())
+    assert run.interrupted == (stop == "ctrl-c")
     run = Comparison.open(tmp_path / "run")
     assert list(run.results) == ["slow"]
-    trained = set()
-    run.run(lambda name, *_: trained.add(name))
-    assert trained == {"quick"}
+    trained = []
+    run.run(lambda name: trained.append(name) or Listener())
+    assert trained == ["quick"]
     for name, expected in finished[0].results.items():
         assert run.results[name].returns == expected.returns
         assert run.results[name].env_steps == expected.env_steps
@@ -276,8 +279,8 @@ def noted(tmp_path, first, second, steps=1000):
     optimum = first.optimum().returns(comparing.start_keys()).mean()
     other = second.optimum().returns(comparing.start_keys()).mean()
     entrants = {
-        "a": Entrant(first, agent, None, {"episodes": 1}),
-        "b": Entrant(second, agent, None, {"episodes": 1}),
+        "a": Entrant(first, agent, None, Budget(1)),
+        "b": Entrant(second, agent, None, Budget(1)),
     }
     run = Comparison.create(entrants, seeds=8, out=tmp_path / "run")
     run.results = {
@@ -319,9 +322,9 @@ def test_agents_that_do_not_fit_are_refused_before_anything_is_trained(tmp_path)
 
 @pytest.mark.parametrize(
     ("damage", "message"),
-    [({"format": 0}, "another format"), ({"kind": "backtest"}, "another format"),
+    [({"format": 0}, "another format"), ({"kind": "backtest"}, "is a backtest, not a comparison"),
      ({"results": {"slow": {}}}, "damaged"), ({"results": {"who": None}}, "damaged"),
-     ({"agents": {"../x": {}}}, "is not described"), ({"agents": {"x": {}}}, "agent is missing")],
+     ({"agents": {"../x": {}}}, "damaged"), ({"agents": {"x": {}}}, "agent is missing")],
 )  # fmt: skip
 def test_damaged_folders(finished, tmp_path, damage, message):
     content = json.loads((finished[0].folder / "comparison.json").read_text())
@@ -368,10 +371,7 @@ def test_the_command(presets, monkeypatch, capsys, tmp_path):
 
 
 def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, capsys, tmp_path):
-    def stop(run, listener):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Comparison, "run", stop)
+    monkeypatch.setattr(BarProgress, "on_chunk", Interrupt().on_chunk)
     arguments = ["compare", "--agents", "dqn,dqn:bold", "--out", tmp_path / "run"]
     assert qfolio(monkeypatch, *arguments) == 130
     printed = capsys.readouterr().out.replace("\n", "")
@@ -407,7 +407,7 @@ def page(results, **changes):
     """The report on results as if they had been trained."""
     ranking = rank(results)
     entry = {"agent": "dqn", "preset": "fast", "agent_settings": {"hidden": [8]},
-             "task_settings": {"horizon": 20}, "budget": {}}  # fmt: skip
+             "task_settings": {"horizon": 20}, "episodes": 1, "steps": None}  # fmt: skip
     content = {
         "task": "pendulum", "seeds": 8, "seed": 0, "version": "1", "device": "cpu",
         "command": "qfolio compare", "started": "2026-01-01T00:00:00",

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
+from qfolio.commands.progress import BarProgress
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.population import Population
 from qfolio.experiments import continual
 from qfolio.experiments.continual import Course, Plan, compare, create, recovery, renew
+from qfolio.experiments.fit import Listener
 from qfolio.report.continual import render_page, verdict
 from qfolio.tasks.catch import Catch
 from qfolio.tasks.pendulum import Pendulum
 
+from listeners import Interrupt
 from shell import TINY, qfolio
 
 OLD, NEW = Pendulum(horizon=20), Pendulum(horizon=20, mass=1.5)
@@ -42,16 +45,15 @@ def content(tmp_path_factory):
     return compare(folder)
 
 
-def stop_at(way, stopping):
-    """Ctrl-C while a way, or the first training, is under way."""
-    learn = continual._learn
+class Names(list):
+    """What is under way, noted; with Ctrl-C at one of them."""
 
-    def interrupted(*args):
-        if args[-1].args == (way,):
-            raise KeyboardInterrupt
-        return learn(*args)
+    def __init__(self, stop=None):
+        self.stop = stop
 
-    stopping.setattr(continual, "_learn", interrupted)
+    def __call__(self, name):
+        self.append(name)
+        return Interrupt() if name == self.stop else Listener()
 
 
 def regrets(task, population):
@@ -124,17 +126,14 @@ def test_recovery_is_staying_near_the_optimum():
     assert found["per_seed"] == [10, 20, None]
 
 
-@pytest.mark.parametrize("way", ["first training", "frozen", "renewed"])
+@pytest.mark.parametrize("way", ["first training", "going on", "renewed"])
 def test_an_interrupted_comparison_goes_on_as_if_it_never_was(content, way, tmp_path):
     create(PLAN, tmp_path / "stopped", "qfolio continual <b>")
-    with pytest.MonkeyPatch.context() as stopping:
-        stop_at(way, stopping)
-        with pytest.raises(KeyboardInterrupt):
-            compare(tmp_path / "stopped")
-    done = []
-    found = compare(tmp_path / "stopped", lambda name, share: done.append(name))
+    assert compare(tmp_path / "stopped", Names(stop=way)) is None
+    done = Names()
+    found = compare(tmp_path / "stopped", done)
     ways = ["first training", *continual.WAYS]
-    assert set(done) == set(ways[ways.index(way) :]) - {"frozen"}  # which does not learn
+    assert done == ways[ways.index(way) :]
 
     def lasting(content):
         courses = {"training": content["training"], **content["courses"]}
@@ -175,7 +174,7 @@ def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
     folder = tmp_path / "there"
     words = ["continual", "pendulum", "--change", "mass=1.5", "--episodes", 8, "--seeds", 2]
     with monkeypatch.context() as stopping:
-        stop_at("fresh", stopping)
+        stopping.setattr(BarProgress, "on_chunk", Interrupt().on_chunk)
         assert qfolio(monkeypatch, *words, "--out", folder, *TINY) == 130
     said = f"Go on with: qfolio continual --resume {folder}"
     assert capsys.readouterr().out.splitlines()[-1].endswith(said)
@@ -194,7 +193,7 @@ def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--resume", "nowhere"], "no change of a task"),
+        (["--resume", "nowhere"], "no continual"),
         (["--resume", ".", "--change", "mass=2"], "add nothing"),
         (["--resume", ".", "--rate", 0.5], "add nothing"),
     ],

@@ -16,9 +16,11 @@ import qfolio.core.files
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
+from qfolio.experiments.budget import Budget
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.ar1 import Ar1
 
+from listeners import Interrupt
 from probes import Explosive
 
 
@@ -49,7 +51,7 @@ def test_n_and_n_episodes_equal_2n(task, agent, tmp_path):
     create(task, agent, tmp_path / "halves", episodes=12, seeds=2).train()
     again = Run.open(tmp_path / "halves")
     assert again.episodes == 12
-    again.train(24)
+    again.train(Budget(24))
     assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
 
 
@@ -57,13 +59,11 @@ def test_steps_say_how_far_as_episodes_do(task, agent, tmp_path):
     create(task, agent, tmp_path / "straight", episodes=None, steps=300, seeds=2).train()
     create(task, agent, tmp_path / "halves", episodes=None, steps=133, seeds=2).train()
     again = Run.open(tmp_path / "halves")
-    assert (again.done("steps"), again.budget) == (134, {"steps": 133})
-    seen = []
-    again.train(steps=300, listener=seen.append)
+    assert (again.done("steps"), again.budget) == (134, Budget(steps=133))
+    again.train(Budget(steps=300))
     assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
-    assert (seen[-1].done, seen[-1].total, seen[-1].unit) == (300, 300, "steps")
-    again.train(14)  # episodes of 25 steps
-    assert again.budget == {"episodes": 14}
+    again.train(Budget(14))  # episodes of 25 steps
+    assert again.budget == Budget(14)
     assert again.done("steps") == 350
 
 
@@ -82,7 +82,7 @@ def test_n_and_n_episodes_equal_2n_in_a_market(name, tmp_path):
     task, agent = IN_A_MARKET[name]
     create(task, agent, tmp_path / "straight", episodes=240, seeds=2).train()
     create(task, agent, tmp_path / "halves", episodes=120, seeds=2).train()
-    Run.open(tmp_path / "halves").train(240)
+    Run.open(tmp_path / "halves").train(Budget(240))
     assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
 
 
@@ -91,6 +91,7 @@ import sys
 from qfolio.core import devices
 devices.configure()
 from qfolio.experiments import run as running
+from qfolio.experiments.fit import Listener
 from qfolio.agents.dqn import DQN
 from qfolio.tasks.pendulum import Pendulum
 running.CHECKPOINT_SECONDS = 0.0
@@ -98,10 +99,11 @@ agent = DQN(hidden=(16,), num_envs=2, batch_size=8, replay_capacity=200, learnin
             episode_steps=0, learning_rate_steps=200.0)
 run = running.Run.create(Pendulum(horizon=25), agent, episodes={episodes}, seeds=2, out={out!r})
 print("started", flush=True)
-def wait(progress):
-    print(progress.episodes, flush=True)
-    sys.stdin.readline()
-run.train(listener=wait)
+class Wait(Listener):
+    def on_chunk(self, training, rows):
+        print(training.population.episodes, flush=True)
+        sys.stdin.readline()
+run.train(listeners=[Wait()])
 """
 
 
@@ -162,7 +164,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(task, agent, tmp
 def test_killed_before_the_first_checkpoint(task, agent, tmp_path):
     """The curve's point at the start is on disk by then, and must not come twice."""
     create(task, agent, tmp_path / "straight").train()
-    create(task, agent, tmp_path / "killed")._evaluate()
+    create(task, agent, tmp_path / "killed").evaluate()
     Run.open(tmp_path / "killed").train()
     assert_same(tmp_path / "killed", tmp_path / "straight")
 
@@ -170,11 +172,7 @@ def test_killed_before_the_first_checkpoint(task, agent, tmp_path):
 def test_ctrl_c_stops_with_a_checkpoint(task, agent, tmp_path):
     run = create(task, agent, tmp_path / "run", episodes=24 * 50)
 
-    def press(progress):
-        if progress.episodes >= 24:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    run.train(listener=press)
+    run.train(listeners=[Interrupt(lambda training: training.population.episodes >= 24)])
     assert run.interrupted
     assert 0 < run.episodes < 24 * 50
     assert Run.open(tmp_path / "run").episodes == run.episodes
@@ -198,7 +196,7 @@ def test_rows_ahead_of_the_checkpoint_are_dropped(task, agent, tmp_path):
     run = Run.open(tmp_path / "run")
     assert len(run.metrics) == 4
     assert metrics.read_text() == spoilt, "reading a run changes nothing"
-    run.train(8)
+    run.train(Budget(8))
     assert metrics.read_text().startswith(good)
     assert [row["episode"] for row in run.metrics] == [1, 2, 3, 4, 5, 6, 7, 8]
 
@@ -236,7 +234,7 @@ def test_whole_numbers_mean_the_same_as_fractions(task, tmp_path):
     )
     create(task, agent, tmp_path / "run", episodes=8).train()
     create(task, agent, tmp_path / "again", episodes=4).train()
-    Run.open(tmp_path / "again").train(8)
+    Run.open(tmp_path / "again").train(Budget(8))
     assert_same(tmp_path / "run", tmp_path / "again", same_plan=False)
 
 
@@ -263,7 +261,7 @@ def test_summary(task, agent, tmp_path):
     np.testing.assert_allclose(summary["return_mean"], np.mean(summary["return_per_seed"]))
     shortfall = summary["optimum"] - np.array(summary["return_per_seed"])
     np.testing.assert_allclose(summary["regret_per_seed"], shortfall / abs(summary["optimum"]))
-    assert run.config["seed"] == 5
+    assert run.config.seed == 5
 
 
 def spoil_checkpoint(folder, how):

@@ -15,6 +15,8 @@ from qfolio.portfolio import policy as module
 from qfolio.portfolio.policy import Policy, follow, on_table, train
 from qfolio.portfolio.prices.table import Prices
 
+from listeners import Tell
+
 ROWS, WINDOW = 80, 5
 AGENTS = {
     "dqn": (
@@ -209,7 +211,9 @@ def test_programs_that_are_used_again_learn_the_same():
 
 def test_progress_and_settings():
     seen = []
-    short = learned("pathwise", episodes=8, listener=seen.append)
+    short = learned(
+        "pathwise", episodes=8, listeners=[Tell(lambda training, rows: seen.append(training.share))]
+    )
     assert seen == [1.0]
     assert short.task.window == WINDOW
     for options, said in (

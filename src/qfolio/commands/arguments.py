@@ -5,8 +5,8 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-INTERRUPTED = 130
-"""The exit code that a shell expects after Ctrl-C."""
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.budget import Budget
 
 Name = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
 Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
@@ -16,3 +16,10 @@ Names = Annotated[tuple[str, ...], arg(metavar="NAME …", help_behavior_hint=""
 Assignments = Annotated[
     tuple[str, ...], arg(name="set", metavar="NAME=VALUE …", help_behavior_hint="")
 ]
+
+
+def budget_of(episodes: int | None, steps: int | None) -> Budget | None:
+    """What ``--episodes`` or ``--steps`` asks for; None where neither is given."""
+    if episodes is not None and steps is not None:
+        raise QfolioError("--episodes and --steps both say how far to train; give one of them.")
+    return None if episodes is None and steps is None else Budget(episodes, steps)

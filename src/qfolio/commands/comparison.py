@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import INTERRUPTED, Count, Folder, Name
+from qfolio.commands.arguments import Count, Folder, Name, budget_of
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
+    from qfolio.experiments.budget import Budget
     from qfolio.experiments.comparison.run import Comparison, Entrant
-    from qfolio.experiments.run import Progress
 
 
 def compare(
@@ -46,50 +46,44 @@ def compare(
     given = (task, agents, preset, episodes, steps, seeds, seed, out)
     if resume is not None and any(option is not None for option in given):
         raise QfolioError("--resume keeps what the comparison was started with; add nothing.")
-    if episodes is not None and steps is not None:
-        raise QfolioError("--episodes and --steps both say how far to train; give one of them.")
+    budget = budget_of(episodes, steps)
     from qfolio.core import devices
 
     devices.configure()
     from qfolio.commands import console
+    from qfolio.commands.progress import stop
     from qfolio.experiments.comparison.run import Comparison
 
     if resume is None:
         task = task or "pendulum"
-        budget = {"episodes": episodes, "steps": steps}
-        asked = {unit: amount for unit, amount in budget.items() if amount is not None}
         now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
         name = f"{re.sub('[/:]', '-', task)}-comparison-{now}"
         run = Comparison.create(
-            _entrants(task, agents or "", preset, asked),
+            _entrants(task, agents or "", preset, budget),
             seeds=10 if seeds is None else seeds,
             seed=seed or 0,
             command=shlex.join(["qfolio", *sys.argv[1:]]),
             note=""
-            if not asked
+            if budget is None
             else "How long to train was set by hand; learning rates that fall with time, and the "
             "like, were tuned for the presets' own lengths.",
             out=out or Path("runs") / name,
         )
     else:
         run = Comparison.open(resume)
-    seeds = run.config["seeds"]
+    seeds = run.config.seeds
     console.say(
-        f"{len(run.entrants)} agents on {run.config['task']} · {seeds} seed{'s' * (seeds > 1)} "
-        f"each · {run.config['device']}"
+        f"{len(run.entrants)} agents on {run.config.task} · {seeds} seed{'s' * (seeds > 1)} "
+        f"each · {run.config.device}"
     )
-    try:
-        _train(run)
-    except KeyboardInterrupt:  # while nothing trains: what is finished is on disk
-        run.interrupted = True
+    _train(run)
     if run.interrupted:
-        console.say(f"Stopped. Go on with: qfolio compare --resume {run.folder}")
-        sys.exit(INTERRUPTED)
+        stop(f"qfolio compare --resume {run.folder}")
     _finish(run)
 
 
 def _entrants(
-    task: str, agents: str, preset: str | None, budget: dict[str, int]
+    task: str, agents: str, preset: str | None, budget: "Budget | None"
 ) -> "dict[str, Entrant]":
     """The agents that ``--agents`` names, by what it calls them."""
     from qfolio.core import registry, settings
@@ -123,21 +117,16 @@ def _entrants(
 def _train(run: "Comparison") -> None:
     """Trains with a bar, and a line for each agent that is finished."""
     from qfolio.commands import console
+    from qfolio.commands.progress import BarProgress
 
-    count = len(run.entrants)
+    names = list(run.entrants)
     with console.bar("") as update:
 
-        def note(name: str, number: int, now: "Progress | None") -> None:
-            if now is None:
-                console.console.print(f"{number + 1} of {count}: {name}")
-                update(completed=0.0, description="compiling")
-                return
-            left = datetime.timedelta(seconds=round(now.seconds_left))
-            speed = f"{now.steps_per_second:,.0f} steps/s"
-            status = f"{name} ({number + 1} of {count})  {speed}  {left} left"
-            update(completed=min(now.done / now.total, 1.0), description=status)
+        def listen(name: str) -> BarProgress:
+            console.console.print(f"{names.index(name) + 1} of {len(names)}: {name}")
+            return BarProgress(update, name)
 
-        run.run(note)
+        run.run(listen)
 
 
 def _finish(run: "Comparison") -> None:

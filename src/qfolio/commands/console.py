@@ -1,7 +1,6 @@
 """What the commands print: live progress and tables."""
 
 import contextlib
-import datetime
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -12,12 +11,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from qfolio.core.training import episode_steps
-
 if TYPE_CHECKING:
-    from qfolio.experiments.run import Progress, Run
+    from qfolio.experiments.run import Run
     from qfolio.portfolio.allocation import Allocation
-    from qfolio.portfolio.backtest import run as backtesting
     from qfolio.portfolio.backtest.assessment import Assessment
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.portfolio.prices.findings import Finding
@@ -47,46 +43,11 @@ def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., 
 
 def describe(run: "Run") -> str:
     config = run.config
-    seeds = f"{config['seeds']} seed" + "s" * (config["seeds"] > 1)
-    preset = config["preset"] or "none"
+    seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
     return (
-        f"{config['agent'].upper()} on {config['task']} · preset {preset} · {seeds} · "
-        f"{config['device']}"
+        f"{config.agent.upper()} on {config.task} · preset {config.preset or 'none'} · {seeds} · "
+        f"{config.device}"
     )
-
-
-def train(
-    run: "Run",
-    budget: dict[str, int],
-    optimum: float | None,
-    show: Callable[["Run"], None] | None = None,
-) -> None:
-    """Trains with a line for each point of the curve and a bar between them.
-
-    budget: episodes or steps, as ``Run.train`` takes them. optimum: on the curve's start states.
-    show: called with the run at each point of the curve.
-    """
-    ((unit, total),) = budget.items()
-    steps = episode_steps(run.task, run.agent)
-    value = "return" if steps == run.task.horizon else f"return/{steps}"  # of shorter episodes
-    columns = (unit, value, "greedy", "optimum", "epsilon", "steps/s", "left")
-    say("".join(f"{name:>11}" for name in columns))
-    with bar("compiling", total, run.done(unit)) as update:
-
-        def note(now: "Progress") -> None:
-            done, value = f"{now.done:,}", number(now.mean_return)
-            rate = f"{now.steps_per_second:,.0f}"
-            epsilon = "–" if math.isnan(now.epsilon) else f"{now.epsilon:.2f}"
-            left = str(datetime.timedelta(seconds=round(now.seconds_left)))
-            status = f"{done} {unit}  return {value}  ε {epsilon}  {rate} steps/s  {left} left"
-            update(completed=min(now.done, total), description=status)
-            if now.greedy_return is not None:
-                cells = (done, value, number(now.greedy_return), number(optimum))
-                say("".join(f"{cell:>11}" for cell in (*cells, epsilon, rate, left)))
-                if show is not None:
-                    show(run)
-
-        run.train(**budget, listener=note)
 
 
 def print_result(seeds: list[int], result: dict[str, Any]) -> None:
@@ -167,26 +128,8 @@ def describe_backtest(backtest: "Backtest") -> str:
     return (
         f"{len(backtest.folds)} folds ({backtest.folds[0].name} to {str(backtest.dates[-1])[:10]}) "
         f"· {len(backtest.prices.assets)} assets · {' and '.join(backtest.agents)} · "
-        f"{config['seeds']} seeds · {config['cost'] * 1e4:g} bp · lag {config['lag']} · "
-        f"{config['device']}"
+        f"{config.seeds} seeds · {config.cost * 1e4:g} bp · lag {config.lag} · {config.device}"
     )
-
-
-def run_backtest(backtest: "Backtest") -> None:
-    """Trains with a bar and the time left."""
-    last = ""
-    with bar("compiling") as update:
-
-        def note(now: "backtesting.Progress") -> None:
-            nonlocal last
-            left = datetime.timedelta(seconds=round(now.seconds_left))
-            description = f"training {now.agent}  {now.done:.0%}  {left} left"
-            update(completed=now.done, description=description)
-            if not console.is_terminal and f"{now.done:.1f}" != last:  # a line for each tenth
-                last = f"{now.done:.1f}"
-                say(description)
-
-        backtest.run(note)
 
 
 def print_assessment(assessment: "Assessment") -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, Name
+from qfolio.commands.arguments import Assignments, Count, Folder, Name
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 
@@ -61,6 +61,7 @@ def continual(
 
     devices.configure()
     from qfolio.commands import console
+    from qfolio.commands.progress import BarProgress, stop
     from qfolio.experiments import continual, presets
     from qfolio.report.continual import verdict, write_continual_report
 
@@ -76,14 +77,10 @@ def continual(
         continual.create(plan, folder, shlex.join(["qfolio", *sys.argv[1:]]))
     else:
         folder = resume
-    try:
-        with console.bar("compiling") as update:
-            content = continual.compare(
-                folder, lambda way, done: update(completed=done, description=way)
-            )
-    except KeyboardInterrupt:  # what is finished is on disk
-        console.say(f"Stopped. Go on with: qfolio continual --resume {folder}")
-        sys.exit(INTERRUPTED)
+    with console.bar("compiling") as update:
+        content = continual.compare(folder, lambda name: BarProgress(update, name))
+    if content is None:
+        stop(f"qfolio continual --resume {folder}")
     write_continual_report(folder, content)
     _print(content)
     console.say(verdict(content))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, File, Folder, Name, Names
+from qfolio.commands.arguments import Assignments, Count, File, Folder, Name, Names
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 
@@ -107,6 +107,7 @@ def backtest(
 
     devices.configure()
     from qfolio.commands import console
+    from qfolio.commands.progress import BacktestProgress, stop
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.portfolio.prices.table import load
 
@@ -138,10 +139,10 @@ def backtest(
             raise QfolioError("--resume keeps what the backtest was started with; add nothing.")
         run, folder = Backtest.open(resume), resume
     console.say(console.describe_backtest(run))
-    console.run_backtest(run)
+    with console.bar("compiling") as update:
+        run.run(BacktestProgress(update))
     if run.interrupted:
-        console.say(f"Stopped. Go on with: qfolio backtest --resume {folder}")
-        sys.exit(INTERRUPTED)
+        stop(f"qfolio backtest --resume {folder}")
     _report(run, folder)
 
 
@@ -192,7 +193,7 @@ def allocate(
     table = run.prices
     if prices is not None:
         # The policy looks at the last rows only; assets may start at any row before.
-        known = features or tuple(run.config["feature_names"])
+        known = features or tuple(run.config.feature_names)
         options: dict[str, Any] = dict(missing=missing, features=known, date=date)
         table = policy.table(load(prices, late="join", **options))
     require_fresh(table, as_of)

@@ -5,18 +5,18 @@ import datetime
 import json
 import re
 import shlex
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, Name
+from qfolio.commands.arguments import Assignments, Count, Folder, Name, budget_of
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
+    from qfolio.experiments.budget import Budget
     from qfolio.experiments.run import Run
 
 
@@ -65,13 +65,11 @@ def train(
 
     devices.configure()
     from qfolio.commands import console
+    from qfolio.commands.progress import stop
     from qfolio.experiments import presets
     from qfolio.experiments.run import Run
 
-    budget = {"episodes": episodes, "steps": steps}
-    asked = {name: amount for name, amount in budget.items() if amount is not None}
-    if len(asked) > 1:
-        raise QfolioError("--episodes and --steps both say how far to train; give one of them.")
+    budget = budget_of(episodes, steps)
     if live and task not in (None, "pendulum"):
         raise QfolioError(f"--live shows the pendulum; there is nothing to see of {task}.")
     with _window(live) as show:
@@ -82,7 +80,7 @@ def train(
             name = f"{re.sub('[/:]', '-', task)}-{agent}-{preset}-{now}"
             folder = out or Path("runs") / name
             chosen = settings.parse(assignments)
-            run = _new_run(task, agent, preset, asked, seeds, seed or 0, folder, chosen)
+            run = _new_run(task, agent, preset, budget, seeds, seed or 0, folder, chosen)
         elif assignments or any(x is not None for x in (task, agent, preset, seeds, seed, out)):
             raise QfolioError(
                 "--resume keeps what the run was started with; add only --episodes or --steps."
@@ -90,15 +88,16 @@ def train(
         else:
             run, folder = Run.open(resume), resume
         console.say(console.describe(run))
-        _train(run, asked or run.budget, show)
+        _train(run, budget or run.budget, show)
+    again = f"qfolio train --resume {folder}"
+    if run.interrupted:
+        stop(again)
     contrast = None
-    if compare and not run.interrupted:
+    if compare:
         contrast = _contrast(run, folder)
-    if not run.interrupted:
-        _finish(run, folder, contrast)
-    if run.interrupted or (contrast is not None and contrast.interrupted):
-        console.say(f"Stopped. Go on with: qfolio train --resume {folder}")
-        sys.exit(INTERRUPTED)
+    if contrast is not None and contrast.interrupted:
+        stop(again)
+    _finish(run, folder, contrast)
 
 
 def evaluate(
@@ -154,9 +153,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3) -> None:
 
     run = Run.open(folder)
     if not isinstance(run.task, Pendulum):
-        raise QfolioError(
-            f"{folder} is a run on {run.config['task']}; only a pendulum can be seen."
-        )
+        raise QfolioError(f"{folder} is a run on {run.config.task}; only a pendulum can be seen.")
     if has_display():
         window = Window(f"qfolio: {folder}")
         for number in range(episodes):
@@ -175,7 +172,7 @@ def _new_run(
     task_name: str,
     agent_name: str,
     preset_name: str,
-    budget: dict[str, int],
+    budget: "Budget | None",
     seeds: int | None,
     seed: int,
     folder: Path,
@@ -192,7 +189,7 @@ def _new_run(
     return Run.create(
         settings.build(task_class, {**preset.task, **task_settings}),
         preset.build(**chosen),
-        **budget or preset.budget,
+        budget=budget or preset.budget,
         seeds=preset.seeds if seeds is None else seeds,
         seed=seed,
         preset=preset_name,
@@ -200,9 +197,10 @@ def _new_run(
     )
 
 
-def _train(run: "Run", budget: dict[str, int], show: Callable[["Run"], None] | None = None) -> None:
+def _train(run: "Run", budget: "Budget", show: Callable[["Run"], None] | None = None) -> None:
     """Trains with live progress, beside the optimum."""
     from qfolio.commands import console
+    from qfolio.commands.progress import RunProgress
     from qfolio.core.evaluation import start_keys
 
     solution, optimum = run.task.optimum(), None
@@ -210,7 +208,7 @@ def _train(run: "Run", budget: dict[str, int], show: Callable[["Run"], None] | N
         with console.console.status("Solving for the exact optimum (once; then it is on disk)"):
             on_curve = solution.returns(start_keys())[: run.population.curve_starts]
             optimum = float(on_curve.mean())
-    console.train(run, budget, optimum, show)
+    run.train(budget, [RunProgress(run, optimum, show)])
 
 
 def _contrast(run: "Run", folder: Path) -> "Run | None":
@@ -229,14 +227,14 @@ def _contrast(run: "Run", folder: Path) -> "Run | None":
         contrast = Run.create(
             run.task,
             variant.variant,
-            **run.budget,
-            seeds=min(2, config["seeds"]),
-            seed=config["seed"],
-            preset=config["preset"],
+            budget=run.budget,
+            seeds=min(2, config.seeds),
+            seed=config.seed,
+            preset=config.preset,
             out=place,
         )
-    if contrast.population.steps_left(**run.budget):
-        say(f"\nFor contrast, {variant.variant_name} ({contrast.config['seeds']} of the seeds):")
+    if run.budget.left(contrast.population):
+        say(f"\nFor contrast, {variant.variant_name} ({contrast.config.seeds} of the seeds):")
         _train(contrast, run.budget)
     return contrast
 
@@ -267,23 +265,23 @@ def _command(run: "Run") -> str:
 
     config = run.config
     resume = f"qfolio train --resume {run.folder}"
-    known = presets_of(config["task"], config["agent"])
+    known = presets_of(config.task, config.agent)
     if not known:
         return resume
-    name = config["preset"] if config["preset"] in known else next(iter(known))
-    default = settings.describe(preset(name, config["task"], config["agent"]).build())
+    name = config.preset if config.preset in known else next(iter(known))
+    default = settings.describe(preset(name, config.task, config.agent).build())
     default |= settings.describe(type(run.task)(**known[name].task))
-    chosen = config["agent_settings"] | config["task_settings"]
+    chosen = config.agent_settings | config.task_settings
     changed = [
         f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}"
         for name, value in chosen.items()
         if value != default[name]
     ]
-    words = ["qfolio train", config["task"], "--agent", config["agent"], "--preset"]
-    ((unit, amount),) = run.budget.items()
-    words += [name, f"--{unit}", amount, "--seeds", config["seeds"], "--seed", config["seed"]]
+    words = ["qfolio train", config.task, "--agent", config.agent, "--preset"]
+    words += [name, f"--{run.budget.unit}", str(run.budget.amount)]
+    words += ["--seeds", str(config.seeds), "--seed", str(config.seed)]
     words += ["--set", *map(shlex.quote, changed)] if changed else []
-    return f"{' '.join(map(str, words))}\n{resume}"
+    return f"{' '.join(words)}\n{resume}"
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import INTERRUPTED, Assignments, Count, Folder, Name
+from qfolio.commands.arguments import Assignments, Count, Folder, Name
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 
@@ -82,7 +82,7 @@ def tune(
     _run(work)
     if work.interrupted:
         console.say(f"Stopped. Go on with: qfolio tune --join {work.folder}")
-        sys.exit(INTERRUPTED)
+        sys.exit(130)
     if count := work.journal.in_hand():
         console.say(
             f"Other processes have {count} trials in hand; the last to finish writes the report."
@@ -117,7 +117,7 @@ def _new(
 ) -> "Tuning":
     from qfolio.core import registry
     from qfolio.experiments import presets
-    from qfolio.experiments.run import check_counts
+    from qfolio.experiments.budget import Budget
     from qfolio.experiments.tuning import search
     from qfolio.experiments.tuning.run import Tuning
 
@@ -129,12 +129,11 @@ def _new(
     space = search.parse(ranges, agent_class)
     if both := [dim.name for dim in space if dim.name in chosen]:
         raise QfolioError(f"{both[0]} is both set and searched; name it in one of the two.")
-    budget = asked or preset.budget
-    ((unit, amount),) = budget.items()
-    check_counts(budget.get("episodes"), preset.seeds, 0, steps=budget.get("steps"))
+    budget = Budget(**asked) if asked else preset.budget
+    unit, amount = budget.unit, budget.amount
     scheduled: dict[str, Any] = {}
-    if "learning_rate_steps" in preset.settings and unit in preset.budget:
-        updates = preset.settings["learning_rate_steps"] * amount / preset.budget[unit]
+    if "learning_rate_steps" in preset.settings and unit == preset.budget.unit:
+        updates = preset.settings["learning_rate_steps"] * amount / preset.budget.amount
         scheduled = {"learning_rate_steps": round(updates, 1)}
     agent = preset.build(**{**scheduled, **chosen})
     now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
@@ -145,7 +144,7 @@ def _new(
         space or [dim for dim in search.usual(agent) if dim.name not in chosen],
         trials=64 if trials is None else trials,
         seeds=2 if seeds is None else seeds,
-        **budget,
+        **budget.to_json(),
         batch=16 if batch is None else batch,
         fresh_seeds=preset.seeds,
         preset=preset_name,

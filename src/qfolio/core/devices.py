@@ -53,7 +53,7 @@ def describe() -> str:
     return f"{len(jax.devices())} × {device.device_kind} ({device.platform})"
 
 
-def circumstances(*programs: str) -> dict[str, str | dict[str, str]]:
+def circumstances(*programs: str) -> dict[str, Any]:
     """When and on what something begins, as its file on disk tells.
 
     programs: Python, or libraries, whose versions it tells, too.

@@ -112,6 +112,11 @@ class Population:
             self._require_healthy()
         return self._members.fetch(episodes)
 
+    @property
+    def learning(self) -> bool:
+        """Whether the next steps learn; the first ones only fill the memory."""
+        return self._plan(1, 1)[1]
+
     def _plan(self, steps: int, most: int) -> tuple[int, bool]:
         """How many steps to go now, in whole rollouts, and whether they learn."""
         length = self.agent.rollout_steps

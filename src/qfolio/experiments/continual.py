@@ -13,43 +13,30 @@ has gone on from it) and, at the end, the report.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 
 from qfolio.core import devices, settings
+from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.files import (
-    new_folder,
-    read_json,
-    read_tree,
-    require_types,
-    write_json,
-    write_tree,
-)
+from qfolio.core.files import new_folder, read_tree, write_tree
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.population import Population
-from qfolio.core.registry import AGENTS, TASKS, name_of
 from qfolio.core.training import TrainingState
-from qfolio.core.version import __version__
+from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.ranking import middle_steps, regret, steps_within
-from qfolio.experiments.run import check_counts, configured_agent, configured_task
+from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.learning.optimizer import Optimizer
 
-FORMAT = 1
-"""Of continual.json."""
-
 FILE, LEARNED = "continual.json", "learned.safetensors"
-
-NUMBERS = ("episodes", "seeds", "seed", "rate", "renewal", "epsilon")
-"""Of a plan, as continual.json holds them."""
 
 POINTS = 24
 """Of a learning curve after the change, about; renewed learning has as many on its shorter way."""
@@ -78,7 +65,7 @@ class Plan:
     epsilon: float = 0.3
 
     def __post_init__(self) -> None:
-        check_counts(self.episodes, self.seeds, self.seed)
+        _ = Budget(self.episodes), seed_range(self.seeds, self.seed)
         for name in ("rate", "renewal", "epsilon"):
             if not 0 < getattr(self, name) <= 1:
                 raise QfolioError(f"{name} is {getattr(self, name)}; it must be from 0 to 1.")
@@ -94,18 +81,6 @@ class Plan:
                 f"recovery is measured against an exact optimum, and {type(self.task).__name__} "
                 "has none; take the pendulum."
             )
-
-    @classmethod
-    def of(cls, content: dict[str, Any]) -> "Plan":
-        """The plan that a continual.json tells."""
-        after = {name: new for name, (_, new) in content["changes"].items()}
-        changed = {**content, "task_settings": content["task_settings"] | after}
-        return cls(
-            configured_task(content),
-            configured_task(changed),
-            configured_agent(content),
-            **{name: content[name] for name in NUMBERS},
-        )
 
     @property
     def changes(self) -> dict[str, tuple[Any, Any]]:
@@ -145,7 +120,7 @@ def _numbers(task: Task) -> list[str]:
     return [name for name in settings.describe(task) if isinstance(getattr(task, name), float)]
 
 
-class Course(NamedTuple):
+class Course(msgspec.Struct):
     """How the seeds fared in one way to go on.
 
     steps: since the change, of all environments of a seed. curve: regrets (point, seed) on the
@@ -160,6 +135,8 @@ class Course(NamedTuple):
     seconds: float
 
 
+FIRST = "first training"
+
 WAYS = {
     "frozen": "the policy as it is",
     "going on": "the same memory, a small learning rate",
@@ -167,8 +144,68 @@ WAYS = {
     "fresh": "a new agent",
 }
 
-Listener = Callable[[str, float], None]
-"""Called with what is under way and how much of it is done."""
+
+class ContinualConfig(Config, frozen=True):
+    """The whole of continual.json: what happens, and what has come out so far."""
+
+    kind: ClassVar[str] = "continual"
+    format: ClassVar[int] = 2
+
+    task: str
+    task_settings: dict[str, Any]
+    changes: dict[str, tuple[Any, Any]]
+    agent: str
+    agent_settings: dict[str, Any]
+    episodes: int
+    seeds: int
+    seed: int
+    rate: float
+    renewal: float
+    epsilon: float
+    device: str
+    started: str
+    starts: int
+    curve_starts: int
+    within: float
+    command: str
+    optimum: dict[str, float] = msgspec.field(default_factory=dict)
+    training: Course | None = None
+    courses: dict[str, Course] = msgspec.field(default_factory=dict)
+    recovery: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, plan: Plan, command: str) -> "ContinualConfig":
+        """What is planned, before anything has come out."""
+        return cls(
+            **describe(plan.task, plan.agent),
+            changes=plan.changes,
+            episodes=plan.episodes,
+            seeds=plan.seeds,
+            seed=plan.seed,
+            rate=plan.rate,
+            renewal=plan.renewal,
+            epsilon=plan.epsilon,
+            **devices.circumstances(),
+            starts=Population.starts,
+            curve_starts=Population.curve_starts,
+            within=WITHIN,
+            command=command,
+        )
+
+    def plan(self) -> Plan:
+        """The plan that was made."""
+        after = {name: new for name, (_, new) in self.changes.items()}
+        return Plan(
+            task_of(self.task, self.task_settings),
+            task_of(self.task, self.task_settings | after),
+            agent_of(self.agent, self.agent_settings),
+            self.episodes,
+            self.seeds,
+            self.seed,
+            self.rate,
+            self.renewal,
+            self.epsilon,
+        )
 
 
 def create(plan: Plan, folder: Path, command: str = "") -> None:
@@ -176,44 +213,41 @@ def create(plan: Plan, folder: Path, command: str = "") -> None:
 
     command: what was typed to start it, for the report.
     """
-    content = {
-        "format": FORMAT,
-        "version": __version__,
-        "task": name_of(TASKS, plan.task),
-        "task_settings": settings.describe(plan.task),
-        "changes": plan.changes,
-        "agent": name_of(AGENTS, plan.agent),
-        "agent_settings": settings.describe(plan.agent),
-        **{name: getattr(plan, name) for name in NUMBERS},
-        **devices.circumstances(),
-        "starts": Population.starts,
-        "curve_starts": Population.curve_starts,
-        "within": WITHIN,
-        "command": command,
-        "courses": {},
-        "recovery": {},
-    }
+    config = ContinualConfig.of(plan, command)
     with new_folder(folder) as place:
-        write_json(place / FILE, content)
+        write_config(place / FILE, config)
 
 
-def compare(folder: Path, listener: Listener = lambda name, share: None) -> dict[str, Any]:
+def compare(folder: Path, listen: Callable[[str], Listener] | None = None) -> dict[str, Any] | None:
     """Trains, changes the world and goes on in every way; all that a report shows, as JSON values.
 
-    What the folder already holds is not done again. Raises QfolioError where a loss is not finite.
+    What the folder already holds is not done again. None where Ctrl-C stopped it. Raises
+    QfolioError where a loss is not finite.
+
+    listen: called with what is under way; makes the listener to that training.
     """
-    content = _read(folder)
-    plan, courses = Plan.of(content), content["courses"]
-    seeds = range(plan.seed, plan.seed + plan.seeds)
+    state = read_config(folder / FILE, ContinualConfig)
+    plan = state.plan()
+
+    def keep(**results: Any) -> None:
+        nonlocal state
+        state = msgspec.structs.replace(state, **results)
+        write_config(folder / FILE, state)
+
+    def learn(name: str, population: Population, episodes: int, points: int) -> Course | None:
+        worlds = grades if name == FIRST else grades[::-1]
+        return _learn(population, episodes, points, worlds, [listen(name)] if listen else [])
+
     grades = Grades(plan.task), Grades(plan.changed)
+    seeds = seed_range(plan.seeds, plan.seed)
     first = Population(plan.task, plan.agent, seeds)
-    missing = [way for way in WAYS if way not in courses]
-    if "training" not in content:
-        training = _learn(first, plan.episodes, 1, grades, partial(listener, "first training"))
+    missing = [way for way in WAYS if way not in state.courses]
+    if state.training is None:
+        training = learn(FIRST, first, plan.episodes, 1)
+        if training is None:
+            return None
         write_tree(folder / LEARNED, first.fetch())
-        content["optimum"] = {"old": grades[0].optimum, "new": grades[1].optimum}
-        content["training"] = training._asdict()
-        write_json(folder / FILE, content)
+        keep(optimum={"old": grades[0].optimum, "new": grades[1].optimum}, training=training)
     elif missing:
         first.restore(read_tree(folder / LEARNED, first.fetch()))
     learned = first.fetch()
@@ -225,31 +259,15 @@ def compare(folder: Path, listener: Listener = lambda name, share: None) -> dict
         elif way != "fresh":
             population.restore(learned)
         share = {"frozen": 0.0, "renewed": plan.renewal}.get(way, 1.0)
-        episodes = round(share * plan.episodes)
-        course = _learn(population, episodes, POINTS, grades[::-1], partial(listener, way))
-        courses[way], content["recovery"][way] = course._asdict(), recovery(course)
-        write_json(folder / FILE, content)
+        course = learn(way, population, round(share * plan.episodes), POINTS)
+        if course is None:
+            return None
+        keep(
+            courses={**state.courses, way: course},
+            recovery={**state.recovery, way: recovery(course)},
+        )
     (folder / LEARNED).unlink(missing_ok=True)
-    return content
-
-
-def _read(folder: Path) -> dict[str, Any]:
-    """What continual.json says, or QfolioError where ``folder`` has none of this version."""
-    path = folder / FILE
-    if not path.is_file():
-        raise QfolioError(f"{folder} is no change of a task: it has no {FILE}.")
-    content = read_json(path)
-    if content.get("format") != FORMAT:
-        raise QfolioError(f"{path} was written in another format; start anew.")
-    wanted: dict[str, Any] = {"task": str, "task_settings": dict, "changes": dict, "agent": str,
-              "agent_settings": dict, "episodes": int, "seeds": int, "seed": int,
-              "courses": dict, "recovery": dict}  # fmt: skip
-    wanted |= dict.fromkeys(("rate", "renewal", "epsilon"), float | int)
-    try:
-        require_types(content, wanted)
-    except QfolioError as error:
-        raise QfolioError(f"{path} is damaged: {error}") from None
-    return content
+    return msgspec.to_builtins(state)
 
 
 def recovery(course: Course) -> dict[str, Any]:
@@ -302,26 +320,43 @@ class Grades:
         return regret(returns, float(self._best[:starts].mean())).tolist()
 
 
+class _Curve(Listener):
+    """Grades the policies after each chunk."""
+
+    def __init__(self, world: Grades) -> None:
+        self.world = world
+        self.steps: list[int] = []
+        self.regrets: list[list[float]] = []
+
+    def add(self, population: Population, steps: int) -> None:
+        self.steps.append(steps * population.agent.num_envs)
+        self.regrets.append(self.world.regrets(population, population.curve_starts))
+
+    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+        self.add(training.population, training.population.steps - training.begun)
+
+
 def _learn(
     population: Population,
     episodes: int,
     points: int,
-    grades: tuple[Grades, Grades],
-    tell: Callable[[float], None],
-) -> Course:
-    """Learns ``episodes`` more, graded now and then; grades: of this world and the other one."""
-    here, there = grades
-    begun, end, seconds = population.steps, population.episodes + episodes, 0.0
-    left = total = population.steps_left(end)
-    steps, curve = [0], [here.regrets(population, population.curve_starts)]
-    while left > 0:
-        compiled, start = population.seconds_compile, perf_counter()
-        population.advance(min(left, -(-total // points)))
-        seconds += perf_counter() - start - (population.seconds_compile - compiled)
-        left = population.steps_left(end)
-        done = population.steps - begun
-        steps.append(done * population.agent.num_envs)
-        curve.append(here.regrets(population, population.curve_starts))
-        tell(done / (done + left))
+    worlds: tuple[Grades, Grades],
+    listeners: list[Listener],
+) -> Course | None:
+    """Learns ``episodes`` more, graded now and then; None where Ctrl-C stopped it.
+
+    worlds: this one and the other one.
+    """
+    here, there = worlds
+    curve = _Curve(here)
+    curve.add(population, 0)
+    seconds = 0.0
+    if episodes:
+        budget = Budget(population.episodes + episodes)
+        chunk = -(-budget.left(population) // points)
+        training = fit(population, budget, [curve, *listeners], chunk=chunk)
+        seconds = training.seconds
+        if training.interrupted:
+            return None
     final, other = (world.regrets(population, population.starts) for world in (here, there))
-    return Course(steps, curve, final, other, seconds)
+    return Course(curve.steps, curve.regrets, final, other, seconds)

@@ -5,7 +5,7 @@ The policy is the mean over the agents of all seeds. It lives in a folder: what 
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from numbers import Real
 from pathlib import Path
@@ -25,8 +25,9 @@ from qfolio.core.mdp import Agent, View
 from qfolio.core.population import Population
 from qfolio.core.registry import AGENTS, find, name_of
 from qfolio.core.training import episode_steps
+from qfolio.experiments.budget import Budget, seed_range
+from qfolio.experiments.fit import Listener, fit
 from qfolio.experiments.presets import Preset, preset
-from qfolio.experiments.run import check_counts
 from qfolio.portfolio.costs import drift
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
@@ -40,9 +41,6 @@ UPDATE_RATE = 0.1
 
 UNKNOWN = np.datetime64("NaT", "s")
 
-Listener = Callable[[float], None]
-"""Is told the share of training that is done, after each chunk."""
-
 
 def train(
     prices: Any,
@@ -51,7 +49,7 @@ def train(
     seeds: int | None = None,
     seed: int = 0,
     episodes: int | None = None,
-    listener: Listener | None = None,
+    listeners: Sequence[Listener] = (),
     **task: Any,
 ) -> "Policy":
     """A policy that has learned from all rows of a price table, all seeds in one program.
@@ -79,10 +77,9 @@ def train(
     if episodes is None:
         raise QfolioError("An agent without a preset needs to be told how many episodes to train.")
     count = 5 if seeds is None else seeds
-    check_counts(episodes, count, seed)
     portfolio = Portfolio.of(table, **settings.convert(Portfolio, task))
-    population = Population(portfolio, agent, range(seed, seed + count))
-    _learn(population, episodes, listener)
+    population = Population(portfolio, agent, seed_range(count, seed))
+    _learn(population, episodes, listeners)
     learner = population.fetch().agent
     return Policy(
         portfolio,
@@ -142,7 +139,7 @@ class Policy:
         prices: Any,
         episodes: int | None = None,
         *,
-        listener: Listener | None = None,
+        listeners: Sequence[Listener] = (),
         **options: Any,
     ) -> "Policy":
         """The policy after it has gone on learning from the last rows of a newer table.
@@ -165,7 +162,7 @@ class Policy:
                 "it anew."
             )
         wanted = self.agent.num_envs if episodes is None else episodes
-        check_counts(wanted, self.seeds, 0)
+        _ = Budget(wanted)
         table = self.table(prices, **options)
         if table.dates[-1] <= self.learned:
             raise QfolioError(
@@ -187,7 +184,7 @@ class Policy:
         state = population.fetch()
         learner = agent.carry_over(self.learner, state.agent)
         population.restore(eqx.tree_at(lambda s: s.agent, state, learner))
-        _learn(population, unlearned + wanted, listener)
+        _learn(population, unlearned + wanted, listeners)
         learner = population.fetch().agent
         return Policy(
             task,
@@ -424,12 +421,10 @@ def _follow(
     return jax.vmap(path)(members, held)
 
 
-def _learn(population: Population, episodes: int, listener: Listener | None) -> None:
-    total = population.steps_left(episodes)
-    while left := population.steps_left(episodes):
-        population.advance(left)
-        if listener is not None:
-            listener(min(1.0, population.steps / total))
+def _learn(population: Population, episodes: int, listeners: Sequence[Listener]) -> None:
+    """Raises KeyboardInterrupt where Ctrl-C stopped it: half a training makes no policy."""
+    if not fit(population, Budget(episodes), listeners).finished:
+        raise KeyboardInterrupt
 
 
 def _list(names: list[str]) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array, PyTree
 
@@ -52,7 +53,7 @@ def report_data(
         title=f"{AGENTS.get(agent, agent)} {words_of(task).where}",
         command=command,
         summary=summary,
-        config=run.config,
+        config=msgspec.to_builtins(run.config),
         curve=_curve(run, names[0]),
         comparison=_curve(contrast, names[1]) if contrast and contrast.evaluations else None,
         training_episodes=np.array([row["episode"] for row in rows]),
@@ -72,11 +73,11 @@ def backtest_data(
 ) -> BacktestData:
     """Collects everything ``write_backtest_report`` needs."""
     config, dates = backtest.config, backtest.prices.dates
-    shift = config["lag"] + 1
+    shift = config.lag + 1
     day = lambda row: str(dates[row])[:10]  # noqa: E731
     return BacktestData(
         title=f"{' and '.join(backtest.agents)} on {len(backtest.prices.assets)} assets",
-        command=config["command"],
+        command=config.command,
         assessment=assessment,
         dates=backtest.dates,
         assets=backtest.prices.assets,
@@ -90,8 +91,12 @@ def backtest_data(
             )
             for name, entry in entries.items()
         },
-        prices=config["prices"],
-        config={key: value for key, value in config.items() if key not in ("prices", "assets")},
+        prices=config.prices,
+        config={
+            key: value
+            for key, value in msgspec.to_builtins(config).items()
+            if key not in ("prices", "assets")
+        },
         folds=[
             {
                 "name": fold.name,
@@ -118,7 +123,7 @@ def greedy_episode(run: Run, task: Pendulum, start: int = EPISODE_START) -> Epis
 
 
 def _curve(run: Run, label: str) -> Curve:
-    seeds = run.config["seeds"]
+    seeds = run.config.seeds
     rows = run.evaluations[: len(run.evaluations) // seeds * seeds]
     table = {
         name: np.array([row[name] for row in rows]).reshape(-1, seeds)

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import shutil
 
@@ -6,12 +7,15 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.baselines import BASELINES
 from qfolio.portfolio.backtest.run import LATEST, Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.policy import follow
 from qfolio.portfolio.prices.table import Prices
+
+from listeners import Interrupt
 
 AGENTS = {
     "dqn": Preset(
@@ -100,11 +104,22 @@ def test_holdings_carry_over_from_fold_to_fold(finished, name, together, monkeyp
     np.testing.assert_allclose(same._decide(name, together), targets, atol=1e-6)
 
 
-def test_what_is_learned_does_not_depend_on_the_group(finished, tmp_path, monkeypatch):
+def test_what_is_learned_does_not_depend_on_the_group(finished, tmp_path):
     """A backtest that is resumed has other groups of folds."""
+
+    class FoldByFold(Here):
+        def map(self, jobs, listen):
+            yield from super().map(
+                [
+                    dataclasses.replace(job, folds=(fold,), tasks=(task,))
+                    for job in jobs
+                    for fold, task in zip(job.folds, job.tasks, strict=True)
+                ],
+                listen,
+            )
+
     alone = create(tmp_path / "run", agents={"pathwise": AGENTS["pathwise"]})
-    monkeypatch.setattr(alone, "_groups", lambda name: [[job] for job in alone._jobs])
-    alone.run()
+    alone.run(executor=FoldByFold())
     for fold in alone.folds:
         one, other = (b._members("pathwise", fold.name) for b in (alone, finished))
         for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
@@ -120,26 +135,28 @@ def test_seeds_differ_and_opening_gives_the_same(finished):
         assert not np.array_equal(returns[0], returns[1])
 
 
-def test_what_was_trained_stays(finished, tmp_path, monkeypatch):
+def test_what_was_trained_stays(finished, tmp_path):
     """A backtest that is stopped goes on behind its finished folds, and ends up the same."""
     stopped = create(tmp_path / "run", agents={"pathwise": AGENTS["pathwise"]})
-    train, groups = Backtest._train, []
+    jobs = []
 
-    def once(self, name, group):
-        groups.append([job.name for job in group])
-        if len(groups) == 2:
-            raise KeyboardInterrupt
-        yield from train(self, name, group)
+    def stop_at_the_second(job, done, share):
+        jobs.append(job)
+        return [Interrupt()] if len(jobs) == 2 else []
 
-    monkeypatch.setattr(Backtest, "_train", once)
-    with pytest.raises(KeyboardInterrupt):
-        stopped.run()
+    stopped.run(stop_at_the_second)
+    assert stopped.interrupted
     resumed = Backtest.open(tmp_path / "run")
     with pytest.raises(QfolioError, match="not finished"):
         resumed.policy()
-    resumed.run()
-    assert groups[1] == groups[2]  # the group that was not finished, and none before it
-    assert groups[-1][-1] == LATEST
+    resumed.run(lambda job, done, share: jobs.append(job) or [])
+    assert not resumed.interrupted
+    # Each fold once: what was finished is not trained again.
+    folds = [fold for job in jobs for fold in job.folds]
+    assert folds == [fold.name for fold in resumed.folds] + [LATEST]
+    rows = resumed.records("pathwise", resumed.folds[0].name)
+    assert rows == finished.records("pathwise", finished.folds[0].name)
+    assert {row["seed"] for row in rows} == {0, 1}
     for fold in (*resumed.folds, None):
         one, other = (
             b._members("pathwise", fold.name) if fold else b.policy("pathwise").learner

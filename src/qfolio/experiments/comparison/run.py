@@ -6,33 +6,31 @@ that ``qfolio evaluate`` and ``watch`` know it) and, at the end, the report. Wha
 on from the last checkpoint of the agent that was training.
 """
 
-import dataclasses
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 
 from qfolio.core import devices, settings
+from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.files import new_folder, read_json, require_types, write_json
+from qfolio.core.files import new_folder, read_json
 from qfolio.core.host import HostPopulation
 from qfolio.core.mdp import Agent, Task
-from qfolio.core.registry import AGENTS, TASKS, name_of
 from qfolio.core.training import begin
-from qfolio.core.version import __version__
+from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.operations import operations_per_step
 from qfolio.experiments.comparison.ranking import Result, conclusion, listed, rank
-from qfolio.experiments.run import Progress, Run, check_counts, configured_agent, configured_task
-
-FORMAT = 1
-"""Of comparison.json."""
+from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.fit import Listener
+from qfolio.experiments.run import Run
 
 FILE = "comparison.json"
 
@@ -50,11 +48,48 @@ class Entrant:
     task: Task
     agent: Agent
     preset: str | None
-    budget: dict[str, int]  # episodes or steps, as ``Run.create`` takes them
+    budget: Budget
 
 
-Listener = Callable[[str, int, Progress | None], None]
-"""Called with an agent's name and number (from 0): before it trains, and with where it is then."""
+class EntrantConfig(msgspec.Struct, kw_only=True):
+    """An entrant as comparison.json holds it."""
+
+    agent: str
+    preset: str | None
+    agent_settings: dict[str, Any]
+    task_settings: dict[str, Any]
+    episodes: int | None
+    steps: int | None
+
+
+# Names become folders.
+EntrantName = Annotated[str, msgspec.Meta(pattern=r"^[\w-]+(:[\w-]+)?$")]
+
+
+class ComparisonConfig(Config, frozen=True):
+    """The whole of comparison.json: what is compared, and what has come out so far."""
+
+    kind: ClassVar[str] = "comparison"
+    format: ClassVar[int] = 2
+
+    task: str
+    seeds: int
+    seed: int
+    command: str
+    note: str
+    agents: dict[EntrantName, EntrantConfig]
+    device: str
+    started: str
+    results: dict[str, Result] = msgspec.field(default_factory=dict)
+    failures: dict[str, str] = msgspec.field(default_factory=dict)
+    ranking: dict[str, Any] | None = None
+    conclusion: list[str] = msgspec.field(default_factory=list)
+    notes: list[str] = msgspec.field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        seed_range(self.seeds, self.seed)
+        if not self.results.keys() <= self.agents.keys():
+            raise QfolioError("there are results of agents that it does not have.")
 
 
 class Comparison:
@@ -63,12 +98,12 @@ class Comparison:
     results: by agent, of those that are finished. failures: why others could not be.
     """
 
-    def __init__(self, config: dict[str, Any], results: dict[str, Result], folder: Path) -> None:
-        self.config, self.results, self.folder = config, results, folder
+    def __init__(self, config: ComparisonConfig, folder: Path) -> None:
+        self.config, self.results, self.folder = config, dict(config.results), folder
         self.failures: dict[str, str] = {}
         self.interrupted = False
         self.entrants = {
-            name: _entrant(config["task"], entry) for name, entry in config["agents"].items()
+            name: _entrant(config.task, entry) for name, entry in config.agents.items()
         }
 
     @classmethod
@@ -96,76 +131,59 @@ class Comparison:
                 "A comparison needs two agents or more; name them with --agents, for example "
                 "--agents dqn:fast,dqn:report."
             )
+        seed_range(seeds, seed)
         for name, entrant in entrants.items():
-            episodes, steps = (entrant.budget.get(unit) for unit in ("episodes", "steps"))
-            check_counts(episodes, seeds, seed, steps=steps)
             _require_fit(name, entrant, seeds)
-        tasks = list(dict.fromkeys(name_of(TASKS, entrant.task) for entrant in entrants.values()))
+        described = {name: describe(one.task, one.agent) for name, one in entrants.items()}
+        tasks = list(dict.fromkeys(entry.pop("task") for entry in described.values()))
         if len(tasks) > 1:
             raise QfolioError(f"A comparison has one task, and here are {', '.join(tasks)}.")
-        config = {
-            "format": FORMAT,
-            "kind": "comparison",
-            "version": __version__,
-            "task": tasks[0],
-            "seeds": int(seeds),
-            "seed": int(seed),
-            "command": command,
-            "note": note,
-            "agents": {
-                name: {
-                    "agent": name_of(AGENTS, entrant.agent),
-                    "preset": entrant.preset,
-                    "agent_settings": settings.describe(entrant.agent),
-                    "task_settings": settings.describe(entrant.task),
-                    "budget": entrant.budget,
-                }
+        config = ComparisonConfig(
+            task=tasks[0],
+            seeds=int(seeds),
+            seed=int(seed),
+            command=command,
+            note=note,
+            agents={
+                name: EntrantConfig(
+                    preset=entrant.preset,
+                    episodes=entrant.budget.episodes,
+                    steps=entrant.budget.steps,
+                    **described[name],
+                )
                 for name, entrant in entrants.items()
             },
             **devices.circumstances(),
-        }
+        )
         with new_folder(Path(out)) as folder:
-            write_json(folder / FILE, {**config, "results": {}})
-        return cls(config, {}, Path(out))
+            write_config(folder / FILE, config)
+        return cls(config, Path(out))
 
     @classmethod
     def open(cls, folder: Path | str) -> "Comparison":
         """A comparison as its last finished agent left it."""
-        path = Path(folder) / FILE
-        if not path.is_file():
-            raise QfolioError(f"{folder} is no comparison: it has no {FILE}.")
-        content = read_json(path)
-        if content.get("format") != FORMAT or content.get("kind") != "comparison":
-            raise QfolioError(f"{path} was written in another format; compare anew.")
-        try:
-            _check(content)
-            results = {name: Result(**entry) for name, entry in content["results"].items()}
-        except (QfolioError, TypeError) as error:
-            raise QfolioError(f"{path} is damaged: {error}") from None
-        kept = ("results", "failures", "ranking", "conclusion", "notes")
-        config = {key: value for key, value in content.items() if key not in kept}
-        return cls(config, results, Path(folder))
+        return cls(read_config(Path(folder) / FILE, ComparisonConfig), Path(folder))
 
     def place(self, name: str) -> Path:
         """The run folder of an agent."""
         return self.folder / "agents" / _folder_name(name)
 
-    def run(self, listener: Listener | None = None) -> None:
+    def run(self, listen: Callable[[str], Listener] | None = None) -> None:
         """Trains and grades every agent that has no result yet.
 
         A first Ctrl-C stops after the current chunk and sets ``interrupted``. An agent that
         diverges is left out and noted in ``failures``.
+
+        listen: called with an agent's name before it trains; makes the listener to its training.
         """
         self.interrupted = False
-        for number, name in enumerate(self.entrants):
+        for name in self.entrants:
             if name in self.results:
                 continue
-            tell = partial(listener, name, number) if listener else None
-            if tell is not None:
-                tell(None)
+            listeners = [] if listen is None else [listen(name)]
             try:
                 run = self._open(name)
-                run.train(listener=tell)
+                run.train(listeners=listeners)
             except QfolioError as error:
                 self.failures[name] = str(error)
                 continue
@@ -186,7 +204,7 @@ class Comparison:
     def notes(self) -> list[str]:
         """What a reader has to know before he compares, in sentences."""
         notes = [f"{name} could not be trained. {why}" for name, why in self.failures.items()]
-        notes += filter(None, [self.config["note"]])
+        notes += filter(None, [self.config.note])
         entrants = {name: self.entrants[name] for name in self.entrants if name in self.results}
         tasks = {name: settings.describe(entrant.task) for name, entrant in entrants.items()}
         differing = [_differing(key, tasks) for key in next(iter(tasks.values()))]
@@ -236,20 +254,16 @@ class Comparison:
         return Run.create(
             entrant.task,
             entrant.agent,
-            seeds=self.config["seeds"],
-            seed=self.config["seed"],
+            budget=entrant.budget,
+            seeds=self.config.seeds,
+            seed=self.config.seed,
             preset=entrant.preset,
             out=place,
-            **entrant.budget,
         )
 
     def _write(self) -> None:
         results = {name: self.results[name] for name in self.entrants if name in self.results}
-        content = {
-            **self.config,
-            "results": {name: dataclasses.asdict(result) for name, result in results.items()},
-            "failures": self.failures,
-        }
+        content: dict[str, Any] = {"results": results, "failures": self.failures}
         if len(results) > 1 and len(results) + len(self.failures) == len(self.entrants):
             ranking = rank(results)
             content |= {
@@ -257,7 +271,7 @@ class Comparison:
                 "conclusion": conclusion(ranking),
                 "notes": self.notes(),
             }
-        write_json(self.folder / FILE, content)
+        write_config(self.folder / FILE, msgspec.structs.replace(self.config, **content))
 
 
 def _folder_name(name: str) -> str:
@@ -273,12 +287,12 @@ def _require_fit(name: str, entrant: Entrant, seeds: int) -> None:
         raise QfolioError(f"{name}: {error}") from None
 
 
-def _entrant(task: str, entry: dict[str, Any]) -> Entrant:
+def _entrant(task: str, entry: EntrantConfig) -> Entrant:
     return Entrant(
-        configured_task({"task": task, **entry}),
-        configured_agent(entry),
-        entry["preset"],
-        entry["budget"],
+        task_of(task, entry.task_settings),
+        agent_of(entry.agent, entry.agent_settings),
+        entry.preset,
+        Budget(entry.episodes, entry.steps),
     )
 
 
@@ -290,22 +304,6 @@ def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
         values.setdefault("empty" if value == "" else str(value), []).append(name)
     groups = (f"{value} for {listed(names)}" for value, names in values.items())
     return f"{key} is {', '.join(groups)}" if len(values) > 1 else None
-
-
-def _check(content: dict[str, Any]) -> None:
-    """Raises QfolioError where settings are missing or of the wrong type."""
-    wanted = {"task": str, "seeds": int, "seed": int, "command": str, "note": str,
-              "agents": dict, "results": dict, "device": str}  # fmt: skip
-    require_types(content, wanted)
-    parts = {"agent": str, "preset": str | None, "agent_settings": dict, "task_settings": dict,
-             "budget": dict}  # fmt: skip
-    for name, entry in content["agents"].items():
-        # Names become folders.
-        if not isinstance(entry, dict) or not re.fullmatch(r"[\w-]+(:[\w-]+)?", name):
-            raise QfolioError(f"the agent {name!r} is not described.")
-        require_types(entry, parts)
-    if not content["results"].keys() <= content["agents"].keys():
-        raise QfolioError("there are results of agents that it does not have.")
 
 
 def _result(run: Run) -> Result:

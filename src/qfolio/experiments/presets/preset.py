@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from qfolio.core import settings
 from qfolio.core.registry import AGENTS, find
+from qfolio.experiments.budget import Budget
 
 if TYPE_CHECKING:
     from qfolio.core.mdp import Agent
@@ -29,9 +30,9 @@ class Preset(NamedTuple):
         return settings.build(find("agent", AGENTS, self.agent), {**self.settings, **changes})
 
     @property
-    def budget(self) -> dict[str, int]:
-        """How far, as ``Run.create`` takes it."""
-        return {"steps": self.steps} if self.steps else {"episodes": self.episodes}
+    def budget(self) -> Budget:
+        """How far each seed is trained."""
+        return Budget(steps=self.steps) if self.steps else Budget(self.episodes)
 
 
 Presets = dict[tuple[str, str], dict[str, Preset]]

@@ -28,7 +28,9 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.registry import AGENTS, TASKS, name_of
 from qfolio.core.training import begin
 from qfolio.core.version import __version__
-from qfolio.experiments.run import check_counts, configured_agent, configured_task, interruptible
+from qfolio.experiments.budget import Budget, seed_range
+from qfolio.experiments.described import agent_of, task_of
+from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
 from qfolio.experiments.tuning.search import Value
@@ -74,7 +76,8 @@ class Tuning:
 
     def __init__(self, config: dict[str, Any], folder: Path, sampler_seed: int | None) -> None:
         self.config, self.folder = config, folder
-        self.task, self.agent = configured_task(config), configured_agent(config)
+        self.task = task_of(config["task"], config["task_settings"])
+        self.agent = agent_of(config["agent"], config["agent_settings"])
         kind = type(self.agent)
         texts = config["search"].items()
         self.space = [search.dimension(name, text, kind) for name, text in texts]
@@ -108,7 +111,7 @@ class Tuning:
         trials: configurations in all. episodes, steps: how far each agent is trained; one of the
         two. batch: configurations trained at once. fresh_seeds: of the final comparison.
         """
-        check_counts(episodes, max(seeds, fresh_seeds), FRESH, steps=steps)
+        _ = Budget(episodes, steps), seed_range(max(seeds, fresh_seeds), FRESH)
         _require_counts(trials=trials, batch=batch, seeds=seeds, fresh_seeds=fresh_seeds)
         search.require_buildable(type(agent), settings.describe(agent), space)
         jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))  # fits the task?
@@ -303,7 +306,7 @@ def _read_config(folder: Path) -> dict[str, Any]:
     nested = dict.fromkeys(("task_settings", "agent_settings", "search"), dict)
     try:
         require_types(config, {**counts, **far, **names, **nested})
-        check_counts(config["episodes"], config["seeds"], FRESH, steps=config["steps"])
+        _ = Budget(config["episodes"], config["steps"]), seed_range(config["seeds"], FRESH)
         _require_counts(**{name: config[name] for name in counts})
     except QfolioError as error:
         raise QfolioError(f"{path} is damaged: {error}") from None

@@ -1,0 +1,126 @@
+"""Live progress of trainings on the terminal: listeners that print."""
+
+import datetime
+import math
+from collections.abc import Callable
+from time import perf_counter
+from typing import TYPE_CHECKING, NoReturn
+
+from qfolio.commands.console import bar, console, number, say
+from qfolio.core.training import episode_steps
+from qfolio.experiments.fit import Listener, Row, Training
+from qfolio.experiments.interrupts import EXIT_CODE
+
+if TYPE_CHECKING:
+    from qfolio.experiments.executor import Job
+    from qfolio.experiments.run import Run
+
+
+class RunProgress(Listener):
+    """A line for each point of a run's learning curve, and a bar between them.
+
+    optimum: on the curve's start states, None where it is not known. show: called with the run at
+    each point of the curve.
+    """
+
+    def __init__(
+        self, run: "Run", optimum: float | None, show: Callable[["Run"], None] | None = None
+    ) -> None:
+        self.run, self.optimum, self.show = run, optimum, show
+
+    def on_start(self, training: Training) -> None:
+        run, budget = self.run, training.budget
+        steps = episode_steps(run.task, run.agent)
+        value = "return" if steps == run.task.horizon else f"return/{steps}"  # of shorter episodes
+        columns = (budget.unit, value, "greedy", "optimum", "epsilon", "steps/s", "left")
+        say("".join(f"{name:>11}" for name in columns))
+        self.points = len(run.evaluations)
+        self.bar = bar("compiling", budget.amount, run.done(budget.unit))
+        self.update = self.bar.__enter__()
+
+    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+        run, budget = self.run, training.budget
+        done = run.done(budget.unit)
+        returns = [row["return"] for row in rows]
+        value = number(sum(returns) / len(returns) if returns else math.nan)
+        rate = f"{training.steps_per_second:,.0f}"
+        epsilon = rows[-1].get("epsilon", math.nan) if rows else math.nan
+        explored = "–" if math.isnan(epsilon) else f"{epsilon:.2f}"
+        left = time_left(training.seconds_left)
+        status = (
+            f"{done:,} {budget.unit}  return {value}  ε {explored}  {rate} steps/s  {left} left"
+        )
+        self.update(completed=min(done, budget.amount), description=status)
+        if len(run.evaluations) > self.points:
+            now = run.evaluations[self.points :][-len(run.population.seeds) :]
+            self.points = len(run.evaluations)
+            greedy = number(sum(row["return"] for row in now) / len(now))
+            cells = (f"{done:,}", value, greedy, number(self.optimum), explored, rate, left)
+            say("".join(f"{cell:>11}" for cell in cells))
+            if self.show is not None:
+                self.show(run)
+
+    def on_end(self, training: Training) -> None:
+        self.bar.__exit__(None, None, None)
+
+
+class BarProgress(Listener):
+    """Moves a bar that ``console.bar`` has made; name: of what is under way."""
+
+    def __init__(self, update: Callable[..., None], name: str) -> None:
+        self.update, self.name = update, name
+
+    def on_start(self, training: Training) -> None:
+        self.update(completed=training.share, description=f"{self.name}  compiling")
+
+    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+        speed = f"{training.steps_per_second:,.0f} steps/s"
+        status = f"{self.name}  {speed}  {time_left(training.seconds_left)} left"
+        self.update(completed=training.share, description=status)
+
+
+class BacktestProgress:
+    """A bar over all jobs of a backtest, or a line for each tenth where there is no terminal.
+
+    Called before each job, it makes the listener to that job's training.
+    """
+
+    def __init__(self, update: Callable[..., None]) -> None:
+        self.update, self.begun, self.said = update, perf_counter(), ""
+
+    def __call__(self, job: "Job", done: float, share: float) -> list[Listener]:
+        """done, share: of all jobs, those that are done, and one of them."""
+        return [_JobProgress(self, job.name.partition("/")[0], done, share)]
+
+    def note(self, agent: str, done: float, known: bool) -> None:
+        """known: whether the agent learns by now, so that its speed says when it will be done."""
+        spent = perf_counter() - self.begun
+        left = time_left(spent * (1 / done - 1) if known and done else math.nan)
+        description = f"{agent}  {left} left"
+        self.update(completed=done, description=description)
+        if not console.is_terminal and f"{done:.1f}" != self.said:
+            self.said = f"{done:.1f}"
+            say(f"{done:4.0%}  {description}")
+
+
+class _JobProgress(Listener):
+    def __init__(self, whole: BacktestProgress, agent: str, done: float, share: float) -> None:
+        self.whole, self.agent, self.done, self.share = whole, agent, done, share
+
+    def on_start(self, training: Training) -> None:
+        self.whole.note(self.agent, self.done, known=self.done > 0)
+
+    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+        done = self.done + self.share * training.share
+        self.whole.note(self.agent, done, known=not math.isnan(training.seconds_left))
+
+
+def time_left(seconds: float) -> str:
+    """As hours, minutes and seconds; a dash where it is not known."""
+    return "–" if math.isnan(seconds) else str(datetime.timedelta(seconds=round(seconds)))
+
+
+def stop(command: str) -> NoReturn:
+    """Says how to go on after Ctrl-C, and exits with the code that a shell expects."""
+    say(f"Stopped. Go on with: {command}")
+    raise SystemExit(EXIT_CODE)

@@ -1,0 +1,59 @@
+"""How far agents are trained, and from which seeds."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from qfolio.core.errors import QfolioError
+
+if TYPE_CHECKING:
+    from qfolio.core.population import Population
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How far each member is trained: a number of episodes, or of steps of all its environments.
+
+    Raises QfolioError unless exactly one of the two is given, from 1 to 2³¹ − 1.
+    """
+
+    episodes: int | None = None
+    steps: int | None = None
+
+    def __post_init__(self) -> None:
+        if (self.episodes is None) == (self.steps is None):
+            raise QfolioError(
+                "give either episodes or steps, to say how far each agent is trained."
+            )
+        _require(self.unit, self.amount, 1, 2**31 - 1)
+
+    @property
+    def unit(self) -> str:
+        """What is counted: "episodes" or "steps"."""
+        return "episodes" if self.steps is None else "steps"
+
+    @property
+    def amount(self) -> int:
+        """How many of them."""
+        amount = self.episodes if self.steps is None else self.steps
+        assert amount is not None
+        return amount
+
+    def to_json(self) -> dict[str, int]:
+        """``{"episodes": n}`` or ``{"steps": n}``."""
+        return {self.unit: self.amount}
+
+    def left(self, population: "Population") -> int:
+        """Steps of each environment until every member of a population has done its budget."""
+        return population.steps_left(self.episodes, steps=self.steps)
+
+
+def seed_range(seeds: int, seed: int) -> range:
+    """``seeds`` seeds from ``seed`` on; raises QfolioError where they do not fit in 32 bits."""
+    _require("seeds", seeds, 1, 2**20)
+    _require("seed", seed, 0, 2**32 - seeds)
+    return range(seed, seed + seeds)
+
+
+def _require(name: str, value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
+        raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")

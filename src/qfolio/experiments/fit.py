@@ -1,0 +1,167 @@
+"""The one driver of training: chunks, records, listeners and Ctrl-C.
+
+Every command that learns trains a population with ``fit``. Whatever else happens between two chunks
+(files, learning curves, progress, checkpoints) is done by a listener.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.population import Population
+from qfolio.core.training import Episodes
+from qfolio.experiments.budget import Budget
+from qfolio.experiments.interrupts import interruptible
+
+Row = dict[str, float]
+"""A finished episode: seed, episode (counted from 1), return and the agent's metrics."""
+
+
+@dataclass
+class Training:
+    """A training under way, as its listeners see it.
+
+    Attributes:
+        population: What is trained.
+        budget: How far.
+        config: What the training is, for those who record it.
+        begun: Steps of each environment before this training.
+        left: Steps of each environment that are left.
+        seconds: Time spent on training, without compiling.
+        members: The member of each row of the last chunk.
+        interrupted: Whether Ctrl-C asked it to stop.
+    """
+
+    population: Population
+    budget: Budget
+    config: Mapping[str, Any] = field(default_factory=dict)
+    begun: int = 0
+    left: int = 0
+    seconds: float = 0.0
+    members: Sequence[int] = ()
+    interrupted: bool = False
+    _learned: int = 0  # steps that learned, of each environment, and the time that they took
+    _learning_seconds: float = 0.0
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is used up."""
+        return self.left == 0
+
+    @property
+    def share(self) -> float:
+        """How much of this training is done, in steps."""
+        done = self.population.steps - self.begun
+        return done / max(done + self.left, 1)
+
+    @property
+    def steps_per_second(self) -> float:
+        """Environment steps of all members; those that learn, as soon as there are such."""
+        per_step = self.population.agent.num_envs * len(self.population.seeds)
+        return self._rate * per_step
+
+    @property
+    def seconds_left(self) -> float:
+        """NaN before learning has begun: what comes before says nothing about its speed."""
+        return self.left / self._rate if self._learned or self.finished else math.nan
+
+    @property
+    def _rate(self) -> float:
+        if self._learned:
+            return self._learned / max(self._learning_seconds, 1e-9)
+        return (self.population.steps - self.begun) / max(self.seconds, 1e-9)
+
+    def advance(self, most: int, strict: bool) -> list[Row]:
+        """Trains one chunk of at most ``most`` steps; returns the episodes that it finished."""
+        population = self.population
+        episodes, steps, compiled = (
+            population.member_episodes,
+            population.steps,
+            population.seconds_compile,
+        )
+        learning, start = population.learning, perf_counter()
+        records = population.advance(min(self.left, most), strict=strict)
+        seconds = perf_counter() - start - (population.seconds_compile - compiled)
+        self.seconds += seconds
+        if learning:
+            self._learned += population.steps - steps
+            self._learning_seconds += seconds
+        self.left = self.budget.left(population)
+        if not strict and not any(population.healthy):
+            self.left = 0
+        rows, self.members = _rows(population.seeds, episodes, records)
+        return rows
+
+
+class Listener:
+    """What is told of a training; a listener overrides what it needs."""
+
+    def on_start(self, training: Training) -> None:
+        """Before the first chunk."""
+
+    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+        """After each chunk, with every episode that it finished, in the order of time."""
+
+    def on_end(self, training: Training) -> None:
+        """After the last chunk, or the one after which Ctrl-C stopped; not after an error."""
+
+
+def fit(
+    population: Population,
+    budget: Budget,
+    listeners: Sequence[Listener] = (),
+    *,
+    config: Mapping[str, Any] | None = None,
+    chunk: int = 2**31,
+    strict: bool = True,
+) -> Training:
+    """Trains a population until each member has done its budget.
+
+    A first Ctrl-C stops after the current chunk and sets ``interrupted``.
+
+    Args:
+        population: What is trained; it goes on from where it is.
+        budget: How far, counted from the very beginning.
+        listeners: Told of every chunk, in their order.
+        config: What the training is, for listeners that record it.
+        chunk: Most steps of a chunk, if fewer than the population's own.
+        strict: Whether a loss that is not finite raises QfolioError; without, the other members
+            go on.
+    """
+    training = Training(population, budget, config or {}, population.steps, budget.left(population))
+    if training.finished:
+        return training
+    with interruptible() as stop:
+        for listener in listeners:
+            listener.on_start(training)
+        training.interrupted = stop.is_set()
+        while not (training.finished or training.interrupted):
+            rows = training.advance(chunk, strict)
+            for listener in listeners:
+                listener.on_chunk(training, rows)
+            training.interrupted = stop.is_set()
+        for listener in listeners:
+            listener.on_end(training)
+        training.interrupted = stop.is_set()
+    return training
+
+
+def _rows(
+    seeds: Sequence[int], before: Sequence[int], episodes: Episodes
+) -> tuple[list[Row], list[int]]:
+    """A row for each finished episode and its member, in the order in which they finished."""
+    # By time first, so that the order does not depend on where chunks begin and end.
+    places = np.argwhere(episodes.finished.swapaxes(0, 1))
+    time, member, environment = places.T
+    columns = {"return": episodes.returns, **episodes.metrics}
+    values = [column[member, time, environment].tolist() for column in columns.values()]
+    count = list(before)
+    rows = []
+    for i, *row in zip(member.tolist(), *values, strict=True):
+        count[i] += 1
+        rows.append({"seed": seeds[i], "episode": count[i], **dict(zip(columns, row, strict=True))})
+    return rows, member.tolist()

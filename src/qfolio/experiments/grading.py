@@ -1,0 +1,55 @@
+"""Grading policies: returns on the fixed start states, the exact optimum, and the regret."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from qfolio.core.evaluation import greedy, start_keys
+from qfolio.core.mdp import Optimum
+from qfolio.core.population import Population
+from qfolio.core.statistics import mean_interval
+from qfolio.solvers.followed import FollowedOptimum
+
+
+def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
+    """Returns, optimum and regret of each member's greedy policy, as JSON values.
+
+    starts: how many of the fixed start states (default: those of the population's kind).
+    """
+    task, keys = population.task, start_keys(starts or population.starts)
+    played = population.evaluate(keys)
+    returns = played.returns.mean(1)
+    solution = task.optimum()
+    optimum, regret = None, None
+    if solution is not None:
+        optimum = float(solution.returns(keys).mean())
+        regret = ((optimum - returns) / abs(optimum)).tolist()
+    return {
+        "return_mean": float(returns.mean()),
+        "return_ci95": list(mean_interval(returns)) if len(returns) > 1 else None,
+        "return_per_seed": returns.tolist(),
+        "optimum": optimum,
+        "regret_per_seed": regret,
+        "overestimation_per_seed": [
+            float(error) if np.isfinite(error) else None for error in played.overestimation
+        ],
+        "rule": _rule(population, solution),
+    }
+
+
+def _rule(population: Population, solution: Optimum | None) -> dict[str, Any] | None:
+    """What the members' policies do beside what is best, in tasks where few numbers say it."""
+    if not isinstance(solution, FollowedOptimum):
+        return None
+    task, agent, members = population.task, population.agent, population.weights()
+    play = jax.jit(lambda weights, state: greedy(task, agent, weights)(state))
+    policies = (
+        partial(play, jax.tree.map(lambda x, i=i: x[i], members))
+        for i in range(len(population.seeds))
+    )
+    return {
+        "exact": task.rule(solution.policy),
+        "per_seed": [task.rule(policy) for policy in policies],
+    }

@@ -1,0 +1,87 @@
+"""Ctrl-C: the first one stops a training after its current chunk, a second one stops at once.
+
+jax computes in the main thread, sometimes for seconds, and Python cannot interrupt it there: an
+exception would come too late, end inside one of jax's callbacks, or crash the process at its exit.
+The command line therefore listens in a thread of its own (``exit_on_ctrl_c``). Whatever is on disk
+at that moment is whole, since files are written under another name and renamed.
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+EXIT_CODE = 130
+"""What a shell expects of a program that Ctrl-C ended."""
+
+_trainings: list[threading.Event] = []
+"""The request to stop the training under way in the main thread, if there is one."""
+
+_SHOW_CURSOR = "\x1b[?25h"
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """Yields an event that the first Ctrl-C sets; a second one interrupts at once.
+
+    Within another such block it is that one's event: both stop.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield threading.Event()
+        return
+    if _trainings:
+        yield _trainings[0]
+        return
+    stop = threading.Event()
+    previous = signal.getsignal(signal.SIGINT)
+    if previous is not _ignore:  # the command line's thread does not need a handler
+        signal.signal(signal.SIGINT, lambda *_: _first(stop) or signal.default_int_handler(*_))
+    _trainings.append(stop)
+    try:
+        yield stop
+    finally:
+        _trainings.remove(stop)
+        signal.signal(signal.SIGINT, previous)
+
+
+def exit_on_ctrl_c() -> None:
+    """Makes Ctrl-C end the process with ``EXIT_CODE``, unless it stops a training first."""
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    signal.signal(signal.SIGINT, _ignore)
+    signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=_listen, args=(receiver, sender), daemon=True).start()
+
+
+def leave(message: str) -> None:
+    """Ends the process with ``EXIT_CODE``, without waiting for jax's threads."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
+    with contextlib.suppress(OSError):
+        os.write(2, f"{cursor}{message}\n".encode() if message else cursor.encode())
+    os._exit(EXIT_CODE)
+
+
+def _ignore(number: int, frame: Any) -> None:
+    """Keeps Python from raising KeyboardInterrupt: the thread acts on the signal."""
+
+
+def _first(stop: threading.Event) -> bool:
+    """Asks a training to stop; false where it has been asked already."""
+    asked = stop.is_set()
+    stop.set()
+    return not asked
+
+
+def _listen(receiver: socket.socket, sender: socket.socket) -> None:
+    """Acts on the numbers of signals; the sender is kept open as long as the thread lives."""
+    while numbers := receiver.recv(64):
+        for number in numbers:
+            if number == signal.SIGINT and not (_trainings and _first(_trainings[0])):
+                leave("qfolio: interrupted")

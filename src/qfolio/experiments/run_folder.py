@@ -1,0 +1,134 @@
+"""The folder of a run.
+
+It holds config.json (settings), metrics.csv and evaluation.csv (appended), checkpoint.safetensors
+(the whole training state, replaced as one), policy.safetensors (weights) and, at the end,
+summary.json. The checkpoint is the truth: rows that are ahead of it are dropped when a run is
+resumed, and then come again, the same to the last digit.
+"""
+
+import contextlib
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from qfolio.core.config import Config, read_config, write_config
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import UNFINISHED, read_tree, write_bytes, write_json, write_tree
+from qfolio.experiments.budget import Budget, seed_range
+from qfolio.experiments.fit import Row
+
+CONFIG, METRICS, EVALUATION = "config.json", "metrics.csv", "evaluation.csv"
+CHECKPOINT, POLICY, SUMMARY = "checkpoint.safetensors", "policy.safetensors", "summary.json"
+
+
+class RunConfig(Config, frozen=True):
+    """What a run is: one agent, one task, some seeds, and how far they are trained."""
+
+    kind: ClassVar[str] = "run"
+    format: ClassVar[int] = 4
+
+    task: str
+    task_settings: dict[str, Any]
+    agent: str
+    agent_settings: dict[str, Any]
+    preset: str | None
+    episodes: int | None
+    steps: int | None
+    seeds: int
+    seed: int
+    device: str
+    versions: dict[str, str]
+    started: str
+
+    def __post_init__(self) -> None:
+        _ = self.budget, self.seed_range
+
+    @property
+    def budget(self) -> Budget:
+        """How far each seed is trained."""
+        return Budget(self.episodes, self.steps)
+
+    @property
+    def seed_range(self) -> range:
+        """The agents' seeds."""
+        return seed_range(self.seeds, self.seed)
+
+
+class RunFolder:
+    """Reads and writes a run's files; a run without a folder has none."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def write_config(self, config: RunConfig) -> None:
+        write_config(self.path / CONFIG, config)
+
+    def read_config(self) -> RunConfig:
+        """Raises QfolioError where the folder holds no run of this version."""
+        return read_config(self.path / CONFIG, RunConfig)
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        write_json(self.path / SUMMARY, summary)
+
+    def write_checkpoint(self, state: Any, weights: Any) -> None:
+        """The policy first: the checkpoint says how far the run is."""
+        write_tree(self.path / POLICY, weights)
+        write_tree(self.path / CHECKPOINT, state)
+
+    def read_checkpoint(self, template: Any) -> Any:
+        """The state that ``write_checkpoint`` wrote, in the shape of ``template``."""
+        return read_tree(self.path / CHECKPOINT, template)
+
+    def append(self, name: str, rows: Sequence[Row]) -> None:
+        """Adds rows to a table, with a header where it is new."""
+        if rows:
+            with (self.path / name).open("a", newline="") as file:
+                file.write(_csv(rows, header=file.tell() == 0))
+
+    def rows(self, name: str, episodes: dict[int, int], steps: int) -> list[Row]:
+        """The rows of a table up to a checkpoint; one cut short by a crash does not count.
+
+        episodes: of each seed, at the checkpoint. steps: of each seed's environments.
+        """
+        path = self.path / name
+        if not path.exists():
+            return []
+        try:
+            table = list(csv.DictReader(path.read_text(errors="replace").splitlines()))
+        except csv.Error as error:
+            raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
+        rows = []
+        for row in table:
+            # A row that was cut short has too few numbers.
+            with contextlib.suppress(TypeError, ValueError, KeyError, OverflowError):
+                values = {key: _number(text) for key, text in row.items()}
+                done = values["episode"] <= episodes[int(values["seed"])]
+                if done and values.get("env_steps", 0) <= steps:
+                    rows.append(values)
+        return rows
+
+    def tidy(self, tables: dict[str, list[Row]]) -> None:
+        """Brings the tables back to these rows, and removes what a killed process left."""
+        for name, rows in tables.items():
+            if rows:
+                write_bytes(self.path / name, _csv(rows, header=True).encode())
+            else:
+                (self.path / name).unlink(missing_ok=True)
+        for path in self.path.glob(f".*{UNFINISHED}"):
+            path.unlink()
+
+
+def _csv(rows: Sequence[Row], header: bool) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    if header:
+        writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _number(text: str) -> float:
+    number = float(text)
+    return int(number) if number.is_integer() and "." not in text else number

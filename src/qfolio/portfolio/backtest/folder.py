@@ -1,0 +1,178 @@
+"""The folder of a backtest.
+
+It holds config.json (settings, written once), prices.safetensors (the table),
+policies/AGENT/FOLD.safetensors (weights, written as soon as a group of folds is trained; of the
+latest, the whole learning state), training/AGENT/FOLD.csv (a row for each training episode) and, at
+the end, returns.csv, weights.csv, summary.json and the report.
+"""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+import numpy as np
+
+from qfolio.core.config import Config, read_config, write_config
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import (
+    read_arrays,
+    read_tree,
+    write_arrays,
+    write_bytes,
+    write_json,
+    write_tree,
+)
+from qfolio.experiments.budget import Budget, seed_range
+from qfolio.experiments.fit import Row
+from qfolio.portfolio.backtest import baselines
+from qfolio.portfolio.prices.table import Prices
+
+# Names become folders.
+AgentName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")]
+
+
+class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
+    """An agent of the backtest, with the settings of its task."""
+
+    agent: str
+    settings: dict[str, Any]
+    task: dict[str, Any]
+    episodes: int
+
+
+class BacktestConfig(Config, frozen=True):
+    """What a backtest is."""
+
+    kind: ClassVar[str] = "backtest"
+    format: ClassVar[int] = 2
+
+    prices: dict[str, Any]
+    assets: list[str]
+    feature_names: list[str]
+    train: str
+    test: str
+    expanding: bool
+    lag: int
+    cost: float
+    cap: float
+    seeds: int
+    seed: int
+    trials: Annotated[int, msgspec.Meta(ge=0, le=10**9)]
+    command: str
+    agents: Annotated[dict[AgentName, AgentConfig], msgspec.Meta(min_length=1)]
+    device: str
+    versions: dict[str, str]
+    started: str
+
+    def __post_init__(self) -> None:
+        seed_range(self.seeds, self.seed)
+        if not {"source", "rows", "first", "last", "digest"} <= self.prices.keys():
+            raise QfolioError("prices is not described.")
+        for name, entry in self.agents.items():
+            Budget(entry.episodes)
+            if name in baselines.BASELINES:
+                raise QfolioError(
+                    f"an agent cannot have the name of the baseline {name}; give it another."
+                )
+
+
+class BacktestFolder:
+    """Reads and writes a backtest's files."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def write(self, config: BacktestConfig, prices: Prices) -> None:
+        """What is there from the start."""
+        write_config(self.path / "config.json", config)
+        arrays = {
+            "dates": prices.dates.astype("datetime64[s]").astype(np.int64),
+            "values": prices.values,
+            "features": prices.features,
+        }
+        write_arrays(self.path / "prices.safetensors", arrays)
+
+    def read_config(self) -> BacktestConfig:
+        """Raises QfolioError where the folder holds no backtest of this version."""
+        return read_config(self.path / "config.json", BacktestConfig)
+
+    def read_prices(self, config: BacktestConfig) -> Prices:
+        """The table; raises QfolioError where it is damaged or not the configuration's."""
+        path = self.path / "prices.safetensors"
+        arrays = read_arrays(path)
+        try:
+            prices = Prices(
+                arrays["dates"].astype("datetime64[s]"),
+                tuple(config.assets),
+                arrays["values"],
+                arrays["features"],
+                tuple(config.feature_names),
+                source=str(config.prices["source"]),
+                note=str(config.prices.get("note", "")),
+            )
+        except (KeyError, ValueError, QfolioError) as error:
+            raise QfolioError(f"{path} is damaged ({error}); restore it or run anew.") from None
+        if prices.digest != config.prices["digest"]:
+            raise QfolioError(f"{path} does not belong to config.json beside it; restore the two.")
+        return prices
+
+    def has_policy(self, agent: str, fold: str) -> bool:
+        return self._policy(agent, fold).exists()
+
+    def write_policy(self, agent: str, fold: str, tree: Any) -> None:
+        write_tree(self._policy(agent, fold), tree)
+
+    def read_policy(self, agent: str, fold: str, template: Any) -> Any:
+        return read_tree(self._policy(agent, fold), template)
+
+    def write_records(self, agent: str, fold: str, rows: Sequence[Row]) -> None:
+        header = list(rows[0]) if rows else []
+        write_bytes(self._records(agent, fold), _csv(header, (row.values() for row in rows)))
+
+    def read_records(self, agent: str, fold: str) -> list[Row]:
+        """The training episodes of a fold; none where their table is missing."""
+        path = self._records(agent, fold)
+        if not path.exists():
+            return []
+        try:
+            table = list(csv.DictReader(path.read_text(errors="replace").splitlines()))
+            return [{name: float(text) for name, text in row.items()} for row in table]
+        except (csv.Error, TypeError, ValueError) as error:
+            raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
+
+    def write_returns(self, days: Sequence[str], columns: dict[str, np.ndarray]) -> None:
+        """returns.csv, a column per strategy and seed."""
+        rows = zip(days, *columns.values(), strict=True)
+        write_bytes(self.path / "returns.csv", _csv(["date", *columns], rows))
+
+    def write_weights(
+        self, days: Sequence[str], assets: Sequence[str], weights: dict[str, np.ndarray]
+    ) -> None:
+        """weights.csv: after each day's trade, cash first, of each strategy."""
+        rows = (
+            (day, name, *row)
+            for name, table in weights.items()
+            for day, row in zip(days, table.round(6), strict=True)
+        )
+        header = ["date", "strategy", "cash", *assets]
+        write_bytes(self.path / "weights.csv", _csv(header, rows))
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        write_json(self.path / "summary.json", summary)
+
+    def _policy(self, agent: str, fold: str) -> Path:
+        return self.path / "policies" / agent / f"{fold}.safetensors"
+
+    def _records(self, agent: str, fold: str) -> Path:
+        return self.path / "training" / agent / f"{fold}.csv"
+
+
+def _csv(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue().encode()

@@ -1,0 +1,74 @@
+"""Training the folds of a backtest: all seeds of some folds are one job."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+from jaxtyping import PyTree
+
+from qfolio.core.mdp import Agent
+from qfolio.core.population import Population
+from qfolio.experiments.budget import Budget
+from qfolio.experiments.fit import Listener, Row, Training, fit
+from qfolio.portfolio.task import Portfolio
+
+
+class TrainedFold(NamedTuple):
+    """What the agents of a fold learned.
+
+    learner: their states, with a leading seed axis. rows: of every training episode, in the order
+    in which they finished.
+    """
+
+    learner: PyTree
+    rows: list[Row]
+
+
+@dataclass(frozen=True)
+class FoldsJob:
+    """Trains all seeds of an agent on some folds, as one population.
+
+    agent_name: of the agent in the backtest. folds: their names. tasks: each fold's part of the
+    table.
+    """
+
+    agent_name: str
+    agent: Agent
+    folds: tuple[str, ...]
+    tasks: tuple[Portfolio, ...]
+    seeds: tuple[int, ...]
+    budget: Budget
+
+    @property
+    def name(self) -> str:
+        return f"{self.agent_name}/{self.folds[0]}"
+
+    def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:
+        """By fold; None where Ctrl-C stopped it."""
+        tasks = [task for task in self.tasks for _ in self.seeds]
+        population = Population(tasks, self.agent, self.seeds * len(self.folds))
+        kept = _RowsByFold(self)
+        training = fit(population, self.budget, [kept, *listeners], config={"job": self.name})
+        if training.interrupted and not training.finished:
+            return None
+        learner = population.fetch().agent
+        count = len(self.seeds)
+        return {
+            fold: TrainedFold(
+                jax.tree.map(lambda x, i=i: x[i * count : (i + 1) * count], learner), kept.rows[i]
+            )
+            for i, fold in enumerate(self.folds)
+        }
+
+
+class _RowsByFold(Listener):
+    """Keeps the training records of each fold."""
+
+    def __init__(self, job: FoldsJob) -> None:
+        self.seeds = len(job.seeds)
+        self.rows: list[list[Row]] = [[] for _ in job.folds]
+
+    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+        for member, row in zip(training.members, rows, strict=True):
+            self.rows[member // self.seeds].append(row)
