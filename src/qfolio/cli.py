@@ -1,18 +1,10 @@
-"""The entry point; jax is imported only by commands that compute."""
+"""The entry point; what is slow to import is imported by the commands that need it."""
 
 import os
 import sys
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-import tyro
-
-from qfolio.commands.comparison import compare
-from qfolio.commands.continual import continual
-from qfolio.commands.portfolio import allocate, backtest, prices
-from qfolio.commands.training import evaluate, train, watch
-from qfolio.commands.tuning import tune
-from qfolio.core.errors import QfolioError
 from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 
 OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
@@ -26,6 +18,15 @@ def main() -> NoReturn:
 
 def run() -> NoReturn:
     """Runs what was typed; errors meant for people become one sentence and exit code 2."""
+    import tyro
+
+    from qfolio.commands.comparison import compare
+    from qfolio.commands.continual import continual
+    from qfolio.commands.portfolio import allocate, backtest, prices
+    from qfolio.commands.training import evaluate, train, watch
+    from qfolio.commands.tuning import tune
+    from qfolio.core.errors import QfolioError
+
     commands: dict[str, Callable[..., Any]] = {
         "backtest": backtest, "allocate": allocate, "prices": prices,
         "train": train, "compare": compare, "evaluate": evaluate, "watch": watch, "tune": tune,
@@ -42,24 +43,24 @@ def run() -> NoReturn:
         finally:
             sys.stdout.flush()  # here, where a broken pipe is expected
     except QfolioError as error:
-        print(f"qfolio: {error}", file=sys.stderr)
-        sys.exit(2)
+        _refuse(str(error))
     except BrokenPipeError:  # such as: qfolio prices table.csv | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads the rest
-        sys.exit(0)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        print(f"qfolio: {where}{error.strerror or error}.", file=sys.stderr)
-        sys.exit(2)
+        _refuse(f"{where}{error.strerror or error}.")
     except MemoryError:
-        print(f"qfolio: {OUT_OF_MEMORY}", file=sys.stderr)
-        sys.exit(2)
+        _refuse(OUT_OF_MEMORY)
     except RuntimeError as error:  # jax's own, which cannot be imported here
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        print(f"qfolio: {OUT_OF_MEMORY}", file=sys.stderr)
-        sys.exit(2)
+        _refuse(OUT_OF_MEMORY)
     except KeyboardInterrupt:
         print("qfolio: interrupted", file=sys.stderr)
         sys.exit(EXIT_CODE)
     sys.exit(0)
+
+
+def _refuse(sentence: str) -> NoReturn:
+    print(f"qfolio: {sentence}", file=sys.stderr)
+    sys.exit(2)

@@ -201,6 +201,30 @@ def test_rows_ahead_of_the_checkpoint_are_dropped(task, agent, tmp_path):
     assert [row["episode"] for row in run.metrics] == [1, 2, 3, 4, 5, 6, 7, 8]
 
 
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "a row lost"])
+def test_a_learning_curve_that_was_damaged(task, agent, tmp_path, damage):
+    """Whole points stay; where there is none, the curve begins again with where the run is."""
+    create(task, agent, tmp_path / "run", seeds=2).train()
+    path = tmp_path / "run" / "evaluation.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    if damage == "missing":
+        path.unlink()
+    else:
+        kept = {
+            "empty": [],
+            "cut": [*lines[:4], lines[4][:5]],
+            "a row lost": [*lines[:3], *lines[4:]],
+        }
+        path.write_text("".join(kept[damage]))
+    run = Run.open(tmp_path / "run")
+    run.train()
+    points = {row["env_steps"] for row in run.evaluations}
+    assert len(run.evaluations) == 2 * len(points)
+    assert len(points) == {"missing": 1, "empty": 1, "cut": 1}.get(
+        damage, (len(lines) - 1) // 2 - 1
+    )
+
+
 @pytest.mark.parametrize(
     "text", ["seed,episode,return\ninf,1,2\n", "seed\n" + "9" * 200_000, "\x00", "a,b\n1\n"]
 )

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
+    from qfolio.experiments.budget import Budget
     from qfolio.experiments.run import Run
     from qfolio.portfolio.allocation import Allocation
     from qfolio.portfolio.backtest.assessment import Assessment
@@ -41,12 +42,18 @@ def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., 
         yield partial(live.update, live.add_task(text, total=total, completed=done))
 
 
-def describe(run: "Run") -> str:
-    config = run.config
+def describe_run(run: "Run", budget: "Budget") -> str:
+    """What is trained on what, and how far where that is more than was asked for."""
+    config, planned = run.config, budget.planned(run.population)
     seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
     return (
         f"{config.agent.upper()} on {config.task} · preset {config.preset or 'none'} · {seeds} · "
         f"{config.device}"
+    ) + (
+        f"\n{budget.amount:,} steps become {planned:,}: {config.agent} takes "
+        f"{run.agent.rollout_steps:,} steps in each of {run.agent.num_envs:,} environments at once."
+        if budget.steps and planned > budget.amount
+        else ""
     )
 
 

@@ -87,8 +87,9 @@ def train(
             )
         else:
             run, folder = Run.open(resume), resume
-        console.say(console.describe(run))
-        _train(run, budget or run.budget, show)
+        budget = budget or run.budget
+        console.say(console.describe_run(run, budget))
+        _train(run, budget, show)
     again = f"qfolio train --resume {folder}"
     if run.interrupted:
         stop(again)

@@ -42,6 +42,12 @@ class Budget:
         """``{"episodes": n}`` or ``{"steps": n}``."""
         return {self.unit: self.amount}
 
+    def planned(self, population: "Population") -> int:
+        """Steps of all environments of a member in the end: whole rollouts, so perhaps more."""
+        length = population.agent.rollout_steps
+        left = -(-self.left(population) // length) * length
+        return (population.steps + left) * population.agent.num_envs
+
     def left(self, population: "Population") -> int:
         """Steps of each environment until every member of a population has done its budget."""
         return population.steps_left(self.episodes, steps=self.steps)

@@ -137,6 +137,8 @@ class Run:
         """
         self.interrupted = False
         budget = budget or self.budget
+        if not self.evaluations and self.population.steps:
+            self.evaluate()  # of a run whose table was lost
         if not budget.left(self.population):
             return
         self.config = msgspec.structs.replace(
@@ -212,7 +214,11 @@ class Run:
         members = zip(self.population.seeds, self.population.member_episodes, strict=True)
         episodes, steps = dict(members), self.done("steps")
         self.metrics = self._folder.rows(METRICS, episodes, steps)
-        self.evaluations = self._folder.rows(EVALUATION, episodes, steps)
+        points: dict[float, list[Row]] = {}
+        for row in self._folder.rows(EVALUATION, episodes, steps):
+            points.setdefault(row["env_steps"], []).append(row)
+        whole = [rows for rows in points.values() if len(rows) == self.config.seeds]
+        self.evaluations = [row for rows in whole for row in rows]
 
     def _snapshot(self) -> dict[str, Any]:
         return {"training": self.population.fetch(), "seconds_train": np.array(self.seconds_train)}

@@ -124,9 +124,8 @@ def greedy_episode(run: Run, task: Pendulum, start: int = EPISODE_START) -> Epis
 
 def _curve(run: Run, label: str) -> Curve:
     seeds = run.config.seeds
-    rows = run.evaluations[: len(run.evaluations) // seeds * seeds]
     table = {
-        name: np.array([row[name] for row in rows]).reshape(-1, seeds)
+        name: np.array([row[name] for row in run.evaluations]).reshape(-1, seeds)
         for name in ("episode", "return", "overestimation")
     }
     return Curve(label, table["episode"].mean(1), table["return"], table["overestimation"])

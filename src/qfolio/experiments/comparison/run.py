@@ -313,7 +313,7 @@ def _result(run: Run) -> Result:
     solution, curve_optimum = run.task.optimum(), None
     if solution is not None:
         curve_optimum = float(solution.returns(start_keys())[: run.population.curve_starts].mean())
-    rows = run.evaluations[: len(run.evaluations) // seeds * seeds]
+    rows = run.evaluations
     members = jax.eval_shape(partial(begin, run.task, run.agent), jnp.uint32(0))
     weights = jax.tree.leaves(jax.eval_shape(run.agent.weights, members.agent))
     at_once = 1 if isinstance(run.population, HostPopulation) else min(len(jax.devices()), seeds)

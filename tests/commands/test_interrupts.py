@@ -1,0 +1,62 @@
+"""Ctrl-C and broken pipes, as a shell sees them."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+TRAIN = ["train", "pendulum", "--no-compare", "--seeds", "2", "--episodes", "100000",
+         "--set", "hidden=8", "num_envs=2", "batch_size=8", "learning_starts=16"]  # fmt: skip
+
+
+def start(folder, **environment):
+    return subprocess.Popen(
+        [sys.executable, "-m", "qfolio", *TRAIN, "--out", str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **environment},
+    )
+
+
+def test_the_first_ctrl_c_stops_after_the_chunk(tmp_path):
+    process = start(tmp_path / "run")
+    for _ in range(3):  # what is trained, the heading, and a first point
+        assert process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    begun = time.perf_counter()
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert out.splitlines()[-1] == f"Stopped. Go on with: qfolio train --resume {tmp_path / 'run'}"
+    assert err == ""
+    assert time.perf_counter() - begun < 10  # two seconds where nobody else computes
+    assert (tmp_path / "run" / "checkpoint.safetensors").exists()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_ctrl_c_while_it_compiles(tmp_path, count):
+    """With an empty cache; no crash at the exit, and nothing more is done."""
+    process = start(tmp_path / "run", QFOLIO_CACHE=str(tmp_path / "cache"))
+    for _ in range(2):  # what is trained, and the heading
+        assert process.stdout.readline()
+    for _ in range(count):
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+    begun = time.perf_counter()
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert err in ("", "qfolio: interrupted\n")
+    if count == 2:
+        assert time.perf_counter() - begun < 5
+
+
+def test_a_reader_that_leaves(tmp_path):
+    """A closed pipe, as ``| head`` leaves it, is no error."""
+    with start(tmp_path / "run") as process:
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.wait(timeout=120) == 0
+        assert process.stderr.read() == ""
