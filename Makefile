@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 NOW := $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: demo test test-fast check format bench bench-gpu clean
+.PHONY: demo test test-all check format bench bench-gpu clean
 
 demo: .venv/installed
 	$(BIN)/qfolio train pendulum --no-compare --out runs/demo-$(NOW)/pendulum
@@ -15,10 +15,11 @@ demo: .venv/installed
 
 # Two processes, each with whole files: most of a test's time is compiling, which keeps one core busy.
 test: .venv/installed-dev
-	$(BIN)/pytest -n 2 --dist loadfile
-
-test-fast: .venv/installed-dev
 	$(BIN)/pytest -n 2 --dist loadfile -m "not slow"
+
+# All tests, also those that learn for long, with programs optimised as users have them.
+test-all: .venv/installed-dev
+	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile
 
 check: .venv/installed-dev
 	$(BIN)/ruff format --check

@@ -1,4 +1,8 @@
-"""Types are checked in every test: shapes by jaxtyping, the rest by beartype."""
+"""Types are checked in every test: shapes by jaxtyping, the rest by beartype.
+
+Compiling takes most of a test's time, so programs are hardly optimised here; ``make test-all`` runs
+them as users do (QFOLIO_TEST_OPTIMIZED=1).
+"""
 
 import os
 from pathlib import Path
@@ -8,13 +12,28 @@ from jaxtyping import install_import_hook
 
 os.environ.setdefault("QFOLIO_CACHE", str(Path(__file__).parents[1] / ".cache"))
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # no window on anybody's screen
+if "QFOLIO_TEST_OPTIMIZED" not in os.environ:
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false".strip()
 
 with install_import_hook("qfolio", "beartype.beartype"):
+    import jax
+
     from qfolio.agents.dqn import DQN
     from qfolio.core import devices
+    from qfolio.core.population import programs_of
     from qfolio.tasks.pendulum import Pendulum
 
 devices.configure()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """Compiled programs of one file do not stay in memory while the next ones run."""
+    yield
+    programs_of.cache_clear()
+    jax.clear_caches()
 
 
 @pytest.fixture
