@@ -10,12 +10,13 @@ import time
 import jax
 import numpy as np
 import pytest
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 import qfolio.core.files
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
+from qfolio.core.files import write_arrays
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.ar1 import Ar1
@@ -297,11 +298,11 @@ def spoil_checkpoint(folder, how):
     elif how == "pickle":
         path.write_bytes(b"\x80\x04cos\nsystem\n(S'touch /tmp/owned'\ntR.")
     elif how == "foreign":
-        save_file({"a": np.zeros(3)}, path)
+        write_arrays(path, {"a": np.zeros(3)})
     elif how == "other shapes":
         arrays = load_file(path)
         arrays["training/steps"] = np.zeros((5,), np.int32)
-        save_file(arrays, path)
+        write_arrays(path, arrays)
 
 
 @pytest.mark.parametrize("how", ["missing", "truncated", "pickle", "foreign", "other shapes"])

@@ -1,15 +1,20 @@
-"""Files that are never half-written and never executed: atomic writes, safetensors, the cache."""
+"""Files that are never half-written and never executed: atomic writes, safetensors, locks."""
 
 import contextlib
+import datetime
+import hashlib
 import json
 import os
-import sys
+import platform
+import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import platformdirs
+from filelock import FileLock, Timeout
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
@@ -23,13 +28,7 @@ def cache_directory() -> Path:
     """Where compiled programs and solved optima are kept; safe to delete at any time."""
     if path := os.environ.get("QFOLIO_CACHE"):
         return Path(path)
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData/Local")
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library/Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "qfolio"
+    return platformdirs.user_cache_path("qfolio", appauthor=False)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -42,8 +41,10 @@ def write_bytes(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)  # a full disk names no file by itself
         raise
 
 
@@ -61,13 +62,50 @@ def new_folder(folder: Path) -> Iterator[Path]:
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    yield temporary
-    mask = os.umask(0)
-    os.umask(mask)
-    temporary.chmod(0o777 & ~mask)  # as the user's new folders are
-    if folder.exists():
-        folder.rmdir()
-    temporary.rename(folder)
+    try:
+        yield temporary
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o777 & ~mask)  # as the user's new folders are
+        if folder.exists():
+            folder.rmdir()
+        temporary.rename(folder)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError):
+            error.filename = str(error.filename or folder).replace(str(temporary), str(folder))
+        raise
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keeps every other process out of a folder, until the block ends or this process does.
+
+    Raises QfolioError where another process holds the folder, and says which.
+    """
+    holder = folder / ".holder"
+    lock = FileLock(folder / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise QfolioError(
+            f"{folder} is in use by {_holder(holder)}; wait until it has finished, or stop it."
+        ) from None
+    try:
+        since = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
+        write_json(holder, {"pid": os.getpid(), "host": platform.node(), "since": since})
+        yield
+    finally:
+        holder.unlink(missing_ok=True)
+        lock.release()
+
+
+def _holder(path: Path) -> str:
+    try:
+        held = read_json(path)
+        return f"process {held['pid']} on {held['host']} since {held['since']}"
+    except (QfolioError, KeyError):  # between taking the lock and signing it
+        return "another process"
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -94,21 +132,43 @@ def require_types(content: dict[str, Any], wanted: dict[str, Any]) -> None:
             raise QfolioError(f"{name} is missing or of the wrong type.")
 
 
-def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Named arrays as safetensors, which hold numbers only and cannot carry code."""
-    write_bytes(path, save({name: np.asarray(a, order="C") for name, a in arrays.items()}))
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Named arrays as safetensors, which hold numbers only and cannot carry code.
+
+    A digest goes with them, so that flipped bits are noticed when they are read.
+    """
+    ordered = {name: np.asarray(a, order="C") for name, a in arrays.items()}
+    write_bytes(path, save(ordered, metadata={"sha256": _digest(ordered)}))
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Raises QfolioError where the file is missing, truncated or not safetensors."""
+    """Raises QfolioError where the file is missing, truncated, changed or not safetensors."""
     try:
-        return load(path.read_bytes())
+        content = path.read_bytes()
+        arrays = load(content)
+        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+        digest = header.get("__metadata__", {}).get("sha256")
     except OSError as error:
         raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
     except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise QfolioError(
             f"{path} is no safetensors file or is damaged ({error}); restore it or train anew."
         ) from None
+    if digest != _digest(arrays):
+        raise QfolioError(
+            f"{path} is damaged: its numbers do not match its digest; restore it or train anew."
+        )
+    return arrays
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """Of names, types, shapes and every bit of arrays."""
+    sha = hashlib.sha256()
+    for name in sorted(arrays):
+        array = arrays[name]
+        sha.update(json.dumps([name, array.dtype.name, array.shape]).encode())
+        sha.update(array.reshape(-1).view(np.uint8).data)
+    return sha.hexdigest()
 
 
 def write_tree(path: Path, tree: Any) -> None:

@@ -1,0 +1,109 @@
+"""Files are whole or absent, damage is noticed, and one process at a time holds a folder."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import (
+    cache_directory,
+    locked,
+    new_folder,
+    read_arrays,
+    write_arrays,
+    write_bytes,
+)
+
+ARRAYS = {"weights": np.arange(6, dtype=np.float32).reshape(2, 3), "steps": np.array(7)}
+
+
+def test_arrays_come_back(tmp_path):
+    write_arrays(tmp_path / "a", ARRAYS | {"none": np.zeros((0, 3)), "flag": np.array(True)})
+    again = read_arrays(tmp_path / "a")
+    assert again["none"].shape == (0, 3)
+    assert again["flag"]
+    for name, array in ARRAYS.items():
+        np.testing.assert_array_equal(again[name], array, strict=True)
+
+
+@pytest.mark.parametrize("place", [-1, -9, -17])
+def test_one_flipped_bit_is_noticed(place, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    write_arrays(path, ARRAYS)
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(QfolioError, match=r"policy\.safetensors is damaged: .* digest"):
+        read_arrays(path)
+
+
+def test_arrays_without_a_digest_are_refused(tmp_path):
+    from safetensors.numpy import save_file
+
+    save_file(ARRAYS, tmp_path / "a")
+    with pytest.raises(QfolioError, match="do not match its digest"):
+        read_arrays(tmp_path / "a")
+
+
+def test_a_folder_that_cannot_be_made_leaves_nothing(tmp_path):
+    with pytest.raises(ZeroDivisionError), new_folder(tmp_path / "run") as folder:
+        write_bytes(folder / "config.json", bytes(1 // 0))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such limits")
+def test_a_file_that_cannot_be_written_is_named(tmp_path):
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with (
+            pytest.raises(OSError, match="File too large") as error,
+            new_folder(tmp_path / "run") as folder,
+        ):
+            write_bytes(folder / "policy", bytes(2000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert error.value.errno == errno.EFBIG
+    assert error.value.filename == str(tmp_path / "run" / "policy")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_named_where_only_the_folder_is_known(tmp_path):
+    with pytest.raises(OSError, match="No space left") as error, new_folder(tmp_path / "run"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert error.value.filename == str(tmp_path / "run")
+
+
+def test_a_lock_says_who_holds_it(tmp_path):
+    hold = "import sys; from pathlib import Path; from qfolio.core.files import locked\n"
+    hold += "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", hold, str(tmp_path)]
+    other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout.readline() == "held\n"
+        host = json.loads((tmp_path / ".holder").read_text())["host"]
+        says = rf"is in use by process {other.pid} on {host} since \d{{4}}-.*; wait until"
+        with pytest.raises(QfolioError, match=says), locked(tmp_path):
+            pass
+    finally:
+        other.kill()
+        other.communicate()
+    with locked(tmp_path):  # a lock ends with its process, however that ends
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+def test_the_cache_lies_where_the_system_keeps_caches(monkeypatch):
+    monkeypatch.setenv("QFOLIO_CACHE", "/somewhere")
+    assert cache_directory() == Path("/somewhere")
+    monkeypatch.delenv("QFOLIO_CACHE")
+    assert cache_directory() == Path(platformdirs.user_cache_dir("qfolio", appauthor=False))
