@@ -298,10 +298,10 @@ def test_a_folder_imports_nothing(tmp_path, monkeypatch):
 
 
 def test_names_and_presets():
-    assert registry.find("task", registry.TASKS, "gym:CartPole-v1") is GymnasiumTask
-    assert registry.name_of(registry.TASKS, task(Delay)) == "gym:TestDelay-v0"
+    assert registry.find("task", "gym:CartPole-v1") is GymnasiumTask
+    assert registry.name_of(task(Delay)) == "gym:TestDelay-v0"
     with pytest.raises(QfolioError, match="gym:CartPole-v1"):
-        registry.find("task", registry.TASKS, "xyz")
+        registry.find("task", "xyz")
     unknown = presets.preset("fast", "gym:TestDelay-v0", "dqn")
     assert unknown.build() == DQN()
     assert settings.build(GymnasiumTask, unknown.task) == task(Delay)

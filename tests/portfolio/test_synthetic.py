@@ -25,7 +25,7 @@ MARKETS = [name for name in TASKS if name.startswith("market/")]
 
 @pytest.fixture(params=MARKETS)
 def market(request):
-    return find("task", TASKS, request.param)(horizon=40)
+    return find("task", request.param)(horizon=40)
 
 
 class Fixed(Agent):

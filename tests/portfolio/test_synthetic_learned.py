@@ -1,7 +1,7 @@
 import pytest
 
 from qfolio.core import settings
-from qfolio.core.registry import TASKS, find
+from qfolio.core.registry import find
 from qfolio.experiments.presets import PRESETS
 from qfolio.experiments.run import Run
 
@@ -12,7 +12,7 @@ MARKETS = [(task, agent) for task, agent in PRESETS if task.startswith("market/"
 @pytest.mark.parametrize(("task", "agent"), MARKETS)
 def test_every_seed_is_within_a_percent_of_the_optimum(task, agent):
     preset = PRESETS[task, agent]["fast"]
-    market = settings.build(find("task", TASKS, task), preset.task)
+    market = settings.build(find("task", task), preset.task)
     run = Run.create(market, preset.build(), episodes=preset.episodes, seeds=2, seed=100)
     run.train()
     result = run.grade()

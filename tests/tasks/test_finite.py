@@ -9,7 +9,7 @@ import pytest
 import qfolio
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
-from qfolio.core.registry import TASKS, find
+from qfolio.core.registry import find
 from qfolio.solvers.finite import (
     finite_horizon,
     policy_evaluation,
@@ -204,7 +204,7 @@ def test_what_is_wrong_with_arrays(changes, message):
 )
 def test_wrong_settings(name, chosen, message):
     with pytest.raises(QfolioError, match=message):
-        settings.build(find("task", TASKS, name), chosen)
+        settings.build(find("task", name), chosen)
 
 
 @pytest.mark.parametrize("discount", [1.0, -0.1])

@@ -265,7 +265,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         if render_mode is not None:
             raise QfolioError(f"render_mode is {render_mode!r}; {name} has none.")
         devices.configure()
-        task: Any = settings.build(find("task", TASKS, name), chosen)
+        task: Any = settings.build(find("task", name), chosen)
         self.task, self._steps = task, task.horizon  # over
         self._there = jax.device_put(task)  # its arrays need not travel at each step
         seen = jax.eval_shape(lambda key: task.observe(task.reset(key)), jax.random.key(0))

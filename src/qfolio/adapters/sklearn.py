@@ -14,7 +14,7 @@ from skfolio.optimization import BaseOptimization
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.registry import AGENTS, find
+from qfolio.core.registry import find
 from qfolio.core.settings import names
 from qfolio.experiments import presets
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
@@ -233,7 +233,7 @@ class PortfolioPolicy(BaseOptimization):
         changes = dict(self.settings or {})
         for name in changes.keys() & set(OWN):
             raise QfolioError(f"{name} is a parameter of its own; leave it out of settings.")
-        mine = names(find("agent", AGENTS, chosen.agent))
+        mine = names(find("agent", chosen.agent))
         of_agent = {name: value for name, value in changes.items() if name in mine}
         of_task = {name: value for name, value in changes.items() if name not in mine}
         window = {} if self.window is None else {"window": self.window}

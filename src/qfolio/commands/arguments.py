@@ -6,6 +6,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.registry import own_modules
 from qfolio.experiments.budget import Budget
 
 Name = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
@@ -13,6 +14,7 @@ Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
 Folder = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 Names = Annotated[tuple[str, ...], arg(metavar="NAME …", help_behavior_hint="")]
+Modules = Annotated[tuple[str, ...], arg(metavar="MODULE …", help_behavior_hint="")]
 Assignments = Annotated[
     tuple[str, ...], arg(name="set", metavar="NAME=VALUE …", help_behavior_hint="")
 ]
@@ -23,3 +25,12 @@ def budget_of(episodes: int | None, steps: int | None) -> Budget | None:
     if episodes is not None and steps is not None:
         raise QfolioError("--episodes and --steps both say how far to train; give one of them.")
     return None if episodes is None and steps is None else Budget(episodes, steps)
+
+
+def again(command: str, folder: Path, *parts: object) -> str:
+    """The command line that goes on with a folder.
+
+    parts: its tasks and agents; the modules of a user's own must be trusted anew.
+    """
+    modules = own_modules(*parts)
+    return " ".join([command, str(folder), *(["--trust", *modules] if modules else [])])

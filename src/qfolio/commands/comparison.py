@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Count, Folder, Name, budget_of
+from qfolio.commands.arguments import Count, Folder, Modules, Name, again, budget_of
+from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
@@ -28,13 +29,15 @@ def compare(
     seed: Count = None,
     out: Folder = None,
     resume: Folder = None,
+    trust: Modules = (),
 ) -> None:
     """Train several agents on one task, with the same seeds, and write a report that compares them.
 
     Args:
         task: What to learn; pendulum otherwise.
         agents: Which, with commas between, each with a preset behind a colon if it is not
-            --preset: dqn,pathwise or dqn:fast,dqn:report.
+            --preset: dqn,pathwise or dqn:fast,dqn:report. Your own are module:Name or
+            module:Name:PRESET.
         preset: Of agents that name none: fast if there is one, or the first.
         episodes: Training episodes of each agent's seeds; the presets say how many otherwise.
         steps: Environment steps of each agent's seeds, instead of episodes.
@@ -42,6 +45,7 @@ def compare(
         seed: The first one, 0 unless given.
         out: A new folder; runs/… otherwise.
         resume: Go on with the comparison in this folder.
+        trust: Modules of your own code that the folder may name (default: none).
     """
     given = (task, agents, preset, episodes, steps, seeds, seed, out)
     if resume is not None and any(option is not None for option in given):
@@ -50,6 +54,7 @@ def compare(
     from qfolio.core import devices
 
     devices.configure()
+    registry.trust(trust)
     from qfolio.commands import console
     from qfolio.commands.progress import stop
     from qfolio.experiments.comparison.run import Comparison
@@ -78,7 +83,8 @@ def compare(
     )
     _train(run)
     if run.interrupted:
-        stop(f"qfolio compare --resume {run.folder}")
+        parts = [part for one in run.entrants.values() for part in (one.task, one.agent)]
+        stop(again("qfolio compare --resume", run.folder, *parts))
     _finish(run)
 
 
@@ -86,32 +92,39 @@ def _entrants(
     task: str, agents: str, preset: str | None, budget: "Budget | None"
 ) -> "dict[str, Entrant]":
     """The agents that ``--agents`` names, by what it calls them."""
-    from qfolio.core import registry, settings
+    from qfolio.core import settings
     from qfolio.experiments import presets
     from qfolio.experiments.comparison.run import Entrant
 
-    task_class = registry.find("task", registry.TASKS, task)
+    task_class = registry.find("task", task)
     entrants: dict[str, Entrant] = {}
     chosen: dict[tuple[str, str], str] = {}
     for entry in filter(None, map(str.strip, agents.split(","))):
-        agent, colon, own = entry.partition(":")
-        registry.find("agent", registry.AGENTS, agent)
+        agent, own = _parts(entry)
+        registry.find("agent", agent)
         known = presets.presets_of(task, agent)
         default = "fast" if "fast" in known else next(iter(known), "fast")
-        name = own if colon else preset or default
+        name = own or preset or default
         if twin := chosen.get((agent, name)):
             raise QfolioError(
                 f"--agents names {agent} with the preset {name} twice: {twin}, {entry}."
             )
         chosen[agent, name] = entry
         settled = presets.preset(name, task, agent)
-        entrants[entry] = Entrant(
+        entrants[":".join(filter(None, (registry.short(agent), own)))] = Entrant(
             settings.build(task_class, settled.task),
             settled.build(),
             name,
             budget or settled.budget,
         )
     return entrants
+
+
+def _parts(entry: str) -> tuple[str, str]:
+    """An agent and its preset, "" where it names none: dqn:fast, module:Name:fast."""
+    parts = entry.split(":")
+    count = 1 if registry.is_known("agent", parts[0]) else 2
+    return ":".join(parts[:count]), ":".join(parts[count:])
 
 
 def _train(run: "Comparison") -> None:

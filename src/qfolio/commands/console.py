@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from qfolio.core.registry import short
+
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
     from qfolio.experiments.run import Run
@@ -47,10 +49,10 @@ def describe_run(run: "Run", budget: "Budget") -> str:
     config, planned = run.config, budget.planned(run.population)
     seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
     return (
-        f"{config.agent.upper()} on {config.task} · preset {config.preset or 'none'} · {seeds} · "
-        f"{config.device}"
+        f"{short(config.agent).upper()} on {config.task} · preset {config.preset or 'none'} · "
+        f"{seeds} · {config.device}"
     ) + (
-        f"\n{budget.amount:,} steps become {planned:,}: {config.agent} takes "
+        f"\n{budget.amount:,} steps become {planned:,}: {short(config.agent)} takes "
         f"{run.agent.rollout_steps:,} steps in each of {run.agent.num_envs:,} environments at once."
         if budget.steps and planned > budget.amount
         else ""

@@ -1,6 +1,7 @@
 """The command that changes a task after training, and compares ways to go on."""
 
 import datetime
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -8,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Name
-from qfolio.core import settings
+from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name
+from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def continual(
     assignments: Assignments = (),
     out: Folder = None,
     resume: Folder = None,
+    trust: Modules = (),
 ) -> None:
     """Change a task after training and compare ways to go on: how soon each recovers, at what cost.
 
@@ -51,6 +53,7 @@ def continual(
         assignments: Hyperparameters, and the task's settings before the change.
         out: A new folder for the report; runs/… otherwise.
         resume: Go on in this folder; only what was under way when it was stopped is done again.
+        trust: Modules of your own code that the folder may name (default: none).
     """
     given = (task, agent, preset, episodes, seeds, seed, rate, renewal, epsilon, out)
     if resume is not None and (
@@ -60,6 +63,7 @@ def continual(
     from qfolio.core import devices
 
     devices.configure()
+    registry.trust(trust)
     from qfolio.commands import console
     from qfolio.commands.progress import BarProgress, stop
     from qfolio.experiments import continual, presets
@@ -72,7 +76,7 @@ def continual(
         options: dict[str, Any] = {k: x for k, x in shares.items() if x is not None}
         options |= {} if seed is None else {"seed": seed}
         plan = _plan(task, change, agent, preset, episodes, seeds, assignments, options)
-        name = f"{task.replace('/', '-')}-continual-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+        name = f"{re.sub('[/:]', '-', task)}-continual-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         folder = out or Path("runs") / name
         continual.create(plan, folder, shlex.join(["qfolio", *sys.argv[1:]]))
     else:
@@ -97,12 +101,11 @@ def _plan(
     assignments: tuple[str, ...],
     options: dict[str, Any],
 ) -> "Plan":
-    from qfolio.core import registry
     from qfolio.experiments import presets
     from qfolio.experiments.continual import Plan
 
-    task_class = registry.find("task", registry.TASKS, task_name)
-    registry.find("agent", registry.AGENTS, agent_name)
+    task_class = registry.find("task", task_name)
+    registry.find("agent", agent_name)
     preset = presets.preset(preset_name, task_name, agent_name)
     if not change:
         raise QfolioError("--change says what becomes of the task, for example --change mass=2.")

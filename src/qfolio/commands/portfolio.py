@@ -10,8 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Assignments, Count, File, Folder, Name, Names
-from qfolio.core import settings
+from qfolio.commands.arguments import (
+    Assignments,
+    Count,
+    File,
+    Folder,
+    Modules,
+    Name,
+    Names,
+    again,
+)
+from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
@@ -71,6 +80,7 @@ def backtest(
     assignments: Assignments = (),
     out: Folder = None,
     resume: Folder = None,
+    trust: Modules = (),
     missing: Missing = "error",
     late: Late = "error",
     features: Names = (),
@@ -81,7 +91,7 @@ def backtest(
     Args:
         file: CSV or Parquet with prices (qfolio prices checks it); the 20 US stocks that come with
             qfolio if none is given.
-        agents: Which, with commas between: dqn, pathwise.
+        agents: Which, with commas between: dqn, pathwise, or your own as module:Name.
         preset: fast (the default).
         cost_bps: Cost of buying or selling, in basis points of what is traded.
         lag: Rows between the close that a decision sees and the close at which it trades.
@@ -97,6 +107,7 @@ def backtest(
             them (dqn.discount=0.9), or of the task (window=20 reward=crra).
         out: A new folder; runs/… otherwise.
         resume: Go on with the backtest in this folder.
+        trust: Modules of your own code that the folder may name (default: none).
         missing: What becomes of a missing price.
         late: What becomes of assets that start later than others.
         features: Columns of further numbers that agents may see.
@@ -106,6 +117,7 @@ def backtest(
     from qfolio.core import devices
 
     devices.configure()
+    registry.trust(trust)
     from qfolio.commands import console
     from qfolio.commands.progress import BacktestProgress, stop
     from qfolio.portfolio.backtest.run import Backtest
@@ -115,7 +127,7 @@ def backtest(
         raise QfolioError(f"--cost-bps is {cost_bps:g}; it must be from 0 to 2000.")
     if resume is None:
         table = load(file, missing=missing, late=late, features=features, date=date)
-        chosen = {name: _preset(name, preset, episodes) for name in _split(agents)}
+        chosen = {name: _preset(agent, preset, episodes) for name, agent in _split(agents).items()}
         chosen = _assign(chosen, settings.parse(assignments))
         folder = out or Path("runs") / f"backtest-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         run = Backtest.create(
@@ -135,14 +147,15 @@ def backtest(
         )
     else:
         defaults = inspect.signature(backtest).parameters
-        if any(options[name] != p.default for name, p in defaults.items() if name != "resume"):
+        kept = defaults.keys() - {"resume", "trust"}
+        if any(options[name] != defaults[name].default for name in kept):
             raise QfolioError("--resume keeps what the backtest was started with; add nothing.")
         run, folder = Backtest.open(resume), resume
     console.say(console.describe_backtest(run))
     with console.bar("compiling") as update:
         run.run(BacktestProgress(update))
     if run.interrupted:
-        stop(f"qfolio backtest --resume {folder}")
+        stop(again("qfolio backtest --resume", folder, *run.agents.values()))
     _report(run, folder)
 
 
@@ -156,6 +169,7 @@ def allocate(
     whole_shares: bool = False,
     as_of: Annotated[str | None, arg(metavar="DATE", help_behavior_hint="")] = None,
     update: bool = False,
+    trust: Modules = (),
     missing: Missing = "error",
     features: Names = (),
     date: Name = None,
@@ -175,6 +189,7 @@ def allocate(
         as_of: The day for which weights are wanted (today otherwise); prices may be at most a week
             older.
         update: Go on learning from the new rows before answering, and keep what was learned.
+        trust: Modules of your own code that the folder may name (default: none).
         missing: What becomes of a missing price.
         features: Columns of further numbers; those of the backtest otherwise.
         date: The column of dates, where its name does not tell.
@@ -183,6 +198,7 @@ def allocate(
     from qfolio.core import devices
 
     devices.configure()
+    registry.trust(trust)
     from qfolio.commands import console
     from qfolio.portfolio.allocation import Allocation, read_holdings, require_fresh
     from qfolio.portfolio.backtest.run import Backtest
@@ -209,18 +225,19 @@ def allocate(
         run.keep(agent, policy)
 
 
-def _split(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    if len(set(names)) < len(names):
+def _split(text: str) -> dict[str, str]:
+    """The agents that ``--agents`` names, by what the backtest calls them."""
+    agents = [name.strip() for name in text.split(",") if name.strip()]
+    names = {registry.short(agent): agent for agent in agents}
+    if len(names) < len(agents):
         raise QfolioError(f"--agents {text} names an agent twice.")
     return names
 
 
 def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
-    from qfolio.core import registry
     from qfolio.experiments import presets
 
-    registry.find("agent", registry.AGENTS, name)
+    registry.find("agent", name)
     chosen = presets.preset(preset, "portfolio", name)
     return chosen if episodes is None else chosen._replace(episodes=episodes)
 
@@ -228,13 +245,12 @@ def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
 def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
     """Presets with settings changed: of one agent (dqn.discount), of all that have it, or the
     task's."""
-    from qfolio.core import registry
     from qfolio.portfolio.task import Portfolio
 
     used = set()
     changed = {}
     for name, preset in presets.items():
-        kind = registry.find("agent", registry.AGENTS, preset.agent)
+        kind = registry.find("agent", preset.agent)
         own, task = {}, {}
         for key, value in chosen.items():
             who, dot, rest = key.rpartition(".")

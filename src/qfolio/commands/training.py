@@ -11,8 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Name, budget_of
-from qfolio.core import settings
+from qfolio.commands.arguments import (
+    Assignments,
+    Count,
+    Folder,
+    Modules,
+    Name,
+    again,
+    budget_of,
+)
+from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
@@ -32,6 +40,7 @@ def train(
     out: Folder = None,
     assignments: Assignments = (),
     resume: Folder = None,
+    trust: Modules = (),
     compare: bool = True,
     live: bool = False,
 ) -> None:
@@ -42,10 +51,10 @@ def train(
             process: finite/cliff, finite/frozen-lake, finite/random; a market with a known optimum:
             market/kelly, market/merton, market/regime, market/ar1, market/no-trade,
             market/garleanu-pedersen; or any environment of Gymnasium by its ID, such as
-            gym:CartPole-v1.
+            gym:CartPole-v1; or a task of your own as module:Name.
         agent: Which algorithm: dqn, reinforce, a2c, ppo, ddpg, td3, sac, mbpo; where states are
-            numbered, q-learning, sarsa, expected-sarsa, double-q, dyna-q; in markets pathwise.
-            Without, the first that has presets for the task.
+            numbered, q-learning, sarsa, expected-sarsa, double-q, dyna-q; in markets pathwise; or
+            your own as module:Name. Without, the first that has presets for the task.
         preset: fast (the default); of dqn on the pendulum also best, categorical, rainbow, and
             report (the run that qfolio grew out of).
         episodes: Training episodes of each agent; the preset says how many otherwise. Those of
@@ -57,6 +66,7 @@ def train(
         assignments: Hyperparameters, for example --set discount=0.98 hidden=256,256 (the settings
             of a report and docs/dqn.md list them).
         resume: Go on with the run in this folder, up to --episodes or --steps if given.
+        trust: Modules of your own code that the folder may name (default: none).
         compare: Train two more agents with one thing changed, for the report (DQN: double DQN; in
             markets, one action at a time instead of all at once).
         live: Show an episode in a window now and then, while training.
@@ -64,6 +74,7 @@ def train(
     from qfolio.core import devices
 
     devices.configure()
+    registry.trust(trust)
     from qfolio.commands import console
     from qfolio.commands.progress import stop
     from qfolio.experiments import presets
@@ -77,7 +88,7 @@ def train(
             task, preset = task or "pendulum", preset or "fast"
             agent = agent or presets.default_agent(task)
             now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
-            name = f"{re.sub('[/:]', '-', task)}-{agent}-{preset}-{now}"
+            name = f"{re.sub('[/:]', '-', task)}-{registry.short(agent)}-{preset}-{now}"
             folder = out or Path("runs") / name
             chosen = settings.parse(assignments)
             run = _new_run(task, agent, preset, budget, seeds, seed or 0, folder, chosen)
@@ -90,14 +101,13 @@ def train(
         budget = budget or run.budget
         console.say(console.describe_run(run, budget))
         _train(run, budget, show)
-    again = f"qfolio train --resume {folder}"
     if run.interrupted:
-        stop(again)
+        stop(_resume(run, folder))
     contrast = None
     if compare:
         contrast = _contrast(run, folder)
     if contrast is not None and contrast.interrupted:
-        stop(again)
+        stop(_resume(run, folder))
     _finish(run, folder, contrast)
 
 
@@ -105,6 +115,7 @@ def evaluate(
     folder: Positional[Path],
     *,
     episodes: Count = None,
+    trust: Modules = (),
     as_json: Annotated[bool, arg(name="json")] = False,
 ) -> None:
     """Grade a run's greedy policies from fixed start states against the optimum.
@@ -113,6 +124,7 @@ def evaluate(
         folder: A run folder.
         episodes: Start states, the same for every run and every agent; 1,024 unless given, and 100
             where Gymnasium steps the environment.
+        trust: Modules of your own code that the folder may name (default: none).
         as_json: Print JSON instead of a table.
     """
     if episodes is not None and episodes < 1:
@@ -120,6 +132,7 @@ def evaluate(
     from qfolio.core import devices
 
     devices.configure()
+    registry.trust(trust)
     from qfolio.experiments.run import Run
 
     run = Run.open(folder)
@@ -133,12 +146,13 @@ def evaluate(
         print_result(run.population.seeds, result)
 
 
-def watch(folder: Positional[Path], *, episodes: int = 3) -> None:
+def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -> None:
     """Show a run's first agent in a window; without a display, write episode.gif.
 
     Args:
         folder: A run folder.
         episodes: Episodes to show in the window.
+        trust: Modules of your own code that the folder may name (default: none).
     """
     from qfolio.commands.window import Window, has_display
     from qfolio.core import devices
@@ -146,6 +160,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3) -> None:
     if episodes < 1:
         raise QfolioError(f"--episodes is {episodes}; it must be at least 1.")
     devices.configure()
+    registry.trust(trust)
     from qfolio.core.evaluation import STARTS
     from qfolio.experiments.run import Run
     from qfolio.report.animation import pendulum_gif
@@ -179,12 +194,11 @@ def _new_run(
     folder: Path,
     chosen: dict[str, str],
 ) -> "Run":
-    from qfolio.core import registry
     from qfolio.experiments import presets
     from qfolio.experiments.run import Run
 
-    task_class = registry.find("task", registry.TASKS, task_name)
-    registry.find("agent", registry.AGENTS, agent_name)
+    task_class = registry.find("task", task_name)
+    registry.find("agent", agent_name)
     preset = presets.preset(preset_name, task_name, agent_name)
     task_settings = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
     return Run.create(
@@ -260,12 +274,17 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
     say(f"Report: {folder / 'report.html'}")
 
 
+def _resume(run: "Run", folder: Path | None) -> str:
+    assert folder is not None
+    return again("qfolio train --resume", folder, run.task, run.agent)
+
+
 def _command(run: "Run") -> str:
     """The command line that repeats a run, and the one that goes on with it."""
     from qfolio.experiments.presets import preset, presets_of
 
     config = run.config
-    resume = f"qfolio train --resume {run.folder}"
+    resume = _resume(run, run.folder)
     known = presets_of(config.task, config.agent)
     if not known:
         return resume

@@ -4,14 +4,13 @@ import datetime
 import math
 import re
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Name
-from qfolio.core import settings
+from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, again
+from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
@@ -34,6 +33,7 @@ def tune(
     assignments: Assignments = (),
     out: Folder = None,
     join: Folder = None,
+    trust: Modules = (),
 ) -> None:
     """Search an agent's hyperparameters, many at once, and report how much each matters.
 
@@ -55,12 +55,15 @@ def tune(
         out: A new folder for the search; runs/… otherwise.
         join: Work on the search in this folder, beside other processes or after them; with
             --trials, up to a new number of trials.
+        trust: Modules of your own code that the folder may name (default: none).
     """
     from qfolio.core import devices
 
     devices.configure()
+    registry.trust(trust)
     tuning = _tuning()
     from qfolio.commands import console
+    from qfolio.commands.progress import stop
     from qfolio.experiments import presets
 
     given: list[Any] = [task, agent, preset, seeds, episodes, steps, out]
@@ -81,8 +84,7 @@ def tune(
     console.say(_describe(work))
     _run(work)
     if work.interrupted:
-        console.say(f"Stopped. Go on with: qfolio tune --join {work.folder}")
-        sys.exit(130)
+        stop(_join(work))
     if count := work.journal.in_hand():
         console.say(
             f"Other processes have {count} trials in hand; the last to finish writes the report."
@@ -115,14 +117,13 @@ def _new(
     assignments: tuple[str, ...],
     out: Path | None,
 ) -> "Tuning":
-    from qfolio.core import registry
     from qfolio.experiments import presets
     from qfolio.experiments.budget import Budget
     from qfolio.experiments.tuning import search
     from qfolio.experiments.tuning.run import Tuning
 
-    task_class = registry.find("task", registry.TASKS, task_name)
-    agent_class = registry.find("agent", registry.AGENTS, agent_name)
+    task_class = registry.find("task", task_name)
+    agent_class = registry.find("agent", agent_name)
     preset = presets.preset(preset_name, task_name, agent_name)
     chosen = settings.parse(assignments)
     task_settings = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
@@ -137,7 +138,7 @@ def _new(
         scheduled = {"learning_rate_steps": round(updates, 1)}
     agent = preset.build(**{**scheduled, **chosen})
     now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    name = f"tune-{re.sub('[/:]', '-', task_name)}-{agent_name}-{now}"
+    name = f"tune-{re.sub('[/:]', '-', task_name)}-{registry.short(agent_name)}-{now}"
     return Tuning.create(
         settings.build(task_class, {**preset.task, **task_settings}),
         agent,
@@ -152,12 +153,17 @@ def _new(
     )
 
 
+def _join(work: "Tuning") -> str:
+    return again("qfolio tune --join", work.folder, work.task, work.agent)
+
+
 def _describe(work: "Tuning") -> str:
     config = work.config
     seeds = f"{config['seeds']} seed" + "s" * (config["seeds"] > 1)
     space = "\n".join(f"  {dim.name:<20} {dim}  ({dim.scale})" for dim in work.space)
+    agent = registry.short(config["agent"]).upper()
     return (
-        f"{config['agent'].upper()} on {config['task']} · preset {config['preset']} · "
+        f"{agent} on {config['task']} · preset {config['preset']} · "
         f"{config['trials']} trials × {seeds} · {far(work)} · "
         f"{config['device']}\n{space}"
     )
@@ -222,4 +228,4 @@ def command(work: "Tuning", values: dict[str, Any]) -> str:
     ((unit, amount),) = work.budget.items()
     words += [config["preset"], f"--{unit}", str(amount)]
     words += ["--set", *map(shlex.quote, written(changed))] if changed else []
-    return f"{' '.join(words)}\nqfolio tune --join {work.folder}"
+    return f"{' '.join(words)}\n{_join(work)}"

@@ -1,9 +1,23 @@
-"""Tasks and agents by name; their modules are imported only when asked for."""
+"""Tasks and agents by name: qfolio's, those of installed packages, and a user's own.
+
+A user's own class is named ``module:Name``; the module may lie in the current directory. An
+installed package offers its classes as entry points in the groups ``qfolio.tasks`` and
+``qfolio.agents``. What a person types is imported (``find``). A folder keeps the names, too, but a
+file may come from a stranger: only modules that have been imported already count there (``build``).
+"""
 
 import difflib
+import os
+import sys
+from collections.abc import Iterable, Mapping
 from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
 
-from qfolio.core.errors import QfolioError
+from qfolio.core import settings
+from qfolio.core.errors import QfolioError, told
 
 TASKS = {
     "pendulum": "qfolio.tasks.pendulum:Pendulum",
@@ -37,33 +51,154 @@ AGENTS = {
     "ppo": "qfolio.agents.ppo:PPO",
 }
 
+Kind = Literal["task", "agent"]
+
+
+class Entries(NamedTuple):
+    """The classes of one kind."""
+
+    table: dict[str, str]  # qfolio's own: where each name is defined
+    base: str  # what each class inherits from
+
+    def where(self, kind: Kind) -> dict[str, str]:
+        """Where each name is defined, those of installed packages included."""
+        installed = entry_points(group=f"qfolio.{kind}s")
+        return {point.name: f"{point.module}:{point.attr}" for point in installed} | self.table
+
+
+ENTRIES: dict[Kind, Entries] = {
+    "task": Entries(TASKS, "qfolio.core.mdp:Task"),
+    "agent": Entries(AGENTS, "qfolio.core.mdp:Agent"),
+}
+
 GYM = "gym:"
 """What begins the name of a task that is an environment of Gymnasium; its ID follows."""
-
-_ANY = {"task": " and any environment of Gymnasium, such as gym:CartPole-v1"}
 
 _GYMNASIUM = "qfolio.tasks.gymnasium:GymnasiumTask"
 
 
-def find(kind: str, table: dict[str, str], name: str) -> type:
-    """The class registered under ``name``; ``kind`` is what the message calls it."""
-    if table is TASKS and name.startswith(GYM):
-        table = {name: _GYMNASIUM}
-    if name not in table:
-        close = difflib.get_close_matches(name, table, n=1)
-        hint = (
-            f"did you mean {close[0]}?"
-            if close
-            else f"there is {', '.join(table)}{_ANY.get(kind, '')}."
+def is_known(kind: Kind, name: str) -> bool:
+    """Whether qfolio or an installed package has something under this name."""
+    return _where(kind, name) is not None
+
+
+def find(kind: Kind, name: str) -> type[Any]:
+    """The class that a person names; imports its module, from the current directory, too.
+
+    Raises QfolioError where there is none, or where it is not of that kind.
+    """
+    where = _where(kind, name)
+    module, _, attribute = (where or name).partition(":")
+    if not attribute or (where is None and not _exists(module)):
+        raise _unknown(kind, name)
+    found = getattr(import_own(module), attribute, None)
+    home, _, base = ENTRIES[kind].base.partition(":")
+    if not (isinstance(found, type) and issubclass(found, getattr(import_module(home), base))):
+        raise QfolioError(
+            f"there is no {kind} {name!r}: {module} has no class {attribute} that inherits from "
+            f"{home}.{base}."
         )
-        raise QfolioError(f"there is no {kind} {name!r}; {hint}")
-    module, _, attribute = table[name].partition(":")
-    return getattr(import_module(module), attribute)
+    missing = {*getattr(found, "__abstractmethods__", ()), *getattr(found, "__abstractvars__", ())}
+    if missing:
+        raise QfolioError(
+            f"the {kind} {name} is not complete: it lacks {', '.join(sorted(missing))}."
+        )
+    return found
 
 
-def name_of(table: dict[str, str], instance: object) -> str:
-    """The registered name of an object's class, or the class's own name."""
+def build(kind: Kind, name: str, chosen: Mapping[str, Any]) -> Any:
+    """The object that a folder names, with its settings.
+
+    Raises QfolioError where that would import a module which nobody but the folder has named.
+    """
+    where = _where(kind, name)
+    if where == _GYMNASIUM:
+        module = str(chosen.get("id", "")).rpartition(":")[0]
+    else:
+        module = name.rpartition(":")[0] if where is None else ""
+    if module and module not in sys.modules and not module.startswith("qfolio."):
+        raise QfolioError(
+            f"the {kind} {name} is code of the module {module}, which is not run because a folder "
+            f"names it; if you trust it, add --trust {module} (in Python, import it first)."
+        )
+    found = find(kind, name)
+    try:
+        return settings.build(found, chosen)
+    except TypeError as error:
+        raise QfolioError(
+            f"the {kind} {name} cannot be made from the folder's settings alone ({error}); make it "
+            "in Python and pass it when opening the folder."
+        ) from None
+
+
+def name_of(instance: object) -> str:
+    """The name that ``find`` and ``build`` know an object's class by."""
     path = f"{type(instance).__module__}:{type(instance).__qualname__}"
     if path == _GYMNASIUM:
         return GYM + instance.id  # type: ignore[attr-defined]
-    return next((name for name, where in table.items() if where == path), type(instance).__name__)
+    tables = (entries.where(kind) for kind, entries in ENTRIES.items())
+    return next((name for table in tables for name, where in table.items() if where == path), path)
+
+
+def short(name: str) -> str:
+    """What to call it in a table or a folder's name: ``Name`` of ``module:Name``."""
+    return name if name.startswith(GYM) else name.rpartition(":")[2]
+
+
+def own_modules(*instances: object) -> list[str]:
+    """The modules that ``build`` needs somebody to trust, to make these again."""
+    names = [name_of(instance).removeprefix(GYM) for instance in instances]
+    modules = [name.rpartition(":")[0] for name in names]
+    return sorted({name for name in modules if name and not name.startswith("qfolio.")})
+
+
+def trust(modules: Iterable[str]) -> None:
+    """Imports modules whose code folders may then name."""
+    for module in modules:
+        import_own(module)
+
+
+def import_own(module: str) -> ModuleType:
+    """Imports a module that a person has named, from the current directory, too."""
+    if not _exists(module):
+        raise QfolioError(
+            f"{module} cannot be imported: it is neither installed nor in this folder."
+        )
+    try:
+        return import_module(module)
+    except Exception as error:
+        raise QfolioError(f"{module} cannot be imported: {told(error)}.") from error
+
+
+def _where(kind: Kind, name: str) -> str | None:
+    """Where a name is defined that qfolio or an installed package has."""
+    if kind == "task" and name.startswith(GYM):
+        return _GYMNASIUM
+    entries = ENTRIES[kind]
+    return entries.table.get(name) or entries.where(kind).get(name)
+
+
+def _unknown(kind: Kind, name: str) -> QfolioError:
+    table = ENTRIES[kind].where(kind)
+    first, colon, _ = name.partition(":")
+    if close := difflib.get_close_matches(first, table, n=1):
+        hint = f"did you mean {close[0]}?"
+    elif colon:
+        hint = f"a module {first} is neither installed nor in this folder."
+    else:
+        gym = ", any environment of Gymnasium, such as gym:CartPole-v1," if kind == "task" else ""
+        hint = f"there is {', '.join(table)}{gym} and your own as module:Name."
+    return QfolioError(f"there is no {kind} {name!r}; {hint}")
+
+
+def _exists(module: str) -> bool:
+    """Whether there is such a module, installed or in the current directory."""
+    here = os.getcwd()
+    if here not in sys.path and "" not in sys.path:
+        sys.path.append(here)  # last, so that a file here stands in for no library
+    try:
+        return module in sys.modules or find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+    except Exception:  # of a package around it, which importing will show
+        return True

@@ -23,7 +23,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import new_folder, read_json, read_tree, write_json, write_tree
 from qfolio.core.mdp import Agent, View
 from qfolio.core.population import Population
-from qfolio.core.registry import AGENTS, find, name_of
+from qfolio.core.registry import build, name_of
 from qfolio.core.training import episode_steps
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Listener, fit
@@ -280,7 +280,7 @@ class Policy:
                 {
                     "format": FORMAT,
                     "kind": "policy",
-                    "agent": name_of(AGENTS, self.agent),
+                    "agent": name_of(self.agent),
                     "settings": settings.describe(self.agent),
                     "task": settings.describe(self.task),
                     "assets": list(self.assets),
@@ -305,8 +305,7 @@ class Policy:
         if config.get("format") != FORMAT or config.get("kind") != "policy":
             raise QfolioError(f"{folder} holds no policy of this version.")
         try:
-            kind = find("agent", AGENTS, config["agent"])
-            agent: Agent = settings.build(kind, config["settings"])
+            agent: Agent = build("agent", config["agent"], config["settings"])
             chosen = settings.convert(Portfolio, config["task"])
             assets, features = tuple(config["assets"]), tuple(config["features"])
             seeds, rows, updates = (int(config[name]) for name in ("seeds", "rows", "updates"))

@@ -22,7 +22,7 @@ from qfolio.portfolio.synthetic.base import OneAsset, Synthetic
 from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
-from qfolio.report.words import AGENTS, words_of
+from qfolio.report.words import agent_name, words_of
 from qfolio.solvers.followed import FollowedOptimum
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 
@@ -50,7 +50,7 @@ def report_data(
     names = ("greedy return", "") if variant is None else (variant.name, variant.variant_name)
     agent, task = summary["agent"], summary["task"]
     return ReportData(
-        title=f"{AGENTS.get(agent, agent)} {words_of(task).where}",
+        title=f"{agent_name(agent)} {words_of(task).where}",
         command=command,
         summary=summary,
         config=msgspec.to_builtins(run.config),

@@ -21,7 +21,7 @@ from qfolio.report import palette
 from qfolio.report.data import decimals
 from qfolio.report.figures.style import LEAD, NARROW, WIDE, new_figure, save_png, svgs
 from qfolio.report.rendering import THIN_SPACE, counted, number, percent, render, setting_groups
-from qfolio.report.words import AGENTS, words_of
+from qfolio.report.words import agent_name, words_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,7 +62,7 @@ class Sweep:
     @property
     def title(self) -> str:
         agent, task = self.config["agent"], self.config["task"]
-        return f"Hyperparameters of {AGENTS.get(agent, agent)} {words_of(task).where}"
+        return f"Hyperparameters of {agent_name(agent)} {words_of(task).where}"
 
     @property
     def verdicts(self) -> list[str]:

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from qfolio.core.registry import GYM
+from qfolio.core.registry import GYM, short
 
 
 class Words(NamedTuple):
@@ -92,5 +92,9 @@ AGENTS = {
 
 def words_of(task: str) -> Words:
     """What the report says of a task; of one that is not registered, its name alone."""
-    name = task.removeprefix(GYM)
-    return TASKS.get(task, Words(f"on {name}" if name != task else f"on the {task}"))
+    return TASKS.get(task, Words(f"on {short(task.removeprefix(GYM))}"))
+
+
+def agent_name(agent: str) -> str:
+    """What the report calls an agent; one that is not qfolio's by the name of its class."""
+    return AGENTS.get(agent, short(agent))

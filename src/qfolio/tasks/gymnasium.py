@@ -10,7 +10,6 @@ import difflib
 import json
 import math
 from functools import cache
-from importlib import import_module
 from typing import Any, NamedTuple, NoReturn
 
 import jax.numpy as jnp
@@ -21,6 +20,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require, static
 from qfolio.core.host import HostTask
 from qfolio.core.mdp import Box, Discrete, Step
+from qfolio.core.registry import import_own
 
 UNLIMITED = 1000
 """Steps after which an episode is cut where the environment itself has no time limit."""
@@ -165,10 +165,8 @@ def _spec(id: str) -> Any:
     module, _, name = id.rpartition(":")
     try:
         if module or name.startswith("qfolio/"):
-            import_module(module or "qfolio.adapters.gym")
+            import_own(module or "qfolio.adapters.gym")
         return gymnasium.spec(name)
-    except ImportError as reason:
-        raise QfolioError(f"{module} cannot be imported for {id} ({reason}).") from None
     except gymnasium.error.Error as reason:
         space = name.rpartition("/")[0]
         there = [other for other in gymnasium.registry if other.rpartition("/")[0] == space]

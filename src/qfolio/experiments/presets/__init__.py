@@ -1,7 +1,7 @@
 """Hyperparameters that belong together: what was tuned for which task."""
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.registry import GYM
+from qfolio.core.registry import AGENTS, GYM, TASKS
 from qfolio.experiments.presets import finite, gymnasium, markets, pendulum, portfolio
 from qfolio.experiments.presets.preset import Preset, Presets
 
@@ -19,16 +19,20 @@ PRESETS: Presets = {
 
 def default_agent(task: str) -> str:
     """The first agent that has presets for a task, which may be none that there is."""
-    default = "ppo" if task.startswith(GYM) else "dqn"
+    default = "dqn" if task in (*TASKS, "portfolio") else "ppo"
     return next((agent for name, agent in PRESETS if name == task), default)
 
 
 def presets_of(task: str, agent: str) -> dict[str, Preset]:
-    """By name; for any environment of Gymnasium there are at least the agent's own defaults."""
+    """By name; there are at least the agent's defaults where it or the task is not qfolio's."""
     known = PRESETS.get((task, agent), {})
-    if task.startswith(GYM) and not known:
+    if known or (task in (*TASKS, "portfolio") and agent in AGENTS):
+        return known
+    if task.startswith(GYM):
         return {"fast": gymnasium.of_any(task.removeprefix(GYM), agent, 100_000)}
-    return known
+    if task == "portfolio":
+        return {"fast": portfolio.of_any(agent)}
+    return {"fast": Preset(agent, {}, steps=100_000, seeds=4)}
 
 
 def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:

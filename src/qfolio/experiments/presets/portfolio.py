@@ -36,6 +36,11 @@ _PATHWISE = {
 }
 
 
+def of_any(agent: str) -> Preset:
+    """An agent's own defaults, on the task that the other agents have."""
+    return Preset(agent, {}, episodes=800, seeds=5, task=_TASK)
+
+
 PRESETS: Presets = {
     ("portfolio", "dqn"): {
         "fast": Preset(

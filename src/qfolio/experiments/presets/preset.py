@@ -5,7 +5,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from qfolio.core import settings
-from qfolio.core.registry import AGENTS, find
+from qfolio.core.registry import find
 from qfolio.experiments.budget import Budget
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class Preset(NamedTuple):
 
     def build(self, **changes: Any) -> "Agent":
         """The agent, with some settings changed."""
-        return settings.build(find("agent", AGENTS, self.agent), {**self.settings, **changes})
+        return settings.build(find("agent", self.agent), {**self.settings, **changes})
 
     @property
     def budget(self) -> Budget:

@@ -25,7 +25,7 @@ from qfolio.core.evaluation import start_keys
 from qfolio.core.files import new_folder, read_json, require_types, write_json
 from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
-from qfolio.core.registry import AGENTS, TASKS, name_of
+from qfolio.core.registry import name_of
 from qfolio.core.training import begin
 from qfolio.core.version import __version__
 from qfolio.experiments.budget import Budget, seed_range
@@ -119,9 +119,9 @@ class Tuning:
             "kind": "tuning",
             "format": FORMAT,
             "version": __version__,
-            "task": name_of(TASKS, task),
+            "task": name_of(task),
             "task_settings": settings.describe(task),
-            "agent": name_of(AGENTS, agent),
+            "agent": name_of(agent),
             "preset": preset,
             "agent_settings": settings.describe(agent),
             "search": {dim.name: str(dim) for dim in space},

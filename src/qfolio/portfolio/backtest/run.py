@@ -17,7 +17,7 @@ from qfolio.core import devices, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import new_folder
 from qfolio.core.mdp import Agent
-from qfolio.core.registry import AGENTS, name_of
+from qfolio.core.registry import name_of
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.executor import Executor, Here, Job
@@ -424,7 +424,7 @@ def _described(
     if episodes is None:
         raise QfolioError(f"{name} has no preset; say with episodes how long it trains in a fold.")
     return AgentConfig(
-        agent=name_of(AGENTS, agent),
+        agent=name_of(agent),
         settings=settings.describe(agent),
         task=dict(task),
         episodes=episodes,

@@ -1,0 +1,104 @@
+"""Names become classes: qfolio's, those of installed packages, and a user's own."""
+
+import sys
+
+import pytest
+
+from qfolio.agents.dqn import DQN
+from qfolio.core import registry
+from qfolio.core.errors import QfolioError
+from qfolio.tasks.catch import Catch
+
+OWN = """
+from qfolio.agents.dqn import DQN
+from qfolio.core.mdp import Task
+from qfolio.tasks.catch import Catch
+
+class Mine(Catch): pass
+class Half(Task):
+    def reset(self, key): ...
+class Learner(DQN): pass
+number = 7
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A module in the current directory, forgotten at the end."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    (tmp_path / "own_parts.py").write_text(OWN)
+    (tmp_path / "broken_parts.py").write_text("import math\n\nmath.nothing\n")
+    yield "own_parts"
+    for name in ("own_parts", "broken_parts"):
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def installed(own, tmp_path):
+    """A package with entry points, beside the module that they name."""
+    place = tmp_path / "parts-1.0.dist-info"
+    place.mkdir()
+    (place / "METADATA").write_text("Metadata-Version: 2.1\nName: parts\nVersion: 1.0\n")
+    (place / "entry_points.txt").write_text(
+        "[qfolio.tasks]\nmy-catch = own_parts:Mine\n[qfolio.agents]\nlearner = own_parts:Learner\n"
+    )
+    sys.path.append(str(tmp_path))
+
+
+def test_a_class_in_the_current_directory(own):
+    mine = registry.find("task", "own_parts:Mine")
+    assert issubclass(mine, Catch)
+    assert registry.name_of(mine()) == "own_parts:Mine"
+    assert isinstance(registry.build("task", "own_parts:Mine", {"rows": 6}), mine)
+    assert registry.own_modules(mine(), Catch(), DQN()) == ["own_parts"]
+    assert registry.short("own_parts:Mine") == "Mine"
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "says"),
+    [
+        ("task", "own_parts:Missing", "own_parts has no class Missing that inherits from .*Task"),
+        ("task", "own_parts:number", "own_parts has no class number"),
+        ("task", "own_parts:Learner", "own_parts has no class Learner that inherits from .*Task"),
+        ("agent", "own_parts:Mine", "there is no agent 'own_parts:Mine'"),
+        ("task", "own_parts:Half", "is not complete: it lacks actions, horizon, observe, step"),
+        ("task", "elsewhere:Mine", "a module elsewhere is neither installed nor in this folder"),
+        ("task", "broken_parts:Mine", r"broken_parts cannot be imported: AttributeError: .*"
+                                      r"\(broken_parts.py, line 3\)"),
+        ("agent", "dqm", "did you mean dqn"),
+        ("agent", "dqm:fast", "did you mean dqn"),
+        ("agent", "nothing like it", "your own as module:Name"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said(own, kind, name, says):
+    with pytest.raises(QfolioError, match=says):
+        registry.find(kind, name)
+
+
+def test_a_folder_runs_no_code_that_nobody_else_names(own):
+    for name in ("own_parts:Mine", "broken_parts:Mine"):
+        with pytest.raises(QfolioError, match=f"add --trust {name.partition(':')[0]} "):
+            registry.build("task", name, {})
+    with pytest.raises(QfolioError, match="add --trust own_parts "):
+        registry.build("task", "gym:own_parts:X-v0", {"id": "own_parts:X-v0"})
+    assert not {"own_parts", "broken_parts"} & set(sys.modules)
+    registry.trust(["own_parts"])
+    assert isinstance(registry.build("task", "own_parts:Mine", {}), Catch)
+    for name in ("os:system", "own_parts:number"):
+        with pytest.raises(QfolioError, match=f"there is no task '{name}'"):
+            registry.build("task", name, {})
+
+
+def test_installed_packages_need_no_trust(installed):
+    assert isinstance(registry.build("task", "my-catch", {}), Catch)
+    assert registry.name_of(registry.find("agent", "learner")()) == "learner"
+    with pytest.raises(QfolioError, match="did you mean my-catch"):
+        registry.find("task", "my-catsh")
+
+
+def test_qfolios_own_names_stay_qfolios(installed, tmp_path):
+    (tmp_path / "parts-1.0.dist-info" / "entry_points.txt").write_text(
+        "[qfolio.agents]\ndqn = own_parts:Learner\n"
+    )
+    assert registry.find("agent", "dqn") is DQN
