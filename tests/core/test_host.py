@@ -14,7 +14,7 @@ from qfolio.agents.ppo import PPO
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.host import HostPopulation
+from qfolio.core.host import Environments, HostPopulation
 from qfolio.core.population import Population
 from qfolio.experiments import presets
 from qfolio.experiments.budget import Budget
@@ -98,8 +98,33 @@ class Unbounded(Tiny):
     action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
 
 
+class Faulty(Tiny):
+    """Does at its second step, or at its start, what no environment should."""
+
+    def __init__(self, fault):
+        self.fault = fault
+
+    def reset(self, *, seed=None, options=None):
+        seen, info = super().reset(seed=seed)
+        if self.fault == "fails to start":
+            raise RuntimeError("no licence")
+        return (np.float32([np.nan, 0]) if self.fault == "starts with NaN" else seen), info
+
+    def step(self, action):
+        self.t += 1
+        seen, reward = self.observe(), 1.0
+        if self.t == 2:
+            if self.fault == "raises":
+                raise KeyError("missing")
+            if self.fault == "old interface":
+                return seen, reward, False, {}
+            seen = {"NaN": seen * np.nan, "longer": np.ones(3), "number": 1.0}.get(self.fault, seen)
+            reward = {"no reward": np.nan}.get(self.fault, reward)
+        return seen, reward, False, False, {}
+
+
 ENVIRONMENTS = {kind: f"Test{kind.__name__}-v0" for kind in (Delay, Endless, Numbered, Aim, Named,
-                                                             Unbounded)}  # fmt: skip
+                                                             Unbounded, Faulty)}  # fmt: skip
 for _kind, _id in ENVIRONMENTS.items():
     gymnasium.register(_id, entry_point=_kind, max_episode_steps=4)
 
@@ -268,6 +293,36 @@ def test_it_goes_on_from_a_checkpoint_in_new_episodes(tmp_path):
 def test_it_says_what_is_wrong(make, message):
     with pytest.raises(QfolioError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("NaN", "step 2 of an episode: its observation is not finite"),
+        ("no reward", "step 2 of an episode: its reward is not finite"),
+        ("starts with NaN", "the start of an episode: its observation is not finite"),
+        ("longer", r"step 2 .* has the shape \(3,\) and its observation space \(2,\)"),
+        ("number", r"step 2 .* has the shape \(\) and its observation space \(2,\)"),
+        ("raises", r"step 2 of an episode: KeyError: 'missing' \(test_host.py, line \d+\)"),
+        ("old interface", r"step 2 of an episode: ValueError: not enough values"),
+        ("fails to start", r"the start of an episode: RuntimeError: no licence"),
+    ],
+)  # fmt: skip
+def test_a_fault_of_an_environment_is_told_as_its_own(fault, says):
+    faulty = task(Faulty, kwargs=json.dumps({"fault": fault}))
+    environments = Environments(faulty, limit=4, count=2)
+    with pytest.raises(QfolioError, match=f"^gym:TestFaulty-v0 failed at {says}"):  # noqa: PT012
+        for index in range(2):
+            environments.reset(index)
+        for _ in range(2):
+            environments.step(np.zeros(2, np.int32))
+
+
+def test_an_agent_that_diverges_is_not_the_environments_fault():
+    wild = PPO(hidden=(8,), num_envs=2, rollout_length=4, batch_size=8, learning_rate=1e30,
+               max_grad_norm=1e30)  # fmt: skip
+    with pytest.raises(QfolioError, match="loss of seed 0 is no longer finite"):
+        trained(task(Aim), wild, [0], 200)
 
 
 def test_without_gymnasium_it_says_what_to_install(monkeypatch):

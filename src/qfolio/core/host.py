@@ -17,9 +17,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from qfolio.core.errors import QfolioError, told
 from qfolio.core.evaluation import Greedy
 from qfolio.core.mdp import Agent, Task, Transition
 from qfolio.core.population import Population, programs_of
+from qfolio.core.registry import name_of
 from qfolio.core.training import (
     Episodes,
     TrainingState,
@@ -81,11 +83,13 @@ class Outcome(NamedTuple):
 class Environments:
     """Environments of one task in a row, stepped one after the other.
 
-    limit: steps after which their episodes are truncated. observation: what is seen now.
+    limit: steps after which their episodes are truncated. observation: what is seen now. Raises
+    QfolioError, which names environment and step, where an environment fails or does not keep to
+    its observation space.
     """
 
     def __init__(self, task: HostTask, limit: int, count: int) -> None:
-        self._facts, self._limit = task.facts, limit
+        self._name, self._facts, self._limit = name_of(task), task.facts, limit
         self._environments = [task.make() for _ in range(count)]
         self._steppers = [environment.step for environment in self._environments]
         shape, kind = task.observation
@@ -94,9 +98,14 @@ class Environments:
 
     def reset(self, index: int, seed: int | None = None) -> None:
         """Starts an episode in one place."""
-        observation, _ = self._environments[index].reset(seed=seed)
-        self.observation[index] = self._facts.seen(observation)
         self._steps[index] = 0
+        try:
+            observation, _ = self._environments[index].reset(seed=seed)
+            self.observation[index] = self._seen(observation)
+        except Exception as error:
+            raise self._failure(index, error) from error
+        if not np.isfinite(self.observation[index]).all():
+            raise self._failure(index, "its observation is not finite")
 
     def step(self, actions: np.ndarray, which: Iterable[int] | None = None) -> Outcome:
         """One step of all, or only of those in some places; resets none."""
@@ -104,12 +113,16 @@ class Environments:
         reward = np.zeros(count, np.float32)
         terminated, truncated = np.zeros(count, bool), np.zeros(count, bool)
         after = np.zeros_like(self.observation)
-        given, seen = self._facts.given(actions), self._facts.seen
-        for i in range(count) if which is None else which:
-            observation, reward[i], terminated[i], truncated[i], _ = self._steppers[i](given[i])
-            after[i] = seen(observation)
-        self.observation = after
+        given = self._facts.given(actions)
         self._steps += 1
+        for i in range(count) if which is None else which:
+            try:
+                observation, reward[i], terminated[i], truncated[i], _ = self._steppers[i](given[i])
+                after[i] = self._seen(observation)
+            except Exception as error:
+                raise self._failure(i, error) from error
+        self._require_finite(after, reward)
+        self.observation = after
         truncated = (truncated | (self._steps >= self._limit)) & ~terminated
         return Outcome(reward, after, terminated, truncated)
 
@@ -119,6 +132,33 @@ class Environments:
             self.observation = self.observation.copy()
             for i in np.flatnonzero(finished).tolist():
                 self.reset(i)
+
+    def _seen(self, observation: Any) -> Any:
+        """An observation as agents get it; numpy alone would stretch one of another shape."""
+        seen, wanted = self._facts.seen(observation), self.observation.shape[1:]
+        if np.shape(seen) != wanted:
+            raise QfolioError(
+                f"its observation has the shape {np.shape(seen)} and its observation space {wanted}"
+            )
+        return seen
+
+    def _require_finite(self, after: np.ndarray, reward: np.ndarray) -> None:
+        """Raises QfolioError where an environment made a number that is not finite."""
+        if np.isfinite(after).all() and np.isfinite(reward).all():
+            return
+        for i in range(len(reward)):
+            for what, value in (("observation", after[i]), ("reward", reward[i])):
+                if not np.isfinite(value).all():
+                    raise self._failure(i, f"its {what} is not finite")
+
+    def _failure(self, index: int, reason: str | Exception) -> QfolioError:
+        if isinstance(reason, QfolioError):
+            reason = str(reason)
+        elif isinstance(reason, Exception):
+            reason = told(reason)
+        step = int(self._steps[index])
+        where = f"at step {step} of an episode" if step else "at the start of an episode"
+        return QfolioError(f"{self._name} failed {where}: {reason}.")
 
 
 class HostPopulation(Population):

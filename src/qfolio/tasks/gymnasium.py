@@ -100,7 +100,8 @@ class Facts(NamedTuple):
         """A batch of agents' actions, each as the environment takes it."""
         if isinstance(self.actions, Discrete):
             return (actions.ravel() + self.first_action).tolist()
-        share = (np.clip(actions, -1.0, 1.0) + 1) / 2
+        # An agent that has diverged is noticed by its losses; no environment should see its NaN.
+        share = (np.clip(np.nan_to_num(actions), -1.0, 1.0) + 1) / 2
         return list(self.low + share.reshape(-1, *self.low.shape) * (self.high - self.low))
 
     def seen(self, observation: Any) -> Any:
