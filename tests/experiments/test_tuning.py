@@ -16,10 +16,11 @@ from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.population import Population
+from qfolio.experiments.budget import Budget
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import Run
 from qfolio.experiments.tuning import search
-from qfolio.experiments.tuning.journal import Trial, best_of, locked
+from qfolio.experiments.tuning.journal import Trial, best_of
 from qfolio.experiments.tuning.run import Tuning, tuning_keys
 from qfolio.experiments.tuning.search import dimension
 from qfolio.experiments.tuning.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
@@ -34,14 +35,14 @@ BOOM = 1e30  # a learning rate with which weights overflow at once
 def start(folder, task, agent, *ranges, trials=4, batch=2, seeds=2):
     space = search.parse(ranges or ["learning_rate=1e-4..1e-2", "discount=0.9..0.99"], type(agent))
     return Tuning.create(
-        task, agent, space, trials=trials, seeds=seeds, episodes=EPISODES, batch=batch,
+        task, agent, space, trials=trials, seeds=seeds, budget=Budget(EPISODES), batch=batch,
         fresh_seeds=2, preset="fast", out=folder,
     )  # fmt: skip
 
 
 def ask(work):
     own = {dim.name: search.own_value(work.agent, dim) for dim in work.space}
-    return work.journal.ask(work.config["batch"], work.config["trials"], own)
+    return work.journal.ask(work.config.batch, work.config.trials, own)
 
 
 def trained(task, agents, seeds, steps=60):
@@ -284,6 +285,34 @@ def test_trials_of_a_killed_process_are_tried_anew(tmp_path, task, agent):
     assert again.journal.in_hand() == 0
 
 
+def proposals(work):
+    """What was tried, in the order in which it was asked for."""
+    return [(trial.values, trial.is_preset, trial.at_random) for trial in work.journal.trials()]
+
+
+@pytest.mark.parametrize("killed", [[0], [1, 4], [5]])
+def test_a_killed_search_proposes_what_an_unbroken_one_does(
+    killed, tmp_path, task, agent, monkeypatch
+):
+    """killed: batches that the process does not live to finish. Half of 18 trials are random."""
+
+    def train(work, agents, *rest):
+        return np.array([[-abs(math.log10(one.learning_rate) + 3)] for one in agents]), 0.0
+
+    monkeypatch.setattr(Tuning, "trained", train)
+    unbroken = start(tmp_path / "unbroken", task, agent, trials=18, batch=3, seeds=1)
+    unbroken.run()
+    work = start(tmp_path / "broken", task, agent, trials=18, batch=3, seeds=1)
+    for batch in range(6):
+        asked = ask(work)
+        if batch in killed:
+            work = Tuning.open(tmp_path / "broken")
+            asked = ask(work)
+        work._train(asked)
+    assert proposals(work) == proposals(unbroken)
+    assert len({str(values) for values, *_ in proposals(work)}) == 18
+
+
 def test_processes_share_a_search(tmp_path, task, agent):
     folder = tmp_path / "s"
     other = start(folder, task, agent)
@@ -301,20 +330,22 @@ def test_an_error_gives_the_batch_back(tmp_path, task, agent, monkeypatch):
     work = start(tmp_path / "s", task, agent)
 
     def fail(*args, **kwargs):
-        raise KeyboardInterrupt
+        raise MemoryError
 
     monkeypatch.setattr(Tuning, "trained", fail)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(MemoryError):
         work.run()
     assert (work.journal.trials(), work.journal.in_hand()) == ([], 0)
     assert not list((work.folder / "processes").iterdir())
 
 
-def test_ctrl_c_stops_after_the_batch(tmp_path, task, agent):
+@pytest.mark.parametrize(("share", "known"), [(1.0, 2), (0.0, 0)])
+def test_ctrl_c_stops_after_the_chunk(share, known, tmp_path, task, agent):
+    """A batch that is finished by then counts; one that is not is tried again."""
     work = start(tmp_path / "s", task, agent)
-    work.run(chunk_listener=lambda done: os.kill(os.getpid(), signal.SIGINT) if done == 1 else None)
+    work.run(chunk_listener=lambda now: now >= share and os.kill(os.getpid(), signal.SIGINT))
     assert work.interrupted
-    assert len(work.journal.trials()) == 2
+    assert (len(work.journal.trials()), work.journal.in_hand()) == (known, 0)
 
 
 def test_a_line_that_a_crash_cut_short(tmp_path, task, agent):
@@ -334,7 +365,7 @@ def test_a_line_that_a_crash_cut_short(tmp_path, task, agent):
         ("journal.log", '{"op_code": 99}\n{}\n', "journal.log is damaged"),
         ("journal.log", "nonsense\nmore\n", "journal.log is damaged"),
         ("study.json", '{"format": 7}', "in another format"),
-        ("study.json", '{"format": 1}', "study.json is damaged: trials is missing"),
+        ("study.json", '{"kind": "search", "format": 2}', "study.json is damaged .task is missing"),
     ],
 )
 def test_damaged_folders(name, content, says, tmp_path, task, agent):
@@ -343,13 +374,6 @@ def test_damaged_folders(name, content, says, tmp_path, task, agent):
     (folder / name).write_text(content)
     with pytest.raises(QfolioError, match=says):
         Tuning.open(folder)
-
-
-def test_a_lock_keeps_others_out(tmp_path):
-    with locked(tmp_path / "lock") as mine, locked(tmp_path / "lock", wait=False) as other:
-        assert (mine, other) == (True, False)
-    with locked(tmp_path / "lock", wait=False) as free:
-        assert free
 
 
 # What a search says
@@ -541,9 +565,9 @@ def test_the_learning_rate_ends_with_the_training(tmp_path, monkeypatch, capsys)
         (["--trials", "0"], "trials is 0"),
         (["--batch", "0"], "batch is 0"),
         (["--episodes", "0"], "episodes is 0"),
-        (["--search", "discount=0.9..0.99", "--set", "discount=0.9"], "both set and searched"),
+        (["--search", "discount=0.9..0.99", "--set", "discount=0.9"], "both name discount"),
         (["--join", "nowhere"], "is no search"),
-        (["--join", "nowhere", "--seeds", "3"], "keeps what the search was started with"),
+        (["--join", "nowhere", "--seeds", "3"], "keeps the settings of the search"),
         (["--set", "torques=0"], "continuous"),
     ],
 )

@@ -16,6 +16,7 @@ from qfolio.core.registry import short
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
     from qfolio.experiments.run import Run
+    from qfolio.experiments.tuning.run import Tuning
     from qfolio.portfolio.allocation import Allocation
     from qfolio.portfolio.backtest.assessment import Assessment
     from qfolio.portfolio.backtest.run import Backtest
@@ -130,6 +131,31 @@ def print_prices(facts: dict[str, Any]) -> None:
         say(f"Features: {', '.join(facts['features'])}.")
     if facts["note"]:
         say(f"Note: {facts['note']}")
+
+
+def describe_search(work: "Tuning") -> str:
+    config, budget = work.config, work.config.budget
+    seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
+    space = "\n".join(f"  {dim.name:<20} {dim}  ({dim.scale})" for dim in work.space)
+    return (
+        f"{short(config.agent).upper()} on {config.task} · preset {config.preset} · "
+        f"{config.trials} trials × {seeds} · {budget.amount:,} {budget.unit} · "
+        f"{config.device}\n{space}"
+    )
+
+
+def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
+    """The best configuration beside the preset and the optimum, and what the search found."""
+    say("")
+    for name, row in (("best", "return_per_seed"), ("preset", "preset_return_per_seed")):
+        returns = [math.nan if x is None else x for x in summary[row]]
+        mean = sum(returns) / len(returns)
+        say(f"{name:<8}{mean:>9.2f}   worst seed {min(returns):.2f}")
+    if summary["optimum"] is not None:
+        say(f"optimum {summary['optimum']:>9.2f}   ({len(returns)} fresh seeds, graded starts)")
+    say("")
+    for sentence in verdicts:
+        say(sentence)
 
 
 def describe_backtest(backtest: "Backtest") -> str:

@@ -14,6 +14,7 @@ from qfolio.experiments.interrupts import EXIT_CODE
 if TYPE_CHECKING:
     from qfolio.experiments.executor import Job
     from qfolio.experiments.run import Run
+    from qfolio.experiments.tuning.run import Progress
 
 
 class RunProgress(Listener):
@@ -113,6 +114,29 @@ class _JobProgress(Listener):
     def on_chunk(self, training: Training, rows: list[Row]) -> None:
         done = self.done + self.share * training.share
         self.whole.note(self.agent, done, known=not math.isnan(training.seconds_left))
+
+
+class SearchProgress:
+    """A line for each batch of a search, and a bar within it."""
+
+    def __enter__(self) -> "SearchProgress":
+        say("".join(f"{name:>11}" for name in ("trials", "diverged", "best", "preset", "an hour")))
+        self.bar = bar("training a batch")
+        self.update = self.bar.__enter__()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.bar.__exit__(None, None, None)
+
+    def chunk(self, done: float) -> None:
+        """done: share of the batch."""
+        self.update(completed=done)
+
+    def batch(self, now: "Progress") -> None:
+        best, preset = (number(trial and trial.value) for trial in (now.best, now.preset))
+        rate = f"{3600 * now.trials / now.seconds:,.0f}"
+        cells = (f"{now.done}/{now.total}", str(now.diverged), best, preset, rate)
+        say("".join(f"{cell:>11}" for cell in cells))
 
 
 def time_left(seconds: float) -> str:

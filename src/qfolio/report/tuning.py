@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
@@ -106,7 +107,7 @@ def sweep(work: Tuning, summary: dict[str, Any], command: str) -> Sweep:
     """What the page shows, from a search and its final comparison."""
     trials = work.journal.trials()
     return Sweep(
-        config=work.config,
+        config=msgspec.to_builtins(work.config),
         space=work.space,
         trials=trials,
         own={dim.name: search.own_value(work.agent, dim) for dim in work.space},

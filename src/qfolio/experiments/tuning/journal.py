@@ -3,11 +3,13 @@
 journal.log is Optuna's own record: lines of JSON, appended, nothing of which is ever unpickled. Any
 number of processes may work on one journal. Each holds a file under processes/ locked while it
 lives, so that the others can tell when it is dead and try its trials anew.
+
+What is proposed next depends on the finished trials alone, not on how often a process was stopped:
+a search that was killed and resumed proposes what an unbroken one does.
 """
 
 import contextlib
 import math
-import sys
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import optuna
+from filelock import FileLock, Timeout
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import TrialState
@@ -54,13 +57,10 @@ class Asked(NamedTuple):
 class Journal:
     """The trials of a search in its folder."""
 
-    def __init__(
-        self, folder: Path, space: Sequence[Dimension], *, at_random: int, seed: int | None
-    ) -> None:
+    def __init__(self, folder: Path, space: Sequence[Dimension], *, at_random: int) -> None:
         """Reads the journal, or begins one.
 
-        at_random: trials drawn at random before the sampler chooses. seed: of what is drawn; None
-        takes it from the system.
+        at_random: trials drawn at random before the sampler chooses.
         """
         self.folder, self.space, self._at_random = folder, space, at_random
         self._process = uuid.uuid4().hex
@@ -73,10 +73,6 @@ class Journal:
                 study_name="qfolio",
                 direction="maximize",
                 load_if_exists=True,
-                # The constant liar keeps those of a batch apart.
-                sampler=optuna.samplers.TPESampler(
-                    seed=seed, constant_liar=True, n_startup_trials=at_random
-                ),
             )
             self.trials()
         except (ValueError, LookupError, TypeError, AttributeError, AssertionError) as error:
@@ -105,7 +101,7 @@ class Journal:
         place = self.folder / "processes" / self._process
         place.parent.mkdir(exist_ok=True)
         try:
-            with locked(place):
+            with FileLock(place):
                 yield
         finally:
             place.unlink(missing_ok=True)
@@ -115,7 +111,7 @@ class Journal:
 
         preset: a configuration that comes first, where the space holds it.
         """
-        with locked(self.folder / "asking.lock"):
+        with FileLock(self.folder / "asking.lock"):
             self._give_up_the_dead()
             self._enqueue(preset)
             states = [trial.state for trial in self._study.get_trials(deepcopy=False)]
@@ -124,6 +120,7 @@ class Journal:
             distributions = {dim.key: dim.distribution() for dim in self.space}
             asked = []
             for _ in range(min(count, total - held)):
+                self._study.sampler = self._sampler(known, self.in_hand())
                 trial = self._study.ask(distributions)
                 trial.set_user_attr("process", self._process)
                 trial.set_user_attr("at random", known < self._at_random)
@@ -145,6 +142,17 @@ class Journal:
         """Notes that a trial was not finished; another will take its place."""
         self._study.tell(asked.trial, state=TrialState.FAIL)
 
+    def _sampler(self, known: int, in_hand: int) -> optuna.samplers.TPESampler:
+        """What proposes one trial, from how many are finished and how many are being trained.
+
+        A sampler that lived on would go on with random numbers that a resumed search lacks.
+        """
+        return optuna.samplers.TPESampler(
+            seed=int(np.random.SeedSequence((known, in_hand)).generate_state(1)[0]),
+            constant_liar=True,  # keeps those of a batch apart
+            n_startup_trials=self._at_random,
+        )
+
     def _values(self, params: Mapping[str, Value]) -> dict[str, Value]:
         return {dim.name: dim.value(params[dim.key]) for dim in self.space}
 
@@ -163,9 +171,10 @@ class Journal:
             process = trial.user_attrs.get("process")
             place = self.folder / "processes" / str(process)
             if process is not None and place.exists():
-                with locked(place, wait=False) as free:
-                    if not free:
-                        continue
+                try:
+                    FileLock(place, timeout=0).acquire().lock.release()
+                except Timeout:
+                    continue
                 place.unlink(missing_ok=True)
             self._study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
@@ -174,28 +183,6 @@ def best_of(trials: Sequence[Trial]) -> Trial | None:
     """The trial with the highest mean return, where one kept a finite loss."""
     finite = [trial for trial in trials if math.isfinite(trial.value)]
     return max(finite, key=lambda trial: trial.value, default=None)
-
-
-@contextlib.contextmanager
-def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Holds a file locked against other processes; yields whether it could be had.
-
-    The system takes the lock off when the process ends, however it ends.
-    """
-    with path.open("a") as file:
-        try:
-            if sys.platform == "win32":
-                import msvcrt
-
-                msvcrt.locking(file.fileno(), msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK, 1)
-            else:
-                import fcntl
-
-                fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            yield False
-        else:
-            yield True
 
 
 def _mend(journal: Path, lock: JournalFileOpenLock) -> None:

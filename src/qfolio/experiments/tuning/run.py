@@ -12,31 +12,33 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array, Float, Key
 
 from qfolio.core import devices, settings
+from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.files import new_folder, read_json, require_types, write_json
+from qfolio.core.files import new_folder, read_json, write_json
 from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
-from qfolio.core.registry import name_of
 from qfolio.core.training import begin
-from qfolio.core.version import __version__
 from qfolio.experiments.budget import Budget, seed_range
-from qfolio.experiments.described import agent_of, task_of
-from qfolio.experiments.interrupts import interruptible
+from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
 from qfolio.experiments.tuning.search import Value
 
-FORMAT = 1
-"""Of the study folder; raised whenever an older folder can no longer be read."""
+STUDY = "study.json"
+"""The name of the file that holds the settings."""
+
+Count = Annotated[int, msgspec.Meta(ge=1, lt=2**20)]
 
 STARTS = 256
 """Start states that configurations are compared on."""
@@ -71,23 +73,60 @@ class Progress:
     trials: int  # in this batch
 
 
+class _Share(Listener):
+    """Tells which share of several trainings, one after the other, is done."""
+
+    def __init__(self, tell: Callable[[float], None], number: int, count: int) -> None:
+        self.tell, self.number, self.count = tell, number, count
+
+    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+        self.tell((self.number + training.share) / self.count)
+
+
+class Study(Config, kw_only=True, frozen=True):
+    """What is searched, by training whom, and how far."""
+
+    kind: ClassVar[str] = "search"
+    format: ClassVar[int] = 2
+
+    task: str
+    task_settings: dict[str, Any]
+    agent: str
+    agent_settings: dict[str, Any]
+    preset: str
+    search: dict[str, str]  # the ranges and choices of the searched settings
+    trials: Count
+    seeds: Count
+    episodes: int | None
+    steps: int | None
+    batch: Count
+    fresh_seeds: Count
+    device: str
+    versions: dict[str, str]
+    started: str
+
+    def __post_init__(self) -> None:
+        _ = self.budget, seed_range(max(self.seeds, self.fresh_seeds), FRESH)
+
+    @property
+    def budget(self) -> Budget:
+        """How far each agent is trained."""
+        return Budget(self.episodes, self.steps)
+
+
 class Tuning:
     """A search in its folder; make it with ``Tuning.create`` or ``Tuning.open``."""
 
-    def __init__(self, config: dict[str, Any], folder: Path, sampler_seed: int | None) -> None:
+    def __init__(self, config: Study, folder: Path) -> None:
         self.config, self.folder = config, folder
-        self.task = task_of(config["task"], config["task_settings"])
-        self.agent = agent_of(config["agent"], config["agent_settings"])
+        self.task = task_of(config.task, config.task_settings)
+        self.agent = agent_of(config.agent, config.agent_settings)
         kind = type(self.agent)
-        texts = config["search"].items()
+        texts = config.search.items()
         self.space = [search.dimension(name, text, kind) for name, text in texts]
         self.interrupted = False
-        self.journal = Journal(
-            folder,
-            self.space,
-            at_random=max(2, round(RANDOM * config["trials"])),
-            seed=sampler_seed,
-        )
+        at_random = max(2, round(RANDOM * config.trials))
+        self.journal = Journal(folder, self.space, at_random=at_random)
 
     @classmethod
     def create(
@@ -98,45 +137,45 @@ class Tuning:
         *,
         trials: int,
         seeds: int,
-        episodes: int | None = None,
-        steps: int | None = None,
+        budget: Budget,
         batch: int,
         fresh_seeds: int,
         preset: str,
         out: Path | str,
     ) -> "Tuning":
-        """A search before its first trial; ``out`` must be a new or empty folder.
+        """A search before its first trial.
 
-        agent: gives the settings that are not searched; it came from ``preset``, perhaps changed.
-        trials: configurations in all. episodes, steps: how far each agent is trained; one of the
-        two. batch: configurations trained at once. fresh_seeds: of the final comparison.
+        Args:
+            task: What to learn.
+            agent: Gives the settings that are not searched; it came from ``preset``.
+            space: What is searched.
+            trials: How many configurations in all.
+            seeds: Agents that each configuration is judged by.
+            budget: How far each agent is trained.
+            batch: Configurations trained at once.
+            fresh_seeds: Seeds of the final comparison, which the search never uses.
+            preset: The name of the preset, for people to read.
+            out: A new or empty folder.
         """
-        _ = Budget(episodes, steps), seed_range(max(seeds, fresh_seeds), FRESH)
         _require_counts(trials=trials, batch=batch, seeds=seeds, fresh_seeds=fresh_seeds)
+        config = Study(
+            **describe(task, agent),
+            preset=preset,
+            search={dim.name: str(dim) for dim in space},
+            trials=trials,
+            seeds=seeds,
+            episodes=budget.episodes,
+            steps=budget.steps,
+            batch=batch,
+            fresh_seeds=fresh_seeds,
+            **devices.circumstances("jax", "optuna"),
+        )
         search.require_buildable(type(agent), settings.describe(agent), space)
         jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))  # fits the task?
-        config = {
-            "kind": "tuning",
-            "format": FORMAT,
-            "version": __version__,
-            "task": name_of(task),
-            "task_settings": settings.describe(task),
-            "agent": name_of(agent),
-            "preset": preset,
-            "agent_settings": settings.describe(agent),
-            "search": {dim.name: str(dim) for dim in space},
-            "trials": trials,
-            "seeds": seeds,
-            "episodes": episodes,
-            "steps": steps,
-            "batch": batch,
-            "fresh_seeds": fresh_seeds,
-            **devices.circumstances("jax", "optuna"),
-        }
         folder = Path(out)
         with new_folder(folder) as unfinished:
-            write_json(unfinished / "study.json", config)
-        return cls(config, folder, sampler_seed=0)
+            write_config(unfinished / STUDY, config)
+        return cls(config, folder)
 
     @classmethod
     def open(
@@ -147,22 +186,15 @@ class Tuning:
         trials: a new number of configurations in all. batch: of this process alone.
         """
         folder = Path(folder)
-        config = _read_config(folder)
+        config = read_config(folder / STUDY, Study)
         if trials is not None:
-            config["trials"] = trials
             _require_counts(trials=trials)
-            write_json(folder / "study.json", config)
+            config = msgspec.structs.replace(config, trials=trials)
+            write_config(folder / STUDY, config)
         if batch is not None:
             _require_counts(batch=batch)
-            config["batch"] = batch
-        # Not the first process's random numbers once more.
-        return cls(config, folder, sampler_seed=None)
-
-    @property
-    def budget(self) -> dict[str, int]:
-        """How far each agent is trained: ``{"episodes": n}`` or ``{"steps": n}``."""
-        given = {name: self.config[name] for name in ("episodes", "steps")}
-        return {name: amount for name, amount in given.items() if amount is not None}
+            config = msgspec.structs.replace(config, batch=batch)
+        return cls(config, folder)
 
     def configured(self, values: dict[str, Value]) -> Agent:
         """The agent with these values of the searched settings."""
@@ -176,19 +208,23 @@ class Tuning:
     ) -> None:
         """Trains batch after batch until there are as many trials as the configuration says.
 
-        A first Ctrl-C stops after the current batch and sets ``interrupted``; a second one gives
-        the batch up. chunk_listener: told how much of a batch is done.
+        Ctrl-C stops after the current chunk and sets ``interrupted``; a batch that it leaves
+        unfinished is proposed again when the search goes on. chunk_listener: told how much of a
+        batch is done.
         """
         preset = {dim.name: search.own_value(self.agent, dim) for dim in self.space}
-        batch, total = self.config["batch"], self.config["trials"]
-        with self.journal.at_work(), interruptible() as stop:
-            while asked := self.journal.ask(batch, total, preset):
-                now = self._train(asked, chunk_listener)
+        batch, total = self.config.batch, self.config.trials
+        self.interrupted = False
+        with self.journal.at_work():
+            while not self.interrupted and (asked := self.journal.ask(batch, total, preset)):
+                try:
+                    now = self._train(asked, chunk_listener)
+                except KeyboardInterrupt:
+                    self.interrupted = True
+                    return
                 if listener is not None:
                     listener(now)
-                if stop.is_set():
-                    self.interrupted = now.done < total
-                    return
+                self.interrupted &= now.done < total
 
     def trained(
         self,
@@ -201,7 +237,8 @@ class Tuning:
 
         Also returns the seconds that compiling took. Agents that share all settings which shape the
         program are one population. All of a population take as many steps as the episodes would
-        if none ended early, so that an agent's result does not depend on its company.
+        if none ended early, so that an agent's result does not depend on its company. Raises
+        KeyboardInterrupt where Ctrl-C stops it before the end.
         """
         groups = defaultdict(list)
         for index, agent in enumerate(agents):
@@ -211,11 +248,12 @@ class Tuning:
         for number, indices in enumerate(groups.values()):
             members = [agents[index] for index in indices for _ in seeds]
             population = population_of(self.task, members, [*seeds] * len(indices))
-            total = population.steps_left(**self.budget)
-            while population.steps < total and any(population.healthy):
-                population.advance(total - population.steps, strict=False)
-                if listener is not None:
-                    listener((number + min(1.0, population.steps / total)) / len(groups))
+            steps = self.config.budget.left(population) * population.agent.num_envs
+            listeners = [] if listener is None else [_Share(listener, number, len(groups))]
+            training = fit(population, Budget(steps=steps), listeners, strict=False)
+            if not training.finished:
+                raise KeyboardInterrupt
+            self.interrupted |= training.interrupted
             played = population.evaluate(keys[: population.starts], tail=0)
             returns = np.asarray(played.returns).mean(1)
             finite = np.array(population.healthy) & np.isfinite(returns)
@@ -240,7 +278,7 @@ class Tuning:
         path = self.folder / "summary.json"
         if path.exists() and (summary := read_json(path)).get("best") == found.values:
             return summary
-        seeds = range(FRESH, FRESH + self.config["fresh_seeds"])
+        seeds = range(FRESH, FRESH + self.config.fresh_seeds)
         agents = [self.configured(found.values), self.agent]
         returns, _ = self.trained(agents, seeds, start_keys(), listener)
         solution = self.task.optimum()
@@ -268,7 +306,7 @@ class Tuning:
         start = perf_counter()
         try:
             agents = [self.configured(one.values) for one in asked]
-            seeds = range(self.config["seeds"])
+            seeds = range(self.config.seeds)
             returns, seconds_compile = self.trained(agents, seeds, tuning_keys(), listener)
         except BaseException:
             for one in asked:
@@ -280,7 +318,7 @@ class Tuning:
         trials = self.journal.trials()
         return Progress(
             done=len(trials),
-            total=self.config["trials"],
+            total=self.config.trials,
             diverged=sum(math.isnan(trial.value) for trial in trials),
             best=best_of(trials),
             preset=next((trial for trial in trials if trial.is_preset), None),
@@ -288,29 +326,6 @@ class Tuning:
             seconds_compile=seconds_compile,
             trials=len(asked),
         )
-
-
-def _read_config(folder: Path) -> dict[str, Any]:
-    path = folder / "study.json"
-    if not path.is_file():
-        raise QfolioError(f"{folder} is no search: it has no study.json.")
-    config = read_json(path)
-    if config.get("format") != FORMAT:
-        raise QfolioError(
-            f"{folder} was written by qfolio {config.get('version', 'of an unknown version')} in "
-            f"another format; this is {__version__}: use that version, or search anew."
-        )
-    counts = dict.fromkeys(("trials", "seeds", "batch", "fresh_seeds"), int)
-    far = dict.fromkeys(("episodes", "steps"), int | None)
-    names = {"task": str, "agent": str, "preset": str}
-    nested = dict.fromkeys(("task_settings", "agent_settings", "search"), dict)
-    try:
-        require_types(config, {**counts, **far, **names, **nested})
-        _ = Budget(config["episodes"], config["steps"]), seed_range(config["seeds"], FRESH)
-        _require_counts(**{name: config[name] for name in counts})
-    except QfolioError as error:
-        raise QfolioError(f"{path} is damaged: {error}") from None
-    return config
 
 
 def _require_counts(**counts: int) -> None:
