@@ -99,7 +99,7 @@ def test_a_lock_says_who_holds_it(tmp_path):
         other.communicate()
     with locked(tmp_path):  # a lock ends with its process, however that ends
         pass
-    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+    assert [path.name for path in tmp_path.iterdir()] == []
 
 
 def test_the_cache_lies_where_the_system_keeps_caches(monkeypatch):

@@ -21,7 +21,7 @@ from qfolio.experiments.budget import Budget
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.ar1 import Ar1
 
-from listeners import Interrupt
+from listeners import Interrupt, Tell
 from probes import Explosive
 
 
@@ -200,6 +200,20 @@ def test_rows_ahead_of_the_checkpoint_are_dropped(task, agent, tmp_path):
     run.train(Budget(8))
     assert metrics.read_text().startswith(good)
     assert [row["episode"] for row in run.metrics] == [1, 2, 3, 4, 5, 6, 7, 8]
+
+
+def test_two_processes_cannot_train_in_one_folder(task, agent, tmp_path):
+    run, other = create(task, agent, tmp_path / "run"), Run.open(tmp_path / "run")
+    tried = []
+
+    def meanwhile(training, rows):
+        with pytest.raises(QfolioError, match=rf"in use by process {os.getpid()}"):
+            other.train()
+        tried.append(rows)
+
+    run.train(listeners=[Tell(meanwhile)])
+    assert tried
+    Run.open(tmp_path / "run").train()
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut", "a row lost"])

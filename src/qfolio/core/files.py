@@ -97,6 +97,8 @@ def locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         holder.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # Windows keeps open files
+            (folder / ".lock").unlink(missing_ok=True)
         lock.release()
 
 

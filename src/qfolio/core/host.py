@@ -8,7 +8,7 @@ cores as there are, the environments of another are stepped.
 
 import abc
 from collections.abc import Callable, Generator, Hashable, Iterable, Sequence
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -41,6 +41,7 @@ LANES = 10
 """Environments that are stepped side by side when a member is graded."""
 
 
+@runtime_checkable
 class Facts(Protocol):
     """How observations and actions are translated between an environment and agents."""
 

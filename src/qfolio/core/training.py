@@ -51,7 +51,7 @@ class Episodes(NamedTuple):
     metrics: dict[str, Float[Array, "time environment"]]  # as monitored, or means over the episode
 
 
-def begin(task: Task, agent: Agent, seed: Int[Array, ""]) -> TrainingState:
+def begin(task: Task, agent: Agent, seed: UInt32[Array, ""]) -> TrainingState:
     """A member before its first step; all its randomness derives from ``seed``."""
     agent_key, task_key, key = jax.random.split(jax.random.key(seed), 3)
     state = agent.init(task, agent_key)

@@ -26,7 +26,7 @@ from qfolio.core import devices, settings
 from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.files import new_folder, read_tree, write_tree
+from qfolio.core.files import locked, new_folder, read_tree, write_tree
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.population import Population
 from qfolio.core.training import TrainingState
@@ -226,6 +226,13 @@ def compare(folder: Path, listen: Callable[[str], Listener] | None = None) -> di
 
     listen: called with what is under way; makes the listener to that training.
     """
+    if not (folder / FILE).is_file():
+        read_config(folder / FILE, ContinualConfig)  # says that this is no such folder
+    with locked(folder):
+        return _compare(folder, listen)
+
+
+def _compare(folder: Path, listen: Callable[[str], Listener] | None) -> dict[str, Any] | None:
     state = read_config(folder / FILE, ContinualConfig)
     plan = state.plan()
 
@@ -236,7 +243,9 @@ def compare(folder: Path, listen: Callable[[str], Listener] | None = None) -> di
 
     def learn(name: str, population: Population, episodes: int, points: int) -> Course | None:
         worlds = grades if name == FIRST else grades[::-1]
-        return _learn(population, episodes, points, worlds, [listen(name)] if listen else [])
+        return _learn(
+            population, episodes, points, worlds, [] if listen is None else [listen(name)]
+        )
 
     grades = Grades(plan.task), Grades(plan.changed)
     seeds = seed_range(plan.seeds, plan.seed)

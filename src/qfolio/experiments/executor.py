@@ -1,7 +1,7 @@
 """Where jobs run: here, one after the other."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
@@ -10,6 +10,7 @@ R_co = TypeVar("R_co", covariant=True)
 R = TypeVar("R")
 
 
+@runtime_checkable
 class Job(Protocol[R_co]):
     """Work as a value: it holds all that it needs, and its result depends on nothing else.
 
@@ -26,6 +27,7 @@ class Job(Protocol[R_co]):
         ...
 
 
+@runtime_checkable
 class Executor(Protocol):
     """Runs jobs and gives their results as they come; it ends early where Ctrl-C stopped one."""
 

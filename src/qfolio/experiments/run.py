@@ -1,5 +1,6 @@
 """A run: seeds of one agent in training on one task, and what they have reported so far."""
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -11,7 +12,7 @@ import numpy as np
 
 from qfolio.core import devices
 from qfolio.core.evaluation import start_keys
-from qfolio.core.files import new_folder, require_new
+from qfolio.core.files import locked, new_folder, require_new
 from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.population import Population
@@ -133,10 +134,14 @@ class Run:
         """Trains until each seed has done its budget (default: what was configured).
 
         A first Ctrl-C stops after the current chunk, sets ``interrupted`` and leaves a checkpoint.
-        A loss that is not finite raises QfolioError; the last good checkpoint stays.
+        Raises QfolioError where a loss is not finite (the last good checkpoint stays) or where
+        another process trains in the folder.
         """
+        with contextlib.nullcontext() if self.folder is None else locked(self.folder):
+            self._train(budget or self.budget, listeners)
+
+    def _train(self, budget: Budget, listeners: Sequence[Listener]) -> None:
         self.interrupted = False
-        budget = budget or self.budget
         if not self.evaluations and self.population.steps:
             self.evaluate()  # of a run whose table was lost
         if not budget.left(self.population):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
-Numbers = NDArray[np.floating[Any] | np.integer[Any]]
+Numbers = NDArray[np.floating[Any]] | NDArray[np.integer[Any]]
 
 
 def decimals(size: float, figures: int = 4, least: int = 1) -> int:

@@ -21,7 +21,7 @@ from qfolio.core import devices, settings
 from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.files import new_folder, read_json
+from qfolio.core.files import locked, new_folder, read_json
 from qfolio.core.host import HostPopulation
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import begin
@@ -176,6 +176,10 @@ class Comparison:
 
         listen: called with an agent's name before it trains; makes the listener to its training.
         """
+        with locked(self.folder):
+            self._run(listen)
+
+    def _run(self, listen: Callable[[str], Listener] | None) -> None:
         self.interrupted = False
         for name in self.entrants:
             if name in self.results:

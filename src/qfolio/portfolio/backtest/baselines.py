@@ -8,7 +8,7 @@ hold orders once, at the very first decision.
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ from qfolio.core.errors import QfolioError
 Floats = NDArray[np.float64]
 
 
+@runtime_checkable
 class Fold(Protocol):
     """Rows of the price table: where to learn and where to decide."""
 

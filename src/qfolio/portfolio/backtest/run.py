@@ -5,6 +5,7 @@ the latest rows, for tomorrow's weights. What they then decide is replayed with 
 float64, beside classical allocators under the same rules.
 """
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from qfolio.core import devices, settings
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import new_folder
+from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.registry import name_of
 from qfolio.experiments.budget import Budget, seed_range
@@ -190,7 +191,8 @@ class Backtest:
         def listeners(job: Job[dict[str, TrainedFold]]) -> Sequence[Listener]:
             return listen(job, done / len(jobs), 1 / len(jobs))
 
-        with interruptible() as stop:
+        lock = contextlib.nullcontext() if self.folder is None else locked(self.folder)
+        with lock, interruptible() as stop:
             for job, trained in (executor or Here()).map(jobs, listeners):
                 agent = job.name.partition("/")[0]
                 for fold, result in trained.items():
