@@ -66,6 +66,10 @@ _HOMES = {
 __all__ = ["__version__", *_HOMES]
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 def __getattr__(name: str) -> Any:
     # Imported on first use, so that `qfolio --help` does not wait for jax.
     if name not in _HOMES:

@@ -1,9 +1,11 @@
+import dataclasses
 import math
+import re
 
 import pytest
 
 from qfolio.agents.dqn import DQN
-from qfolio.core import settings
+from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
 
@@ -53,3 +55,29 @@ def test_refuses_what_does_not_fit(name, value):
 def test_unknown_names_get_a_suggestion():
     with pytest.raises(QfolioError, match="did you mean learning_rate"):
         settings.build(DQN, {"learning_rat": 1})
+
+
+def refusal(kind, chosen):
+    """What is said of settings that do not fit, and nothing of others."""
+    try:
+        settings.build(kind, chosen)
+    except QfolioError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("task", name) for name in registry.TASKS] + [("agent", name) for name in registry.AGENTS],
+)
+def test_a_range_that_is_named_includes_its_ends(kind, name):
+    """Of a setting that must be above 0, nobody should read "from 0" or "between 0 and"."""
+    found = registry.find(kind, name)
+    numbers = [field.name for field in dataclasses.fields(found) if field.type in (int, float)]
+    assert numbers
+    for setting in numbers:
+        for value in (0, 1, 100):
+            said = refusal(found, {setting: value})
+            if ends := re.search(r"(?:from|between) ([\d.,]+) (?:to|and) ([\d.,]+)", said):
+                low, high = (float(end.rstrip(".").replace(",", "")) for end in ends.groups())
+                assert not low <= value <= high, said

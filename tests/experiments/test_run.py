@@ -56,6 +56,11 @@ def test_n_and_n_episodes_equal_2n(task, agent, tmp_path):
     assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
 
 
+def test_a_run_says_what_it_is(task, agent, tmp_path):
+    run = Run.create(task, agent, steps=1000, seeds=2, out=tmp_path / "run")
+    assert repr(run) == f"<Run: dqn on pendulum, 2 seeds, 0 of 1,000 steps, in {tmp_path / 'run'}>"
+
+
 def test_steps_say_how_far_as_episodes_do(task, agent, tmp_path):
     create(task, agent, tmp_path / "straight", episodes=None, steps=300, seeds=2).train()
     create(task, agent, tmp_path / "halves", episodes=None, steps=133, seeds=2).train()

@@ -96,7 +96,8 @@ class Run:
     ) -> "Run":
         """A run as its last checkpoint left it.
 
-        task, agent: needed only where they are not among those that qfolio registers.
+        task, agent: needed only where the folder alone cannot make them: they hold arrays, or are a
+        user's own and their module has not been imported.
         """
         files = RunFolder(Path(folder))
         config = files.read_config()
@@ -108,6 +109,13 @@ class Run:
         )
         run._read_checkpoint()
         return run
+
+    def __repr__(self) -> str:
+        config, unit = self.config, self.budget.unit
+        seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
+        done = f"{self.done(unit):,} of {self.budget.amount:,} {unit}"
+        where = f", in {self.folder}" if self.folder else ""
+        return f"<Run: {config.agent} on {config.task}, {seeds}, {done}{where}>"
 
     @property
     def folder(self) -> Path | None:

@@ -202,7 +202,7 @@ def _merton_weight(drift: float, volatility: float, cost: float) -> float:
     weight = drift / volatility**2
     require(
         1e-9 < weight < 1 - 1e-9,
-        f"drift / volatility² is {weight:.3g}; it must lie between 0 and 1, or the best region "
+        f"drift / volatility² is {weight:.3g}; it must be above 0 and below 1, or the best region "
         "touches all cash or all asset",
     )
     return weight

@@ -73,6 +73,14 @@ def test_all_strategies_are_replayed_on_the_same_days(finished):
     assert assessment.strategies["dqn"].to_reference.reference == "equal-weight"
 
 
+def test_a_backtest_says_what_it_is(finished):
+    first, last = (str(date)[:10] for date in finished.dates[[0, -1]])
+    assert repr(finished) == (
+        f"<Backtest: {', '.join(finished.agents)} on {len(finished.prices.assets)} assets, "
+        f"{len(finished.folds)} folds from {first} to {last}, 2 seeds, in {finished.folder}>"
+    )
+
+
 def test_costs_are_charged(finished):
     """Each entry is what an independent replay of its decisions earns, at the cost asked for."""
     entries, _ = finished.entries()

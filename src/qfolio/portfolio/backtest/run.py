@@ -31,6 +31,7 @@ from qfolio.portfolio.backtest.folds import Fold, latest, spell, walk_forward
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.policy import Policy, follow, state_template
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, describe
 from qfolio.portfolio.task import Portfolio
 
@@ -164,6 +165,15 @@ class Backtest:
         files = BacktestFolder(Path(folder))
         config = files.read_config()
         return cls(files.read_prices(config), config, files, agents)
+
+    def __repr__(self) -> str:
+        seeds = f"{self.config.seeds} seed" + "s" * (self.config.seeds > 1)
+        folds = f"{len(self.folds)} fold" + "s" * (len(self.folds) > 1)
+        where = f", in {self.folder}" if self.folder else ""
+        return (
+            f"<Backtest: {', '.join(self.agents)} on {len(self.prices.assets)} assets, {folds} "
+            f"from {day(self.dates[0])} to {day(self.dates[-1])}, {seeds}{where}>"
+        )
 
     @property
     def folder(self) -> Path | None:

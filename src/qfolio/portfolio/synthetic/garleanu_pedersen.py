@@ -37,7 +37,7 @@ class GarleanuPedersen(Synthetic):
 
     def __check_init__(self) -> None:
         require(self, "phi", lambda x: 0 < x <= 1, "above 0 and at most 1")
-        require(self, "rho", lambda x: 0 < x < 1, "between 0 and 1")
+        require(self, "rho", lambda x: 0 < x < 1, "above 0 and below 1")
         positive = "noise risk_aversion cost_scale variance"
         require(self, positive, lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")
 

@@ -27,7 +27,7 @@ class Kelly(OneAsset):
     def __check_init__(self) -> None:
         require(self, "up", lambda x: 1 < x <= 100, "above 1 and at most 100")
         require(self, "down", lambda x: 0.01 <= x < 1, "at least 0.01 and below 1")
-        require(self, "probability", lambda x: 0 < x < 1, "between 0 and 1")
+        require(self, "probability", lambda x: 0 < x < 1, "above 0 and below 1")
 
     def reset_market(self, key: PRNGKeyArray) -> Float[Array, ""]:
         return jnp.array(1.0)
