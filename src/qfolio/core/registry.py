@@ -3,7 +3,8 @@
 A user's own class is named ``module:Name``; the module may lie in the current directory. An
 installed package offers its classes as entry points in the groups ``qfolio.tasks`` and
 ``qfolio.agents``. What a person types is imported (``find``). A folder keeps the names, too, but a
-file may come from a stranger: only modules that have been imported already count there (``build``).
+file may come from a stranger: only modules that have been imported already count there
+(``imported``, ``build``).
 """
 
 import difflib
@@ -106,22 +107,21 @@ def find(kind: Kind, name: str) -> type[Any]:
     return found
 
 
-def build(kind: Kind, name: str, chosen: Mapping[str, Any]) -> Any:
-    """The object that a folder names, with its settings.
+def imported(kind: Kind, name: str) -> type[Any]:
+    """The class that a folder or a setting names.
 
-    Raises QfolioError where that would import a module which nobody but the folder has named.
+    Raises QfolioError where finding it would run code that nobody but a file has named.
     """
-    where = _where(kind, name)
-    if where == _GYMNASIUM:
-        module = str(chosen.get("id", "")).rpartition(":")[0]
-    else:
-        module = name.rpartition(":")[0] if where is None else ""
-    if module and module not in sys.modules and not module.startswith("qfolio."):
-        raise QfolioError(
-            f"the {kind} {name} is code of the module {module}, which is not run because a folder "
-            f"names it; if you trust it, add --trust {module} (in Python, import it first)."
-        )
-    found = find(kind, name)
+    if _where(kind, name) is None:
+        _require_imported(kind, name, name.rpartition(":")[0])
+    return find(kind, name)
+
+
+def build(kind: Kind, name: str, chosen: Mapping[str, Any]) -> Any:
+    """The object that a folder names, with its settings; ``imported`` says which are refused."""
+    found = imported(kind, name)
+    if _where(kind, name) == _GYMNASIUM:
+        _require_imported(kind, name, str(chosen.get("id", "")).rpartition(":")[0])
     try:
         return settings.build(found, chosen)
     except TypeError as error:
@@ -176,6 +176,14 @@ def _where(kind: Kind, name: str) -> str | None:
         return _GYMNASIUM
     entries = ENTRIES[kind]
     return entries.table.get(name) or entries.where(kind).get(name)
+
+
+def _require_imported(kind: Kind, name: str, module: str) -> None:
+    if module and module not in sys.modules and not module.startswith("qfolio."):
+        raise QfolioError(
+            f"the {kind} {name} is code of the module {module}, which is not run because a folder "
+            f"names it; if you trust it, add --trust {module} (in Python, import it first)."
+        )
 
 
 def _unknown(kind: Kind, name: str) -> QfolioError:
