@@ -1,4 +1,4 @@
-"""Hyperparameters as text: from ``name=value`` and JSON to an object's fields, and back."""
+"""Settings as text and JSON: from ``name=value`` to an object's fields, and back."""
 
 import dataclasses
 import difflib
@@ -21,12 +21,12 @@ def describe(instance: Any) -> dict[str, Any]:
 
 
 def names(kind: type) -> set[str]:
-    """What can be set of an agent or task."""
+    """Names of the settings of an agent or task."""
     return set(_types(kind))
 
 
 def _types(kind: type) -> dict[str, Any]:
-    """What can be written as text and JSON; arrays are no settings."""
+    """Types of the settings; fields that hold arrays are none."""
     hints = typing.get_type_hints(kind)
     kinds = (bool, int, float, str, tuple[int, ...])
     return {f.name: hints[f.name] for f in dataclasses.fields(kind) if hints[f.name] in kinds}

@@ -32,7 +32,7 @@ _HELD = (*_KNOWN, TrialState.RUNNING)
 
 
 class Trial(NamedTuple):
-    """A configuration that was trained."""
+    """A configuration that has been trained."""
 
     number: int
     values: dict[str, Value]  # of the searched settings
@@ -48,7 +48,7 @@ class Trial(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """A configuration that is to be trained."""
+    """A configuration to train."""
 
     values: dict[str, Value]
     trial: optuna.Trial
@@ -79,7 +79,7 @@ class Journal:
             raise QfolioError(f"{path} is damaged ({error}); restore it, or search anew.") from None
 
     def trials(self) -> list[Trial]:
-        """What all processes have trained so far, in the order in which it was asked for."""
+        """The trials that all processes have finished, in the order of their proposal."""
         found = []
         for trial in self._study.get_trials(states=_KNOWN):
             noted = trial.user_attrs
@@ -92,12 +92,12 @@ class Journal:
         return found
 
     def in_hand(self) -> int:
-        """Trials that processes are working on."""
+        """Number of trials that processes are training."""
         return len(self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
 
     @contextlib.contextmanager
     def at_work(self) -> Iterator[None]:
-        """Shows the others that this process lives."""
+        """Shows other processes that this one is alive."""
         place = self.folder / "processes" / self._process
         place.parent.mkdir(exist_ok=True)
         try:
@@ -107,9 +107,9 @@ class Journal:
             place.unlink(missing_ok=True)
 
     def ask(self, count: int, total: int, preset: Mapping[str, Value]) -> list[Asked]:
-        """What to train next: ``count`` trials, or as many as are missing to ``total``.
+        """Proposes ``count`` trials, or as many as are left of ``total``.
 
-        preset: a configuration that comes first, where the space holds it.
+        preset: a configuration to propose first, if it lies within the space.
         """
         with FileLock(self.folder / "asking.lock"):
             self._give_up_the_dead()
@@ -128,7 +128,7 @@ class Journal:
             return asked
 
     def tell(self, asked: Asked, returns: Sequence[float], seconds: float) -> None:
-        """Notes the returns of a trial by seed; where one is NaN, it is worse than all others."""
+        """Records the returns of a trial by seed; with a NaN it ranks below all others."""
         trial = asked.trial
         trial.set_user_attr("returns", [x if math.isfinite(x) else None for x in returns])
         trial.set_user_attr("seconds", round(seconds, 3))
@@ -139,7 +139,7 @@ class Journal:
             self._study.tell(trial, state=TrialState.PRUNED)
 
     def give_up(self, asked: Asked) -> None:
-        """Notes that a trial was not finished; another will take its place."""
+        """Records that a trial was not finished; it will be proposed again."""
         self._study.tell(asked.trial, state=TrialState.FAIL)
 
     def _sampler(self, known: int, in_hand: int) -> optuna.samplers.TPESampler:
@@ -186,7 +186,7 @@ def best_of(trials: Sequence[Trial]) -> Trial | None:
 
 
 def _mend(journal: Path, lock: JournalFileOpenLock) -> None:
-    """Takes off a last line that a crash has cut short; Optuna would not read on after it."""
+    """Removes a last line that a crash has cut short; Optuna could not read past it."""
     if not journal.exists():
         return
     lock.acquire()

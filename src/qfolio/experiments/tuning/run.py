@@ -44,24 +44,24 @@ STARTS = 256
 """Start states that configurations are compared on."""
 
 FRESH = 1000
-"""The first of the seeds that the best configuration is trained with anew, at the end."""
+"""First of the fresh seeds that the best configuration is retrained with at the end."""
 
 RANDOM = 0.5
-"""Share of the trials that are drawn at random before Optuna's sampler chooses: its own gather
-around the best, and do not show what happens elsewhere."""
+"""Share of the trials that are drawn at random before Optuna's sampler takes over, whose own trials
+gather around the best and do not show what happens elsewhere."""
 
 
 def tuning_keys(n: int = STARTS) -> Key[Array, " start"]:
-    """Keys of the start states for tuning; none of them is among those that results are graded on.
+    """Keys of the start states for tuning, none of which is used to grade results.
 
-    Choosing by what is graded would make every grade too good.
+    Choosing by the graded starts would bias every grade upwards.
     """
     return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(70607), i))(jnp.arange(n))
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a search is, after each batch."""
+    """Progress of a search, after each batch."""
 
     done: int  # trials of all processes
     total: int
@@ -262,18 +262,18 @@ class Tuning:
         return result, seconds_compile
 
     def conclude(self, listener: Callable[[float], None] | None = None) -> dict[str, Any]:
-        """Trains the best configuration with fresh seeds, beside the agent that it started from.
+        """Trains the best configuration and the preset with fresh seeds, and grades both.
 
-        Both are graded on the fixed start states, which tuning never saw. The result is written to
-        summary.json, and read from there where the best is still the same.
+        They are graded on the fixed start states, which the search never used. The result is
+        written to summary.json, and read from there while the best is the same.
         """
         trials = self.journal.trials()
         found = best_of(trials)
         if found is None:
             raise QfolioError(
                 f"None of the {len(trials)} configurations kept a finite loss; search lower "
-                "learning rates, or bound the gradient (huber or max_grad_norm, whichever the "
-                "agent has)."
+                "learning rates, or bound the gradient (huber_delta or max_grad_norm, whichever "
+                "the agent has)."
             )
         path = self.folder / "summary.json"
         if path.exists() and (summary := read_json(path)).get("best") == found.values:
@@ -302,7 +302,7 @@ class Tuning:
     def _train(
         self, asked: Sequence[Asked], listener: Callable[[float], None] | None = None
     ) -> Progress:
-        """Trains a batch and notes what it returned."""
+        """Trains a batch and records its returns."""
         start = perf_counter()
         try:
             agents = [self.configured(one.values) for one in asked]

@@ -1,4 +1,4 @@
-"""The space of a hyperparameter search: which settings, from where to where, and on what scale."""
+"""The space of a hyperparameter search: which settings, over what range, on what scale."""
 
 import dataclasses
 import itertools
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from qfolio.core.mdp import Agent
 
 Value = float | str
-"""Of a searched setting: a number, or the text of a choice."""
+"""Value of a searched setting: a number, or a choice as text."""
 
 USUAL = {
     "learning_rate": "1e-4..1e-2",
@@ -35,14 +35,14 @@ USUAL = {
     "exploration_noise": "0.01..1",
     "initial_temperature": "0.01..1",
 }
-"""Searched unless told otherwise, of the numbers that an agent has; ranges for where its own value
-is 0, 1 or infinite and so says nothing about the scale."""
+"""Settings that are searched by default, where an agent has them. A range surrounds the agent's own
+value; these are the ranges where that value is 0, 1 or infinite and so gives no scale."""
 
 AROUND = 10.0
-"""A range goes from the agent's own value divided by this to that times this."""
+"""A default range spans the agent's own value divided by this and multiplied by it."""
 
 PROGRAMS = 64
-"""The most combinations of settings that shape the program: each is compiled for itself."""
+"""Most combinations of settings that shape the program; each is compiled separately."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Dimension:
 
     @property
     def key(self) -> str:
-        """The name under which the journal holds it."""
+        """Its name in the journal."""
         return f"1-{self.name}" if self.scale == "near-one" else self.name
 
     def distribution(self) -> "BaseDistribution":
@@ -80,7 +80,7 @@ class Dimension:
         return FloatDistribution(*ends, log=self.scale != "linear")
 
     def value(self, stored: Value) -> Value:
-        """The setting for what the journal holds, with four digits that matter."""
+        """The setting for a value in the journal, rounded to four significant digits."""
         if isinstance(stored, str):
             return stored
         short = float(f"{stored:.4g}")
@@ -88,11 +88,11 @@ class Dimension:
         return min(max(value, self.low), self.high)
 
     def stored(self, value: Value) -> Value:
-        """What the journal holds for a value of the setting."""
+        """The value in the journal for a value of the setting."""
         return _missing(value) if self.scale == "near-one" else value  # type: ignore[arg-type]
 
     def position(self, value: Value) -> float:
-        """The place of a value on the scale: 0 at its low end, 1 at its high one."""
+        """Position of a value on the scale, from 0 at the low end to 1 at the high end."""
         if isinstance(value, str):
             return (self.choices.index(value) + 0.5) / len(self.choices)
         if self.scale == "linear":
@@ -104,7 +104,7 @@ class Dimension:
         return (here - low) / (high - low)
 
     def at(self, position: float) -> float:
-        """The number at a place on the scale."""
+        """The value at a position on the scale."""
         if self.scale == "linear":
             return self.low + position * (self.high - self.low)
         ends = (self.low, self.high)
@@ -119,7 +119,7 @@ class Dimension:
         return self.low <= value <= self.high
 
     def around(self, value: float) -> "Dimension":
-        """The same on its scale around a value, where that says something about the scale."""
+        """The dimension with a range around a value, unless that value gives no scale."""
         whole = 1.0 if self.high <= 1 else math.inf  # what is a share stays one
         if self.scale == "near-one" and 0 < value < 1:
             missing = _missing(value)
@@ -150,7 +150,7 @@ def parse(assignments: Iterable[str], kind: type["Agent"]) -> list[Dimension]:
 
 
 def dimension(name: str, text: str, kind: type["Agent"]) -> Dimension:
-    """A dimension from its text; raises QfolioError where that makes no sense."""
+    """Parses one dimension; raises QfolioError where the text is no valid range or list."""
     prefix, colon, rest = text.partition(":")
     scale, body = (prefix.strip(), rest) if colon else ("", text)
     low, dots, high = body.partition("..")
@@ -185,14 +185,14 @@ def dimension(name: str, text: str, kind: type["Agent"]) -> Dimension:
 
 
 def usual(agent: "Agent") -> list[Dimension]:
-    """What is searched unless told otherwise: the agent's numbers that usually matter."""
+    """The dimensions that are searched by default."""
     kind = type(agent)
     names = [name for name in USUAL if name in numbers(kind)]
     return [dimension(n, USUAL[n], kind).around(getattr(agent, n)) for n in names]
 
 
 def numbers(kind: type["Agent"]) -> list[str]:
-    """Settings that are inputs of the program: members of a population may differ in them."""
+    """Settings that are inputs of the program, in which members of a population may differ."""
     hints = typing.get_type_hints(kind)
     fields = dataclasses.fields(kind)
     return [f.name for f in fields if hints[f.name] is float and not f.metadata.get("static")]
@@ -201,9 +201,11 @@ def numbers(kind: type["Agent"]) -> list[str]:
 def require_buildable(
     kind: type["Agent"], base: Mapping[str, Any], space: Sequence[Dimension]
 ) -> None:
-    """Raises QfolioError where an end or a choice makes no agent, before anything is trained."""
+    """Raises QfolioError where the end of a range or a choice is no valid setting."""
     if not space:
-        raise QfolioError(f"{kind.__name__} has no number that is usually searched; name some.")
+        raise QfolioError(
+            f"{kind.__name__} has no setting that is searched by default; name some with --search."
+        )
     for dim in space:
         for value in dim.choices or (dim.low, dim.high):
             settings.build(kind, {**base, dim.name: value})
@@ -231,12 +233,12 @@ def written(settings: Mapping[str, Any]) -> list[str]:
 
 
 def positions(space: Sequence[Dimension], values: Mapping[str, Value]) -> np.ndarray:
-    """The place of one configuration on all scales."""
+    """Position of a configuration on each scale."""
     return np.clip([dim.position(values[dim.name]) for dim in space], 0.0, 1.0)
 
 
 def _scale(low: float, high: float) -> str:
-    """Logarithmic where the ends are a factor of 10 apart, from 0 or from 1."""
+    """Logarithmic where the ends, or their distances from 1, are a factor of 10 apart."""
     if low > 0 and high / low >= 10:
         return "log"
     if high < 1 and _missing(low) / _missing(high) >= 10:
@@ -245,7 +247,7 @@ def _scale(low: float, high: float) -> str:
 
 
 def _missing(share: float) -> float:
-    """What is missing to 1, without the digits that the subtraction makes up."""
+    """1 less a share, without the digits that rounding adds."""
     return float(f"{1 - share:.10g}")
 
 

@@ -21,16 +21,16 @@ from qfolio.experiments.tuning.search import Dimension, positions
 Floats = NDArray[np.float64]
 
 TOLERANCE = 0.05
-"""How much worse than the best a robust value may do, as a share of the optimum (or the best)."""
+"""Loss that a robust value may incur, as a share of the optimum (or of the best return)."""
 
 ENOUGH = 12
-"""Trials from which on effects are estimated at all."""
+"""Fewest trials from which effects are estimated."""
 
 MOST = 400
-"""Trials that the model is fitted to, evenly from first to last: its time grows with their cube."""
+"""Most trials that the model is fitted to, evenly spaced: its cost grows with their cube."""
 
 POINTS = 41
-"""On the scale of each setting."""
+"""Points on the scale of each setting at which its effect is estimated."""
 
 _LEAST_REGRET = 1e-4
 
@@ -58,14 +58,14 @@ class Outcome:
 
     @property
     def tolerance(self) -> str:
-        """What a robust value may lose, in words."""
+        """The loss that a robust value may incur, in words."""
         share = f"{100 * TOLERANCE:.0f}"
         if self.optimum is None:
             return f"{share}\N{NARROW NO-BREAK SPACE}% of the best return"
         return f"{share} points of regret"
 
     def height(self, returns: ArrayLike) -> Floats:
-        """Of returns; those that are NaN count as the worst."""
+        """Heights of returns; NaN counts as the worst."""
         values = np.nan_to_num(np.asarray(returns, float), nan=self.floor)
         if self.optimum is None:
             return np.maximum(values, self.floor)
@@ -73,7 +73,7 @@ class Outcome:
         return -np.log10(np.maximum(regret, _LEAST_REGRET))
 
     def loss(self, height: ArrayLike) -> Floats:
-        """What is missing at a height, as a share of the optimum (or of the best return)."""
+        """The loss at a height, as a share of the optimum (or of the best return)."""
         values = np.asarray(height, float)
         if self.optimum is None:
             return (self.best - values) / max(abs(self.best), 1e-12)
@@ -82,7 +82,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Effect:
-    """What one setting does."""
+    """The effect of one setting."""
 
     dimension: Dimension
     share: float  # of the variation, by itself
@@ -102,7 +102,7 @@ class Effect:
 
     @property
     def width(self) -> float:
-        """The share of what was searched that is robust."""
+        """Share of the searched range that is robust."""
         if self.dimension.choices:
             return float(self.robust.mean())
         low, high = self.range
@@ -111,7 +111,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What a search says about its settings, the most important first."""
+    """The effects of all settings, most important first."""
 
     outcome: Outcome
     effects: list[Effect]
@@ -121,7 +121,7 @@ class Sensitivity:
 def sensitivity(
     space: Sequence[Dimension], trials: Sequence[Trial], optimum: float | None
 ) -> Sensitivity | None:
-    """Importance and effect of each setting; None where there are too few trials to say."""
+    """Importance and effect of each setting; None where there are too few trials."""
     values = [trial.value for trial in trials]
     if np.isfinite(values).sum() < ENOUGH:
         return None
@@ -262,7 +262,7 @@ def percent(share: float) -> str:
 
 
 def short(value: float) -> str:
-    """A setting with as few digits as tell it apart: two that matter, near 1 of what is missing."""
+    """Two significant digits of a setting; near 1, of its distance from 1."""
     if 0.9 < value < 1:
         return f"{value:.{1 - math.floor(math.log10(1 - value))}f}".rstrip("0")
     return f"{float(f'{value:.2g}'):g}"
