@@ -68,15 +68,15 @@ class Outcome:
         """Heights of returns; NaN counts as the worst."""
         values = np.nan_to_num(np.asarray(returns, float), nan=self.floor)
         if self.optimum is None:
-            return np.maximum(values, self.floor)
+            return np.asarray(np.maximum(values, self.floor))
         regret = (self.optimum - values) / max(abs(self.optimum), 1e-12)
-        return -np.log10(np.maximum(regret, _LEAST_REGRET))
+        return np.asarray(-np.log10(np.maximum(regret, _LEAST_REGRET)))
 
     def loss(self, height: ArrayLike) -> Floats:
         """The loss at a height, as a share of the optimum (or of the best return)."""
         values = np.asarray(height, float)
         if self.optimum is None:
-            return (self.best - values) / max(abs(self.best), 1e-12)
+            return np.asarray((self.best - values) / max(abs(self.best), 1e-12))
         return np.asarray(10.0**-values)
 
 
