@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, NoReturn
 
+from qfolio.core.text import printable
 from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 
 OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
@@ -62,5 +63,5 @@ def run() -> NoReturn:
 
 
 def _refuse(sentence: str) -> NoReturn:
-    print(f"qfolio: {sentence}", file=sys.stderr)
+    print(f"qfolio: {printable(sentence)}", file=sys.stderr)
     sys.exit(2)

@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -103,21 +104,67 @@ def test_allocations_that_are_refused(folder, monkeypatch, capsys, options, mess
     assert "Traceback" not in printed
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("asset,shares\nD,1\n", "does not know"), ("asset,shares\nA,-1\n", "0 or more"),
-        ("asset,shares\nA,x\n", "must be a number"), ("A,1\n", "columns asset and shares"),
-        ("asset,shares\nA,1\nA,2\n", "comes twice"), ("", "columns asset and shares"),
-        ("asset,shares\ncash,5\n", "leave out one"), ("asset,shares\nA,nan\n", "0 or more"),
-    ],
-)  # fmt: skip
-def test_holdings_that_are_refused(folder, monkeypatch, capsys, tmp_path, content, message):
+def test_holdings_are_refused_by_their_line(folder, monkeypatch, capsys, tmp_path):
     path = tmp_path / "holdings.csv"
-    path.write_text(content)
+    path.write_text("asset,shares\nA,1\ncash,5\n")
     assert qfolio(monkeypatch, "allocate", folder, *AS_OF, "--holdings", path,
                   "--capital", 5) == 2  # fmt: skip
-    assert message in capsys.readouterr().err
+    assert "line 3: cash is also given by --capital" in capsys.readouterr().err
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    """Of the finished backtest, to change."""
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def judge(folder, low, high, verdict):
+    """Has the backtest find this of its agent, beside equal weights."""
+    path = folder / "summary.json"
+    summary = json.loads(path.read_text())
+    difference = summary["strategies"]["pathwise-together"]["to_reference"]
+    assert len(difference["growth_interval"]) == 2
+    difference.update(growth_interval=[low, high], verdict=verdict)
+    path.write_text(json.dumps(summary))
+
+
+def test_an_allocation_names_agent_date_and_verdict(folder, copy, monkeypatch, capsys):
+    verdict = json.loads((folder / "summary.json").read_text())["strategies"]["pathwise-together"][
+        "to_reference"
+    ]["verdict"]
+    plan = allocation(folder, monkeypatch, capsys, "--capital", 1)
+    assert (plan["agent"], plan["trained_until"]) == ("pathwise", "2020-09-16")
+    assert plan["verdict"] == verdict
+    judge(copy, -0.02, 0.03, "No evidence of \x1b[2Jskill.")
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 0
+    printed = capsys.readouterr().out
+    assert "Agent: pathwise, trained on prices up to 2020-09-16." in printed
+    assert "In its backtest: No evidence of \\x1b[2Jskill." in printed
+
+
+def test_a_policy_that_was_found_worse_is_traded_on_demand_only(copy, monkeypatch, capsys):
+    for high in (-0.01, None):  # null stands for wealth that is gone
+        judge(copy, -0.03, high, "pathwise-together falls short of equal-weight.")
+        assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 2
+        assert capsys.readouterr().err == (
+            "qfolio: In its own backtest, pathwise-together falls short of equal-weight; to trade "
+            "it all the same, add --agent pathwise or --anyway.\n"
+        )
+    for consent in (["--agent", "pathwise"], ["--anyway"]):
+        plan = allocation(copy, monkeypatch, capsys, "--capital", 1, *consent)
+        assert plan["verdict"] == "pathwise-together falls short of equal-weight."
+
+
+def test_a_backtest_without_a_verdict(copy, monkeypatch, capsys):
+    (copy / "summary.json").write_text('{"strategies": {"pathwise": 1}}')
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 2
+    assert "summary.json is damaged; write it again" in capsys.readouterr().err
+    (copy / "summary.json").unlink()
+    for consent in ([], ["--agent", "pathwise"]):
+        assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1, *consent) == 2
+        assert "is not finished, so it does not say how pathwise" in capsys.readouterr().err
+    plan = allocation(copy, monkeypatch, capsys, "--capital", 1, "--anyway")
+    assert plan["verdict"] is None
 
 
 def test_prices_that_do_not_match(folder, monkeypatch, capsys, tmp_path):
@@ -138,6 +185,22 @@ def test_the_check_of_prices(monkeypatch, capsys, tmp_path):
     printed = capsys.readouterr().out
     assert "row 6 (2020-01-05), column 'C'" in printed
     assert "negative" in printed
+
+
+def test_the_check_of_prices_guesses_at_splits_and_escapes_names(monkeypatch, capsys, tmp_path):
+    path = write_table(tmp_path / "prices.csv", names=("A", "B", "\x1b[2J\u202eC"))
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    for row in rows[200:]:
+        row[1] = str(float(row[1]) / 2)
+    path.write_text("\n".join(map(",".join, rows)))
+    assert qfolio(monkeypatch, "prices", path, "--features", rows[0][3]) == 0
+    printed = capsys.readouterr().out
+    assert "close to 1/2: perhaps a split that was not adjusted. If so, use adj" in printed
+    assert "0 errors, 1 warning, 0 notes." in printed
+    assert "Features: \\x1b[2J\\u202eC." in printed
+    monkeypatch.chdir(tmp_path)
+    assert qfolio(monkeypatch, "prices", "\x1b[2J.csv") == 2
+    assert "\\x1b[2J.csv' cannot be read" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

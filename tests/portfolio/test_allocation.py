@@ -127,10 +127,12 @@ def test_what_was_learned_is_kept_last(monkeypatch, tmp_path, capsys):
             weights=lambda prices, held: {"cash": 1 / 2, "A": 1 / 4, "B": 1 / 4},
             task=SimpleNamespace(cost=0.0),
             updates=updates,
+            learned=np.datetime64("2024-12-31", "s"),
         )
 
     test_run = SimpleNamespace(
         prices=PRICES,
+        agents={"dqn": None},
         config={"feature_names": []},
         policy=lambda agent: policy(0),
         keep=lambda agent, policy: kept.append((agent, policy.updates)),
@@ -138,7 +140,7 @@ def test_what_was_learned_is_kept_last(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(Backtest, "open", lambda folder: test_run)
     newer = tmp_path / "newer.csv"
     newer.write_text("date,A,B\n2025-01-01,1,\n2025-01-02,1,2\n2025-01-03,1,2\n")
-    options = {"prices": newer, "as_of": "2025-01-03", "agent": "dqn", "as_json": True}
+    options = {"prices": newer, "as_of": "2025-01-03", "anyway": True, "as_json": True}
     with pytest.raises(QfolioError, match="nothing to allocate"):
         allocate(tmp_path, update=True, **options)
     assert kept == []
@@ -159,4 +161,7 @@ def test_prices_of_another_day():
     require_fresh(PRICES, "2025-01-07")
     for day, message in (("2025-01-08", "stale"), ("2024-12-30", "after"), ("x", "must be a date")):
         with pytest.raises(QfolioError, match=message):
+            require_fresh(PRICES, day)
+    for day in ("NaT", "today", "2025", ""):  # numpy reads these
+        with pytest.raises(QfolioError, match=f"--as-of is '{day}'; it must be a date"):
             require_fresh(PRICES, day)

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from qfolio.core.registry import short
+from qfolio.core.text import printable
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -20,13 +21,15 @@ if TYPE_CHECKING:
     from qfolio.portfolio.allocation import Allocation
     from qfolio.portfolio.backtest.assessment import Assessment
     from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.portfolio.backtest.standing import Standing
     from qfolio.portfolio.prices.findings import Finding
 
 console = Console(highlight=False)
 
 
 def say(text: str) -> None:
-    print(text, flush=True)
+    """Prints lines; characters that the terminal would obey are escaped."""
+    print("\n".join(map(printable, text.split("\n"))), flush=True)
 
 
 @contextlib.contextmanager
@@ -111,24 +114,25 @@ def print_rule(rule: dict[str, Any]) -> None:
 
 
 def print_findings(findings: "list[Finding]") -> None:
-    """What is wrong with a price table, errors first."""
-    for finding in sorted(findings, key=lambda finding: finding.severity != "error"):
-        said = f"{finding.severity}: {finding}".removesuffix("?")
-        say(f"{said}. {finding.advice or ''}".rstrip())
-    errors = sum(finding.count for finding in findings if finding.severity == "error")
-    warnings = sum(finding.count for finding in findings if finding.severity == "warning")
+    """What is wrong with a price table, errors first, then warnings and notes."""
+    severities = ("error", "warning", "note")
+    for finding in sorted(findings, key=lambda finding: severities.index(finding.severity)):
+        end = "" if str(finding).endswith("?") else "."
+        say(f"{finding.severity}: {finding}{end} {finding.advice}".rstrip())
     if findings:
-        say(f"{errors:,} errors, {warnings:,} warnings.")
+        counts = (sum(f.count for f in findings if f.severity == kind) for kind in severities)
+        said = (f"{n:,} {kind}{'s' * (n != 1)}" for n, kind in zip(counts, severities, strict=True))
+        say(f"{', '.join(said)}.")
 
 
 def print_prices(facts: dict[str, Any]) -> None:
     """What a price table holds, from ``prices.describe``."""
     say(
-        f"{facts['source']}: {facts['rows']:,} rows of {facts['assets']:,} assets, "
+        f"{printable(facts['source'])}: {facts['rows']:,} rows of {facts['assets']:,} assets, "
         f"{facts['first']} to {facts['last']}, about {facts['periods_per_year']:g} a year."
     )
     if facts["features"]:
-        say(f"Features: {', '.join(facts['features'])}.")
+        say(f"Features: {printable(', '.join(facts['features']))}.")
     if facts["note"]:
         say(f"Note: {facts['note']}")
 
@@ -197,8 +201,13 @@ def print_assessment(assessment: "Assessment") -> None:
         say(verdict)
 
 
-def print_allocation(allocation: "Allocation") -> None:
-    """The trades of tomorrow, and what they cost."""
+def print_allocation(allocation: "Allocation", standing: "Standing", trained: str) -> None:
+    """Whose trades these are, the trades, and what they cost.
+
+    trained: the date of the last row that the policy has learned from.
+    """
+    say(f"Agent: {standing.agent}, trained on prices up to {trained}.")
+    say(f"In its backtest: {standing.verdict or 'not finished, so there is no verdict.'}")
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("asset")
     for name in ("price", "weight now", "target", "trade, money", "trade, shares"):
@@ -215,7 +224,7 @@ def print_allocation(allocation: "Allocation") -> None:
     for asset, price, now, target, trade in rows:
         if now or target or trade:
             table.add_row(
-                Text(asset),
+                Text(printable(asset)),
                 f"{price:,.2f}",
                 f"{now:.2%}",
                 f"{target:.2%}",
@@ -227,5 +236,5 @@ def print_allocation(allocation: "Allocation") -> None:
     say(
         f"After the close of {allocation.date}: wealth {allocation.wealth:,.2f}, expected cost "
         f"{allocation.cost:,.2f}, cash left {allocation.cash_after:,.2f}. "
-        "Assets that are neither held nor wanted are left out."
+        "Assets that are neither held nor wanted are not shown."
     )

@@ -41,15 +41,15 @@ def prices(
     features: Names = (),
     date: Name = None,
 ) -> None:
-    """Check a price table and say what is wrong with it, by row and column.
+    """Check a price table and report what is wrong with it, by row and column.
 
     Args:
-        file: CSV or Parquet, wide (date × asset) or long (date, asset, price); the 20 US stocks
-            that come with qfolio if none is given.
-        missing: What becomes of a missing price.
-        late: What becomes of assets that start later than others.
-        features: Columns of further numbers, which are no assets.
-        date: The column of dates, where its name does not tell.
+        file: CSV or Parquet file, wide (a column per asset), long (date, asset, price) or as
+            yfinance saves it (default: the 20 US stocks that come with qfolio).
+        missing: How to treat missing prices.
+        late: How to treat assets that start later than the table.
+        features: Columns that hold features instead of prices.
+        date: Column of dates (default: found by its name).
     """
     from qfolio.commands import console
     from qfolio.portfolio.prices.table import check, describe, load
@@ -166,6 +166,7 @@ def allocate(
     holdings: File = None,
     capital: Annotated[float | None, arg(metavar="X", help_behavior_hint="")] = None,
     agent: Name = None,
+    anyway: bool = False,
     whole_shares: bool = False,
     as_of: Annotated[str | None, arg(metavar="DATE", help_behavior_hint="")] = None,
     update: bool = False,
@@ -175,37 +176,50 @@ def allocate(
     date: Name = None,
     as_json: Annotated[bool, arg(name="json")] = False,
 ) -> None:
-    """Tomorrow's target weights, and the trades that lead there.
+    """Compute tomorrow's target weights, and the trades that lead there.
+
+    The verdict of the backtest on the agent is printed, too. Where the first agent did worse than
+    equal weights, nothing is allocated without --agent or --anyway.
 
     Args:
-        folder: The folder of a backtest; its policy was trained on the latest rows, too.
-        prices: The latest prices, CSV or Parquet, with the assets of the backtest; those of the
-            backtest itself if none are given.
-        holdings: CSV with the columns asset and shares; a row "cash" holds money. Without it, all
-            is cash.
-        capital: Money in cash; without holdings, all there is.
-        agent: Whose weights; the backtest's first agent otherwise.
-        whole_shares: Round trades so that no fractions of shares are needed.
-        as_of: The day for which weights are wanted (today otherwise); prices may be at most a week
-            older.
-        update: Go on learning from the new rows before answering, and keep what was learned.
+        folder: Folder of a backtest; its policies were trained on the latest rows, too.
+        prices: Latest prices, CSV or Parquet, of the assets of the backtest (default: the prices
+            of the backtest).
+        holdings: Table with a column of assets (asset, symbol, ticker) and one of shares (shares,
+            quantity, qty); a row "cash" holds money (default: all is cash).
+        capital: Money in cash, unless the holdings say it.
+        agent: Agent to follow (default: the first of the backtest).
+        anyway: Allocate even if the backtest is not finished, or found the agent worse than equal
+            weights.
+        whole_shares: Trade whole shares only.
+        as_of: Day for which weights are wanted; prices may be up to a week older (default: today).
+        update: Go on learning from the new rows first, and keep what was learned.
         trust: Modules of your own code that the folder may name (default: none).
-        missing: What becomes of a missing price.
-        features: Columns of further numbers; those of the backtest otherwise.
-        date: The column of dates, where its name does not tell.
+        missing: How to treat missing prices.
+        features: Columns that hold features (default: those of the backtest).
+        date: Column of dates (default: found by its name).
         as_json: Print JSON instead of a table.
     """
+    import numpy as np
+
     from qfolio.core import devices
 
     devices.configure()
     registry.trust(trust)
     from qfolio.commands import console
-    from qfolio.portfolio.allocation import Allocation, read_holdings, require_fresh
+    from qfolio.portfolio.allocation import Allocation, require_fresh
     from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.portfolio.backtest.standing import Standing
+    from qfolio.portfolio.holdings import read_holdings
+    from qfolio.portfolio.prices.findings import day
     from qfolio.portfolio.prices.table import load
 
     run = Backtest.open(folder)
-    policy = run.policy(agent)
+    name = next(iter(run.agents)) if agent is None else agent
+    standing = Standing.of(folder, name)
+    if not anyway:
+        standing.require_sound(folder, named=agent is not None)
+    policy = run.policy(name)
     table = run.prices
     if prices is not None:
         # The policy looks at the last rows only; assets may start at any row before.
@@ -217,12 +231,14 @@ def allocate(
     if update:
         policy = policy.update(table)
     allocation = Allocation.of(policy, table, shares, cash, whole_shares=whole_shares)
+    trained = None if np.isnat(policy.learned) else day(policy.learned)
     if as_json:
-        print(json.dumps(allocation.to_json(), indent=2))
+        of = {"agent": name, "trained_until": trained, "verdict": standing.verdict or None}
+        print(json.dumps({**of, **allocation.to_json()}, indent=2))
     else:
-        console.print_allocation(allocation)
+        console.print_allocation(allocation, standing, trained or "an unknown date")
     if update:
-        run.keep(agent, policy)
+        run.keep(name, policy)
 
 
 def _split(text: str) -> dict[str, str]:

@@ -1,26 +1,23 @@
-"""From target weights to the trades that lead there."""
+"""Turns target weights into trades."""
 
 import dataclasses
 import datetime
 import math
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import quote
 from qfolio.portfolio.costs import remainder_factor
 from qfolio.portfolio.policy import Policy
-from qfolio.portfolio.prices.reading import quote
 from qfolio.portfolio.prices.table import Prices
 
-MAX_AGE = np.timedelta64(7, "D")
-"""Prices older than this are not those of today."""
+MAX_AGE = datetime.timedelta(days=7)
+"""Prices that are older are stale."""
 
 NOISE = 1e-6
-"""Targets that differ from what is held by this weight at most are no orders: policies decide in
-float32."""
+"""Targets within this weight of what is held are no orders, since policies decide in float32."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,11 +43,18 @@ class Allocation:
         *,
         whole_shares: bool = False,
     ) -> "Allocation":
-        """The policy's target after the table's last row, for who holds ``shares`` and ``cash``.
+        """The policy's target after the table's last row, and the trades from what is held now.
 
         The targets are scaled to what is left after costs (the transaction remainder factor), so
         that the trades never need more money than there is. Whole shares are rounded toward zero;
         where less is sold by this than is spent, fewer of the cheapest assets are bought.
+
+        Args:
+            policy: Decides on the target weights.
+            prices: Ends with the row after which to trade.
+            shares: Held now, of shape (assets,).
+            cash: In money.
+            whole_shares: Trade no fractions of shares.
 
         Raises:
             QfolioError: There is nothing to allocate.
@@ -122,7 +126,7 @@ class Allocation:
 
 
 def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """The targets without noise; exactly what is held where nothing is ordered. Cash first."""
+    """The targets without rounding noise, cash first; exactly ``held`` where nothing is ordered."""
     orders = np.abs(targets - held) > NOISE
     if not orders[1:].any():
         return held
@@ -132,7 +136,7 @@ def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
 
 
 def _whole(trades: np.ndarray, prices: np.ndarray, cash: float, rate: float) -> np.ndarray:
-    """Trades rounded toward zero, and fewer of the cheapest bought where money would not do."""
+    """Trades rounded toward zero, with fewer of the cheapest bought where money runs short."""
     trades = np.trunc(trades + np.copysign(1e-9, trades)) + 0.0  # no -0
     spent, received = np.maximum(trades, 0) @ prices, np.maximum(-trades, 0) @ prices
     budget = (cash + received * (1 - rate)) * (1 - rate)
@@ -145,69 +149,21 @@ def _whole(trades: np.ndarray, prices: np.ndarray, cash: float, rate: float) -> 
     return np.asarray(trades)
 
 
-def read_holdings(
-    path: Path | None, assets: Sequence[str], capital: float | None
-) -> tuple[np.ndarray, float]:
-    """Shares of each asset, and cash, from a CSV with the columns asset and shares.
-
-    Raises:
-        QfolioError: The file cannot be read or names an unknown asset, a number is missing or
-            negative, or cash is given twice.
-    """
-    import csv
-
-    if capital is not None and not 0 <= capital < math.inf:
-        raise QfolioError(f"--capital is {capital}; it must be a sum of money, at least 0.")
-    shares, cash = np.zeros(len(assets)), capital
-    if path is None:
-        return shares, cash or 0.0
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except (UnicodeDecodeError, csv.Error):
-        raise QfolioError(f"{path} is no text file with commas; save it as CSV.") from None
-    header = [cell.strip().lower() for cell in rows[0]] if rows else []
-    if "asset" not in header or "shares" not in header:
-        raise QfolioError(f"{path} needs a first line with the columns asset and shares.")
-    name_at, shares_at = header.index("asset"), header.index("shares")
-    seen = set()
-    for number, row in enumerate(rows[1:], start=2):
-        if not any(cell.strip() for cell in row):
-            continue
-        where = f"{path}, line {number}"
-        try:
-            name, amount = row[name_at].strip(), float(row[shares_at])
-        except (IndexError, ValueError):
-            raise QfolioError(f"{where}: shares must be a number.") from None
-        if not 0 <= amount < math.inf:
-            raise QfolioError(f"{where}: {quote(name)} has {amount} shares; it must be 0 or more.")
-        if name in seen:
-            raise QfolioError(f"{where}: {quote(name)} comes twice; add the two up.")
-        seen.add(name)
-        if name.lower() == "cash":
-            if capital is not None:
-                raise QfolioError(f"{where}: cash is also given by --capital; leave out one.")
-            cash = amount
-        elif name in assets:
-            shares[list(assets).index(name)] = amount
-        else:
-            raise QfolioError(f"{where}: the backtest does not know {quote(name)}.")
-    return shares, cash or 0.0
-
-
 def require_fresh(prices: Prices, as_of: str | None) -> None:
-    """Raises QfolioError where the last prices are not of the week before ``as_of`` (today)."""
+    """Raise QfolioError unless the last prices are of the week up to ``as_of`` (default: today)."""
     try:
-        day = np.datetime64(as_of or datetime.date.today().isoformat(), "D")
+        today = datetime.date.today() if as_of is None else datetime.date.fromisoformat(as_of)
     except ValueError:
-        raise QfolioError(f"--as-of is {as_of!r}; it must be a date such as 2025-12-31.") from None
-    last = prices.dates[-1].astype("datetime64[D]")
-    if last > day:
         raise QfolioError(
-            f"The prices end on {last}, after {day}; leave out the later rows, or set --as-of."
+            f"--as-of is {quote(as_of)}; it must be a date such as 2025-12-31."
+        ) from None
+    last = prices.dates[-1].astype("datetime64[D]").item()
+    if last > today:
+        raise QfolioError(
+            f"The prices end on {last}, after {today}; leave out the later rows, or set --as-of."
         )
-    if day - last > MAX_AGE:
+    if today - last > MAX_AGE:
         raise QfolioError(
-            f"The prices are stale: they end on {last}, {(day - last).astype(int)} days before "
-            f"{day}; bring the latest ones with --prices, or say --as-of {last}."
+            f"The prices are stale: they end on {last}, {(today - last).days} days before {today}; "
+            f"bring the latest with --prices, or set --as-of {last}."
         )

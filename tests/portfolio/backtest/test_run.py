@@ -35,7 +35,7 @@ def table(rows=260, seed=0):
     rng = np.random.default_rng(seed)
     values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0))
     dates = np.datetime64("2020-01-01") + np.arange(rows)
-    return Prices(dates, ("A", "B", "<b>C"), values, note="made up")
+    return Prices(dates, ("A", "B", "=<b>C"), values, note="made up")
 
 
 def create(folder=None, prices=None, agents=AGENTS, **settings):
@@ -201,7 +201,7 @@ def test_tables_say_what_was_replayed(finished):
     assert lines[0].split(",")[:4] == ["date", "dqn/0", "dqn/1", "dqn-together"]
     assert len(lines) == 161
     assert float(lines[1].split(",")[1]) == entries["dqn"].simulation.returns[0, 0]
-    assert (finished.folder / "weights.csv").read_text().startswith("date,strategy,cash,A,B,<b>C")
+    assert (finished.folder / "weights.csv").read_text().startswith("date,strategy,cash,A,B,'=<b>C")
     summary = json.loads((finished.folder / "summary.json").read_text())
     assert summary["strategies"]["pathwise"]["kind"] == "agent"
 
@@ -233,16 +233,16 @@ def test_the_policy_for_tomorrow(finished):
     policy = finished.policy("pathwise")
     latest = finished.prices.between(-30, None)
     weights = policy.weights(latest, {"A": 0.5})
-    assert list(weights) == ["cash", "A", "B", "<b>C"]
+    assert list(weights) == ["cash", "A", "B", "=<b>C"]
     assert sum(weights.values()) == pytest.approx(1, abs=1e-5)
-    shuffled = latest.select(["<b>C", "A", "B"])
+    shuffled = latest.select(["=<b>C", "A", "B"])
     assert policy.weights(shuffled, {"A": 0.5}) == pytest.approx(weights, abs=1e-6)
     for holdings, message in (({"A": 1.5}, "from 0 to 1"), ({"D": 0.5}, "does not know"),
                               ({"A": 0.7, "B": 0.7}, "sum to")):  # fmt: skip
         with pytest.raises(QfolioError, match=message):
             policy.weights(latest, holdings)
     with pytest.raises(QfolioError, match="without 'B'"):
-        policy.weights(latest.select(["A", "<b>C"]))
+        policy.weights(latest.select(["A", "=<b>C"]))
     with pytest.raises(QfolioError, match="5 rows"):
         policy.weights(latest.between(0, 5))
 

@@ -25,6 +25,7 @@ from qfolio.core.files import (
     write_json,
     write_tree,
 )
+from qfolio.core.text import csv_cell
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Row
 from qfolio.portfolio.backtest import baselines
@@ -173,6 +174,5 @@ class BacktestFolder:
 def _csv(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerows([csv_cell(cell) for cell in row] for row in (header, *rows))
     return text.getvalue().encode()

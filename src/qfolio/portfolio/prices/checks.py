@@ -1,13 +1,15 @@
-"""All checks of a price table, in order."""
+"""Runs all checks of a price table, in order."""
 
 from typing import Any
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import quote
+from qfolio.portfolio.prices.columns import find_columns
 from qfolio.portfolio.prices.findings import Finding, Findings
 from qfolio.portfolio.prices.gaps import complete
-from qfolio.portfolio.prices.layout import arrange
+from qfolio.portfolio.prices.grid import arrange
 from qfolio.portfolio.prices.plausibility import FEWEST_ROWS, check_cells, check_moves, check_size
-from qfolio.portfolio.prices.reading import Table, quote
+from qfolio.portfolio.prices.reading import Table
 
 MISSING = ("error", "drop-asset", "forward-fill")
 LATE = ("error", "drop-asset", "trim", "join")
@@ -16,16 +18,17 @@ LATE = ("error", "drop-asset", "trim", "join")
 def examine(
     table: Table, missing: str, late: str, features: tuple[str, ...], date: str | None
 ) -> tuple[dict[str, Any], list[Finding]]:
-    """What ``Prices`` are made of (nothing where the table has errors), and all findings.
+    """The arguments of ``Prices`` (none where the table has errors), and all findings.
 
     Raises:
-        QfolioError: A choice is not known.
+        QfolioError: ``missing`` or ``late`` is not one of the choices.
     """
     for name, value, known in (("missing", missing, MISSING), ("late", late, LATE)):
         if value not in known:
             raise QfolioError(f"{name} is {quote(value)}; it must be one of {', '.join(known)}.")
     findings = Findings()
-    grid = arrange(table, features, date, findings)
+    columns = find_columns(table, features, date, findings)
+    grid = None if columns is None else arrange(table, columns, findings)
     if grid is None:
         return {}, findings
     ordered = not findings.bad

@@ -1,25 +1,29 @@
-"""What is wrong with a price table: sentences with their row, column and advice."""
+"""Findings: what is wrong or odd in a price table, and what to do about it."""
 
 import difflib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from qfolio.portfolio.prices.reading import Table, quote
+from qfolio.core.text import quote
 
-LISTED = 5  # faults of one kind that are named one by one; the rest is counted
+LISTED = 5  # findings of one kind that are named one by one; the others are counted
+
+Severity = Literal["error", "warning", "note"]
 
 
 @dataclass(frozen=True)
 class Finding:
     """One thing that is wrong with a table, or ``count`` of a kind.
 
-    ``row`` is counted as people see it: in text files from 1, the header included, as spreadsheets
-    and editors do; in data frames and Parquet files from 0.
+    An error stops the table from being read. A warning is something odd, and a note says how the
+    table was read. Rows are counted as people see them: in text files from 1, header included, as
+    spreadsheets and editors do; in data frames and Parquet files from 0.
     """
 
-    severity: str  # "error" or "warning"
+    severity: Severity
     message: str
     row: int | None = None
     column: str | None = None
@@ -37,81 +41,34 @@ class Finding:
         return f"{where}: {self.message}" if where else self.message
 
 
-# The way from cells to prices.
-
-
-@dataclass(frozen=True)
-class Block:
-    """One kind of number, prices or a feature, by date and asset (or by date alone)."""
-
-    values: np.ndarray  # (rows, assets or 1), NaN where missing or wrong
-    wrong: np.ndarray  # where something stands that is no number
-    columns: tuple[int, ...]  # the table's column that each column here comes from
-    name: str  # "price", or "feature"
-
-
-@dataclass(frozen=True)
-class Grid:
-    """The table's cells by date and asset, before anything is dropped or filled."""
-
-    table: Table
-    long: bool
-    dates: np.ndarray  # (rows,)
-    assets: tuple[str, ...]
-    lines: np.ndarray  # (rows, assets): the row of the table; -1 where a long table has none
-    prices: Block
-    features: tuple[Block, ...]
-
-    def spot(self, block: Block, i: int, j: int) -> dict[str, Any]:
-        """Where a cell stands, for a finding."""
-        line = int(self.lines[i, j])
-        return {
-            "row": self.table.first_row + line if line >= 0 else None,
-            "column": self.table.names[block.columns[j]],
-            "date": None if np.isnat(self.dates[i]) else day(self.dates[i]),
-        }
-
-    def subject(self, block: Block, j: int) -> str:
-        return f"the {block.name}" + (f" of {quote(self.assets[j])}" if self.long else "")
-
-
 class Findings(list[Finding]):
+    """All findings on a table, in the order in which they were made."""
+
     def error(self, message: str, **rest: Any) -> None:
         self.append(Finding("error", message, **rest))
 
     def warn(self, message: str, **rest: Any) -> None:
         self.append(Finding("warning", message, **rest))
 
-    def cells(self, grid: Grid, block: Block, mask: np.ndarray, what: Any, advice: str) -> None:
-        """An error for each cell of the mask; ``what`` is a text or a function of (i, j)."""
-        spots = np.argwhere(mask)
-        for i, j in spots[:LISTED].tolist():
-            said = f": {what(i, j)}" if callable(what) else f" {what}"
-            self.error(grid.subject(block, j) + said, **grid.spot(block, i, j), advice=advice)
-        if (rest := len(spots) - LISTED) > 0:
-            kind = "is no number" if callable(what) else what
-            more = amount(rest, f"more {block.name}")
-            self.error(f"and {more}: the {block.name} {kind}", advice=advice, count=rest)
+    def note(self, message: str, **rest: Any) -> None:
+        self.append(Finding("note", message, **rest))
 
-    def rows(self, table: Table, column: str, said: dict[int, str], advice: str) -> None:
-        """An error for each row of the table in ``said``."""
+    def rows(self, first_row: int, column: str, said: Mapping[int, str], advice: str) -> None:
+        """An error for each row in ``said``, which are counted from ``first_row``."""
         for line in list(said)[:LISTED]:
-            row = table.first_row + line
-            self.error(said[line], row=row, column=column, advice=advice)
+            self.error(said[line], row=first_row + line, column=column, advice=advice)
         if (rest := len(said) - LISTED) > 0:
-            self.error(
-                f"and {amount(rest, 'more row')} of this kind",
-                column=column,
-                advice=advice,
-                count=rest,
-            )
+            more = f"and {amount(rest, 'more row')} of this kind"
+            self.error(more, column=column, advice=advice, count=rest)
 
     @property
     def bad(self) -> bool:
+        """True where there is an error."""
         return any(finding.severity == "error" for finding in self)
 
 
 def day(moment: Any) -> str:
+    """A date, with its time unless that is midnight."""
     text = str(np.datetime64(moment, "s"))
     return text.removesuffix("T00:00:00").replace("T", " ")
 
@@ -121,6 +78,14 @@ def amount(count: int, noun: str) -> str:
     return f"{count:,} {noun}" + "s" * (count != 1)
 
 
-def hint(name: str, known: Any) -> str:
+def listing(names: Iterable[str]) -> str:
+    """The first few names in quotation marks, and how many more there are."""
+    quoted = [quote(name) for name in names]
+    rest = len(quoted) - LISTED
+    return ", ".join(quoted[:LISTED]) + (f" and {rest:,} more" if rest > 0 else "")
+
+
+def hint(name: str, known: Iterable[str]) -> str:
+    """A question that names the closest of the known names; nothing if none is close."""
     close = difflib.get_close_matches(name, [k for k in known if k], n=1)
     return f"; did you mean {quote(close[0])}?" if close else ""

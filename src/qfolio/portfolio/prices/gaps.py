@@ -1,11 +1,12 @@
-"""Missing prices and assets that start late: what remains of a grid after the user's choices."""
+"""Treats missing prices and assets that start late as the user chose."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from qfolio.portfolio.prices.findings import LISTED, Findings, Grid, amount, day
-from qfolio.portfolio.prices.reading import quote
+from qfolio.core.text import quote
+from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day, listing
+from qfolio.portfolio.prices.grid import Grid, report_cells
 
 
 @dataclass(frozen=True)
@@ -13,13 +14,13 @@ class Rest:
     """What remains of a grid after the user's choices: rows from ``head`` on, and these assets."""
 
     head: int
-    assets: np.ndarray  # places in the grid
+    assets: np.ndarray  # columns of the grid
     values: np.ndarray
     features: np.ndarray
 
 
 def complete(grid: Grid, missing: str, late: str, findings: Findings) -> Rest:
-    """Closes gaps or drops assets as the user chose: first ``missing``, then ``late``."""
+    """Close gaps and drop assets as the user chose: first ``missing``, then ``late``."""
     values, names = grid.prices.values, grid.assets
     present = ~np.isnan(values) | grid.prices.wrong
     rows = np.arange(len(values))[:, None]
@@ -33,16 +34,21 @@ def complete(grid: Grid, missing: str, late: str, findings: Findings) -> Rest:
     gaps = ~present & (rows >= start)
     drop = np.zeros(len(names), dtype=bool)
     # Features start with their asset; those of the market with the table.
-    unknown = [np.isnan(b.values) & ~b.wrong & ((rows >= start) if grid.long else (rows >= head))
-               for b in grid.features]  # fmt: skip
+    unknown = [
+        np.isnan(block.values) & ~block.wrong & (rows >= (start if block.by_asset else head))
+        for block in grid.features
+    ]
     filled = [block.values for block in grid.features]
 
     if missing == "drop-asset":
         drop = empty | gaps.any(axis=0)
-        if grid.long:
-            for holes in unknown:
+        for block, holes in zip(grid.features, unknown, strict=True):
+            if block.by_asset:
                 drop |= holes.any(axis=0)
-            unknown = [holes & ~drop for holes in unknown]
+        unknown = [
+            holes & ~drop if block.by_asset else holes
+            for block, holes in zip(grid.features, unknown, strict=True)
+        ]
         _report_dropped(names, drop, "prices are missing", findings)
     else:
         for j in np.flatnonzero(empty)[:LISTED].tolist():
@@ -57,10 +63,10 @@ def complete(grid: Grid, missing: str, late: str, findings: Findings) -> Rest:
         unknown = [holes & np.isnan(c) for holes, c in zip(unknown, filled, strict=True)]
     if missing == "error":
         advice = (
-            "Fill the cells, or choose what becomes of gaps: missing='forward-fill' or "
+            "Fill the cells, or choose how to treat gaps: missing='forward-fill' or "
             "'drop-asset' (--missing)."
         )
-        findings.cells(grid, grid.prices, gaps & (rows < end), "is missing", advice)
+        report_cells(grid, grid.prices, gaps & (rows < end), "is missing", advice, findings)
         stops = np.flatnonzero((start < end) & (end < len(values)))
         for j in stops[:LISTED].tolist():
             last = day(grid.dates[end[j] - 1])
@@ -68,16 +74,16 @@ def complete(grid: Grid, missing: str, late: str, findings: Findings) -> Rest:
         if (rest := len(stops) - LISTED) > 0:
             findings.error(f"and {amount(rest, 'more asset')} whose prices end early", count=rest)
     for block, holes in zip(grid.features, unknown, strict=True):
-        findings.cells(
+        report_cells(
             grid, block, holes, "is missing",
             "Fill the cells, start the table where the features do, or choose "
-            "missing='forward-fill' (--missing).",
+            "missing='forward-fill' (--missing).", findings,
         )  # fmt: skip
 
     keep = ~drop & ~empty
     behind = keep & (start > head)
     if behind.any():
-        advice = "Choose what becomes of it: late='drop-asset', 'trim' or 'join' (--late)."
+        advice = "Choose how to treat late starts: late='drop-asset', 'trim' or 'join' (--late)."
         if late == "error":
             for j in np.flatnonzero(behind)[:LISTED].tolist():
                 said = f"the first price is that of {day(grid.dates[start[j]])}"
@@ -119,16 +125,14 @@ def _of_asset(grid: Grid, j: int, said: str, advice: str, findings: Findings) ->
 def _report_dropped(
     names: tuple[str, ...], drop: np.ndarray, reason: str, findings: Findings
 ) -> None:
-    if dropped := [quote(names[j]) for j in np.flatnonzero(drop)]:
-        more = " and others" if len(dropped) > LISTED else ""
-        listed = ", ".join(dropped[:LISTED])
-        findings.warn(
-            f"left out, because {reason}: {listed}{more} ({amount(len(dropped), 'asset')})"
-        )
+    if drop.any():
+        listed = listing(names[j] for j in np.flatnonzero(drop))
+        count = amount(int(drop.sum()), "asset")
+        findings.warn(f"left out, because {reason}: {listed} ({count})")
 
 
 def _report_filled(grid: Grid, gaps: np.ndarray, findings: Findings) -> None:
-    """Says how much is filled, and where the longest stretch lies."""
+    """Warn how much is filled, and where the longest gap is."""
     run = np.zeros(gaps.shape[1], dtype=np.int64)
     longest = np.zeros_like(run)
     for row in gaps:

@@ -1,21 +1,20 @@
-"""Whether prices can be right: odd cells, impossible moves, unadjusted splits, gaps in time."""
+"""Reports cells that are no prices, impossible moves, likely splits and gaps in time."""
 
 from typing import Any
 
 import numpy as np
 
-from qfolio.portfolio.prices import reading as tables
-from qfolio.portfolio.prices.findings import LISTED, Block, Findings, Grid, amount, day
+from qfolio.core.text import quote
+from qfolio.portfolio.prices.cells import not_a_number
+from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day
+from qfolio.portfolio.prices.frequency import every_day, spacing
 from qfolio.portfolio.prices.gaps import Rest
-from qfolio.portfolio.prices.reading import quote
+from qfolio.portfolio.prices.grid import Block, Grid, report_cells
 
 FEWEST_ROWS, FEW_ROWS = 3, 60
 LEAST_JUMP = 0.3  # in log; the smallest split, 3/2, is 0.41
 LARGEST_MOVE = 1e6  # within one row; beyond it relatives and their products leave float32
 SPLITS = (1.5, 2, 3, 4, 5, 6, 7, 8, 10, 15, 20, 25, 30, 50, 100, 1000)
-
-
-# Checks and choices on the grid.
 
 
 def check_cells(grid: Grid, findings: Findings) -> None:
@@ -26,7 +25,7 @@ def check_cells(grid: Grid, findings: Findings) -> None:
         if name.strip().lower() == "cash":
             findings.error(
                 f"the asset {quote(name)} has the name of the money that is not invested",
-                advice="Rename or remove its column." if not grid.long else "Rename or remove it.",
+                advice="Rename or remove it." if grid.long else "Rename or remove its column.",
             )
     if len(grid.dates) < FEWEST_ROWS:
         findings.error(
@@ -49,26 +48,27 @@ def check_cells(grid: Grid, findings: Findings) -> None:
         def said_of(i: int, j: int, block: Block = block) -> str:
             return _complaint(grid, block, i, j)
 
-        findings.cells(grid, block, block.wrong & ~texts, said_of, advice)
-        findings.cells(grid, block, np.isinf(block.values), "is infinite", advice)
+        report_cells(grid, block, block.wrong & ~texts, said_of, advice, findings)
+        report_cells(grid, block, np.isinf(block.values), "is infinite", advice, findings)
     values = grid.prices.values
-    findings.cells(
+    report_cells(
         grid, grid.prices, values == 0, "is zero",
         "Leave the cell empty where there was no trade; a worthless asset must be dropped.",
+        findings,
     )  # fmt: skip
-    findings.cells(
+    report_cells(
         grid, grid.prices, np.isfinite(values) & (values < 0), "is negative",
-        "Give prices, not returns.",
+        "Give prices, not returns.", findings,
     )  # fmt: skip
 
 
 def _complaint(grid: Grid, block: Block, i: int, j: int) -> str:
     cell = grid.table.columns[block.columns[j]][int(grid.lines[i, j])]
-    return tables.no_number(cell, grid.table.decimal)
+    return not_a_number(cell, grid.table.decimal)
 
 
 def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
-    """Moves that no market makes, and moves that look like a split which was not adjusted."""
+    """Report moves that no market makes, and moves as large as those of an unadjusted split."""
     values = np.where(np.isfinite(rest.values) & (rest.values > 0), rest.values, np.nan)
     with np.errstate(over="ignore", divide="ignore", under="ignore"):
         relatives = values[1:] / values[:-1]
@@ -99,13 +99,11 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
     for i, j, ratio in sorted(splits)[:LISTED]:
         findings.warn(
             f"{grid.subject(grid.prices, int(rest.assets[j]))} is {relatives[i, j]:.4g} times the "
-            f"one before, close to {ratio}: a split that is not adjusted?",
-            advice="Use adjusted prices.", **spot(i, j),
+            f"one before, close to {ratio}: perhaps a split that was not adjusted",
+            advice="If so, use adjusted prices.", **spot(i, j),
         )  # fmt: skip
     if (more := len(splits) - LISTED) > 0:
-        findings.warn(
-            f"and {amount(more, 'more move')} like splits that are not adjusted", count=more
-        )
+        findings.warn(f"and {amount(more, 'more move')} that may be splits", count=more)
 
 
 def _ratio(split: float, up: bool) -> str:
@@ -138,18 +136,3 @@ def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:
         )
     if (more := len(long) - LISTED) > 0:
         findings.warn(f"and {amount(more, 'more gap')} between dates", count=more)
-
-
-# Dates and names.
-
-
-def spacing(dates: np.ndarray) -> tuple[np.ndarray, float]:
-    """The days from each of two or more rows to the next, and their (lower) median."""
-    steps = np.diff(dates).astype(np.int64) / 86400.0
-    return steps, float(np.sort(steps)[(len(steps) - 1) // 2])
-
-
-def every_day(dates: np.ndarray) -> bool:
-    """True where weekends have rows as other days have."""
-    weekday = (dates.astype("datetime64[D]").astype(np.int64) + 3) % 7  # 1970-01-01: Thursday
-    return float((weekday >= 5).mean()) > 0.1 if len(dates) else False

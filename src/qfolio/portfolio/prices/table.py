@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.prices import reading as tables
+from qfolio.core.text import quote
+from qfolio.portfolio.prices import reading
 from qfolio.portfolio.prices.checks import examine
+from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.findings import Finding, day, hint
-from qfolio.portfolio.prices.layout import text_columns
-from qfolio.portfolio.prices.plausibility import every_day, spacing
-from qfolio.portfolio.prices.reading import quote
+from qfolio.portfolio.prices.frequency import periods_per_year
 
 DEFAULT_SOURCE = "skfolio: 20 US stocks"
 DEFAULT_NOTE = (
@@ -107,8 +107,8 @@ class Prices:
 
     @property
     def periods_per_year(self) -> float:
-        """252 for business days, 365 for every day, 52, 12, 4 or 1, else the rows a year holds."""
-        return _periods_per_year(self.dates)
+        """Rows of a year, as the dates show; cf. ``frequency.periods_per_year``."""
+        return periods_per_year(self.dates)
 
     @property
     def digest(self) -> str:
@@ -234,21 +234,9 @@ def _read(
         from skfolio.datasets import load_sp500_dataset
 
         source, label, note = load_sp500_dataset(), DEFAULT_SOURCE, DEFAULT_NOTE
-    table = tables.read(source, lambda names: text_columns(names, date))
+    table = reading.read(source, lambda names: text_columns(names, date))
     channels = (features,) if isinstance(features, str) else tuple(features)
     content, findings = examine(table, missing, late, channels, date)
     if not content:
         return None, findings
     return Prices(**content, source=label or table.source, note=note), findings
-
-
-def _periods_per_year(dates: np.ndarray) -> float:
-    if len(dates) < 2:
-        return 252.0
-    steps, usual = spacing(dates)
-    if 0.9 <= usual <= 1.1:
-        return 365.0 if every_day(dates) else 252.0
-    for low, high, periods in ((6, 8, 52.0), (27, 32, 12.0), (88, 93, 4.0), (360, 370, 1.0)):
-        if low <= usual <= high:
-            return periods
-    return float(365.25 * len(steps) / steps.sum())

@@ -1,0 +1,33 @@
+"""Text that comes from files, made safe for messages, the terminal and CSV cells."""
+
+import re
+import unicodedata
+from typing import Any
+
+UNSAFE = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
+"""Unicode categories that a terminal may obey instead of showing: control, format (which turns the
+direction of text), unassigned, private, surrogates, line and paragraph separators."""
+
+_FORMULA = re.compile(r"(^|[;\t\r\n])([^\S\t\r\n]*[=+\-@＝＋－＠])")
+
+
+def printable(text: str) -> str:
+    """The text with escapes in place of characters that a terminal may obey."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(ascii(c)[1:-1] if unicodedata.category(c) in UNSAFE else c for c in text)
+
+
+def quote(value: object, limit: int = 60) -> str:
+    """Any value in quotation marks, on one line and cut to ``limit`` characters."""
+    text = str(value)
+    return f"'{printable(text if len(text) <= limit else text[: limit - 1] + '…')}'"
+
+
+def csv_cell(value: Any) -> Any:
+    """The value of a CSV cell; text that a spreadsheet would take for a formula gets an apostrophe.
+
+    Numbers are left alone. Semicolons and tabs start a cell, too, where a spreadsheet splits at
+    them. Source: OWASP, "CSV Injection".
+    """
+    return _FORMULA.sub(r"\1'\2", value) if isinstance(value, str) else value

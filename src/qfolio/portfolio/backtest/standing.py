@@ -1,0 +1,69 @@
+"""How an agent of a finished backtest stands against equal weights."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import read_json
+from qfolio.portfolio.backtest.assessment import MARGIN
+from qfolio.portfolio.backtest.run import TOGETHER
+
+
+@dataclass(frozen=True)
+class Standing:
+    """The verdict of a backtest on the policy that ``allocate`` follows, all seeds together.
+
+    agent: its name.
+    verdict: the sentence of the report; empty where the backtest is not finished.
+    worse: True where the agent grew less than equal weights, beyond what chance explains.
+    """
+
+    agent: str
+    verdict: str
+    worse: bool
+
+    @staticmethod
+    def of(folder: Path, agent: str) -> "Standing":
+        """The standing of an agent, from summary.json in the folder of its backtest.
+
+        Raises:
+            QfolioError: The file is damaged or does not know the agent.
+        """
+        path = folder / "summary.json"
+        if not path.exists():
+            return Standing(agent, "", False)
+        strategies = read_json(path).get("strategies", {})
+        try:
+            agents = [name for name, entry in strategies.items() if entry["kind"] == "agent"]
+            if agent not in agents:
+                known = ", ".join(name for name in agents if not name.endswith(TOGETHER))
+                raise QfolioError(f"The backtest has no agent {agent!r}; there is {known}.")
+            name = f"{agent}{TOGETHER}" if f"{agent}{TOGETHER}" in agents else agent
+            difference = strategies[name]["to_reference"]
+            _, high = difference["growth_interval"]
+            # An end that is no finite number is null: the wealth is gone.
+            worse = high is None or high < -MARGIN
+            return Standing(agent, str(difference["verdict"]), worse)
+        except (AttributeError, KeyError, TypeError, ValueError):
+            raise QfolioError(
+                f"{path} is damaged; write it again with qfolio backtest --resume {folder}."
+            ) from None
+
+    def require_sound(self, folder: Path, named: bool) -> None:
+        """Raise QfolioError where the policy should not be traded without a second thought.
+
+        Args:
+            folder: Of the backtest, for the message.
+            named: Whether the user asked for this very agent.
+        """
+        if not self.verdict:
+            raise QfolioError(
+                f"The backtest in {folder} is not finished, so it does not say how {self.agent} "
+                f"compares with equal weights; finish it with qfolio backtest --resume {folder}, "
+                "or allocate with --anyway."
+            )
+        if self.worse and not named:
+            raise QfolioError(
+                f"In its own backtest, {self.verdict.rstrip('.')}; to trade it all the same, add "
+                f"--agent {self.agent} or --anyway."
+            )

@@ -1,0 +1,91 @@
+"""Reads what is held now: shares and cash, as brokers export them."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.text import quote
+from qfolio.portfolio.prices.cells import CURRENCIES, is_missing, label, not_a_number, numbers
+from qfolio.portfolio.prices.findings import hint
+from qfolio.portfolio.prices.reading import read
+from qfolio.portfolio.prices.vocabulary import plain
+
+ASSET_NAMES = ("asset", "symbol", "ticker", "name", "instrument")
+SHARES_NAMES = ("shares", "quantity", "qty", "units", "position")
+CASH = "cash"
+
+
+def read_holdings(
+    path: Path | None, assets: Sequence[str], capital: float | None
+) -> tuple[np.ndarray, float]:
+    """Shares of each asset, of shape (assets,), and cash.
+
+    Args:
+        path: A table with a column of assets (asset, symbol, ticker, …) and one of shares (shares,
+            quantity, qty, …), in which a row "cash" holds money; other columns are left alone.
+            Without it, all is cash.
+        assets: Those that may be held.
+        capital: Money in cash, where the table does not say.
+
+    Raises:
+        QfolioError: The file is not such a table, names an unknown asset or one asset twice, a
+            number cannot be read or is negative, or cash is given twice.
+    """
+    if capital is not None and not 0 <= capital < math.inf:
+        raise QfolioError(f"--capital is {capital}; it must be a sum of money, at least 0.")
+    shares = np.zeros(len(assets))
+    if path is None:
+        return shares, capital or 0.0
+    table = read(path, _name_columns)
+    name_column = _only_column(path, table.names, ASSET_NAMES)
+    shares_column = _only_column(path, table.names, SHARES_NAMES)
+    cells = table.columns[shares_column]
+    values, wrong = numbers(cells, table.decimal)
+    places = {name: j for j, name in enumerate(assets)}
+    held: dict[str, float] = {}
+    for i, cell in enumerate(table.columns[name_column].tolist()):
+        where = f"{path}, line {table.first_row + i}"
+        name, amount = label(cell), float(values[i])
+        if not name and is_missing(cells[i]):
+            continue
+        if name.lower() == CASH:
+            name = CASH
+            if capital is not None:
+                raise QfolioError(f"{where}: cash is also given by --capital; leave out one.")
+        elif name not in places:
+            known = f"the backtest does not know {quote(name)}{hint(name, assets)}"
+            raise QfolioError(f"{where}: {known if name else 'the asset has no name'}.")
+        if name in held:
+            raise QfolioError(f"{where}: {quote(name)} comes twice; add the two up.")
+        if is_missing(cells[i]):
+            raise QfolioError(f"{where}: there is no number of shares of {quote(name)}.")
+        if wrong[i] or (name != CASH and CURRENCIES & set(str(cells[i]))):
+            raise QfolioError(f"{where}: {not_a_number(cells[i], table.decimal)}.")
+        if not 0 <= amount < math.inf:
+            raise QfolioError(f"{where}: {quote(name)} has {amount:g} shares; give 0 or more.")
+        held[name] = amount
+    cash = held.pop(CASH, capital or 0.0)
+    for name, amount in held.items():
+        shares[places[name]] = amount
+    return shares, cash
+
+
+def _name_columns(names: tuple[str, ...]) -> set[int]:
+    """The columns that stay text, though names may look like numbers."""
+    return {j for j, name in enumerate(names) if plain(name) in ASSET_NAMES}
+
+
+def _only_column(path: Path, names: tuple[str, ...], known: tuple[str, ...]) -> int:
+    found = [j for j, name in enumerate(names) if plain(name) in known]
+    if not found:
+        raise QfolioError(
+            f"{path} needs a first line with the columns asset (or symbol, ticker) and shares "
+            "(or quantity, qty)."
+        )
+    if len(found) > 1:
+        listed = " and ".join(quote(names[j]) for j in found)
+        raise QfolioError(f"{path}: the columns {listed} could both be the {known[0]}; keep one.")
+    return found[0]

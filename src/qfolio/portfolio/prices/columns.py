@@ -1,0 +1,212 @@
+"""Tells which column of a table holds dates, which assets, which prices and which features."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from qfolio.core.text import quote
+from qfolio.portfolio.prices.bars import columns_of_kind, pick_prices
+from qfolio.portfolio.prices.cells import dates, is_missing, numbers, readable_date
+from qfolio.portfolio.prices.findings import LISTED, Findings, hint, listing
+from qfolio.portfolio.prices.reading import Table
+from qfolio.portfolio.prices.vocabulary import (
+    ADJUSTED_NAMES,
+    ASSET_NAMES,
+    DATE_NAMES,
+    PRICE_NAMES,
+    plain,
+)
+
+LOOKED_AT = 1000  # cells of a column that tell what it holds
+
+
+class Feature(NamedTuple):
+    """Where a feature is: in one column, or in one for each asset of a wide table."""
+
+    columns: tuple[int, ...]
+    by_asset: bool
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What the columns of a table hold, by their places in it.
+
+    date: where the dates are.
+    asset: where a long table names the asset of a row; None in a wide one.
+    assets: names of the assets of a wide table; empty in a long one.
+    prices: one for each asset of a wide table; a single one in a long table.
+    """
+
+    date: int
+    asset: int | None
+    assets: tuple[str, ...]
+    prices: tuple[int, ...]
+    features: tuple[Feature, ...]
+
+
+def text_columns(names: tuple[str, ...], date: str | None) -> set[int]:
+    """Columns of a text file that hold dates or names, though they may look like numbers."""
+    known = DATE_NAMES + ASSET_NAMES
+    return {0, *(j for j, name in enumerate(names) if plain(name) in known or name == date)}
+
+
+def find_columns(
+    table: Table, features: tuple[str, ...], date: str | None, findings: Findings
+) -> Columns | None:
+    """The columns that matter; None after an error."""
+    columns = _check_names(table, features, date, findings)
+    if findings.bad:
+        return None
+    when = _date_column(table, columns, date)
+    if when is None:
+        findings.error(
+            "there is no column of dates",
+            advice="Name it 'date', or say which column it is with date= (--date).",
+        )
+        return None
+    counted = (j for j in columns if j != when and _counts_rows(table, j))
+    columns = [j for j in columns if j not in {when, *counted}]
+    single = {table.names[j]: j for j in columns}
+    by_asset = {name: columns_of_kind(table, name) for name in features}
+    for name in features:
+        if name not in single and not by_asset[name]:
+            findings.error(f"the column {quote(name)} holds dates or row numbers, no feature")
+            return None
+    channels = {j for name in features for j in by_asset[name].values()}
+    channels |= {single[name] for name in features if name in single}
+    others = [j for j in columns if j not in channels]
+    label, price = _long_columns(table, others, when, findings)
+    if findings.bad:
+        return None
+    if label is not None and price is not None:
+        return Columns(
+            when, label, (), (price,), tuple(Feature((single[name],), True) for name in features)
+        )
+    _check_wide(table, others, findings)
+    if findings.bad:
+        return None
+    assets, prices = pick_prices(table, others, findings)
+    wanted = []
+    for name in features:
+        if name in single:
+            wanted.append(Feature((single[name],), by_asset=False))
+        elif lacking := [asset for asset in assets if asset not in by_asset[name]]:
+            findings.error(
+                f"there is no {quote(name)} of {listing(lacking)}", advice="Add its column."
+            )
+        else:
+            wanted.append(Feature(tuple(by_asset[name][asset] for asset in assets), by_asset=True))
+    return None if findings.bad else Columns(when, None, assets, prices, tuple(wanted))
+
+
+def _check_names(
+    table: Table, features: tuple[str, ...], date: str | None, findings: Findings
+) -> list[int]:
+    """The columns that count: all but those without name and content."""
+    names = table.names
+    columns = [j for j, name in enumerate(names) if name or not _is_blank(table.columns[j])]
+    places: dict[str, list[int]] = {}
+    for j in columns:
+        places.setdefault(names[j], []).append(j)
+    for name, where in places.items():
+        if len(where) > 1:
+            listed = " and ".join(str(j + 1) for j in where[:LISTED])
+            more = " and others" if len(where) > LISTED else ""
+            findings.error(
+                f"the columns {listed}{more} have the same name", column=name,
+                advice="Give every column a name of its own.",
+            )  # fmt: skip
+    if table.first_row and not findings.bad and readable_date(names[0]):
+        findings.error(
+            "the first line holds values instead of column names", row=table.first_row - 1,
+            advice="Put a line of names on top, such as date,AAPL,MSFT.",
+        )  # fmt: skip
+    for name in dict.fromkeys((*features, *([] if date is None else [date]))):
+        if name not in places and not columns_of_kind(table, name):
+            findings.error(f"there is no column {quote(name)}{hint(name, names)}")
+    if len(set(features)) < len(features) or date in features:
+        findings.error("a column is named twice among the features and the dates")
+    return columns
+
+
+def _is_blank(cells: np.ndarray) -> bool:
+    if cells.dtype.kind == "f":
+        return bool(np.isnan(cells).all())
+    return cells.dtype.kind != "M" and all(map(is_missing, cells.tolist()))
+
+
+def _counts_rows(table: Table, j: int) -> bool:
+    """True for the row numbers that many programs write as a column of their own."""
+    if table.names[j] not in ("", "Unnamed: 0", "index", "__index_level_0__"):
+        return False
+    values, _ = numbers(table.columns[j])
+    return bool(np.array_equal(values, np.arange(len(values))))
+
+
+def _date_column(table: Table, columns: list[int], date: str | None) -> int | None:
+    if date is not None:
+        return table.names.index(date)
+    for name in (*DATE_NAMES, "index level 0"):  # the latter is written by pandas to Parquet
+        for j in columns:
+            if plain(table.names[j]) == name:
+                return j
+    if not columns or plain(table.names[columns[0]]) in ASSET_NAMES:
+        return None
+    cells = table.columns[columns[0]][:LOOKED_AT]
+    moments, _ = dates(cells)
+    likely = (~np.isnat(moments)).any() or numbers(cells)[1].any()
+    return columns[0] if likely else None
+
+
+def _long_columns(
+    table: Table, columns: list[int], when: int, findings: Findings
+) -> tuple[int | None, int | None]:
+    """The columns of assets and of prices in a long table; (None, None) in a wide one.
+
+    NAME and VALUE may also be two assets of a wide table.
+    """
+    names = {j: plain(table.names[j]) for j in columns}
+    assets = [j for j in columns if names[j] in ASSET_NAMES]
+    prices = [j for j in columns if names[j] in ADJUSTED_NAMES] or [
+        j for j in columns if names[j] in PRICE_NAMES
+    ]
+    if not assets or not prices:
+        return None, None
+    labels = [j for j in assets if _are_labels(table.columns[j])]
+    moments, _ = dates(table.columns[when])
+    known = moments[~np.isnat(moments)]
+    if not labels and len(np.unique(known)) == len(known):
+        return None, None
+    for what, found in (("assets", labels or assets), ("prices", prices)):
+        if len(found) > 1:
+            listed = " and ".join(quote(table.names[j]) for j in found)
+            findings.error(f"the columns {listed} could all be the {what}", advice="Keep one.")
+    return (labels or assets)[0], prices[0]
+
+
+def _are_labels(cells: np.ndarray) -> bool:
+    """True for cells that are text, or whole numbers of which few differ: prices are neither."""
+    values, wrong = numbers(cells)
+    if wrong[:LOOKED_AT].any():
+        return True
+    values = values[np.isfinite(values)]
+    different = len(np.unique(values))
+    return bool((values == np.rint(values)).all()) and 0 < different <= max(1, len(values) // 10)
+
+
+def _check_wide(table: Table, columns: list[int], findings: Findings) -> None:
+    for j in columns:
+        if not table.names[j]:
+            findings.error(f"column {j + 1} has no name", advice="Name it or remove it.")
+        cells = table.columns[j][:LOOKED_AT]
+        if (
+            plain(table.names[j]) in ASSET_NAMES
+            and np.isnan(numbers(cells)[0]).all()
+            and not _is_blank(cells)
+        ):
+            findings.error(
+                "holds names of assets, but no column is called price or close",
+                column=table.names[j],
+                advice="Name the column of prices 'price'.",
+            )

@@ -1,0 +1,199 @@
+"""A table's cells by date and asset, whichever way the table is laid out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.text import quote
+from qfolio.portfolio.prices.cells import NO_DATE, currencies, dates, label, numbers
+from qfolio.portfolio.prices.columns import Columns
+from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day
+from qfolio.portfolio.prices.reading import Table
+
+MOST_CELLS, SPARSEST = 100_000_000, 0.05  # a long table that would be this large and this empty
+WRITE_DATES = "Write dates as 2020-01-31."
+
+
+@dataclass(frozen=True)
+class Block:
+    """One kind of number, prices or a feature, by date and asset (or by date alone)."""
+
+    values: np.ndarray  # (rows, assets or 1), NaN where missing or wrong
+    wrong: np.ndarray  # of the same shape: where something stands that is not a number
+    columns: tuple[int, ...]  # the table's column of each column here
+    name: str  # "price" or "feature"
+    by_asset: bool  # False for a feature of the whole market
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The table's cells by date and asset, before anything is dropped or filled."""
+
+    table: Table
+    long: bool
+    dates: np.ndarray  # (rows,)
+    assets: tuple[str, ...]
+    lines: np.ndarray  # (rows, assets): the row of the table; -1 where a long table has none
+    prices: Block
+    features: tuple[Block, ...]
+
+    def spot(self, block: Block, i: int, j: int) -> dict[str, Any]:
+        """Row, column and date of a cell, for a finding."""
+        line = int(self.lines[i, j])
+        return {
+            "row": self.table.first_row + line if line >= 0 else None,
+            "column": self.table.names[block.columns[j]],
+            "date": None if np.isnat(self.dates[i]) else day(self.dates[i]),
+        }
+
+    def subject(self, block: Block, j: int) -> str:
+        """What a finding is about: the price, or in a long table the price of which asset."""
+        return f"the {block.name}" + (f" of {quote(self.assets[j])}" if self.long else "")
+
+
+def report_cells(
+    grid: Grid,
+    block: Block,
+    mask: np.ndarray,
+    what: str | Callable[[int, int], str],
+    advice: str,
+    findings: Findings,
+) -> None:
+    """An error for each cell of the mask; ``what`` is wrong, or tells it from row and asset."""
+    spots = np.argwhere(mask)
+    for i, j in spots[:LISTED].tolist():
+        said = f" {what}" if isinstance(what, str) else f": {what(i, j)}"
+        findings.error(grid.subject(block, j) + said, **grid.spot(block, i, j), advice=advice)
+    if (rest := len(spots) - LISTED) > 0:
+        kind = what if isinstance(what, str) else "is not a number"
+        more = amount(rest, f"more {block.name}")
+        findings.error(f"and {more}: the {block.name} {kind}", advice=advice, count=rest)
+
+
+def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
+    """The grid of a table; None where it would be far too large."""
+    prices = columns.prices
+    if len(signs := sorted(set().union(*(currencies(table.columns[j]) for j in prices)))) > 1:
+        findings.error(
+            f"prices are in several currencies: {' and '.join(signs)}",
+            advice="Convert all prices to one currency.",
+        )
+    moments, complaints = dates(table.columns[columns.date])
+    used = [*prices, *(j for feature in columns.features for j in feature.columns)]
+    values, wrong = _read_numbers(table, used)
+    undated = np.array([complaints.get(i) == NO_DATE for i in range(len(moments))], dtype=bool)
+    blank = undated & np.isnan(values).all(axis=1) & ~wrong.any(axis=1)
+    form = _wide if columns.asset is None else _long
+    return form(table, columns, moments, complaints, values, wrong, blank, findings)
+
+
+def _read_numbers(table: Table, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """The columns' numbers and wrong cells, each of shape (rows, columns)."""
+    count = len(table.columns[0])
+    values, wrong = np.empty((count, len(columns))), np.empty((count, len(columns)), dtype=bool)
+    for k, j in enumerate(columns):
+        values[:, k], wrong[:, k] = numbers(table.columns[j], table.decimal)
+    return values, wrong
+
+
+def _wide(
+    table: Table, columns: Columns, moments: np.ndarray, complaints: dict[int, str],
+    values: np.ndarray, wrong: np.ndarray, blank: np.ndarray, findings: Findings,
+) -> Grid:  # fmt: skip
+    lines = np.flatnonzero(~blank)
+    name = table.names[columns.date]
+    complaints = {line: said for line, said in complaints.items() if not blank[line]}
+    findings.rows(table.first_row, name, complaints, WRITE_DATES)
+    lines = _in_order(table, name, moments, lines, findings)
+    values, wrong, moments = values[lines], wrong[lines], moments[lines]
+    blocks: list[Block] = []
+    start = 0
+    for own, by_asset in ((columns.prices, True), *columns.features):
+        part = slice(start, start + len(own))
+        kind = "feature" if blocks else "price"
+        blocks.append(Block(values[:, part], wrong[:, part], own, kind, by_asset))
+        start = part.stop
+    rows = np.broadcast_to(lines[:, None], (len(lines), max(len(columns.assets), 1)))
+    return Grid(table, False, moments, columns.assets, rows, blocks[0], tuple(blocks[1:]))
+
+
+def _in_order(
+    table: Table, name: str, moments: np.ndarray, lines: np.ndarray, findings: Findings
+) -> np.ndarray:
+    """The rows, turned around where the newest comes first; errors where there is no order."""
+    known = lines[~np.isnat(moments[lines])]
+    steps = np.diff(moments[known]).astype(np.int64)
+    if (steps > 0).all():
+        return lines
+    if len(steps) > 1 and (steps <= 0).all() and (steps < 0).any():
+        findings.note("the newest row comes first; the rows are read in reverse order", column=name)
+        lines, known, steps = lines[::-1], known[::-1], -steps[::-1]
+    first: dict[Any, int] = {}
+    repeated, unsorted = {}, {}
+    for line in known.tolist():
+        before = first.setdefault(moments[line], line)
+        if before != line:
+            row = table.first_row + before
+            repeated[line] = f"the date {day(moments[line])} stands in row {row} already"
+    for line in known[1:][steps < 0].tolist():
+        if line not in repeated:
+            unsorted[line] = f"the date {day(moments[line])} comes after a later one"
+    findings.rows(table.first_row, name, repeated, "Remove one of the two rows.")
+    findings.rows(table.first_row, name, unsorted, "Sort the rows, oldest first.")
+    return lines
+
+
+def _long(
+    table: Table, columns: Columns, moments: np.ndarray, complaints: dict[int, str],
+    values: np.ndarray, wrong: np.ndarray, blank: np.ndarray, findings: Findings,
+) -> Grid | None:  # fmt: skip
+    import pandas as pd
+
+    assert columns.asset is not None
+    names = table.names
+    labels = np.array([label(c) for c in table.columns[columns.asset].tolist()], dtype=object)
+    nameless = labels == ""
+    blank = blank & nameless
+    complaints = {line: said for line, said in complaints.items() if not blank[line]}
+    findings.rows(table.first_row, names[columns.date], complaints, WRITE_DATES)
+    unnamed = {int(i): "the asset has no name" for i in np.flatnonzero(nameless & ~blank)}
+    advice = "Name the asset in every row."
+    findings.rows(table.first_row, names[columns.asset], unnamed, advice)
+
+    lines = np.flatnonzero(~nameless & ~np.isnat(moments))
+    days, i = np.unique(moments[lines], return_inverse=True)
+    j, assets = pd.factorize(labels[lines])  # in order of appearance
+    size = len(days) * len(assets)
+    if size > MOST_CELLS and len(lines) < SPARSEST * size:
+        findings.error(
+            f"{len(assets):,} assets on {len(days):,} dates have {len(lines):,} prices only, "
+            "so that nearly all are missing",
+            advice="Check the columns of dates and assets, or keep the assets that matter.",
+        )
+        return None
+    place = i * len(assets) + j
+    _, first, back = np.unique(place, return_index=True, return_inverse=True)
+    repeated = {
+        int(lines[k]): f"{quote(assets[j[k]])} on {day(days[i[k]])} stands in row "
+        f"{table.first_row + int(lines[first[back[k]]])} already"
+        for k in np.flatnonzero(first[back] != np.arange(len(place))).tolist()
+    }
+    advice = "Remove one of the two rows."
+    findings.rows(table.first_row, names[columns.asset], repeated, advice)
+
+    def pivot(column: np.ndarray, empty: Any) -> np.ndarray:
+        grid = np.full(size, empty, dtype=column.dtype)
+        grid[place[::-1]] = column[::-1]  # the first of repeated rows stands
+        return grid.reshape(len(days), len(assets))
+
+    blocks = [
+        Block(
+            pivot(values[lines, k], np.nan), pivot(wrong[lines, k], False), (c,) * len(assets),
+            "feature" if k else "price", by_asset=True,
+        )
+        for k, (c,) in enumerate((columns.prices, *(own for own, _ in columns.features)))
+    ]  # fmt: skip
+    where = pivot(lines, -1)
+    return Grid(table, True, days, tuple(assets), where, blocks[0], tuple(blocks[1:]))

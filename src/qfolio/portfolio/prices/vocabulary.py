@@ -1,0 +1,41 @@
+"""The names that columns of price tables usually have."""
+
+import re
+
+DATE_NAMES = ("date", "datetime", "timestamp", "time")
+ASSET_NAMES = ("asset", "ticker", "symbol", "name")
+ADJUSTED_NAMES = ("adjusted close", "adj close", "adjclose", "adjusted price", "adj price")
+PRICE_NAMES = ("close", "price", "value")
+KINDS = {
+    "adjusted": (*ADJUSTED_NAMES, "adjusted"),
+    "close": ("close", "closing price", "close/last", "price", "last"),
+    "open": ("open",),
+    "high": ("high",),
+    "low": ("low",),
+    "volume": ("volume", "vol"),
+    "other": (
+        "adj open", "adj high", "adj low", "adj volume", "adjopen", "adjhigh", "adjlow",
+        "adjvolume", "vwap", "trades", "transactions", "trade count", "number of trades",
+        "openint", "open interest", "turnover", "market cap", "marketcap", "close time",
+        "dividends", "dividend", "dividend amount", "divcash", "stock splits", "splits",
+        "split coefficient", "split ratio", "splitfactor", "capital gains", "change", "change %",
+        "chg%", "repaired?",
+    ),
+}  # fmt: skip
+"""What a column of one asset may hold, and how such columns are called."""
+
+_KIND = {name: kind for kind, names in KINDS.items() for name in names}
+
+
+def plain(name: str) -> str:
+    """A column's name without capitals and punctuation: adj close for Adj_Close and <ADJ CLOSE>."""
+    return " ".join(re.sub(r"[-_.<>\s]+", " ", name.lower()).split())
+
+
+def kind(name: str) -> str | None:
+    """What a column of this name holds (a key of ``KINDS``); None for any other name."""
+    return _KIND.get(plain(name))
+
+
+def is_price(name: str) -> bool:
+    return kind(name) in ("adjusted", "close")

@@ -1,0 +1,40 @@
+"""Names from files, made harmless."""
+
+import pytest
+
+from qfolio.core.text import csv_cell, printable, quote
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("A\x1b[31mB", r"A\x1b[31mB"),
+        ("\u202eevil\u2069", r"\u202eevil\u2069"),
+        ("a\nb\r\x85\u2028\x9b", r"a\nb\r\x85\u2028\x9b"),
+        ("\ud800\ufeff", r"\ud800\ufeff"),
+        ("95\N{NARROW NO-BREAK SPACE}% Société, 東京 \N{MINUS SIGN}", None),
+    ],
+)
+def test_a_terminal_obeys_nothing(text: str, shown: str | None):
+    assert printable(text) == (text if shown is None else shown)
+
+
+def test_quotes_are_short():
+    assert quote("x" * 99) == f"'{'x' * 59}…'"
+    assert quote("\x1b") == r"'\x1b'"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["=cmd|' /C calc'!A0", "+1", "-1", "@SUM(A1)", "\t=1", " =1", "\r=1", "＝1", "a;=1", "a\t@b"],
+)
+def test_no_cell_is_a_formula(text: str):
+    cell = csv_cell(text)
+    assert cell.replace("'", "", 1) == text or text.startswith("=cmd")
+    for part in cell.replace("\t", ";").replace("\r", ";").split(";"):
+        assert part.strip()[:1] not in tuple("=+-@＝")
+
+
+def test_other_cells_stay_as_they_are():
+    for value in ("A", "a-b", "2024-01-02", "it's", -1.5, 0, None):
+        assert csv_cell(value) == value

@@ -1,0 +1,37 @@
+"""How many rows a year has, from the dates alone."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from qfolio.portfolio.prices.frequency import periods_per_year
+
+
+@pytest.mark.parametrize(
+    ("frequency", "expected"),
+    [("B", 252), ("D", 365), ("W", 52), ("ME", 12), ("QE", 4), ("YE", 1), ("2D", 182.625)],
+)
+def test_days_and_longer(frequency: str, expected: float):
+    assert periods_per_year(days(pd.date_range("2001-01-01", periods=40, freq=frequency))) == (
+        expected
+    )
+
+
+def test_bars_of_sessions():
+    """From 9:30 to 16:00 there are 79 closes, five minutes apart; one session has no nights."""
+    session = pd.date_range("2024-03-04 09:30", "2024-03-04 16:00", freq="5min")
+    assert periods_per_year(days(session)) == 79 * 252
+    week = np.concatenate([days(session + pd.Timedelta(days=k)) for k in range(5)])
+    assert periods_per_year(week) == 79 * 252
+    half_day = np.concatenate([week, days(session[:43] + pd.Timedelta(days=7))])
+    assert periods_per_year(half_day) == 79 * 252
+
+
+def test_bars_around_the_clock():
+    assert periods_per_year(days(pd.date_range("2024-03-04", periods=24 * 14, freq="h"))) == (
+        24 * 365
+    )
+
+
+def days(index: pd.DatetimeIndex) -> np.ndarray:
+    return index.to_numpy("datetime64[s]")

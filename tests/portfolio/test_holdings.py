@@ -1,0 +1,72 @@
+"""What is held now, from files as brokers export them."""
+
+from pathlib import Path
+
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.holdings import read_holdings
+
+ASSETS = ("AAA", "BBB", "NA")
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "holdings.csv"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "asset,shares\nAAA,100.5\ncash,7\n",
+        "Symbol,Quantity\nAAA,100.5\n\nCash,7\n",
+        "Account,Ticker,Description,Qty,Price\nx,AAA,Triple A,100.5,$3\nx,CASH,,$7,\n",
+        'Symbol;Units\nAAA;"100,5"\nBBB;0\nCash;7\n',
+    ],
+)
+def test_headers_of_brokers(tmp_path: Path, text: str):
+    shares, cash = read_holdings(write(tmp_path, text), ASSETS, None)
+    assert shares.tolist() == [100.5, 0, 0]
+    assert cash == 7
+
+
+def test_names_and_money_that_are_given_otherwise(tmp_path: Path):
+    shares, cash = read_holdings(write(tmp_path, "asset,shares\nNA,2\n"), ASSETS, 5.0)
+    assert (shares.tolist(), cash) == ([0, 0, 2], 5)
+    shares, cash = read_holdings(None, ASSETS, 5.0)
+    assert (shares.tolist(), cash) == ([0, 0, 0], 5)
+    with pytest.raises(QfolioError, match="--capital is nan"):
+        read_holdings(None, ASSETS, float("nan"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("asset,shares\nBBB,1\nAAA,1,000\n", "there are 3 fields, but 2 column names"),
+        ("asset,shares\nAAA,1,000\n", "row 2: there are 3 fields, but 2 column names"),
+        ('asset,shares\nAAA,"1,000"\n', "line 2: '1,000' may mean 1000 or 1.000"),
+        ("asset,shares\nAAA,1_000\n", "line 2: '1_000' is not a number"),
+        ("asset,shares\nAAA,１２\n", "line 2: '１２' is not a number"),
+        ("asset,shares\nAAA,$5\n", "line 2: '$5' is not a number"),
+        ("asset,shares\nAAA,x\n", "line 2: 'x' is not a number"),
+        ("asset,shares\nAAA,True\n", "line 2: 'True' is not a number"),
+        ("asset,shares\nAAA,\n", "line 2: there is no number of shares of 'AAA'"),
+        ("asset,shares\nAAA,nan\n", "line 2: there is no number of shares of 'AAA'"),
+        ("asset,shares\nBBB,1\nAAA\n", "line 3: there is no number of shares of 'AAA'"),
+        ("asset,shares\nAAA,-1\n", "line 2: 'AAA' has -1 shares; give 0 or more"),
+        ("asset,shares\nAAA,inf\n", "line 2: 'AAA' has inf shares; give 0 or more"),
+        ("asset,shares\nAAA,1\nAAA,2\n", "line 3: 'AAA' comes twice; add the two up"),
+        ("asset,shares\ncash,1\nCash,2\n", "line 3: 'cash' comes twice"),
+        ("asset,shares\nAAB,1\n", "line 2: the backtest does not know 'AAB'; did you mean 'AAA'?"),
+        ("asset,shares\n,1\n", "line 2: the asset has no name"),
+        ("asset,shares,shares\nAAA,1,2\n", "'shares' and 'shares' could both be the shares"),
+        ("Symbol,Name,Qty\nAAA,Triple,2\n", "'Symbol' and 'Name' could both be the asset"),
+        ("AAA,1\n", "needs a first line with the columns asset"),
+        ("", "is empty"),
+    ],
+)
+def test_holdings_that_are_refused(tmp_path: Path, text: str, message: str):
+    with pytest.raises(QfolioError) as raised:
+        read_holdings(write(tmp_path, text), ASSETS, None)
+    assert message in str(raised.value)
