@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
 def test_backtest_writes_the_whole_folder(folder):
     assert {path.name for path in folder.iterdir()} == {
         "config.json", "prices.safetensors", "policies", "returns.csv", "weights.csv",
-        "summary.json", "wealth.png", "report.html",
+        "summary.json", "training", "wealth.png", "report.html",
     }  # fmt: skip
     config = json.loads((folder / "config.json").read_text())
     assert config["cost"] == pytest.approx(0.001)

@@ -133,7 +133,7 @@ def test_what_was_learned_is_kept_last(monkeypatch, tmp_path, capsys):
     test_run = SimpleNamespace(
         prices=PRICES,
         agents={"dqn": None},
-        config={"feature_names": []},
+        config=SimpleNamespace(feature_names=[]),
         policy=lambda agent: policy(0),
         keep=lambda agent, policy: kept.append((agent, policy.updates)),
     )

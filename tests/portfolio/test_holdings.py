@@ -58,7 +58,10 @@ def test_names_and_money_that_are_given_otherwise(tmp_path: Path):
         ("asset,shares\nAAA,inf\n", "line 2: 'AAA' has inf shares; give 0 or more"),
         ("asset,shares\nAAA,1\nAAA,2\n", "line 3: 'AAA' comes twice; add the two up"),
         ("asset,shares\ncash,1\nCash,2\n", "line 3: 'cash' comes twice"),
-        ("asset,shares\nAAB,1\n", "line 2: the backtest does not know 'AAB'; did you mean 'AAA'?"),
+        (
+            "asset,shares\nAAB,1\n",
+            "line 2: the backtest does not know 'AAB' (did you mean 'AAA'?).",
+        ),
         ("asset,shares\n,1\n", "line 2: the asset has no name"),
         ("asset,shares,shares\nAAA,1,2\n", "'shares' and 'shares' could both be the shares"),
         ("Symbol,Name,Qty\nAAA,Triple,2\n", "'Symbol' and 'Name' could both be the asset"),

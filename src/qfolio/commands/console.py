@@ -117,8 +117,7 @@ def print_findings(findings: "list[Finding]") -> None:
     """What is wrong with a price table, errors first, then warnings and notes."""
     severities = ("error", "warning", "note")
     for finding in sorted(findings, key=lambda finding: severities.index(finding.severity)):
-        end = "" if str(finding).endswith("?") else "."
-        say(f"{finding.severity}: {finding}{end} {finding.advice}".rstrip())
+        say(f"{finding.severity}: {finding}. {finding.advice}".rstrip())
     if findings:
         counts = (sum(f.count for f in findings if f.severity == kind) for kind in severities)
         said = (f"{n:,} {kind}{'s' * (n != 1)}" for n, kind in zip(counts, severities, strict=True))

@@ -348,7 +348,7 @@ def test_unknown_choices_and_columns():
         load(frame(), missing="backward-fill")
     with pytest.raises(QfolioError, match="late is 'never'"):
         check(frame(), late="never")
-    with pytest.raises(QfolioError, match="no column 'volumes'; did you mean 'volume'"):
+    with pytest.raises(QfolioError, match=r"no column 'volumes' \(did you mean 'volume'"):
         load(frame(A=A, volume=B), features=("volumes",))
     with pytest.raises(QfolioError, match="no column 'day'"):
         load(frame(), date="day")

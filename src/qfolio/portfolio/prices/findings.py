@@ -86,6 +86,6 @@ def listing(names: Iterable[str]) -> str:
 
 
 def hint(name: str, known: Iterable[str]) -> str:
-    """A question that names the closest of the known names; nothing if none is close."""
+    """A question in brackets that names the closest known name; nothing if none is close."""
     close = difflib.get_close_matches(name, [k for k in known if k], n=1)
-    return f"; did you mean {quote(close[0])}?" if close else ""
+    return f" (did you mean {quote(close[0])}?)" if close else ""

@@ -1,6 +1,8 @@
 """Treats missing prices and assets that start late as the user chose."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,99 +17,126 @@ class Rest:
 
     head: int
     assets: np.ndarray  # columns of the grid
-    values: np.ndarray
-    features: np.ndarray
+    values: np.ndarray  # (rows, assets)
+    features: np.ndarray  # (rows, assets, features)
+
+
+class _Span(NamedTuple):
+    """Where prices are, rows counted in the grid."""
+
+    head: int  # the first row with any price
+    start: np.ndarray  # (assets,): the row of the first price; the number of rows if there is none
+    end: np.ndarray  # (assets,): the row after the last price
+    gaps: np.ndarray  # (rows, assets): after the first price, and without one
+
+    @property
+    def empty(self) -> np.ndarray:
+        """Assets without any price."""
+        return self.start >= self.end
 
 
 def complete(grid: Grid, missing: str, late: str, findings: Findings) -> Rest:
     """Close gaps and drop assets as the user chose: first ``missing``, then ``late``."""
-    values, names = grid.prices.values, grid.assets
-    present = ~np.isnan(values) | grid.prices.wrong
+    span = _span(grid)
+    if span.head:
+        findings.warn(f"left out at the start: {amount(span.head, 'row')} without prices")
+    values, channels, keep = _treat_gaps(grid, span, missing, findings)
+    head, keep = _treat_late_starts(grid, span, keep, late, findings)
+    if grid.assets and not keep.any():
+        findings.error("no asset is left", advice="Look at the gaps of the table first.")
+    channels = [np.broadcast_to(channel, values.shape) for channel in channels]
+    features = np.stack(channels, axis=-1) if channels else np.empty((*values.shape, 0))
+    return Rest(head, np.flatnonzero(keep), values[head:, keep], features[head:, keep])
+
+
+def _span(grid: Grid) -> _Span:
+    present = ~np.isnan(grid.prices.values) | grid.prices.wrong
+    count, some = len(present), present.any(axis=0)
+    start = np.where(some, present.argmax(axis=0), count)
+    end = np.where(some, count - present[::-1].argmax(axis=0), 0)
+    gaps = ~present & (np.arange(count)[:, None] >= start)
+    return _Span(int(start.min()) if some.any() else 0, start, end, gaps)
+
+
+def _treat_gaps(
+    grid: Grid, span: _Span, missing: str, findings: Findings
+) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+    """Prices and features with their gaps treated, and which assets to keep."""
+    values, channels = grid.prices.values, [block.values for block in grid.features]
     rows = np.arange(len(values))[:, None]
-    begun = np.flatnonzero(present.any(axis=1))
-    head = int(begun[0]) if len(begun) else 0
-    if head:
-        findings.warn(f"left out at the start: {amount(head, 'row')} without prices")
-    start = np.where(present.any(axis=0), present.argmax(axis=0), len(values))
-    end = np.where(present.any(axis=0), len(values) - present[::-1].argmax(axis=0), 0)
-    empty = ~present.any(axis=0)
-    gaps = ~present & (rows >= start)
-    drop = np.zeros(len(names), dtype=bool)
     # Features start with their asset; those of the market with the table.
-    unknown = [
-        np.isnan(block.values) & ~block.wrong & (rows >= (start if block.by_asset else head))
+    holes = [
+        np.isnan(block.values)
+        & ~block.wrong
+        & (rows >= (span.start if block.by_asset else span.head))
         for block in grid.features
     ]
-    filled = [block.values for block in grid.features]
-
+    keep = ~span.empty
     if missing == "drop-asset":
-        drop = empty | gaps.any(axis=0)
-        for block, holes in zip(grid.features, unknown, strict=True):
+        drop = span.empty | span.gaps.any(axis=0)
+        for k, block in enumerate(grid.features):
             if block.by_asset:
-                drop |= holes.any(axis=0)
-        unknown = [
-            holes & ~drop if block.by_asset else holes
-            for block, holes in zip(grid.features, unknown, strict=True)
-        ]
-        _report_dropped(names, drop, "prices are missing", findings)
+                drop |= holes[k].any(axis=0)
+        holes = [h & ~drop if b.by_asset else h for h, b in zip(holes, grid.features, strict=True)]
+        _report_dropped(grid, drop, "prices are missing", findings)
+        keep = ~drop
     else:
-        for j in np.flatnonzero(empty)[:LISTED].tolist():
-            _of_asset(grid, j, "there are no prices at all", "Remove the asset.", findings)
-        if (rest := int(empty.sum()) - LISTED) > 0:
-            findings.error(f"and {amount(rest, 'more asset')} without prices", count=rest)
+        _report_assets(
+            grid, span.empty, lambda j: "there are no prices at all", "without prices",
+            "Remove the asset.", findings,
+        )  # fmt: skip
     if missing == "forward-fill":
-        if gaps.any():
-            _report_filled(grid, gaps, findings)
-        values = _fill_forward(values)
-        filled = [_fill_forward(channel) for channel in filled]
-        unknown = [holes & np.isnan(c) for holes, c in zip(unknown, filled, strict=True)]
+        if span.gaps.any():
+            _report_filled(grid, span.gaps, findings)
+        values, channels = _fill_forward(values), [_fill_forward(channel) for channel in channels]
+        holes = [h & np.isnan(channel) for h, channel in zip(holes, channels, strict=True)]
     if missing == "error":
         advice = (
             "Fill the cells, or choose how to treat gaps: missing='forward-fill' or "
             "'drop-asset' (--missing)."
         )
-        report_cells(grid, grid.prices, gaps & (rows < end), "is missing", advice, findings)
-        stops = np.flatnonzero((start < end) & (end < len(values)))
-        for j in stops[:LISTED].tolist():
-            last = day(grid.dates[end[j] - 1])
-            _of_asset(grid, j, f"there are no prices after {last}", advice, findings)
-        if (rest := len(stops) - LISTED) > 0:
-            findings.error(f"and {amount(rest, 'more asset')} whose prices end early", count=rest)
-    for block, holes in zip(grid.features, unknown, strict=True):
-        report_cells(
-            grid, block, holes, "is missing",
-            "Fill the cells, start the table where the features do, or choose "
-            "missing='forward-fill' (--missing).", findings,
+        within = span.gaps & (rows < span.end)
+        report_cells(grid, grid.prices, within, "is missing", advice, findings)
+        _report_assets(
+            grid, ~span.empty & (span.end < len(values)),
+            lambda j: f"there are no prices after {day(grid.dates[span.end[j] - 1])}",
+            "whose prices end early", advice, findings,
         )  # fmt: skip
+    advice = (
+        "Fill the cells, start the table where the features do, or choose "
+        "missing='forward-fill' (--missing)."
+    )
+    for block, unknown in zip(grid.features, holes, strict=True):
+        report_cells(grid, block, unknown, "is missing", advice, findings)
+    return values, channels, keep
 
-    keep = ~drop & ~empty
-    behind = keep & (start > head)
-    if behind.any():
-        advice = "Choose how to treat late starts: late='drop-asset', 'trim' or 'join' (--late)."
-        if late == "error":
-            for j in np.flatnonzero(behind)[:LISTED].tolist():
-                said = f"the first price is that of {day(grid.dates[start[j]])}"
-                _of_asset(grid, j, f"{said}, the table's {day(grid.dates[head])}", advice, findings)
-            if (rest := int(behind.sum()) - LISTED) > 0:
-                findings.error(
-                    f"and {amount(rest, 'more asset')} with a late start", advice=advice, count=rest
-                )
-        elif late == "drop-asset":
-            _report_dropped(names, behind, "they start late", findings)
-            keep &= ~behind
-        elif late == "trim":
-            head = int(start[behind].max())
-            findings.warn(
-                f"the table starts on {day(grid.dates[head])}, with the last asset to start",
-            )
-        else:
-            findings.warn(f"joining later than the first row: {amount(int(behind.sum()), 'asset')}")
-    if grid.assets and not keep.any():
-        findings.error("no asset is left", advice="Look at the gaps of the table first.")
-    shape = (len(values), len(names))
-    channels = [np.broadcast_to(channel, shape) for channel in filled]
-    features = np.stack(channels, axis=-1) if channels else np.empty((*shape, 0))
-    return Rest(head, np.flatnonzero(keep), values[head:, keep], features[head:, keep])
+
+def _treat_late_starts(
+    grid: Grid, span: _Span, keep: np.ndarray, late: str, findings: Findings
+) -> tuple[int, np.ndarray]:
+    """The row at which the table is to start, and which assets to keep."""
+    behind = keep & (span.start > span.head)
+    if not behind.any():
+        return span.head, keep
+    if late == "error":
+        _report_assets(
+            grid, behind,
+            lambda j: f"the first price is that of {day(grid.dates[span.start[j]])}, the table's "
+            f"{day(grid.dates[span.head])}",
+            "with a late start",
+            "Choose how to treat late starts: late='drop-asset', 'trim' or 'join' (--late).",
+            findings,
+        )  # fmt: skip
+    elif late == "drop-asset":
+        _report_dropped(grid, behind, "they start late", findings)
+        return span.head, keep & ~behind
+    elif late == "trim":
+        head = int(span.start[behind].max())
+        findings.warn(f"the table starts on {day(grid.dates[head])}, with the last asset to start")
+        return head, keep
+    else:
+        findings.warn(f"joining after the first row: {amount(int(behind.sum()), 'asset')}")
+    return span.head, keep
 
 
 def _fill_forward(values: np.ndarray) -> np.ndarray:
@@ -115,18 +144,27 @@ def _fill_forward(values: np.ndarray) -> np.ndarray:
     return np.take_along_axis(values, np.maximum.accumulate(rows, axis=0), axis=0)
 
 
-def _of_asset(grid: Grid, j: int, said: str, advice: str, findings: Findings) -> None:
-    if grid.long:
-        said = f"{quote(grid.assets[j])}: {said}"
-    column = grid.table.names[grid.prices.columns[j]]
-    findings.error(said, column=column, advice=advice)
-
-
-def _report_dropped(
-    names: tuple[str, ...], drop: np.ndarray, reason: str, findings: Findings
+def _report_assets(
+    grid: Grid,
+    which: np.ndarray,
+    said: Callable[[int], str],
+    kind: str,
+    advice: str,
+    findings: Findings,
 ) -> None:
+    """An error for each of these assets; ``kind`` is what those have in common that are counted."""
+    found: Sequence[int] = np.flatnonzero(which).tolist()
+    for j in found[:LISTED]:
+        name = f"{quote(grid.assets[j])}: " if grid.long else ""
+        column = grid.table.names[grid.prices.columns[j]]
+        findings.error(name + said(j), column=column, advice=advice)
+    if (rest := len(found) - LISTED) > 0:
+        findings.error(f"and {amount(rest, 'more asset')} {kind}", advice=advice, count=rest)
+
+
+def _report_dropped(grid: Grid, drop: np.ndarray, reason: str, findings: Findings) -> None:
     if drop.any():
-        listed = listing(names[j] for j in np.flatnonzero(drop))
+        listed = listing(grid.assets[j] for j in np.flatnonzero(drop))
         count = amount(int(drop.sum()), "asset")
         findings.warn(f"left out, because {reason}: {listed} ({count})")
 

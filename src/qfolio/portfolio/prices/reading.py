@@ -1,6 +1,6 @@
-"""Reads tables as people have them (CSV, Parquet, data frames) as named columns of cells.
+"""Reads CSV and Parquet files and data frames as tables of named columns.
 
-Nothing here knows what a price is, and nothing that stands in a file is executed or unpickled.
+Nothing in a file is ever executed or unpickled.
 """
 
 import csv
@@ -62,14 +62,14 @@ def read(source: Any, texts: Callable[[tuple[str, ...]], set[int]]) -> Table:
     kind = path.suffix.lower()
     if kind not in TEXT_FILES + PARQUET_FILES:
         raise QfolioError(
-            f"{quote(path)} is not read: tables come as CSV (.csv, .tsv, .txt) or Parquet "
+            f"{quote(path, 300)} is not read: tables come as CSV (.csv, .tsv, .txt) or Parquet "
             "(.parquet); export it as CSV."
         )
     try:
         content = path.read_bytes()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise QfolioError(f"{quote(path)} cannot be read: {reason}.") from None
+        raise QfolioError(f"{quote(path, 300)} cannot be read: {reason}.") from None
     if kind in PARQUET_FILES:
         return _from_parquet(content, path.name)
     return _from_text(content, path.name, texts)

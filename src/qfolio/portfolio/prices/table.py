@@ -1,7 +1,7 @@
-"""Prices in: a table is checked first, cell by cell, and only then becomes numbers.
+"""Price tables: read, checked cell by cell, and only then turned into numbers.
 
-A gap is an error until the user names what shall become of it. Gaps are only ever filled forward:
-a price that was filled from a later one would tell an agent the future.
+A gap is an error until the user chooses how to treat it. Gaps are only ever filled forward: a price
+filled from a later one would tell an agent the future.
 """
 
 import hashlib
@@ -22,8 +22,8 @@ from qfolio.portfolio.prices.frequency import periods_per_year
 
 DEFAULT_SOURCE = "skfolio: 20 US stocks"
 DEFAULT_NOTE = (
-    "20 US stocks picked later among those still listed in 2022 (survivors): strategies that hold "
-    "them look better than they could have been at the time."
+    "20 US stocks, chosen in hindsight from those still listed in 2022 (survivors): strategies "
+    "that hold them look better than they could have been at the time."
 )
 
 
@@ -33,13 +33,13 @@ class Prices:
 
     Attributes:
         dates: datetime64[s] of shape (rows,), strictly increasing.
-        assets: Names of the columns, without repetition.
+        assets: Names of the columns, each different.
         values: float64 of shape (rows, assets), finite and positive; NaN only before an asset's
             first row, where ``load`` was told late="join".
         features: float64 of shape (rows, assets, channels); NaN only before an asset's first row.
         feature_names: Names of the channels.
         source: Where the table comes from.
-        note: What a reader of any result on it must be told.
+        note: A caveat for readers of any result on the table.
 
     Raises:
         QfolioError: The arrays break one of these rules.
@@ -85,7 +85,7 @@ class Prices:
 
     @classmethod
     def from_frame(cls, frame: Any, **options: Any) -> "Prices":
-        """A data frame, checked; the options are those of ``load``."""
+        """Read and check a data frame; the options are those of ``load``."""
         return load(frame, **options)
 
     def __len__(self) -> int:
@@ -93,9 +93,9 @@ class Prices:
 
     @property
     def relatives(self) -> np.ndarray:
-        """price[k] / price[k-1] for k = 1 … rows-1, of shape (rows-1, assets); cf. ``first_rows``.
+        """Price relatives price[k] / price[k-1], k = 1 … rows-1, of shape (rows-1, assets).
 
-        The relative of an asset's first own row is NaN, like those before it.
+        NaN up to and including an asset's first row; cf. ``first_rows``.
         """
         return np.asarray(self.values[1:] / self.values[:-1])
 
@@ -112,7 +112,7 @@ class Prices:
 
     @property
     def digest(self) -> str:
-        """16 hexadecimal digits that tell tables of different content apart."""
+        """16 hexadecimal digits, different for tables of different content."""
         names = repr((self.assets, self.feature_names, self.values.shape))
         sha = hashlib.sha256(names.encode("utf-8", "surrogatepass"))
         sha.update(self.dates.astype("<i8").tobytes())
@@ -121,7 +121,7 @@ class Prices:
         return sha.hexdigest()[:16]
 
     def select(self, assets: Sequence[str]) -> "Prices":
-        """These assets, in this order. Raises QfolioError for unknown ones."""
+        """The table of these assets, in this order. Raises QfolioError for unknown ones."""
         places = {name: j for j, name in enumerate(self.assets)}
         for name in assets:
             if name not in places:
@@ -162,16 +162,20 @@ def load(
         source: Path of a CSV or Parquet file; a data frame that narwhals knows (pandas, polars,
             pyarrow, …); None for skfolio's 20 US stocks, 1990 to 2022, which need no download;
             or Prices, which are returned as they are. A table is wide (a column of dates, then a
-            column per asset) or long (columns of dates, of assets and of prices, known by their
-            names, such as date, ticker and close, in any order of rows).
-        missing: What becomes of a missing price after an asset's first: "error", "drop-asset", or
-            "forward-fill" (the last known price stands; also for features). Comes before ``late``.
-        late: What becomes of assets whose first price comes later than the table's: "error",
-            "drop-asset", "trim" (the table starts with the last of them) or "join" (they are NaN
-            before their first row).
-        features: Columns of further numbers: in a long table one for each asset and date, in a
-            wide table for the whole market, the same for all assets.
-        date: The column of dates, where its name does not tell.
+            column per asset) or long (columns of dates, assets and prices, found by their names,
+            such as date, ticker and close, with rows in any order). Columns of bars (open, high,
+            low, close, volume) may have a header on two levels, as yfinance has them; their
+            adjusted close is taken, or else their close.
+        missing: How to treat missing prices after an asset's first: "error", "drop-asset", or
+            "forward-fill" (the last known price stands; also for features). Applied before
+            ``late``.
+        late: How to treat assets that start later than the table: "error", "drop-asset", "trim"
+            (the table starts with the last of them) or "join" (they are NaN before their first
+            row).
+        features: Columns that hold features: in a long table one number for each asset and date,
+            in a wide table one for the whole market, or, under a header on two levels, a kind such
+            as Volume, which has a column per asset.
+        date: Column of dates (default: found by its name).
 
     Raises:
         QfolioError: The table has errors (the first are named), or there is no table.
@@ -198,10 +202,10 @@ def check(
     features: Sequence[str] = (),
     date: str | None = None,
 ) -> list[Finding]:
-    """Everything that is wrong with a table or looks odd, by row and column; see ``load``.
+    """All errors, warnings and notes on a table, by row and column; the arguments are ``load``'s.
 
-    At most five cells of one kind are named, the rest is counted. ``load`` succeeds with the same
-    arguments exactly where no finding is an error.
+    At most five cells of one kind are named, the others are counted. ``load`` succeeds with the
+    same arguments exactly if no finding is an error.
 
     Raises:
         QfolioError: There is no table to check: no such file, not text, rows of unequal length.
@@ -210,7 +214,7 @@ def check(
 
 
 def describe(prices: Prices) -> dict[str, Any]:
-    """What a report says of a table, as JSON values."""
+    """What a report says about a table, as JSON values."""
     return {
         "source": prices.source,
         "rows": len(prices),
