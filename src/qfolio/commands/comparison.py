@@ -5,7 +5,7 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -136,7 +136,7 @@ def _train(run: "Comparison") -> None:
     with console.bar("") as update:
 
         def listen(name: str) -> BarProgress:
-            console.console.print(f"{names.index(name) + 1} of {len(names)}: {name}")
+            console.say(f"{names.index(name) + 1} of {len(names)}: {name}")
             return BarProgress(update, name)
 
         run.run(listen)
@@ -148,39 +148,5 @@ def _finish(run: "Comparison") -> None:
 
     content = run.finish()
     write_comparison_report(run.folder, content)
-    print_ranking(content)
+    console.print_ranking(content)
     console.say(f"Report: {run.folder / 'report.html'}")
-
-
-def print_ranking(content: dict[str, Any]) -> None:
-    """A row for each agent, best first, and what follows from it in words."""
-    from rich.table import Table
-    from rich.text import Text
-
-    from qfolio.commands import console
-    from qfolio.experiments.comparison.ranking import HEADLINE, amount, share, span
-
-    ranking = content["ranking"]
-    write = share if ranking["measure"] == "regret" else amount
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    near = f"steps to {HEADLINE:.0%}".replace("%", " %")
-    table.add_column("agent", no_wrap=True)
-    for name in (ranking["measure"], "95 % interval", "worst", near, "s a seed", "parameters"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for name in ranking["order"]:
-        measures, result = ranking["agents"][name], content["results"][name]
-        final = measures["final"]
-        ends = [write(end) for end in final["interval"] or ()]
-        within = next(x for x in measures["within"] if x["threshold"] == HEADLINE)
-        table.add_row(
-            Text(name),
-            write(final["iqm"]),
-            " … ".join([*(end.removesuffix(" %") for end in ends[:-1]), *ends[-1:]]) or "–",
-            write(final["worst"]),
-            "–" if within["steps"] is None else f"{within['steps']:,.0f}",
-            span(result["seconds_per_seed"]).removesuffix(" s"),
-            f"{result['parameters']:,}",
-        )
-    console.console.print(table)
-    for sentence in [*content["conclusion"], *content["notes"]]:
-        console.say(sentence)

@@ -237,3 +237,54 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
         f"{allocation.cost:,.2f}, cash left {allocation.cash_after:,.2f}. "
         "Assets that are neither held nor wanted are not shown."
     )
+
+
+def print_ranking(content: dict[str, Any]) -> None:
+    """A row for each agent, best first, and what follows from it in words."""
+    from qfolio.experiments.comparison.ranking import HEADLINE, amount, share, span
+
+    ranking = content["ranking"]
+    write = share if ranking["measure"] == "regret" else amount
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    near = f"steps to {HEADLINE:.0%}".replace("%", " %")
+    table.add_column("agent", no_wrap=True)
+    for name in (ranking["measure"], "95 % interval", "worst", near, "s a seed", "parameters"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name in ranking["order"]:
+        measures, result = ranking["agents"][name], content["results"][name]
+        final = measures["final"]
+        ends = [write(end) for end in final["interval"] or ()]
+        within = next(x for x in measures["within"] if x["threshold"] == HEADLINE)
+        table.add_row(
+            Text(name),
+            write(final["iqm"]),
+            " … ".join([*(end.removesuffix(" %") for end in ends[:-1]), *ends[-1:]]) or "–",
+            write(final["worst"]),
+            "–" if within["steps"] is None else f"{within['steps']:,.0f}",
+            span(result["seconds_per_seed"]).removesuffix(" s"),
+            f"{result['parameters']:,}",
+        )
+    console.print(table)
+    for sentence in [*content["conclusion"], *content["notes"]]:
+        say(sentence)
+
+
+def print_ways(content: dict[str, Any]) -> None:
+    """A row for each way."""
+    from qfolio.core.statistics import interquartile_mean
+
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("way")
+    for name in ("regret", "worst seed", "steps to recover", "recovered", "steps", "old world"):
+        table.add_column(name, justify="right")
+    for way, course in content["courses"].items():
+        recovery = content["recovery"][way]
+        reached = sum(step is not None for step in recovery["per_seed"])
+        final, other = (interquartile_mean(course[name]) for name in ("final", "other"))
+        middle = recovery["middle"]
+        table.add_row(
+            way, f"{final:.1%}", f"{max(course['final']):.1%}",
+            "–" if middle is None else f"{middle:,.0f}", f"{reached} of {content['seeds']}",
+            f"{course['steps'][-1]:,}", f"{other:.1%}",
+        )  # fmt: skip
+    console.print(table)

@@ -86,7 +86,7 @@ def continual(
     if content is None:
         stop(f"qfolio continual --resume {folder}")
     write_continual_report(folder, content)
-    _print(content)
+    console.print_ways(content)
     console.say(verdict(content))
     console.say(f"Report: {folder / 'report.html'}")
 
@@ -120,27 +120,3 @@ def _plan(
         seeds=preset.seeds if seeds is None else seeds,
         **options,
     )
-
-
-def _print(content: dict[str, Any]) -> None:
-    """A row for each way."""
-    from rich.table import Table
-
-    from qfolio.commands.console import console
-    from qfolio.core.statistics import interquartile_mean
-
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column("way")
-    for name in ("regret", "worst seed", "steps to recover", "recovered", "steps", "old world"):
-        table.add_column(name, justify="right")
-    for way, course in content["courses"].items():
-        recovery = content["recovery"][way]
-        reached = sum(step is not None for step in recovery["per_seed"])
-        final, other = (interquartile_mean(course[name]) for name in ("final", "other"))
-        middle = recovery["middle"]
-        table.add_row(
-            way, f"{final:.1%}", f"{max(course['final']):.1%}",
-            "–" if middle is None else f"{middle:,.0f}", f"{reached} of {content['seeds']}",
-            f"{course['steps'][-1]:,}", f"{other:.1%}",
-        )  # fmt: skip
-    console.print(table)

@@ -154,6 +154,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
         episodes: Episodes to show in the window.
         trust: Modules of your own code that the folder may name (default: none).
     """
+    from qfolio.commands.console import say
     from qfolio.commands.window import Window, has_display
     from qfolio.core import devices
 
@@ -181,7 +182,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
     episode = greedy_episode(run, run.task)
     path = folder / "episode.gif"
     pendulum_gif(path, episode.states, episode.torques, episode.rewards)
-    print(f"There is no display here; the episode is in {path}")
+    say(f"There is no display here; the episode is in {path}")
 
 
 def _new_run(
