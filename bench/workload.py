@@ -5,6 +5,7 @@ each number.
 """
 
 from itertools import pairwise
+from typing import Any
 
 from qfolio.agents.ddpg import DDPG
 from qfolio.agents.dqn import DQN
@@ -27,7 +28,7 @@ read again (2); Adam reads and writes the weights and both moments (6); the targ
 
 def families() -> dict[str, Agent]:
     """Other algorithms on the pendulum with continuous torques; peers.py has the same settings."""
-    off_policy = {
+    off_policy: dict[str, Any] = {
         "hidden": (256, 256), "batch_size": 256, "replay_capacity": 50_000,
         "learning_starts": 256, "learning_rate": 1e-3, "tau": 0.005, "discount": 0.99,
     }  # fmt: skip

@@ -4,7 +4,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from qfolio.core.mdp import Box, Discrete, Simplex, Step, Task, View
+from qfolio.core.market import View
+from qfolio.core.mdp import Box, Discrete, Simplex, Step, Task
 
 TERMINATED, GOES_ON = jnp.array(True), jnp.array(False)
 

@@ -193,16 +193,32 @@ def test_outputs_come_back_from_where_tanh_is_flat():
     np.testing.assert_allclose(actor_slope(Box(1, 3.0), critics, -5.0), -0.2 - flat(5), rtol=1e-4)
     np.testing.assert_allclose(actor_slope(Box(1, 3.0), critics, 3.9), -flat(3.9), rtol=1e-4)
     np.testing.assert_allclose(actor_slope(Box(1), critics, 5.0), -1)
+    # Without the penalty only the critics count, as in the papers.
+    np.testing.assert_allclose(actor_slope(Box(1, 3.0), critics, 5.0, 0.0), -flat(5), rtol=1e-3)
 
 
-def actor_slope(actions, critics, output):
+def actor_slope(actions, critics, output, penalty=0.1):
     """Of the actor's loss, in what its network puts out."""
 
     def loss(output):
         actor = ddpg.Actor(lambda observation: output[None, None], actions)
-        return ddpg.actor_loss(actor, critics, jnp.zeros((1, 1)))[0]
+        return ddpg.actor_loss(actor, critics, jnp.zeros((1, 1)), penalty)[0]
 
     return jax.grad(loss)(jnp.array(output))
+
+
+@pytest.mark.parametrize("pessimistic", [True, False])
+def test_td3s_actor_climbs_the_smaller_value_or_the_first_critics(pessimistic):
+    agent = TD3(hidden=(8,), policy_delay=1, pessimistic_actor=pessimistic, saturation_penalty=0.0)
+    start, batch = begun(agent), batch_of()
+    after = updated(agent, start, batch)
+
+    def loss(actor):
+        q = after.critics(batch.observation, actor(batch.observation))
+        return -(q.min(0) if pessimistic else q[0]).mean()
+
+    rate = agent.learning_rate * agent.actor_learning_rate_ratio
+    assert_close(after.actor, adams_first_step(loss, start.actor, rate), 1e-5)
 
 
 def test_actor_and_targets_wait_for_the_critics():
@@ -236,14 +252,14 @@ def test_the_actors_step_leaves_the_critics_alone_and_targets_follow(agent):
 
 
 def test_nothing_follows_what_is_terminal():
-    """The first step of Adam goes where the gradient of the critics' loss says, goal held fixed."""
+    """The first step of Adam goes where the gradient of the critics' loss says, the target held."""
     agent = DDPG(hidden=(8,), discount=0.9, reward_scale=0.5, learning_rate=0.01)
     start, batch = begun(agent), batch_of()
     q_next = start.critics(batch.next_observation, start.actor(batch.next_observation))[0]
     following = jnp.array([0.9, 0.81, 0.9, 0.81, 0.729, 0.9])  # as returns over steps end
-    goal = 0.5 * batch.reward + following * ~batch.terminal * q_next
+    target = 0.5 * batch.reward + following * ~batch.terminal * q_next
     expected = adams_first_step(
-        lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01
+        lambda c: critic_loss(c, batch, target, jnp.inf)[0], start.critics, 0.01
     )
     assert_close(updated(agent, start, batch, following).critics, expected, 1e-5)
 
@@ -253,13 +269,17 @@ def test_what_follows_is_brought_to_what_rewards_allow():
     agent = DDPG(hidden=(8,), discount=0.9, reward_scale=0.5)
     steps = batch_of(4)._replace(reward=jnp.zeros(4), terminal=jnp.array([False] * 3 + [True]))
     batch = Batch(steps, 0.9, jnp.array([-2.0, 1.0]))
-    goal = agent.goal(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]))
-    np.testing.assert_allclose(goal, [-9, 4.5, 2.7, 0], rtol=1e-5)
+    target = agent.target(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]))
+    np.testing.assert_allclose(target, [-9, 4.5, 2.7, 0], rtol=1e-5)
     # Entropy that is worth 0.1 a step adds to what is possible, and one that costs takes away.
-    goal = agent.goal(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]), 0.1)
-    np.testing.assert_allclose(goal, [-9, 5.4, 2.7, 0], rtol=1e-5)
-    goal = agent.goal(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]), -0.1)
-    np.testing.assert_allclose(goal, [-9.9, 4.5, 2.7, 0], rtol=1e-5)
+    target = agent.target(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]), (0.0, 0.1))
+    np.testing.assert_allclose(target, [-9, 5.4, 2.7, 0], rtol=1e-5)
+    target = agent.target(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]), (-0.1, 0.0))
+    np.testing.assert_allclose(target, [-9.9, 4.5, 2.7, 0], rtol=1e-5)
+    # The papers believe what their critics say.
+    plain = dataclasses.replace(agent, clip_bootstrap=False)
+    target = plain.target(batch, jnp.array([-99.0, 99.0, 3.0, 99.0]))
+    np.testing.assert_allclose(target, [-89.1, 89.1, 2.7, 0], rtol=1e-5)
 
 
 def test_critics_learn_roots_of_values():
@@ -273,9 +293,9 @@ def test_critics_learn_roots_of_values():
     np.testing.assert_allclose(
         rescaled.critics(batch.observation, batch.action), unsquash(output), rtol=1e-6
     )
-    goal = jnp.linspace(-8.0, 3.0, 6)
-    loss, _ = critic_loss(rescaled.critics, batch, goal, math.inf)
-    expected, _ = critic_loss(plain.critics, batch, squash(goal), math.inf)
+    target = jnp.linspace(-8.0, 3.0, 6)
+    loss, _ = critic_loss(rescaled.critics, batch, target, math.inf)
+    expected, _ = critic_loss(plain.critics, batch, squash(target), math.inf)
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
 
@@ -310,7 +330,7 @@ def test_gradients_against_differences():
         )
         key = jax.random.key(5)
         batch = double(batch_of())
-        goal = jnp.linspace(-1.0, 1.0, 6)
+        target = jnp.linspace(-1.0, 1.0, 6)
         deterministic, soft = double(begun(DDPG(hidden=(8, 8)))), double(begun(SAC(hidden=(8, 8))))
         rescaled = double(begun(DDPG(hidden=(8, 8), value_rescaling=True)))
         weighed = SAC(hidden=(8, 8))
@@ -326,21 +346,21 @@ def test_gradients_against_differences():
             return lambda actor: sac.actor_loss(actor, x.critics, temperature, observation, key)[0]
 
         cases = {
-            "critic": (lambda c: critic_loss(c, batch, goal, jnp.inf)[0], soft.critics),
+            "critic": (lambda c: critic_loss(c, batch, target, jnp.inf)[0], soft.critics),
             "critic of numbers": (
-                lambda c: critic_loss(c, numbers, goal, jnp.inf)[0],
+                lambda c: critic_loss(c, numbers, target, jnp.inf)[0],
                 numbered.critics,
             ),
             "critic of roots": (
-                lambda c: critic_loss(c, batch, goal, jnp.inf)[0],
+                lambda c: critic_loss(c, batch, target, jnp.inf)[0],
                 rescaled.critics,
             ),
             "actor by roots": (
-                lambda a: ddpg.actor_loss(a, rescaled.critics, batch.observation)[0],
+                lambda a: ddpg.actor_loss(a, rescaled.critics, batch.observation, 0.1)[0],
                 rescaled.actor,
             ),
             "deterministic actor": (
-                lambda a: ddpg.actor_loss(a, deterministic.critics, batch.observation)[0],
+                lambda a: ddpg.actor_loss(a, deterministic.critics, batch.observation, 0.1)[0],
                 deterministic.actor,
             ),
             "soft actor": (soft_loss(soft), soft.actor),
@@ -377,7 +397,7 @@ def test_soft_values_by_hand():
     np.testing.assert_allclose(loss, -(1.75 + 0.5 * entropy[0]), rtol=1e-6)
 
 
-def test_the_soft_goal_counts_the_next_steps_entropy():
+def test_the_soft_target_counts_the_next_steps_entropy():
     """The critics' first step goes towards r + γ (min Q' + α H)."""
     agent = SAC(hidden=(8,), discount=0.9, learning_rate=0.01, initial_temperature=0.7)
     task = OneState()
@@ -386,19 +406,42 @@ def test_the_soft_goal_counts_the_next_steps_entropy():
     q, entropy = sac.expectations(
         start.actor, start.critics, batch.next_observation, jax.random.key(0)
     )
-    goal = batch.reward + 0.9 * (q + 0.7 * entropy) * ~batch.terminal
+    target = batch.reward + 0.9 * (q + 0.7 * entropy) * ~batch.terminal
     expected = adams_first_step(
-        lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01
+        lambda c: critic_loss(c, batch, target, jnp.inf)[0], start.critics, 0.01
     )
     assert_close(updated(agent, start, batch).critics, expected, 1e-5)
-    # A last reward of −1 and entropy worth 0.7 H̄ are the most that can follow.
-    most = -1 + 0.7 * math.log1p(0.184)
-    goal = batch.reward + 0.9 * jnp.minimum(q + 0.7 * entropy, most) * ~batch.terminal
+    # A last reward of −1, with two actions that are as likely, is the most that can follow.
+    most = -1 + 0.7 * math.log(2)
+    assert ((q + 0.7 * entropy) > most).any()
+    target = batch.reward + 0.9 * jnp.minimum(q + 0.7 * entropy, most) * ~batch.terminal
     expected = adams_first_step(
-        lambda c: critic_loss(c, batch, goal, jnp.inf)[0], start.critics, 0.01
+        lambda c: critic_loss(c, batch, target, jnp.inf)[0], start.critics, 0.01
     )
     bounded = updated(agent, start, batch, rewards=[-jnp.inf, -1.0])
     assert_close(bounded.critics, expected, 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("actions", "entropy"),
+    [
+        (Box(2, 3.0), 2 * math.log(6)),
+        (Box(1), 2 + math.log(2 * math.pi * math.e) / 2),  # the largest standard deviation is e²
+        (Simplex(2), math.log(0.5)),
+        (Discrete(4), math.log(4)),
+    ],
+)
+def test_entropy_to_come_is_believed_where_no_reward_has_been_seen(actions, entropy):
+    """With rewards of 0 the soft value of a uniform policy is α H for ever."""
+    agent = SAC(hidden=(8,), discount=0.9)
+    steps = batch_of(2)._replace(reward=jnp.zeros(2), terminal=jnp.zeros(2, bool))
+    batch = Batch(steps, 0.9, jnp.zeros(2))
+    forever = 0.5 * entropy / (1 - 0.9)
+    following = jnp.array([forever, 0.0])
+    target = agent.target(batch, following, agent.bonus(actions, jnp.array(0.5)))
+    np.testing.assert_allclose(target, 0.9 * following, rtol=1e-5)
+    more = agent.target(batch, jnp.full(2, 999.0), agent.bonus(actions, jnp.array(0.5)))
+    np.testing.assert_allclose(more, 0.9 * max(forever, 0.0), rtol=1e-5)
 
 
 @pytest.mark.parametrize(("spread", "rises"), [(0.01, False), (2.0, True)])

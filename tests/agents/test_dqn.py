@@ -22,7 +22,7 @@ from qfolio.learning.distributional import (
 )
 from qfolio.learning.encoders import MLP
 from qfolio.learning.exploration import epsilon_greedy
-from qfolio.learning.optimizer import learning_rate
+from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import (
     Scale,
@@ -34,6 +34,7 @@ from qfolio.learning.targets import (
 )
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.merton import Merton
+from qfolio.tasks.gymnasium import GymnasiumTask
 from qfolio.tasks.pendulum import Pendulum
 
 VALUES, ROOTS = Scale(roots=False), Scale(roots=True)
@@ -61,8 +62,10 @@ def test_bootstrap_by_hand():
 
 
 def test_td_target_by_hand():
-    goal = td_target(jnp.array([1.0, 1.0]), jnp.array([False, True]), jnp.array([10.0, 10.0]), 0.9)
-    np.testing.assert_allclose(goal, [10, 1])
+    target = td_target(
+        jnp.array([1.0, 1.0]), jnp.array([False, True]), jnp.array([10.0, 10.0]), 0.9
+    )
+    np.testing.assert_allclose(target, [10, 1])
 
 
 def test_possible_values_by_hand():
@@ -135,19 +138,19 @@ def test_selecting_and_evaluating_have_no_gradient(task, agent, values):
     online, target = gradients(agent, state, other)
     assert largest(online) > 0
     assert largest(target) == 0
-    # Scaling what the goals are made of moves the goals, not the way that the gradient takes.
+    # Scaling what the targets are made of moves the targets, not the way that the gradient takes.
     batch = agent.observe(state, rollout(agent)).replay.sample(jax.random.key(2), 8)
 
-    def goals_moved_by_hand(online):
+    def targets_moved_by_hand(online):
         frozen = jax.tree.map(jax.lax.stop_gradient, state.online)
         z = chosen(agent._read(online, batch.observation), batch.action)
         kind = agent._values
         selector = kind.mean(agent._read(frozen, batch.next_observation))
         following = bootstrap(agent._read(other, batch.next_observation), selector)
-        goal = batch.reward[:, None] + 0.9 * kind.outcomes(following)
-        return kind.loss(z, goal, following)[0].mean()
+        target = batch.reward[:, None] + 0.9 * kind.outcomes(following)
+        return kind.loss(z, target, following)[0].mean()
 
-    expected = jax.grad(goals_moved_by_hand)(state.online)
+    expected = jax.grad(targets_moved_by_hand)(state.online)
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)  # noqa: E731
     jax.tree.map(close, online, expected)
 
@@ -219,8 +222,8 @@ def test_explores_with_probability_epsilon(task, epsilon):
 
 
 def test_the_learning_rate_falls_along_a_cosine():
-    agent = DQN(learning_rate=2.0, learning_rate_final=0.5, learning_rate_steps=100.0)
-    rates = [float(learning_rate(agent, jnp.array(i))) for i in (0, 50, 100, 1000)]
+    schedule = CosineSchedule(2.0, 0.5, learning_rate_steps=100.0)
+    rates = [float(schedule(jnp.array(i))) for i in (0, 50, 100, 1000)]
     np.testing.assert_allclose(rates, [2, 1.5, 1, 1], rtol=1e-6)
 
 
@@ -250,12 +253,25 @@ def test_adam_equals_its_formula(task):
         {"priority_exponent": 1.1}, {"values": "means"}, {"atoms": 1, "values": "categorical"},
         {"v_max": -10.0, "values": "categorical"},
         {"huber_delta": float("inf"), "values": "quantile"},
-        {"noise_scale": -1.0}, {"persistence": 1.5},
+        {"noise_scale": -1.0}, {"persistence": 1.5}, {"importance_steps": 0.0},
     ],
 )  # fmt: skip
 def test_refuses_what_makes_no_sense(settings):
     with pytest.raises(QfolioError, match=next(iter(settings))):
         DQN(**settings)
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        (Pendulum(torques=0), "those of Pendulum are continuous; take sac or ppo"),
+        (Merton(), "those of Merton are continuous; give it a menu of .* or take sac or ppo"),
+        (GymnasiumTask("Pendulum-v1"), "those of Pendulum-v1 are continuous; take sac or ppo"),
+    ],
+)
+def test_continuous_actions_are_refused_by_the_tasks_name(task, words):
+    with pytest.raises(QfolioError, match=f"dqn chooses among numbered actions, and {words}"):
+        DQN().init(task, jax.random.key(0))
 
 
 @pytest.mark.parametrize(
@@ -316,20 +332,20 @@ def test_the_projection_keeps_means_within_the_support(spacing):
 def test_the_categorical_priority_is_the_divergence():
     kind = Categorical(VALUES, 5, -2.0, 2.0)
     z = jax.random.normal(jax.random.key(0), (3, 5))
-    goal = kind.outcomes(z)
-    loss, off = kind.loss(z, goal, z)  # the goal is the estimate itself
+    target = kind.outcomes(z)
+    loss, off = kind.loss(z, target, z)  # the target is the estimate itself
     np.testing.assert_allclose(off, 0.0, atol=1e-6)
     assert (loss > 0.1).all()
-    assert (kind.loss(z, goal + 1, z)[1] > 0.01).all()
+    assert (kind.loss(z, target + 1, z)[1] > 0.01).all()
 
 
 def test_values_of_roots_by_hand():
     """The root of 3 is 1, that of 8 is 2: z (2 + z)."""
     expected = Expected(ROOTS, math.inf)
-    z, goal = jnp.array([[1.0]]), jnp.array([[8.0]])
+    z, target = jnp.array([[1.0]]), jnp.array([[8.0]])
     np.testing.assert_allclose(expected.mean(z), [3.0])
     np.testing.assert_allclose(expected.outcomes(z), [[3.0]])
-    np.testing.assert_allclose(expected.loss(z, goal, z), [[0.5], [1.0]], rtol=1e-6)
+    np.testing.assert_allclose(expected.loss(z, target, z), [[0.5], [1.0]], rtol=1e-6)
 
     categorical = Categorical(ROOTS, 5, -8.0, 8.0)
     np.testing.assert_allclose(categorical.support, [-8, -3, 0, 3, 8], atol=1e-6)
@@ -337,10 +353,10 @@ def test_values_of_roots_by_hand():
     np.testing.assert_allclose(categorical.mean(z), [-0.8 - 0.6 + 0.3 + 2.4], rtol=1e-5)
 
     quantile = Quantile(ROOTS, 2, 10.0)
-    z, goal = jnp.array([[2.0, 0.0]]), jnp.array([[15.0, 3.0]])  # whose roots are 3 and 1
+    z, target = jnp.array([[2.0, 0.0]]), jnp.array([[15.0, 3.0]])  # whose roots are 3 and 1
     np.testing.assert_allclose(quantile.mean(z), [4.0])
     np.testing.assert_allclose(quantile.outcomes(z), [[8.0, 0.0]])
-    loss, off = quantile.loss(z, goal, z)
+    loss, off = quantile.loss(z, target, z)
     np.testing.assert_allclose(loss, quantile_huber_loss(z, jnp.array([[3.0, 1.0]]), 10.0))
     np.testing.assert_allclose(off, [9.0 - 4.0])
 
@@ -445,7 +461,7 @@ def test_sizes_of_noise_are_learned(task, agent):
     assert largest(noisy.bias_scales) > 0
 
 
-def test_goals_are_without_noise(task, agent):
+def test_targets_are_without_noise(task, agent):
     """Only the values that are compared with them are noisy."""
     agent = dataclasses.replace(agent, noisy=True, double=True, noise_scale=0.0)
     quiet = agent.init(task, jax.random.key(0)).online
@@ -469,6 +485,7 @@ def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):
         num_envs=4,
         batch_size=6,
         prioritized=True,
+        importance_steps=10.0,
         replay_capacity=16,
         learning_starts=8,
     )
@@ -490,7 +507,7 @@ def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):
     replay = agent.observe(after, step).replay
     index = replay.draw(jax.random.key(2), 6)
     losses = agent._losses(after.online, after.target, replay.at(index), 0.99, jax.random.key(0))
-    beta = 0.4 + 0.6 / agent.learning_rate_steps
+    beta = 0.4 + 0.6 / 10
     weight = replay.priorities.importance(index, beta)
     assert float(weight.min()) < 1
     np.testing.assert_allclose(metrics["loss"], (weight * losses.each).mean(), rtol=1e-4)

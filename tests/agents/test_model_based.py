@@ -12,7 +12,7 @@ from qfolio.core.mdp import Box, Discrete, Transition
 from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
-from qfolio.learning.encoders import SmoothMLP
+from qfolio.learning.encoders import MLP
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import unsquash
 from qfolio.portfolio.synthetic.merton import Merton
@@ -97,7 +97,9 @@ def test_numbered_actions_are_told_apart():
 def test_the_models_gradient_against_differences():
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(1), 4)
-        members = jax.vmap(lambda key: SmoothMLP((3 + 11, 8, 3 + 2), key))(keys[:2])
+        members = jax.vmap(lambda key: MLP((3 + 11, 8, 3 + 2), key, activation=jax.nn.silu))(
+            keys[:2]
+        )
         model = Model(members, jnp.array([1.0, 1, 8]), Discrete(11))
         step = Experience(
             observation=jax.random.normal(keys[0], (5, 3)),
@@ -143,6 +145,15 @@ def test_each_member_counts_real_steps_as_often_as_chance_says():
         np.testing.assert_allclose(share, [math.exp(-1) / math.factorial(k) for k in range(4)],
                                    atol=0.04)  # fmt: skip
     assert abs(np.corrcoef(counts.T)[0, 1]) < 0.1
+
+
+def test_each_seed_draws_counts_of_its_own():
+    agent = MBPO(**SMALL)
+    population = Population(Aim(), agent, [0, 1])
+    population.advance(20)  # steps that are only observed
+    replay = population.fetch().agent.replay
+    first, second = (replay.unpack(jnp.array(rows)).counts[:80] for rows in replay.rows)
+    assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.3
 
 
 def test_learns_values_from_imagined_steps():

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from qfolio.agents.a2c import A2C
-from qfolio.agents.on_policy import Batch, normalised
+from qfolio.agents.on_policy import Batch, normalized
 from qfolio.agents.ppo import PPO, clipped, minibatches, shuffled
 from qfolio.agents.reinforce import REINFORCE
 from qfolio.core.errors import QfolioError
@@ -64,7 +64,7 @@ def test_advantages_by_hand():
     no = column(False, False, False, False)
 
     def of(terminated=no, truncated=no, gae_lambda=0.5):
-        found = advantages(reward, value, following, terminated, truncated, 0.5, trace)
+        found = advantages(reward, value, following, terminated, truncated, 0.5, gae_lambda)
         return np.asarray(found)[:, 0]
 
     errors = np.array([1, 3, 5, 7])
@@ -103,21 +103,24 @@ def test_clipped_objective_by_hand():
     np.testing.assert_array_equal(slope, [1, 1, 1, 0, 0, -1, -1, -1])
 
 
-def test_normalised_by_hand():
+def test_normalized_by_hand():
     root = np.sqrt(1.5)
-    np.testing.assert_allclose(normalised(jnp.array([1.0, 2, 3])), [-root, 0, root], rtol=1e-6)
+    np.testing.assert_allclose(normalized(jnp.array([1.0, 2, 3])), [-root, 0, root], rtol=1e-6)
+    counted = jnp.array([True, True, True, False])
+    some = normalized(jnp.array([1.0, 2, 3, 99]), counted)[:3]
+    np.testing.assert_allclose(some, [-root, 0, root], rtol=1e-6)
 
 
 def test_minibatches_hold_every_row_once_and_whole():
     row = jnp.arange(12.0)
     batch = Batch(row[:, None], row, row, row, row)
     first, second = (minibatches(jax.random.key(i), batch, 4) for i in range(2))
-    assert first.goal.shape == (3, 4)
-    np.testing.assert_array_equal(np.sort(first.goal, axis=None), row)
-    assert (np.asarray(first.goal).ravel() != row).any()
-    assert (first.goal != second.goal).any()
+    assert first.target.shape == (3, 4)
+    np.testing.assert_array_equal(np.sort(first.target, axis=None), row)
+    assert (np.asarray(first.target).ravel() != row).any()
+    assert (first.target != second.target).any()
     for part in (first.observation[..., 0], first.action, first.log_prob, first.advantage):
-        np.testing.assert_array_equal(part, first.goal)
+        np.testing.assert_array_equal(part, first.target)
 
 
 @pytest.mark.parametrize("n", [1, 5, 8])
@@ -144,40 +147,45 @@ def plain_loss(name, agent, weights, batch):
     output = dense(weights.actor.mlp, observation)[:, 0]
     policy = stats.norm(2 * output, std)
     log_prob, total = policy.logpdf(action[:, 0]), 0.0
-    advantage = np.asarray(batch.advantage)
-    scaled = (advantage - advantage.mean()) / advantage.std()
+    advantage = scaled = np.asarray(batch.advantage)
+    if agent.normalize_advantages:
+        scaled = (advantage - advantage.mean()) / advantage.std()
     for i in range(len(advantage)):
-        if name == "a2c":
-            total -= log_prob[i] * advantage[i]
-        elif name == "reinforce":
+        if name != "ppo":
             total -= log_prob[i] * scaled[i]
         else:
             ratio = np.exp(log_prob[i] - batch.log_prob[i])
             bound = np.clip(ratio, 1 - agent.clip_range, 1 + agent.clip_range)
             total -= min(ratio * scaled[i], bound * scaled[i])
     value = dense(weights.critic.mlp, observation)[:, 0]
-    error = ((np.asarray(batch.goal) - value) ** 2).mean()
+    error = ((np.asarray(batch.target) - value) ** 2).mean()
     entropy = stats.norm(0, std).entropy()
     beyond = np.maximum(np.abs(output) - 2, 0)
     assert beyond.any(), "some means are to be out of reach"
-    total = total / len(advantage) + 0.1 * (beyond**2).mean()
+    total = total / len(advantage) + agent.saturation_penalty * (beyond**2).mean()
     return total + agent.value_coef * error - agent.entropy_coef * entropy
 
 
+PAPER = {"normalize_advantages": False, "saturation_penalty": 0.0}
+
+
 @pytest.mark.parametrize(
-    ("name", "kind"),
+    ("name", "kind", "changes"),
     [
-        ("reinforce", "numbers"),
-        ("a2c", "numbers"),
-        ("ppo", "numbers"),
-        ("ppo", "choice"),
-        ("ppo", "weights"),
+        ("reinforce", "numbers", {}),
+        ("reinforce", "numbers", PAPER),
+        ("a2c", "numbers", {}),
+        ("a2c", "numbers", PAPER),
+        ("ppo", "numbers", {}),
+        ("ppo", "numbers", PAPER),
+        ("ppo", "choice", {}),
+        ("ppo", "weights", {}),
     ],
 )
-def test_loss_and_gradient(name, kind):
+def test_loss_and_gradient(name, kind, changes):
     """Against finite differences; where actions are numbers, against plain formulas, too."""
     with jax.enable_x64(True):
-        agent = dataclasses.replace(AGENTS[name], entropy_coef=0.1, rollout_length=16)
+        agent = dataclasses.replace(AGENTS[name], entropy_coef=0.1, rollout_length=16, **changes)
         task = TASKS[kind]
         state = agent.init(task, jax.random.key(0))
         rollout = a_rollout(agent, task, state, jax.random.key(1))
@@ -231,12 +239,12 @@ def test_judging_is_what_the_formulas_say():
             if terminated or rollout.truncated[time, column]:
                 advantage = 0.0
             reward = 0.5 * float(rollout.reward[time, column])
-            goal = reward + (0.0 if terminated else agent.discount * following[time, column])
-            error = goal - value[time, column]
+            target = reward + (0.0 if terminated else agent.discount * following[time, column])
+            error = target - value[time, column]
             advantage = error + agent.discount * 0.8 * advantage
             row = time * agent.num_envs + column
             assert float(batch.advantage[row]) == pytest.approx(advantage, abs=1e-5)
-            assert float(batch.goal[row]) == pytest.approx(
+            assert float(batch.target[row]) == pytest.approx(
                 advantage + value[time, column], abs=1e-5
             )
             np.testing.assert_array_equal(batch.action[row], rollout.action[time, column])
@@ -249,6 +257,7 @@ def test_one_step_of_ppo_from_its_own_policy_is_the_policy_gradient():
     task, key = TASKS["choice"], jax.random.key(1)
     state = ppo.init(task, jax.random.key(0))
     rollout = a_rollout(ppo, task, state, key)
+    rollout = rollout._replace(truncated=rollout.truncated.at[-1].set(True))  # whole episodes
     after, _ = ppo.learn(task, state, rollout, key)
     expected, _ = REINFORCE(**settings).learn(task, state, rollout, key)
     compare = lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6)  # noqa: E731
@@ -355,6 +364,52 @@ def test_the_first_policy_is_the_same_everywhere():
 def test_wrong_settings(agent, changes, message):
     with pytest.raises(QfolioError, match=message):
         agent(**changes)
+
+
+@pytest.mark.parametrize("time_limit_terminal", [False, True])
+def test_reinforce_learns_from_whole_episodes_alone(time_limit_terminal):
+    """Episodes that end early leave one unfinished at the rollout's end: it does not count.
+
+    Returns are sums of rewards to the end, and to what the baseline says behind a time limit,
+    unless that is taken for the end.
+    """
+    agent = REINFORCE(
+        hidden=(8,), num_envs=2, rollout_length=6, episode_steps=6, discount=0.5,
+        time_limit_terminal=time_limit_terminal, max_grad_norm=np.inf, learning_rate=0.01,
+    )  # fmt: skip
+    task = TASKS["numbers"]
+    state = agent.init(task, jax.random.key(0))
+    rollout = a_rollout(agent, task, state, jax.random.key(1))
+    column = lambda *steps: jnp.zeros(6, bool).at[jnp.array(steps)].set(True)  # noqa: E731
+    rollout = rollout._replace(
+        terminated=jnp.stack([column(1, 3), column(0)], 1),
+        truncated=jnp.zeros((6, 2), bool).at[2, 1].set(True),
+    )
+    value = lambda x: np.asarray(jax.vmap(state.weights.value)(x))  # noqa: E731
+    reward, following = np.asarray(rollout.reward), value(rollout.next_observation)
+    limit = 0.0 if time_limit_terminal else following[2, 1]
+    r = reward[:, 0]
+    first = [r[0] + r[1] / 2, r[1], r[2] + r[3] / 2, r[3]]
+    r = reward[:, 1]
+    second = [r[0], r[1] + (r[2] + limit / 2) / 2, r[2] + limit / 2]
+    returns = np.array(first + second)
+    rows = np.array([0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 2, 3, 0, 1, 2])
+    take = lambda x: jax.tree.map(lambda x: jnp.asarray(x)[rows[1], rows[0]], x)  # noqa: E731
+    observation, action = take(rollout.observation), take(rollout.action)
+    advantage = returns - take(value(rollout.observation))
+    scaled = (advantage - advantage.mean()) / advantage.std()
+
+    def loss(weights):
+        log_prob = weights.policy(observation).log_prob(action)
+        error = ((returns - weights.value(observation)) ** 2).mean()
+        return agent.value_coef * error - (log_prob * scaled).mean()
+
+    after, _ = agent.learn(task, state, rollout, jax.random.key(2))
+    gradient = jax.grad(loss)(state.weights)
+    expected = jax.tree.map(lambda g: 0.1 * g, gradient)  # Adam's first moment
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), after.optimizer.mu, expected
+    )
 
 
 def test_reinforce_wants_whole_episodes():

@@ -9,12 +9,13 @@ from qfolio.agents.dqn import DQN
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
-from qfolio.core.mdp import Step, View
+from qfolio.core.market import View
+from qfolio.core.mdp import Step
 from qfolio.core.population import Population
 from qfolio.experiments import presets
 from qfolio.learning import networks
 from qfolio.learning.encoders import CNN, LSTM, RNN
-from qfolio.learning.networks import SHARED, Outputs, Shared
+from qfolio.learning.networks import SHARED, NetworkConfig, Outputs, Shared
 from qfolio.tasks.catch import Catch
 from qfolio.tasks.hidden_pendulum import HiddenPendulum
 from qfolio.tasks.pendulum import Pendulum
@@ -88,7 +89,7 @@ def test_long_short_term_memory_by_hand():
 )  # fmt: skip
 def test_every_network_fits_what_is_observed(kind, task):
     observation = jax.vmap(lambda key: task.observe(task.reset(key)))(jax.random.split(KEY, 6))
-    network = networks.build(kind, task, observation[0], (16, 8), Outputs(3), KEY)
+    network = networks.build(NetworkConfig(kind, (16, 8)), task, observation[0], Outputs(3), KEY)
     assert jax.eval_shape(network, observation).shape == (6, 3)
     gradient = jax.jit(jax.grad(lambda n: (n(observation) ** 2).sum()))(network)
     for leaf in jax.tree.leaves(gradient):  # every part takes part
@@ -105,7 +106,7 @@ def test_the_input_gain_is_of_each_channel(kind):
     task = Scaled()
     observation = task.observe(task.reset(KEY))
     plain, gained = (
-        networks.build(kind, task, observation, (16,), Outputs(3), KEY, gain).encoder
+        networks.build(NetworkConfig(kind, (16,), gain), task, observation, Outputs(3), KEY).encoder
         for gain in (0.0, 2.0)
     )
     first = lambda e: (e.first if kind == "cnn" else e.inputs).weights[0]  # noqa: E731

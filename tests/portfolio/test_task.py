@@ -7,6 +7,7 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
+from qfolio.core.market import MenuActions
 from qfolio.core.mdp import Discrete, Position, Simplex
 from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
@@ -178,7 +179,7 @@ def test_menus():
     assert grid.actions == Discrete(5)
     np.testing.assert_allclose(grid.weights(jnp.array([1.0, 0]), jnp.array(3)), [0.25, 0.75])
     tilts = Menu("tilts:0.1", jnp.ones(2))
-    assert tilts.actions == Discrete(7, pooled=3, each=2)
+    assert tilts.actions == MenuActions(7, pooled=3, each=2)
     held = jnp.array([0.5, 0.3, 0.2])
     choices = [tilts.weights(held, jnp.array(i)) for i in range(7)]
     expected = [held, [1, 0, 0], [0, 0.5, 0.5], [0, 1, 0], [0, 0, 1], [0.45, 0.37, 0.18],
@@ -187,7 +188,7 @@ def test_menus():
     some = Menu("tilts:0.1", jnp.array([0.5, 0.0, 0.5]))
     np.testing.assert_allclose(some.weights(jnp.ones(4) / 4, jnp.array(2)), [0, 0.5, 0, 0.5])
     over = Menu("overweight:0.1", jnp.ones(2))
-    assert over.actions == Discrete(5, pooled=3, each=1)
+    assert over.actions == MenuActions(5, pooled=3, each=1)
     choices = [over.weights(held, jnp.array(i)) for i in (0, 2, 3, 4)]
     expected = [held, [0, 0.5, 0.5], [0, 0.55, 0.45], [0, 0.45, 0.55]]
     np.testing.assert_allclose(choices, np.array(expected), atol=1e-6)

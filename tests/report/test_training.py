@@ -19,7 +19,8 @@ from PIL import Image
 
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
-from qfolio.core.mdp import Position, View
+from qfolio.core.market import View
+from qfolio.core.mdp import Position
 from qfolio.experiments.run import Run
 from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
 from qfolio.portfolio.synthetic.no_trade import NoTrade

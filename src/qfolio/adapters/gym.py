@@ -75,6 +75,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         render_mode: str | None = None,
         **task: Any,
     ) -> None:
+        from qfolio.core.mdp import Discrete
         from qfolio.portfolio.task import Portfolio
 
         if render_mode not in (None, "ansi"):
@@ -105,7 +106,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         )
         self.action_space = (
             spaces.Discrete(self.task.actions.n)
-            if self.task.menu
+            if isinstance(self.task.actions, Discrete)
             else spaces.Box(-1.0, 1.0, (assets + 1,), np.float32)
         )
         self._row, self._steps = -1, self.task.horizon  # over
@@ -260,7 +261,8 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         import jax
 
         from qfolio.core import devices
-        from qfolio.core.mdp import Discrete, Simplex, View
+        from qfolio.core.market import View
+        from qfolio.core.mdp import Discrete, Simplex
 
         if render_mode is not None:
             raise QfolioError(f"render_mode is {render_mode!r}; {name} has none.")

@@ -5,9 +5,9 @@ log probabilities times their advantages, and the critic one towards the returns
 docs/policy_gradients.md has the formulas and the deviations from the paper.
 """
 
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
-from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState
+from qfolio.agents.on_policy import OnPolicy, OnPolicyState
 from qfolio.core.fields import number, require, static
 from qfolio.core.mdp import Metrics, Task, Transition
 
@@ -18,12 +18,10 @@ class A2C(OnPolicy):
     rollout_length: int = static(5)
     gae_lambda: float = number(1.0)  # λ of the advantages: 0 trusts the critic, 1 the rewards
     learning_rate: float = number(7e-4)
+    normalize_advantages: bool = static(False)
 
     def __check_init__(self) -> None:
         require(self, "gae_lambda", lambda x: 0 <= x <= 1, "between 0 and 1")
-
-    def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
-        return log_prob * batch.advantage
 
     def learn(
         self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray

@@ -9,7 +9,7 @@ holds every formula and its place.
 import abc
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,14 +17,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.core.fields import number, require, sizes, static
-from qfolio.core.mdp import Agent, Discrete, Metrics, Task, Transition
+from qfolio.core.mdp import Actions, Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.exploration import uniform
-from qfolio.learning.networks import Flat, Network
-from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
-from qfolio.learning.targets import Scale, huber_loss, possible_values, td_target
-
-Weights = TypeVar("Weights", bound=PyTree)
+from qfolio.learning.networks import Flat, Network, NetworkConfig
+from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
+from qfolio.learning.targets import Scalar, Scale, huber_loss, possible_values, td_target
 
 
 class Critics(eqx.Module):
@@ -56,21 +55,21 @@ class Critics(eqx.Module):
         return self.scale.values(jax.vmap(read)(self.networks))
 
     def errors(
-        self, q: Float[Array, "critic batch"], goal: Float[Array, " batch"]
+        self, q: Float[Array, "critic batch"], target: Float[Array, " batch"]
     ) -> Float[Array, "critic batch"]:
         """How far off the networks' outputs were, when they said ``q``."""
-        return self.scale.outputs(q) - self.scale.outputs(goal)
+        return self.scale.outputs(q) - self.scale.outputs(target)
 
 
 def critic_loss(
     critics: Critics,
     batch: Experience,
-    goal: Float[Array, " batch"],
-    huber: Float[Array, ""] | float,
+    target: Float[Array, " batch"],
+    huber_delta: Scalar,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Mean Huber loss of the errors to one goal, summed over the critics; and what to report."""
+    """Mean Huber loss of the errors to one target, summed over the critics; and what to report."""
     q = critics(batch.observation, batch.action)
-    loss = huber_loss(critics.errors(q, goal), huber).mean(1).sum()
+    loss = huber_loss(critics.errors(q, target), huber_delta).mean(1).sum()
     return loss, {"loss": loss, "q": q.mean()}
 
 
@@ -82,16 +81,39 @@ class Batch(NamedTuple):
     rewards: Float[Array, "2"]  # the lowest and the highest that there ever were
 
 
-class ActorCriticState(eqx.Module):
+class Actor(eqx.Module):
+    """A policy: a network, and the actions that its outputs stand for."""
+
+    network: Network
+    actions: Actions
+
+
+class Learned(eqx.Module):
+    """What gradient steps change."""
+
+    actor: Actor
+    critics: Critics
+    target_critics: Critics
+    actor_adam: optimizer.Optimizer
+    critic_adam: optimizer.Optimizer
+
+
+L = TypeVar("L", bound=Learned)
+
+
+class ActorCriticState(eqx.Module, Generic[L]):
     """All that an agent learns and remembers."""
 
-    learned: Any  # what gradient steps change; its actor explores
+    learned: L
     replay: Replay
     steps: Int[Array, ""]  # of each environment
     rewards: Float[Array, "2"]  # the lowest and the highest that there ever were
 
 
-class ActorCritic(Agent):
+State = TypeVar("State", bound=ActorCriticState)
+
+
+class ActorCritic(Agent, Generic[L]):
     """Settings, buffer and gradient steps; an algorithm adds what it learns and how it explores."""
 
     network: str = static("flat")  # the actor's: over everything observed; mlp, cnn, rnn: by asset
@@ -113,74 +135,92 @@ class ActorCritic(Agent):
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
     huber_delta: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
     value_rescaling: bool = static(False)  # critics learn roots of values: small ones weigh more
+    clip_bootstrap: bool = static(True)  # to the values that the rewards so far allow
 
     def __check_init__(self) -> None:
-        require_replay(self)
+        self._replay.check()
+        self._networks.check()
+        self._schedule.check()
+        require(self, "gradient_steps", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "actor_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
         require(self, "discount tau", lambda x: 0 <= x <= 1, "between 0 and 1")
-        optimizer.require_schedule(self)
-        networks.require_network(self)
+        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+
+    @property
+    def _replay(self) -> ReplayConfig:
+        return ReplayConfig(
+            self.num_envs, self.batch_size, self.n_steps, self.replay_capacity, self.learning_starts
+        )
+
+    @property
+    def _networks(self) -> NetworkConfig:
+        return NetworkConfig(self.network, self.hidden, self.input_gain)
+
+    @property
+    def _schedule(self) -> CosineSchedule:
+        return CosineSchedule(
+            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
+        )
 
     @abc.abstractmethod
-    def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Any:
+    def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> L:
         """What gradient steps will change; ``observation`` is an example."""
 
     @abc.abstractmethod
-    def explore(self, learned: Any, observation: PyTree, key: PRNGKeyArray) -> Array:
+    def explore(self, learned: L, observation: PyTree, key: PRNGKeyArray) -> Array:
         """Actions for a batch of observations, with exploration."""
 
     @abc.abstractmethod
-    def update(self, learned: Any, batch: Batch, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+    def update(self, learned: L, batch: Batch, key: PRNGKeyArray) -> tuple[L, Metrics]:
         """One gradient step of all that learns."""
 
-    def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState:
+    def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState[L]:
         observation = task.observe(task.reset(key))
         action = uniform(task.actions, key, 1)[0]
         row = Experience.like(observation, action, with_last=self.n_steps > 1)
         learned = self.begin(task, observation, key)
-        replay = Replay.empty(row, self.replay_capacity, self.num_envs, self.n_steps)
         none = jnp.array([jnp.inf, -jnp.inf])
-        return ActorCriticState(learned, replay, jnp.array(0, jnp.int32), none)
+        return ActorCriticState(learned, self._replay.empty(row), jnp.array(0, jnp.int32), none)
 
     def warm_up(self) -> int:
-        return warm_up(self)
+        return self._replay.warm_up
 
-    def act(self, state: ActorCriticState, observation: PyTree, key: PRNGKeyArray) -> Array:
+    def act(self, state: ActorCriticState[L], observation: PyTree, key: PRNGKeyArray) -> Array:
         random_key, key = jax.random.split(key)
         random = uniform(state.learned.actor.actions, random_key, self.num_envs)
         action = self.explore(state.learned, observation, key)
         return jnp.where(state.steps < self.warm_up(), random, action)
 
-    def observe(self, state: ActorCriticState, rollout: Transition) -> ActorCriticState:
+    def observe(self, state: State, rollout: Transition) -> State:
         step = Experience.of(rollout, with_last=self.n_steps > 1)
         lowest, highest = state.rewards
         rewards = jnp.stack(
             [jnp.minimum(lowest, step.reward.min()), jnp.maximum(highest, step.reward.max())]
         )
-        replay = state.replay.add(self.row(step, state.steps))
+        replay = state.replay.add(self.row(state, step))
         return eqx.tree_at(
             lambda s: (s.replay, s.steps, s.rewards), state, (replay, state.steps + 1, rewards)
         )
 
-    def row(self, step: Experience, steps: Int[Array, ""]) -> PyTree:
-        """What the buffer keeps of a step of all environments, the ``steps``-th."""
+    def row(self, state: ActorCriticState[L], step: Experience) -> PyTree:
+        """What the buffer keeps of a step of all environments, made in ``state``."""
         return step
 
     def learn(
-        self, task: Task, state: ActorCriticState, rollout: Transition, key: PRNGKeyArray
-    ) -> tuple[ActorCriticState, Metrics]:
+        self, task: Task, state: ActorCriticState[L], rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[ActorCriticState[L], Metrics]:
         state = self.observe(state, rollout)
         learned, metrics = self.practise(state.learned, state.replay, state.rewards, key)
         return eqx.tree_at(lambda s: s.learned, state, learned), metrics
 
     def practise(
-        self, learned: Any, replay: Replay, rewards: Float[Array, "2"], key: PRNGKeyArray
-    ) -> tuple[Any, Metrics]:
-        """``updates`` gradient steps on batches from a buffer."""
+        self, learned: L, replay: Replay, rewards: Float[Array, "2"], key: PRNGKeyArray
+    ) -> tuple[L, Metrics]:
+        """``gradient_steps`` gradient steps on batches from a buffer."""
 
-        def update(learned: Any, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+        def update(learned: L, key: PRNGKeyArray) -> tuple[L, Metrics]:
             sample_key, key = jax.random.split(key)
             index = replay.draw(sample_key, self.batch_size)
             batch = Batch(*join(replay, index, self.discount), rewards)
@@ -189,46 +229,35 @@ class ActorCritic(Agent):
         learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         return learned, {**metrics, "q": metrics["q"] / self.reward_scale}
 
-    def carry_over(self, state: ActorCriticState, fresh: ActorCriticState) -> ActorCriticState:
+    def carry_over(self, state: State, fresh: State) -> State:
         return eqx.tree_at(lambda s: (s.replay, s.rewards), state, (fresh.replay, fresh.rewards))
 
-    def weights(self, state: ActorCriticState) -> Any:
+    def weights(self, state: ActorCriticState[L]) -> PyTree:
         return state.learned.actor
 
-    def goal(
-        self, batch: Batch, following: Float[Array, " batch"], bonus: Array | float = 0.0
+    def target(
+        self,
+        batch: Batch,
+        following: Float[Array, " batch"],
+        bonus: tuple[Scalar, Scalar] = (0.0, 0.0),
     ) -> Float[Array, " batch"]:
-        """Bellman target, where what follows is brought to what the rewards so far allow.
+        """Bellman target; with ``clip_bootstrap`` what follows is as the rewards so far allow.
 
-        bonus: what each later step is worth besides its reward.
+        bonus: the least and the most that a later step may be worth besides its reward.
         """
-        rewards = self.reward_scale * batch.rewards
-        rewards = rewards + jnp.stack([jnp.minimum(bonus, 0.0), jnp.maximum(bonus, 0.0)])
-        following = jnp.clip(following, *possible_values(rewards, self.discount))
+        if self.clip_bootstrap:
+            each = self.reward_scale * batch.rewards + jnp.stack([jnp.asarray(x) for x in bonus])
+            following = jnp.clip(following, *possible_values(each, self.discount))
         steps = batch.steps
         return td_target(
             self.reward_scale * steps.reward, steps.terminal, following, batch.discount
         )
 
-    def descend(
-        self,
-        loss: Callable[..., tuple[Float[Array, ""], Metrics]],
-        weights: Weights,
-        adam: optimizer.Optimizer,
-        rate: Float[Array, ""],
-        *others: Any,
-    ) -> tuple[Weights, optimizer.Optimizer, Metrics]:
-        """One step down the gradient in ``weights`` of ``loss(weights, *others)``."""
-        gradient, metrics = jax.grad(loss, has_aux=True)(weights, *others)
-        return *optimizer.descend(self, weights, gradient, adam, rate), metrics
-
     def build(
         self, task: Task, observation: PyTree, outputs: networks.Outputs, key: PRNGKeyArray
     ) -> Network:
         """A network over observations alone."""
-        return networks.build(
-            self.network, task, observation, self.hidden, outputs, key, self.input_gain
-        )
+        return networks.build(self._networks, task, observation, outputs, key)
 
     def build_critics(
         self, task: Task, observation: PyTree, count: int, key: PRNGKeyArray

@@ -14,27 +14,27 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from qfolio.agents import actor_critic
 from qfolio.agents.actor_critic import ActorCritic, Batch, Critics, critic_loss
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require
 from qfolio.core.mdp import Box, Discrete, Metrics, Simplex, Task
 from qfolio.learning import optimizer
-from qfolio.learning.networks import Network, outputs_of, saturation
+from qfolio.learning.networks import outputs_of, saturation
 from qfolio.learning.replay import Experience
-from qfolio.learning.targets import follow
+from qfolio.learning.targets import Scalar, follow
 
 REACH = 4.0
 """Output beyond which tanh counts as flat; there it is within 0.0007 of its bound."""
 
 
-class Actor(eqx.Module):
+class Actor(actor_critic.Actor):
     """A deterministic policy: a network whose outputs are brought among the actions.
 
     By tanh between the bounds of a box, by softmax onto the simplex of weights.
     """
 
-    network: Network
     actions: Box | Simplex
 
     def __call__(self, observation: PyTree) -> Float[Array, "batch entry"]:
@@ -58,53 +58,50 @@ class Actor(eqx.Module):
         return jnp.clip(action + self.actions.unit * noise, -bound, bound)
 
 
-class Learned(eqx.Module):
-    """What gradient steps change."""
+class Learned(actor_critic.Learned):
+    """What gradient steps change: the actor has a target, too."""
 
     actor: Actor
-    critics: Critics
     target_actor: Actor
-    target_critics: Critics
-    actor_adam: optimizer.Optimizer
-    critic_adam: optimizer.Optimizer
 
 
 def actor_loss(
-    actor: Actor, critics: Critics, observation: PyTree
+    actor: Actor, critics: Critics, observation: PyTree, saturation_penalty: Scalar
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Minus the mean of Q(s, π(s)), by the smaller critic where there are several.
+    """Minus the mean of Q(s, π(s)), by the smallest of the critics.
 
-    Where tanh is flat there is something to pay.
+    saturation_penalty: what a unit of ``saturation`` costs.
     """
     output = actor.network(observation)
     value = critics(observation, actor.among(output)).min(0).mean()
-    return saturation(actor.actions, output, REACH) - value, {}
+    return saturation_penalty * saturation(actor.actions, output, REACH).mean() - value, {}
 
 
-class DDPG(ActorCritic):
+class DDPG(ActorCritic[Learned]):
     """A deterministic actor and a critic, both with targets that follow them."""
 
     exploration_noise: float = number(0.1)  # standard deviation of the noise, in units of the bound
+    saturation_penalty: float = number(0.1)  # on outputs where tanh is flat; 0: none
 
     critics: ClassVar[int] = 1
 
     def __check_init__(self) -> None:
-        require(self, "exploration_noise", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        scales = "exploration_noise saturation_penalty"
+        require(self, scales, lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
 
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
         if isinstance(task.actions, Discrete):
             raise QfolioError(
                 f"{type(self).__name__.lower()} needs continuous actions, and those of "
-                f"{type(task).__name__} are numbered; take dqn or sac, or make them continuous: "
+                f"{task.name} are numbered; take dqn or sac, or make them continuous: "
                 "torques=0 of the pendulum, no menu in a market."
             )
         actor_key, critic_key = jax.random.split(key)
         network = self.build(task, observation, outputs_of(task.actions), actor_key)
         actor = Actor(network, task.actions)
         critics = self.build_critics(task, observation, self.critics, critic_key)
-        return Learned(
-            actor, critics, actor, critics, optimizer.begin(actor), optimizer.begin(critics)
-        )
+        begin = optimizer.begin
+        return Learned(actor, critics, critics, begin(actor), begin(critics), actor)
 
     def policy(self, weights: Actor, observation: PyTree) -> Float[Array, "batch entry"]:
         return weights(observation)
@@ -125,15 +122,15 @@ class DDPG(ActorCritic):
     ) -> tuple[Learned, Metrics]:
         """A step of the critics towards the Bellman target."""
         following = self.following(learned, batch.steps.next_observation, key)
-        goal = self.goal(batch, following)
-        rate = optimizer.learning_rate(self, learned.critic_adam.count)
-        critics, adam, metrics = self.descend(
+        target = self.target(batch, following)
+        rate = self._schedule(learned.critic_adam.count)
+        critics, adam, metrics = optimizer.minimize(
             critic_loss,
             learned.critics,
             learned.critic_adam,
             rate,
             batch.steps,
-            goal,
+            target,
             self.huber_delta,
         )
         learned = eqx.tree_at(lambda x: (x.critics, x.critic_adam), learned, (critics, adam))
@@ -147,12 +144,22 @@ class DDPG(ActorCritic):
 
     def improve(self, learned: Learned, batch: Experience) -> Learned:
         """A step of the actor up the critics; then the targets follow."""
-        rate = self.actor_learning_rate_ratio * optimizer.learning_rate(
-            self, learned.critic_adam.count
+        rate = self.actor_learning_rate_ratio * self._schedule(learned.critic_adam.count)
+        actor, adam, _ = optimizer.minimize(
+            actor_loss,
+            learned.actor,
+            learned.actor_adam,
+            rate,
+            self.climbed(learned.critics),
+            batch.observation,
+            self.saturation_penalty,
         )
-        actor, adam, _ = self.descend(
-            actor_loss, learned.actor, learned.actor_adam, rate, learned.critics, batch.observation
+        targets = (learned.target_critics, learned.target_actor)
+        target_critics, target_actor = follow(targets, (learned.critics, actor), self.tau)
+        return Learned(
+            actor, learned.critics, target_critics, adam, learned.critic_adam, target_actor
         )
-        targets = (learned.target_actor, learned.target_critics)
-        targets = follow(targets, (actor, learned.critics), self.tau)
-        return Learned(actor, learned.critics, *targets, adam, learned.critic_adam)
+
+    def climbed(self, critics: Critics) -> Critics:
+        """The critics of whose values the actor climbs the smallest."""
+        return critics

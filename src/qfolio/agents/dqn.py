@@ -28,13 +28,15 @@ from qfolio.agents import hindsight
 from qfolio.agents.hindsight import Move
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, sizes, static
-from qfolio.core.mdp import Agent, Contrast, Discrete, ExogenousTask, Metrics, Task, Transition
-from qfolio.learning import distributional, heads, optimizer
-from qfolio.learning.distributional import Values
-from qfolio.learning.exploration import epsilon_greedy, epsilon_now
-from qfolio.learning.networks import Network, require_network
-from qfolio.learning.priorities import Priorities, importance_exponent_now
-from qfolio.learning.replay import Discount, Experience, Replay, join, require_replay, warm_up
+from qfolio.core.mdp import Agent, Discrete, ExogenousTask, Metrics, Task, Transition
+from qfolio.learning import heads, optimizer
+from qfolio.learning.distributional import ValueConfig, Values
+from qfolio.learning.exploration import EpsilonSchedule, epsilon_greedy
+from qfolio.learning.heads import HeadConfig
+from qfolio.learning.networks import Network, NetworkConfig
+from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.priorities import ImportanceSchedule, Priorities
+from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
 from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
 
 
@@ -76,7 +78,8 @@ class DQN(Agent):
     n_steps: int = static(1)  # whose rewards a target adds up
     prioritized: bool = static(False)  # transitions are drawn by how far off their values were
     priority_exponent: float = number(0.6)  # α
-    importance_exponent: float = number(0.4)  # β at the start; 1 after learning_rate_steps
+    importance_exponent: float = number(0.4)  # β at the start
+    importance_steps: float = number(1e5)  # gradient steps until β is 1
     values: str = static("expected")  # what is learned of a return: expected, categorical, quantile
     atoms: int = static(51)  # numbers for each action, where values are a distribution
     v_min: float = number(-10.0)  # ends of categorical's support, in units of scaled reward
@@ -102,46 +105,77 @@ class DQN(Agent):
     value_rescaling: bool = static(False)  # learn roots of values: small ones weigh more
 
     def __check_init__(self) -> None:
-        require_replay(self)
-        require_network(self)
-        optimizer.require_schedule(self)
+        self._replay.check()
+        self._networks.check()
+        self._schedule.check()
+        self._value_config.check()
+        require(self, "gradient_steps", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "importance_steps", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "target_update_interval", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
         fractions = "discount tau epsilon_start epsilon_end epsilon_decay persistence"
         exponents = " priority_exponent importance_exponent"
         require(self, fractions + exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
-        distributional.require_values(self)
         if self.all_actions:
-            hindsight.require_plain(self)
+            hindsight.require_plain({name: getattr(self, name) for name in hindsight.PLAIN})
         if self.market_baseline and self.batch_size < 2:
             raise QfolioError(
                 "market_baseline compares holders; it needs a batch_size of 2 or more."
             )
 
-    def contrast(self) -> Contrast:
-        if self.all_actions:
-            single = dataclasses.replace(self, all_actions=False)
-            return Contrast("all actions at once", "one action at a time", single)
-        names = ("without double DQN", "double DQN")
-        other = dataclasses.replace(self, double=not self.double)
-        return Contrast(names[self.double], names[not self.double], other)
+    @property
+    def _replay(self) -> ReplayConfig:
+        return ReplayConfig(
+            self.num_envs, self.batch_size, self.n_steps, self.replay_capacity,
+            self.learning_starts, self.prioritized,
+        )  # fmt: skip
+
+    @property
+    def _networks(self) -> NetworkConfig:
+        return NetworkConfig(self.network, self.hidden, self.input_gain)
+
+    @property
+    def _head(self) -> HeadConfig:
+        noise = self.noise_scale if self.noisy else None
+        return HeadConfig(self._values.atoms, self.dueling, noise)
+
+    @property
+    def _schedule(self) -> CosineSchedule:
+        return CosineSchedule(
+            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
+        )
+
+    @property
+    def _epsilon(self) -> EpsilonSchedule:
+        return EpsilonSchedule(self.epsilon_start, self.epsilon_end, self.epsilon_decay)
+
+    @property
+    def _importance(self) -> ImportanceSchedule:
+        return ImportanceSchedule(self.importance_exponent, self.importance_steps)
+
+    @property
+    def _value_config(self) -> ValueConfig:
+        return ValueConfig(
+            self.values, self.atoms, self.v_min, self.v_max, self.huber_delta, self.value_rescaling
+        )
 
     @property
     def _values(self) -> Values:
         """What the network's numbers mean."""
-        return distributional.values_of(self)
+        return self._value_config.build()
 
     def init(self, task: Task, key: PRNGKeyArray) -> DQNState:
         if not isinstance(task.actions, Discrete):
+            menu = "give it a menu of allocations (menu=grid:10), or "
             raise QfolioError(
-                f"dqn chooses among numbered actions, and those of {type(task).__name__} are "
-                "continuous; in a market, give it a menu of allocations (menu=grid:10)."
+                f"dqn chooses among numbered actions, and those of {task.name} are continuous; "
+                f"{menu if isinstance(task, ExogenousTask) else ''}take sac or ppo."
             )
         state = task.reset(key)
         observation = task.observe(state)
-        online = heads.build(self, task, observation, self._values.atoms, key)
+        online = heads.build(self._networks, self._head, task, observation, key)
         zero = jnp.array(0, jnp.int32)
         if self.all_actions:
             hindsight.require_exogenous(task)
@@ -152,18 +186,16 @@ class DQN(Agent):
             online=online,
             target=online,
             optimizer=optimizer.begin(online),
-            replay=Replay.empty(
-                row, self.replay_capacity, self.num_envs, self.n_steps, self.prioritized
-            ),
+            replay=self._replay.empty(row),
             episodes=zero,
             steps=zero,
         )
 
     def warm_up(self) -> int:
-        return warm_up(self)
+        return self._replay.warm_up
 
     def monitor(self, state: DQNState) -> Metrics:
-        return {"epsilon": epsilon_now(self, state.episodes)}
+        return {"epsilon": self._epsilon(state.episodes)}
 
     def carry_over(self, state: DQNState, fresh: DQNState) -> DQNState:
         return eqx.tree_at(lambda s: s.replay, state, fresh.replay)
@@ -185,7 +217,7 @@ class DQN(Agent):
         if self.noisy:
             key, noise_key = jax.random.split(key)
             online = heads.draw_noise(online, noise_key)
-        epsilon = epsilon_now(self, state.episodes)
+        epsilon = self._epsilon(state.episodes)
         last = state.replay.latest().action if self.persistence else None
         return epsilon_greedy(key, self._q(online, observation), epsilon, last, self.persistence)
 
@@ -194,7 +226,7 @@ class DQN(Agent):
 
     def _read(self, network: Network, observation: PyTree) -> Float[Array, "batch action atom"]:
         """What the network says of each action; ``_values`` knows what it means."""
-        return heads.read(self, self._values.atoms, network, observation)
+        return heads.read(self._head, network, observation)
 
     def observe(self, state: DQNState, rollout: Transition) -> DQNState:
         wrong, with_last = self.time_limit_terminal, self.n_steps > 1
@@ -232,7 +264,7 @@ class DQN(Agent):
         index = dataclasses.replace(replay, priorities=priorities).draw(draw_key, self.batch_size)
         weight: Array | float = 1.0
         if priorities is not None:
-            weight = priorities.importance(index, importance_exponent_now(self, adam.count))
+            weight = priorities.importance(index, self._importance(adam.count))
 
         def objective(online: Network) -> tuple[Float[Array, ""], Losses]:
             if self.all_actions:
@@ -245,7 +277,8 @@ class DQN(Agent):
         (loss, losses), gradient = jax.value_and_grad(objective, has_aux=True)(online)
         if priorities is not None and losses.off is not None:
             priorities = priorities.update(index, losses.off, self.priority_exponent)
-        online, adam = optimizer.descend(self, online, gradient, adam)
+        rate = self._schedule(adam.count + 1)
+        online, adam = optimizer.descend(online, gradient, adam, rate)
         return (online, adam, priorities), {"loss": loss, "max_q": losses.max_q}
 
     def _losses(
@@ -265,10 +298,10 @@ class DQN(Agent):
         following = bootstrap(z_next, values.mean(selector))
 
         reward = self.reward_scale * batch.reward
-        goals = jax.vmap(td_target, (None, None, 1, None), 1)  # one for each outcome
-        goal = goals(reward, batch.terminal, values.outcomes(following), discount)
+        each_target = jax.vmap(td_target, (None, None, 1, None), 1)  # one for each outcome
+        targets = each_target(reward, batch.terminal, values.outcomes(following), discount)
         each, off = values.loss(
-            chosen(z, batch.action), lax.stop_gradient(goal), lax.stop_gradient(following)
+            chosen(z, batch.action), lax.stop_gradient(targets), lax.stop_gradient(following)
         )
         return Losses(each, off, values.mean(z).max(1).mean() / self.reward_scale)
 
@@ -277,6 +310,7 @@ class DQN(Agent):
     ) -> Losses:
         assert isinstance(task, ExogenousTask)
         q = partial(self._q, online), partial(self._q, target)
-        error, values = hindsight.errors(self, task, moves, key, *q)
+        rule = hindsight.Rule(self.discount, self.reward_scale, self.double, self.market_baseline)
+        error, values = hindsight.errors(rule, task, moves, key, *q)
         each = huber_loss(error, self.huber_delta)
         return Losses(each, None, values.max(1).mean() / self.reward_scale)

@@ -5,9 +5,9 @@ for exogenous inputs, Sinclair et al. 2023): the buffer keeps moves instead of t
 are drawn anew at each update, and all actions regress together.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import ExogenousTask, Position, Task, Transition
-from qfolio.learning.targets import bootstrap, td_target
+from qfolio.learning.targets import Scalar, bootstrap, td_target
 
 Q = Callable[[PyTree], Float[Array, "batch action"]]
 """From observations to action values."""
@@ -35,14 +35,17 @@ class Move(NamedTuple):
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), moves)
 
 
-def require_plain(agent: Any) -> None:
-    """Raises QfolioError where an agent wants what moves and holdings drawn anew do not give."""
-    plain: dict[str, Any] = {
-        "values": "expected", "n_steps": 1, "prioritized": False, "noisy": False,
-        "persistence": 0.0, "value_rescaling": False,
-    }  # fmt: skip
-    for name, value in plain.items():
-        if getattr(agent, name) != value:
+PLAIN: dict[str, str | bool | int | float] = {
+    "values": "expected", "n_steps": 1, "prioritized": False, "noisy": False, "persistence": 0.0,
+    "value_rescaling": False,
+}  # fmt: skip
+"""The settings of an agent that moves, and holdings drawn anew, allow for."""
+
+
+def require_plain(settings: Mapping[str, str | bool | int | float]) -> None:
+    """Raises QfolioError where one of an agent's settings is not as in ``PLAIN``."""
+    for name, value in PLAIN.items():
+        if settings[name] != value:
             raise QfolioError(
                 "all_actions learns expected values from single moves, all drawn alike, and needs "
                 f"no exploration; take {name}={str(value).lower()}, or all_actions=false."
@@ -54,7 +57,7 @@ def require_exogenous(task: Task) -> None:
     if not isinstance(task, ExogenousTask):
         raise QfolioError(
             "all_actions needs a market, whose prices do not answer to actions; "
-            f"{type(task).__name__} is none."
+            f"{task.name} is none."
         )
     if getattr(task, "reward", "") == "differential-sharpe":
         raise QfolioError(
@@ -63,19 +66,19 @@ def require_exogenous(task: Task) -> None:
         )
 
 
-def errors(
-    agent: Any,
-    task: ExogenousTask,
-    moves: Move,
-    key: PRNGKeyArray,
-    online: Q,
-    target: Q,
-) -> tuple[Float[Array, "batch action"], Float[Array, "batch action"]]:
-    """Goal less value for every action from a holding drawn for each move, and the values.
+class Rule(NamedTuple):
+    """How targets are made; the names are those of the agent's settings."""
 
-    With the agent's ``market_baseline`` rewards count from what the same move pays another holder,
-    on average over actions.
-    """
+    discount: Scalar
+    reward_scale: Scalar
+    double: bool
+    market_baseline: bool  # rewards count from what the same move pays another holder on average
+
+
+def errors(
+    rule: Rule, task: ExogenousTask, moves: Move, key: PRNGKeyArray, online: Q, target: Q
+) -> tuple[Float[Array, "batch action"], Float[Array, "batch action"]]:
+    """Target less value for every action from a holding drawn for each move, and the values."""
     count = len(jax.tree.leaves(moves)[0])
     holdings = jax.vmap(task.draw_holding)(jax.random.split(key, count))
     q = online(jax.vmap(task.observe)(Position(moves.market, holdings)))
@@ -86,7 +89,7 @@ def errors(
 
     actions = jnp.arange(q.shape[-1])
     reward, next_holdings = jax.vmap(partial(after, holdings))(actions)  # (action, batch)
-    if agent.market_baseline:
+    if rule.market_baseline:
         # It depends on the market alone: taking it off leaves the best policy as it is, and takes
         # off what all actions have in common of the market's noise (input-dependent baselines, Mao
         # et al. 2019).
@@ -94,11 +97,11 @@ def errors(
         reward = reward - jax.vmap(partial(after, others))(actions)[0].mean(0)
     never = jnp.zeros(reward.shape[1:], bool)
 
-    def goal(reward: Array, holding: PyTree) -> Array:
+    def towards(reward: Array, holding: PyTree) -> Array:
         view = jax.vmap(task.observe)(Position(moves.next_market, holding))
         q_next = target(view)
-        following = bootstrap(q_next, online(view) if agent.double else q_next)
-        return td_target(agent.reward_scale * reward, never, following, agent.discount)
+        following = bootstrap(q_next, online(view) if rule.double else q_next)
+        return td_target(rule.reward_scale * reward, never, following, rule.discount)
 
-    goals = lax.stop_gradient(jax.vmap(goal)(reward, next_holdings)).T
-    return goals - q, q
+    targets = lax.stop_gradient(jax.vmap(towards)(reward, next_holdings)).T
+    return targets - q, q

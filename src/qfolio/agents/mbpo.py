@@ -13,15 +13,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 
-from qfolio.agents.actor_critic import ActorCriticState
-from qfolio.agents.sac import SAC
+from qfolio.agents.actor_critic import ActorCriticState, State
+from qfolio.agents.sac import SAC, Learned
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, require_sizes, sizes, static
 from qfolio.core.mdp import Actions, Discrete, Metrics, Task, Transition
 from qfolio.learning import optimizer
-from qfolio.learning.encoders import SmoothMLP
+from qfolio.learning.encoders import MLP
 from qfolio.learning.exploration import uniform
 from qfolio.learning.replay import Experience, Replay
 from qfolio.learning.targets import squash, unsquash
@@ -38,7 +38,7 @@ class Model(eqx.Module):
     Small rewards decide where large ones are avoided, and a root is finer near zero.
     """
 
-    members: SmoothMLP
+    members: MLP
     scale: Float[Array, " seen"]  # range of each component of an observation
     actions: Actions
 
@@ -88,12 +88,13 @@ class Remembered(NamedTuple):
     counts: Float[Array, "*batch member"]
 
 
-class MBPOState(ActorCriticState):
+class MBPOState(ActorCriticState[Learned]):
     """That of SAC, whose buffer holds real steps, with a model and its imagination."""
 
     model: Model
     model_adam: optimizer.Optimizer
     imagined: Replay
+    bootstrap_key: UInt32[Array, "2"]  # of the counts; each step folds its number in
 
 
 class MBPO(SAC):
@@ -116,17 +117,17 @@ class MBPO(SAC):
         require_sizes(self, "model_hidden")
 
     def init(self, task: Task, key: PRNGKeyArray) -> MBPOState:
-        model_key, key = jax.random.split(key)
+        model_key, key, bootstrap_key = jax.random.split(key, 3)
         observation = task.observe(task.reset(key))
         if getattr(observation, "ndim", 0) != 1 or task.states is not None:
             raise QfolioError(
                 "mbpo predicts observations that are one row of numbers; those of "
-                f"{type(task).__name__} are not. Take sac or dqn."
+                f"{task.name} are not. Take sac or dqn."
             )
         actions = task.actions
         entries = actions.n if isinstance(actions, Discrete) else uniform(actions, key, 1).shape[1]
         layers = (observation.size + entries, *self.model_hidden, observation.size + 2)
-        make = lambda key: SmoothMLP(layers, key, GAIN)  # noqa: E731
+        make = lambda key: MLP(layers, key, GAIN, jax.nn.silu)  # noqa: E731
         model = Model(
             jax.vmap(make)(jax.random.split(model_key, self.ensemble_size)),
             jnp.broadcast_to(jnp.array(task.observation_scale), observation.shape),
@@ -144,32 +145,36 @@ class MBPO(SAC):
             model=model,
             model_adam=optimizer.begin(model.members),
             imagined=Replay.empty(step, self.model_replay_capacity, width),
+            bootstrap_key=jax.random.key_data(bootstrap_key),
         )
 
-    def row(self, step: Experience, steps: Int[Array, ""]) -> Remembered:
-        key = jax.random.fold_in(jax.random.key(0), steps)
+    def row(self, state: ActorCriticState[Learned], step: Experience) -> Remembered:
+        assert isinstance(state, MBPOState)
+        key = jax.random.fold_in(jax.random.wrap_key_data(state.bootstrap_key), state.steps)
         counts = jax.random.poisson(key, 1.0, (len(step.reward), self.ensemble_size))
         return Remembered(step, counts.astype(jnp.float32))
 
     def learn(
-        self, task: Task, state: MBPOState, rollout: Transition, key: PRNGKeyArray
+        self, task: Task, state: ActorCriticState[Learned], rollout: Transition, key: PRNGKeyArray
     ) -> tuple[MBPOState, Metrics]:
-        state = self.observe(state, rollout)
+        assert isinstance(state, MBPOState)
+        now = self.observe(state, rollout)
         model_key, imagine_key, key = jax.random.split(key, 3)
-        model, model_adam, metrics = self._study(state, model_key)
-        imagined = self._imagine(model, state, imagine_key)
-        learned, more = self.practise(state.learned, imagined, state.rewards, key)
-        state = MBPOState(
-            learned, state.replay, state.steps, state.rewards, model, model_adam, imagined
-        )
-        return state, metrics | more
+        model, model_adam, metrics = self._study(now, model_key)
+        imagined = self._imagine(model, now, imagine_key)
+        learned, more = self.practise(now.learned, imagined, now.rewards, key)
+        now = MBPOState(
+            learned, now.replay, now.steps, now.rewards, model, model_adam, imagined,
+            now.bootstrap_key,
+        )  # fmt: skip
+        return now, metrics | more
 
     def _study(
         self, state: MBPOState, key: PRNGKeyArray
     ) -> tuple[Model, optimizer.Optimizer, Metrics]:
         """Gradient steps of the model on real transitions."""
         done = state.learned.critic_adam.count
-        rate = self.model_learning_rate_ratio * optimizer.learning_rate(self, done)
+        rate = self.model_learning_rate_ratio * self._schedule(done)
 
         def update(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, Metrics]:
             members, adam = carry
@@ -177,7 +182,7 @@ class MBPO(SAC):
             loss = lambda members: model_loss(  # noqa: E731
                 eqx.tree_at(lambda m: m.members, state.model, members), batch.step, batch.counts
             )
-            members, adam, metrics = self.descend(loss, members, adam, rate)
+            members, adam, metrics = optimizer.minimize(loss, members, adam, rate)
             return (members, adam), metrics
 
         carry = (state.model.members, state.model_adam)
@@ -201,6 +206,7 @@ class MBPO(SAC):
         _, steps = lax.scan(step, starts, jax.random.split(key, self.model_rollout_length))
         return state.imagined.add(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps))
 
-    def carry_over(self, state: MBPOState, fresh: MBPOState) -> MBPOState:
+    def carry_over(self, state: State, fresh: State) -> State:
+        assert isinstance(fresh, MBPOState)
         state = super().carry_over(state, fresh)
         return eqx.tree_at(lambda s: s.imagined, state, fresh.imagined)

@@ -6,20 +6,21 @@ actions that did better, and the estimate towards what came. ``reinforce.py``, `
 ``ppo.py`` differ in how. docs/policy_gradients.md has the formulas.
 """
 
-import abc
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.fields import number, require, sizes, static
 from qfolio.core.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
-from qfolio.learning.networks import Flat, Network, Outputs, outputs_of
-from qfolio.learning.targets import advantages
+from qfolio.learning.networks import Flat, Network, NetworkConfig, Outputs, outputs_of, saturation
+from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.targets import Scalar, advantages
 
 REACH = 2.0
 """Mean, in bounds, beyond which nearly all draws count as cut to the bound."""
@@ -53,7 +54,8 @@ class Batch(NamedTuple):
     action: Array
     log_prob: Float[Array, " batch"]  # of the action, when it was drawn
     advantage: Float[Array, " batch"]
-    goal: Float[Array, " batch"]  # of the critic
+    target: Float[Array, " batch"]  # of the critic
+    counted: Bool[Array, " batch"] | None = None  # steps to learn from; None: all
 
 
 class OnPolicy(Agent):
@@ -72,6 +74,9 @@ class OnPolicy(Agent):
     value_coef: float = number(0.5)  # of the critic's mean squared error in the loss
     entropy_coef: float = number(0.0)  # of the policy's entropy, which the loss rewards
     initial_std: float = number(1.0)  # in units of the bound, or of the logits of weights
+    normalize_advantages: bool = static(True)  # to mean 0 and deviation 1 over a batch
+    time_limit_terminal: bool = static(False)  # nothing follows where the clock cuts an episode
+    saturation_penalty: float = number(0.1)  # on means far beyond the bounds; 0: none
     reward_scale: float = number(1.0)  # the critic learns values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
 
@@ -80,10 +85,22 @@ class OnPolicy(Agent):
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "discount", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
-        require(self, "value_coef entropy_coef", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        coefficients = "value_coef entropy_coef saturation_penalty"
+        require(self, coefficients, lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "initial_std", lambda x: 1e-9 <= x <= 1e9, "from 10⁻⁹ to 10⁹")
-        optimizer.require_schedule(self)
-        networks.require_network(self)
+        require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        self._schedule.check()
+        self._networks.check()
+
+    @property
+    def _networks(self) -> NetworkConfig:
+        return NetworkConfig(self.network, self.hidden, self.input_gain)
+
+    @property
+    def _schedule(self) -> CosineSchedule:
+        return CosineSchedule(
+            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
+        )
 
     @property
     def rollout_steps(self) -> int:
@@ -94,9 +111,7 @@ class OnPolicy(Agent):
         observation = task.observe(task.reset(start_key))
 
         def build(outputs: Outputs, key: PRNGKeyArray) -> Network:
-            return networks.build(
-                self.network, task, observation, self.hidden, outputs, key, self.input_gain
-            )
+            return networks.build(self._networks, task, observation, outputs, key)
 
         weights = PolicyAndValue(
             actor=_quiet(build(outputs_of(task.actions), actor_key)),
@@ -121,9 +136,7 @@ class OnPolicy(Agent):
     def observe(self, state: OnPolicyState, rollout: Transition) -> OnPolicyState:
         return state
 
-    def judge(
-        self, weights: PolicyAndValue, rollout: Transition, gae_lambda: Float[Array, ""] | float
-    ) -> Batch:
+    def judge(self, weights: PolicyAndValue, rollout: Transition, gae_lambda: Scalar) -> Batch:
         """Compares a rollout that these weights made with what they expect.
 
         gae_lambda: λ of the advantages, from 0 (trust the critic) to 1 (trust the rewards).
@@ -131,12 +144,15 @@ class OnPolicy(Agent):
         step = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout)
         value = weights.value(step.observation)
         by_time = lambda x: x.reshape(rollout.reward.shape)  # noqa: E731
+        terminated, truncated = rollout.terminated, rollout.truncated
+        if self.time_limit_terminal:
+            terminated = terminated | truncated
         advantage = advantages(
             self.reward_scale * rollout.reward,
             by_time(value),
             by_time(weights.value(step.next_observation)),
-            rollout.terminated,
-            rollout.truncated,
+            terminated,
+            truncated,
             self.discount,
             gae_lambda,
         ).reshape(-1)
@@ -145,35 +161,46 @@ class OnPolicy(Agent):
             action=step.action,
             log_prob=weights.policy(step.observation).log_prob(step.action),
             advantage=advantage,
-            goal=advantage + value,
+            target=advantage + value,
         )
 
-    @abc.abstractmethod
     def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
         """What the policy raises, by the log density that it gives to the batch's actions."""
+        return log_prob * self.weighed(batch)
+
+    def weighed(self, batch: Batch) -> Float[Array, " batch"]:
+        """The advantages as the objective takes them."""
+        if not self.normalize_advantages:
+            return batch.advantage
+        return normalized(batch.advantage, batch.counted)
 
     def loss(self, weights: PolicyAndValue, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
         """Minus the objective and the policy's entropy, with the critic's error."""
         output = weights.actor(batch.observation)
         policy = policy_of(weights.actions, output, weights.log_std)
-        loss = -self.objective(policy.log_prob(batch.action), batch).mean()
-        value_loss = ((batch.goal - weights.value(batch.observation)) ** 2).mean()
-        entropy = policy.entropy().mean()
+        mean = partial(jnp.mean, where=batch.counted)
+        loss = -mean(self.objective(policy.log_prob(batch.action), batch))
+        value_loss = mean((batch.target - weights.value(batch.observation)) ** 2)
+        entropy = mean(policy.entropy())
         total = loss + self.value_coef * value_loss - self.entropy_coef * entropy
-        total += networks.saturation(weights.actions, output, REACH)
+        total += self.saturation_penalty * mean(saturation(weights.actions, output, REACH))
         return total, {"loss": loss, "value_loss": value_loss, "entropy": entropy}
 
     def descend(self, state: OnPolicyState, batch: Batch) -> tuple[OnPolicyState, Metrics]:
         """One gradient step."""
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.weights, batch)
         gradient = optimizer.clip(gradient, self.max_grad_norm)
-        weights, adam = optimizer.descend(self, state.weights, gradient, state.optimizer)
+        rate = self._schedule(state.optimizer.count + 1)
+        weights, adam = optimizer.descend(state.weights, gradient, state.optimizer, rate)
         return OnPolicyState(weights, adam), metrics
 
 
-def normalised(advantage: Float[Array, " batch"]) -> Float[Array, " batch"]:
-    """Advantages with mean 0 and standard deviation 1."""
-    return (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+def normalized(
+    advantage: Float[Array, " batch"], counted: Bool[Array, " batch"] | None = None
+) -> Float[Array, " batch"]:
+    """Advantages with mean 0 and standard deviation 1 over those that count."""
+    mean, std = advantage.mean(where=counted), advantage.std(where=counted)
+    return (advantage - mean) / (std + 1e-8)
 
 
 def _coordinates(actions: Actions) -> int:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, require_sizes, sizes, static
+from qfolio.core.market import View
 from qfolio.core.mdp import (
     Agent,
     Box,
@@ -29,10 +30,10 @@ from qfolio.core.mdp import (
     Simplex,
     Task,
     Transition,
-    View,
 )
 from qfolio.learning import optimizer
 from qfolio.learning.networks import SHARED, Reading, Shared
+from qfolio.learning.optimizer import CosineSchedule
 
 
 class Band(eqx.Module):
@@ -63,17 +64,18 @@ class Band(eqx.Module):
         self, reading: Reading, holding: Float[Array, "batch asset"]
     ) -> Float[Array, "batch entry"]:
         """The holding, brought between the edges; cash is what is left of 1."""
-        box = isinstance(self.actions, Box)
-        start, unit = (0.0, 1.0) if box else [1 / (1 + self.actions.assets)] * 2
         # Among many assets weights are small, and so is what an output of one should mean.
-        scale = 1.0 if box else 2 * unit
+        start, unit, scale = 0.0, 1.0, 1.0
+        if isinstance(self.actions, Simplex):
+            start = unit = 1 / (1 + self.actions.assets)
+            scale = 2 * unit
         edges = (
             start
             + unit / 8 * jnp.array([-1.0, 1.0])
             + scale * self.network.answer(reading, holding)[1]
         )
         assets = jnp.clip(holding, edges.min(-1), edges.max(-1))
-        if box:
+        if isinstance(self.actions, Box):
             return assets
         return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
 
@@ -110,12 +112,18 @@ class Pathwise(Agent):
         require(self, "episode_steps tail", lambda x: x >= 0, "at least 0")
         require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-        optimizer.require_schedule(self)
+        self._schedule.check()
         require_sizes(self)
         if self.tail >= self.rollout_length:
             raise QfolioError(
                 f"tail is {self.tail}; it must be less than rollout_length, {self.rollout_length}."
             )
+
+    @property
+    def _schedule(self) -> CosineSchedule:
+        return CosineSchedule(
+            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
+        )
 
     @property
     def discount(self) -> None:
@@ -129,7 +137,7 @@ class Pathwise(Agent):
         if not isinstance(task, ExogenousTask) or isinstance(task.actions, Discrete):
             raise QfolioError(
                 "pathwise needs a market whose actions are weights or positions; "
-                f"{type(task).__name__} is none (in a market, leave menu empty)."
+                f"{task.name} is none (in a market, leave menu empty)."
             )
         episode = min(self.episode_steps or task.horizon, task.horizon)
         if episode % self.rollout_length:
@@ -175,7 +183,8 @@ class Pathwise(Agent):
             policy, adam = carry
             loss, gradient = jax.value_and_grad(self._loss)(policy, task, rollout)
             gradient = optimizer.clip(gradient, self.max_grad_norm)
-            return optimizer.descend(self, policy, gradient, adam), loss
+            rate = self._schedule(adam.count + 1)
+            return optimizer.descend(policy, gradient, adam, rate), loss
 
         carry = (state.policy, state.optimizer)
         (policy, adam), losses = lax.scan(update, carry, None, length=self.gradient_steps)

@@ -2,8 +2,8 @@
 
 A rollout is used for several epochs of gradient steps on minibatches. What keeps the policy near
 the one that made the rollout is the objective: it rewards no change of an action's probability
-beyond 1 ± ``clip``. Advantages are generalised (Schulman et al. 2016). docs/policy_gradients.md has
-the formulas and the deviations from the paper.
+beyond 1 ± ``clip_range``. Advantages are generalised (Schulman et al. 2016).
+docs/policy_gradients.md has the formulas and the deviations from the paper.
 """
 
 import jax
@@ -11,10 +11,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, normalised
+from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, static
 from qfolio.core.mdp import Metrics, Task, Transition
+from qfolio.learning.targets import Scalar
 
 
 class PPO(OnPolicy):
@@ -38,9 +39,7 @@ class PPO(OnPolicy):
             )
 
     def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
-        return clipped(
-            jnp.exp(log_prob - batch.log_prob), normalised(batch.advantage), self.clip_range
-        )
+        return clipped(jnp.exp(log_prob - batch.log_prob), self.weighed(batch), self.clip_range)
 
     def learn(
         self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
@@ -57,7 +56,7 @@ class PPO(OnPolicy):
 
 def minibatches(key: PRNGKeyArray, batch: Batch, size: int) -> Batch:
     """The batch's rows in random order, as (minibatch, row, ...)."""
-    order = shuffled(key, batch.goal.shape[0]).reshape(-1, size)
+    order = shuffled(key, batch.target.shape[0]).reshape(-1, size)
     return jax.tree.map(lambda x: x[order], batch)
 
 
@@ -75,7 +74,7 @@ def shuffled(key: PRNGKeyArray, n: int) -> Int[Array, " n"]:
 
 
 def clipped(
-    ratio: Float[Array, " batch"], advantage: Float[Array, " batch"], clip: Float[Array, ""] | float
+    ratio: Float[Array, " batch"], advantage: Float[Array, " batch"], clip: Scalar
 ) -> Float[Array, " batch"]:
     """min(rA, clip(r, 1 − ε, 1 + ε)A) (Schulman et al. 2017, eq. 7).
 

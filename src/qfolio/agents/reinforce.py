@@ -2,13 +2,15 @@
 
 Whole episodes are played; then the policy takes one step along the gradient of its actions' log
 probabilities, each times the return that followed it less the baseline. No reward is replaced by an
-estimate, except that of what a time limit cuts off. docs/policy_gradients.md has the formulas and
-the deviations from the paper.
+estimate: the steps of an episode that is unfinished at the end of a rollout are left out. The one
+exception can be switched off (``time_limit_terminal``): the baseline stands in for what a time
+limit cuts off. docs/policy_gradients.md has the formulas and the deviations from the paper.
 """
 
-from jaxtyping import Array, Float, PRNGKeyArray
+from jax import lax
+from jaxtyping import Array, Bool, PRNGKeyArray
 
-from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, normalised
+from qfolio.agents.on_policy import OnPolicy, OnPolicyState
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import static
 from qfolio.core.mdp import Metrics, Task, Transition
@@ -17,7 +19,7 @@ from qfolio.core.mdp import Metrics, Task, Transition
 class REINFORCE(OnPolicy):
     """REINFORCE with a learned baseline."""
 
-    rollout_length: int = static(200)  # whole episodes
+    rollout_length: int = static(200)  # a multiple of the longest episode
 
     def init(self, task: Task, key: PRNGKeyArray) -> OnPolicyState:
         episode = min(self.episode_steps or task.horizon, task.horizon)
@@ -28,10 +30,14 @@ class REINFORCE(OnPolicy):
             )
         return super().init(task, key)
 
-    def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
-        return log_prob * normalised(batch.advantage)
-
     def learn(
         self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        return self.descend(state, self.judge(state.weights, rollout, gae_lambda=1.0))
+        batch = self.judge(state.weights, rollout, gae_lambda=1.0)
+        return self.descend(state, batch._replace(counted=finished(rollout).reshape(-1)))
+
+
+def finished(rollout: Transition) -> Bool[Array, "time environment"]:
+    """Whether the episode of each step ends within the rollout."""
+    ends = (rollout.terminated | rollout.truncated).astype(int)
+    return lax.cummax(ends, axis=0, reverse=True).astype(bool)

@@ -12,11 +12,11 @@ import math
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from qfolio.agents import actor_critic
 from qfolio.agents.actor_critic import (
     ActorCritic,
     ActorCriticState,
@@ -25,21 +25,18 @@ from qfolio.agents.actor_critic import (
     critic_loss,
 )
 from qfolio.core.fields import number, require
-from qfolio.core.mdp import Actions, Discrete, Metrics, Simplex, Task
+from qfolio.core.mdp import Actions, Box, Discrete, Metrics, Simplex, Task
 from qfolio.learning import optimizer
 from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed
-from qfolio.learning.networks import Network, Outputs, outputs_of
-from qfolio.learning.targets import Scale, follow
+from qfolio.learning.networks import Outputs, outputs_of
+from qfolio.learning.targets import Scalar, Scale, follow
 
 LOG_STD = (-10.0, 2.0)
 """Where a normal number's log standard deviation is kept."""
 
 
-class Actor(eqx.Module):
+class Actor(actor_critic.Actor):
     """A stochastic policy over any kind of actions."""
-
-    network: Network
-    actions: Actions
 
     def __call__(self, observation: PyTree) -> Categorical | Gaussian | Squashed | LogisticNormal:
         output = self.network(observation)
@@ -54,19 +51,15 @@ class Actor(eqx.Module):
         return normal if math.isinf(bound) else Squashed(normal, bound)
 
 
-class Learned(eqx.Module):
-    """What gradient steps change."""
+class Learned(actor_critic.Learned):
+    """What gradient steps change: the temperature, too."""
 
     actor: Actor
-    critics: Critics
-    target_critics: Critics
     log_temperature: Float[Array, ""]
-    actor_adam: optimizer.Optimizer
-    critic_adam: optimizer.Optimizer
     temperature_adam: optimizer.Optimizer
 
 
-def target_entropy(actions: Actions, spread: Float[Array, ""] | float) -> Float[Array, ""]:
+def target_entropy(actions: Actions, spread: Scalar) -> Float[Array, ""]:
     """The entropy of a choice that is uniform over a share of each coordinate's range.
 
     A coordinate without bounds counts as one from −1 to 1, weights have the simplex's volume, and
@@ -77,6 +70,13 @@ def target_entropy(actions: Actions, spread: Float[Array, ""] | float) -> Float[
     if isinstance(actions, Simplex):
         return actions.assets * jnp.log(spread) - math.lgamma(actions.assets + 1)
     return actions.n * jnp.log(2 * actions.unit * spread)
+
+
+def largest_entropy(actions: Actions) -> Float[Array, ""]:
+    """An upper bound of a policy's entropy: uniform, or as wide as it may be without bounds."""
+    if isinstance(actions, Box) and math.isinf(actions.bound):
+        return jnp.array(actions.n * (LOG_STD[1] + math.log(2 * math.pi * math.e) / 2))
+    return target_entropy(actions, 1.0)
 
 
 def expectations(
@@ -124,7 +124,7 @@ class Policy(NamedTuple):
     critics: Critics | None
 
 
-class SAC(ActorCritic):
+class SAC(ActorCritic[Learned]):
     """A stochastic actor, two critics with targets, and a temperature."""
 
     spread: float = number(0.184)  # target entropy, as share of the actions; Haarnoja's is e⁻¹/2
@@ -149,11 +149,11 @@ class SAC(ActorCritic):
         log_temperature = jnp.log(jnp.asarray(self.initial_temperature, float))
         begin = optimizer.begin
         return Learned(
-            actor, critics, critics, log_temperature,
-            begin(actor), begin(critics), begin(log_temperature),
+            actor, critics, critics, begin(actor), begin(critics),
+            log_temperature, begin(log_temperature),
         )  # fmt: skip
 
-    def weights(self, state: ActorCriticState) -> Policy:
+    def weights(self, state: ActorCriticState[Learned]) -> Policy:
         actor, critics = state.learned.actor, state.learned.critics
         return Policy(actor, critics if isinstance(actor.actions, Discrete) else None)
 
@@ -174,34 +174,46 @@ class SAC(ActorCritic):
     def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
         next_key, key = jax.random.split(key)
         temperature = jnp.exp(learned.log_temperature)
-        rate = optimizer.learning_rate(self, learned.critic_adam.count)
+        rate = self._schedule(learned.critic_adam.count)
 
         following, entropy = expectations(
             learned.actor, learned.target_critics, batch.steps.next_observation, next_key
         )
         value = following + temperature * entropy
         wanted = target_entropy(learned.actor.actions, self.spread)
-        goal = self.goal(batch, value, temperature * wanted)
-        critics, critic_adam, metrics = self.descend(
+        target = self.target(batch, value, self.bonus(learned.actor.actions, temperature))
+        critics, critic_adam, metrics = optimizer.minimize(
             critic_loss,
             learned.critics,
             learned.critic_adam,
             rate,
             batch.steps,
-            goal,
+            target,
             self.huber_delta,
         )
-        actor, actor_adam, more = self.descend(
+        actor, actor_adam, more = optimizer.minimize(
             actor_loss, learned.actor, learned.actor_adam, self.actor_learning_rate_ratio * rate,
             critics, temperature, batch.steps.observation, key,
         )  # fmt: skip
         excess = more["entropy"] - wanted
-        log_temperature, temperature_adam, last = self.descend(
+        log_temperature, temperature_adam, last = optimizer.minimize(
             temperature_loss, learned.log_temperature, learned.temperature_adam, rate, excess
         )
         target_critics = follow(learned.target_critics, critics, self.tau)
         learned = Learned(
-            actor, critics, target_critics, log_temperature,
-            actor_adam, critic_adam, temperature_adam,
+            actor, critics, target_critics, actor_adam, critic_adam,
+            log_temperature, temperature_adam,
         )  # fmt: skip
         return learned, metrics | more | last
+
+    def bonus(
+        self, actions: Actions, temperature: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The least and the most that a step's entropy is worth.
+
+        The policy may be as random as its actions allow, and is as certain as the target entropy
+        wants it.
+        """
+        wanted = target_entropy(actions, self.spread)
+        most = jnp.maximum(wanted, largest_entropy(actions))
+        return temperature * jnp.minimum(wanted, 0.0), temperature * jnp.maximum(most, 0.0)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, static
 from qfolio.core.mdp import Agent, Discrete, Metrics, Task, Transition
-from qfolio.learning.exploration import epsilon_greedy, epsilon_now
+from qfolio.learning.exploration import EpsilonSchedule, epsilon_greedy
 from qfolio.learning.targets import bootstrap, td_target
 
 Values = Float[Array, "state action"]
@@ -89,11 +89,15 @@ class Tabular(Agent):
         require(self, "learning_rate_decay", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "initial_value", lambda x: abs(x) <= 1e30, "from −1e30 to 1e30")
 
+    @property
+    def _epsilon(self) -> EpsilonSchedule:
+        return EpsilonSchedule(self.epsilon_start, self.epsilon_end, self.epsilon_decay)
+
     def init(self, task: Task, key: PRNGKeyArray) -> TableState:
         if task.states is None or not isinstance(task.actions, Discrete):
             missing = "numbered states" if task.states is None else "numbered actions"
             raise QfolioError(
-                f"A table needs {missing}, and {type(task).__name__} has none; take a task that "
+                f"A table needs {missing}, and {task.name} has none; take a task that "
                 "has, such as pendulum/grid, or another agent, such as dqn."
             )
         shape = (self.count, task.states, task.actions.n)
@@ -104,7 +108,7 @@ class Tabular(Agent):
         return 0
 
     def monitor(self, state: TableState) -> Metrics:
-        return {"epsilon": epsilon_now(self, state.episodes)}
+        return {"epsilon": self._epsilon(state.episodes)}
 
     def weights(self, state: TableState) -> Tables:
         return state.tables
@@ -121,7 +125,7 @@ class Tabular(Agent):
         self, state: TableState, observation: Int[Array, " batch"], key: PRNGKeyArray
     ) -> Int[Array, " batch"]:
         values = self.action_values(state.tables, observation)
-        return epsilon_greedy(key, values, epsilon_now(self, state.episodes))
+        return epsilon_greedy(key, values, self._epsilon(state.episodes))
 
     def observe(self, state: State, rollout: Transition) -> State:
         finished = (rollout.terminated | rollout.truncated).sum(dtype=jnp.int32)
@@ -151,7 +155,7 @@ class Tabular(Agent):
 def step_share(entry: Int[Array, " batch"], rate: Float[Array, " batch"]) -> Float[Array, " batch"]:
     """The part of each error that is added to its entry: α, where no other move has that entry.
 
-    n moves of one entry together go as far as n steps of α towards one goal: 1 − (1 − α)ⁿ towards
+    n moves of one entry together go as far as n steps of α towards one target: 1 − (1 − α)ⁿ towards
     the mean of theirs.
     """
     if len(entry) == 1:
@@ -177,7 +181,7 @@ class ExpectedSarsa(Tabular):
     def learn(
         self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[TableState, Metrics]:
-        move, epsilon = Move.of(rollout), epsilon_now(self, state.episodes)
+        move, epsilon = Move.of(rollout), self._epsilon(state.episodes)
         values = state.tables[0, move.next_state]
         following = (1 - epsilon) * values.max(-1) + epsilon * values.mean(-1)
         state = self.update(state, move, following)
@@ -228,7 +232,7 @@ class Sarsa(Tabular):
     ) -> tuple[SarsaState, Metrics]:
         move, last = Move.of(rollout), state.last
         values = state.tables[0, last.next_state]
-        drawn = epsilon_greedy(key, values, epsilon_now(self, state.episodes))
+        drawn = epsilon_greedy(key, values, self._epsilon(state.episodes))
         action = jnp.where(last.truncated, drawn, move.action)
         following = jnp.take_along_axis(values, action[:, None], axis=1)[:, 0]
         state = self.update(state, last, following)

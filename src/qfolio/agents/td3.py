@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from qfolio.agents.actor_critic import Batch
+from qfolio.agents.actor_critic import Batch, Critics
 from qfolio.agents.ddpg import DDPG, Learned
 from qfolio.core.fields import number, require, static
 from qfolio.core.mdp import Metrics
@@ -25,6 +25,7 @@ class TD3(DDPG):
     target_noise: float = number(0.2)  # of the target's action, in units of the bound
     target_noise_clip: float = number(0.5)  # the largest such noise
     policy_delay: int = static(2)  # critics' steps for one of the actor and the targets
+    pessimistic_actor: bool = static(True)  # climbs the smaller value; false: the first critic's
 
     critics: ClassVar[int] = 2
 
@@ -47,3 +48,8 @@ class TD3(DDPG):
         noise = jnp.clip(noise, -self.target_noise_clip, self.target_noise_clip)
         action = learned.target_actor.perturb(action, noise)
         return learned.target_critics(observation, action).min(0)
+
+    def climbed(self, critics: Critics) -> Critics:
+        if self.pessimistic_actor:
+            return critics
+        return jax.tree.map(lambda x: x[:1], critics)

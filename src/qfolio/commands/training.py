@@ -231,8 +231,9 @@ def _contrast(run: "Run", folder: Path) -> "Run | None":
     """The same training with the one thing changed that the report contrasts; resumable too."""
     from qfolio.commands.console import say
     from qfolio.experiments.run import Run
+    from qfolio.report.contrast import contrast_of
 
-    variant = run.agent.contrast()
+    variant = contrast_of(run.agent)
     if variant is None:
         return None
     place = folder / "contrast"
@@ -316,11 +317,13 @@ def _window(live: bool) -> Iterator[Callable[["Run"], None] | None]:
     if not has_display():
         raise QfolioError("--live needs a display; without one, qfolio watch DIR writes a GIF.")
     from qfolio.report.collect import greedy_episode
+    from qfolio.tasks.pendulum import Pendulum
 
     window = Window()
 
     def show(run: "Run") -> None:
         window.caption(f"qfolio: after {run.episodes:,} episodes")
+        assert isinstance(run.task, Pendulum)
         episode = greedy_episode(run, run.task)
         window.show(episode.states, episode.torques)
 

@@ -8,7 +8,7 @@ know only this file.
 import abc
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -18,15 +18,9 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 
 class Discrete(eqx.Module):
-    """A choice among ``n`` actions, numbered from 0.
-
-    In a market, the first ``pooled`` may concern all of it, and the others come in ``each`` blocks
-    of one action per asset.
-    """
+    """A choice among ``n`` actions, numbered from 0."""
 
     n: int = eqx.field(static=True)
-    pooled: int = eqx.field(static=True, default=0)
-    each: int = eqx.field(static=True, default=0)
 
 
 class Simplex(eqx.Module):
@@ -59,13 +53,6 @@ class Box(eqx.Module):
 
 
 Actions = Discrete | Simplex | Box
-
-
-class View(NamedTuple):
-    """What an agent may see of a market: what is known of each asset, and what it holds."""
-
-    features: Float[Array, "*batch asset time channel"]
-    holding: Float[Array, "*batch asset"]  # weights, without cash
 
 
 class Step(NamedTuple):
@@ -111,8 +98,21 @@ Policy = Callable[[PyTree], Array]
 class Task(eqx.Module):
     """A Markov decision process with a time limit; no method resets the task by itself."""
 
-    horizon: eqx.AbstractVar[int]
-    actions: eqx.AbstractVar[Actions]
+    if TYPE_CHECKING:  # a setting or a property of each task; to a checker, no argument of Task
+
+        @property
+        def horizon(self) -> int: ...
+
+        @property
+        def actions(self) -> Actions: ...
+    else:
+        horizon: eqx.AbstractVar[int]
+        actions: eqx.AbstractVar[Actions]
+
+    @property
+    def name(self) -> str:
+        """What messages call the task."""
+        return type(self).__name__
 
     @abc.abstractmethod
     def reset(self, key: PRNGKeyArray) -> PyTree:
@@ -199,9 +199,23 @@ Metrics = dict[str, Array]
 class Agent(eqx.Module):
     """An algorithm: hyperparameters are its fields, everything it learns lives in its state."""
 
-    num_envs: eqx.AbstractVar[int]  # stepped side by side
-    episode_steps: eqx.AbstractVar[int]  # training episodes are cut here; 0: the task's horizon
-    discount: eqx.AbstractVar[Any]  # of the action values; None where it estimates none
+    if TYPE_CHECKING:  # a setting or a property of each agent; to a checker, no argument of Agent
+
+        @property
+        def num_envs(self) -> int:
+            """Environments that are stepped side by side."""
+
+        @property
+        def episode_steps(self) -> int:
+            """Steps after which training episodes are cut; 0: the task's horizon."""
+
+        @property
+        def discount(self) -> float | None:
+            """Of the action values; None where the agent estimates none."""
+    else:
+        num_envs: eqx.AbstractVar[int]
+        episode_steps: eqx.AbstractVar[int]
+        discount: eqx.AbstractVar[Any]
 
     @property
     def rollout_steps(self) -> int:
@@ -252,15 +266,3 @@ class Agent(eqx.Module):
     def action_values(self, weights: PyTree, observation: PyTree) -> Array | None:
         """Q(s, ·) for a batch of observations, where the agent estimates it."""
         return None
-
-    def contrast(self) -> "Contrast | None":
-        """A variant with one thing changed, for a report to set beside this agent."""
-        return None
-
-
-class Contrast(NamedTuple):
-    """A variant of an agent, and how the two are called where they stand side by side."""
-
-    name: str
-    variant_name: str
-    variant: Agent

@@ -102,8 +102,9 @@ class Plan:
             agent = dataclasses.replace(agent, epsilon_start=min(epsilon, self.epsilon))
         return agent
 
-    def _set(self, **changes: float) -> Agent:
-        return dataclasses.replace(self.agent, **changes)
+    def _set(self, **changes: float) -> Any:
+        agent: Any = self.agent
+        return dataclasses.replace(agent, **changes)
 
 
 def _setting(agent: Agent, name: str) -> float:

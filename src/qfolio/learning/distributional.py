@@ -2,19 +2,19 @@
 
 A network gives ``atoms`` numbers z for each action. Each kind of value says what they mean: their
 ``mean`` is the action value, ``outcomes`` are the returns that may follow, each of which makes a
-goal, and ``loss`` is the distance of z from the goals, with how far off the value was, to set
+target, and ``loss`` is the distance of z from the targets, with how far off the value was, to set
 priorities by. Numbers that stand for returns may be roots of them (``Scale``).
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from qfolio.core.fields import require
-from qfolio.learning.targets import Scale, huber_loss
+from qfolio.learning.targets import Scalar, Scale, huber_loss
 
 Losses = tuple[Float[Array, " batch"], Float[Array, " batch"]]
 
@@ -23,7 +23,7 @@ class Expected(NamedTuple):
     """The expected return alone (Mnih et al. 2015)."""
 
     scale: Scale
-    huber_delta: Float[Array, ""] | float
+    huber_delta: Scalar
 
     @property
     def atoms(self) -> int:
@@ -38,10 +38,10 @@ class Expected(NamedTuple):
     def loss(
         self,
         z: Float[Array, "batch 1"],
-        goal: Float[Array, "batch 1"],
+        target: Float[Array, "batch 1"],
         following: Float[Array, "batch 1"],
     ) -> Losses:
-        error = (self.scale.outputs(goal) - z)[:, 0]
+        error = (self.scale.outputs(target) - z)[:, 0]
         return huber_loss(error, self.huber_delta), jnp.abs(error)
 
 
@@ -50,8 +50,8 @@ class Categorical(NamedTuple):
 
     scale: Scale
     atoms: int
-    low: Float[Array, ""] | float
-    high: Float[Array, ""] | float
+    low: Scalar
+    high: Scalar
 
     @property
     def support(self) -> Float[Array, " atom"]:
@@ -67,11 +67,11 @@ class Categorical(NamedTuple):
     def loss(
         self,
         z: Float[Array, "batch atom"],
-        goal: Float[Array, "batch atom"],
+        target: Float[Array, "batch atom"],
         following: Float[Array, "batch atom"],
     ) -> Losses:
         """Cross-entropy; its distance from the least possible is the divergence of the two."""
-        wanted = project(goal, jax.nn.softmax(following), self.support)
+        wanted = project(target, jax.nn.softmax(following), self.support)
         loss = -(wanted * jax.nn.log_softmax(z)).sum(-1)
         return loss, jnp.maximum(loss - jax.scipy.special.entr(wanted).sum(-1), 0.0)
 
@@ -81,7 +81,7 @@ class Quantile(NamedTuple):
 
     scale: Scale
     atoms: int
-    huber_delta: Float[Array, ""] | float
+    huber_delta: Scalar
 
     def mean(self, z: Float[Array, "*batch atom"]) -> Float[Array, "*batch"]:
         return self.scale.values(z).mean(-1)
@@ -92,11 +92,11 @@ class Quantile(NamedTuple):
     def loss(
         self,
         z: Float[Array, "batch atom"],
-        goal: Float[Array, "batch atom"],
+        target: Float[Array, "batch atom"],
         following: Float[Array, "batch atom"],
     ) -> Losses:
-        off = jnp.abs(goal.mean(-1) - self.mean(z))
-        return quantile_huber_loss(z, self.scale.outputs(goal), self.huber_delta), off
+        off = jnp.abs(target.mean(-1) - self.mean(z))
+        return quantile_huber_loss(z, self.scale.outputs(target), self.huber_delta), off
 
 
 Values = Expected | Categorical | Quantile
@@ -104,25 +104,35 @@ Values = Expected | Categorical | Quantile
 KINDS = ("expected", "categorical", "quantile")
 
 
-def values_of(agent: Any) -> Values:
-    """What the settings of an agent ask for."""
-    scale = Scale(agent.value_rescaling)
-    if agent.values == "categorical":
-        return Categorical(scale, agent.atoms, agent.v_min, agent.v_max)
-    if agent.values == "quantile":
-        return Quantile(scale, agent.atoms, agent.huber_delta)
-    return Expected(scale, agent.huber_delta)
+class ValueConfig(NamedTuple):
+    """What an agent's settings say of its action values; the names are those of the settings."""
 
+    values: str  # one of KINDS
+    atoms: int  # numbers for each action, where values are a distribution
+    v_min: Scalar  # ends of the categorical support
+    v_max: Scalar
+    huber_delta: Scalar  # |error| beyond which the loss is linear
+    value_rescaling: bool  # whether numbers that stand for returns are roots of them
 
-def require_values(agent: Any) -> None:
-    """Raises QfolioError where the settings of an agent's values make no sense."""
-    require(agent, "values", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
-    require(agent, "atoms", lambda x: 2 <= x <= 1001, "from 2 to 1001")
-    require(agent, "v_min v_max", lambda x: -1e30 <= x <= 1e30, "from -1e30 to 1e30")
-    if agent.values == "categorical":
-        require(agent, "v_max", lambda x: x > agent.v_min, f"above v_min ({agent.v_min})")
-    if agent.values == "quantile":
-        require(agent, "huber_delta", math.isfinite, "finite for quantiles, such as 1")
+    def check(self) -> None:
+        """Raises QfolioError where the settings make no sense."""
+        require(self, "values", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+        require(self, "atoms", lambda x: 2 <= x <= 1001, "from 2 to 1001")
+        require(self, "v_min v_max", lambda x: -1e30 <= x <= 1e30, "from -1e30 to 1e30")
+        require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
+        if self.values == "categorical":
+            require(self, "v_max", lambda x: x > self.v_min, f"above v_min ({self.v_min})")
+        if self.values == "quantile":
+            require(self, "huber_delta", math.isfinite, "finite for quantiles, such as 1")
+
+    def build(self) -> Values:
+        """The kind of values that the settings ask for."""
+        scale = Scale(self.value_rescaling)
+        if self.values == "categorical":
+            return Categorical(scale, self.atoms, self.v_min, self.v_max)
+        if self.values == "quantile":
+            return Quantile(scale, self.atoms, self.huber_delta)
+        return Expected(scale, self.huber_delta)
 
 
 def project(
@@ -146,7 +156,7 @@ def project(
 def quantile_huber_loss(
     quantiles: Float[Array, "batch quantile"],
     outcomes: Float[Array, "batch outcome"],
-    delta: Float[Array, ""] | float,
+    delta: Scalar,
 ) -> Float[Array, " batch"]:
     """Sum over quantiles of the mean over outcomes (Dabney et al. 2018, eq. 10 and algorithm 1).
 

@@ -18,9 +18,12 @@ from qfolio.core.errors import QfolioError
 Gain = Float[Array, "*inputs"] | float
 """Factors of an encoder's first weights, one for each channel or for all."""
 
+Activation = Callable[[Array], Array]
+"""What a layer's units give."""
+
 
 class MLP(eqx.Module):
-    """Fully connected layers with ReLU between them and none after the last.
+    """Fully connected layers with an activation between them and none after the last.
 
     Weights and biases start uniform in ±1/√inputs (LeCun et al. 1998, section 4.6, up to √3); the
     first layer's weights are multiplied by ``input_gain``, one factor for each input.
@@ -28,14 +31,16 @@ class MLP(eqx.Module):
 
     weights: list[Float[Array, "inputs outputs"]]
     biases: list[Float[Array, " outputs"]]
+    activation: Activation = eqx.field(static=True)
 
     def __init__(
         self,
         sizes: tuple[int, ...],
         key: PRNGKeyArray,
         input_gain: Float[Array, "*inputs"] | float = 1.0,
+        activation: Activation = jax.nn.relu,
     ) -> None:
-        self.weights, self.biases = [], []
+        self.weights, self.biases, self.activation = [], [], activation
         for inputs, outputs in pairwise(sizes):
             key, weight_key, bias_key = jax.random.split(key, 3)
             bound = inputs**-0.5
@@ -46,20 +51,9 @@ class MLP(eqx.Module):
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         *hidden, last = zip(self.weights, self.biases, strict=True)
         for weight, bias in hidden:
-            x = self.activate(x @ weight + bias)
+            x = self.activation(x @ weight + bias)
         weight, bias = last
         return x @ weight + bias
-
-    def activate(self, x: Float[Array, "*batch units"]) -> Float[Array, "*batch units"]:
-        """What a layer's units give."""
-        return jax.nn.relu(x)
-
-
-class SmoothMLP(MLP):
-    """The same with SiLU, x σ(x), between the layers (Elfwing et al. 2018): no kinks."""
-
-    def activate(self, x: Float[Array, "*batch units"]) -> Float[Array, "*batch units"]:
-        return jax.nn.silu(x)
 
 
 class CNN(eqx.Module):

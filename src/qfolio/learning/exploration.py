@@ -1,23 +1,31 @@
 """How agents explore: ε-greedily, or by actions drawn uniformly."""
 
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.core.mdp import Actions, Discrete, Simplex
+from qfolio.learning.targets import Scalar
 
 
-def epsilon_now(agent: Any, episodes: Int[Array, ""]) -> Float[Array, ""]:
-    """ε of the agent's settings after so many finished episodes: it falls with each of them."""
-    return jnp.maximum(agent.epsilon_end, agent.epsilon_start * agent.epsilon_decay**episodes)
+class EpsilonSchedule(NamedTuple):
+    """ε, which each finished episode multiplies by a factor, down to a lower bound."""
+
+    epsilon_start: Scalar
+    epsilon_end: Scalar
+    epsilon_decay: Scalar
+
+    def __call__(self, episodes: Int[Array, ""]) -> Float[Array, ""]:
+        """ε after so many finished episodes."""
+        return jnp.maximum(self.epsilon_end, self.epsilon_start * self.epsilon_decay**episodes)
 
 
 def epsilon_greedy(
     key: PRNGKeyArray,
     values: Float[Array, "batch action"],
-    epsilon: Float[Array, ""] | float,
+    epsilon: Scalar,
     last: Int[Array, " batch"] | None = None,
     persistence: float = 0.0,
 ) -> Int[Array, " batch"]:

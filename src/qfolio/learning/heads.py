@@ -1,7 +1,7 @@
 """The last layers of a network where plain ones will not do: streams, and noise on the weights."""
 
 import math
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from qfolio.core.mdp import Task
 from qfolio.learning import networks
 from qfolio.learning.encoders import MLP
+from qfolio.learning.targets import Scalar
 
 
 class NoisyMLP(MLP):
@@ -23,9 +24,9 @@ class NoisyMLP(MLP):
     weight_scales: list[Float[Array, "inputs outputs"]]
     bias_scales: list[Float[Array, " outputs"]]
 
-    def __init__(self, mlp: MLP, scale: Float[Array, ""] | float) -> None:
+    def __init__(self, mlp: MLP, scale: Scalar) -> None:
         """Noise starts at ``scale``/√inputs."""
-        self.weights, self.biases = mlp.weights, mlp.biases
+        self.weights, self.biases, self.activation = mlp.weights, mlp.biases, mlp.activation
         starts = [scale / math.sqrt(len(weight)) for weight in mlp.weights]
         fill = lambda x, start: jnp.full_like(x, start)  # noqa: E731
         self.weight_scales = list(map(fill, mlp.weights, starts))
@@ -53,9 +54,7 @@ class Streams(eqx.Module):
     trunk: MLP | None
     streams: list[MLP]
 
-    def __init__(
-        self, mlp: MLP, first: int, noise: Float[Array, ""] | float | None, key: PRNGKeyArray
-    ) -> None:
+    def __init__(self, mlp: MLP, first: int, noise: Scalar | None, key: PRNGKeyArray) -> None:
         """Parts the last two layers of ``mlp``, or its last one where there are not three.
 
         first: outputs of the first stream; 0 for a single stream of all. noise: the size that the
@@ -80,33 +79,44 @@ class Streams(eqx.Module):
         return jnp.concatenate([stream(x) for stream in self.streams], axis=-1)
 
 
+class HeadConfig(NamedTuple):
+    """What the last layers of a network of action values are."""
+
+    atoms: int  # numbers for each action
+    dueling: bool  # a stream for the state's value and one for advantages
+    noise: Scalar | None  # the size that the noise of their weights starts with; None: no noise
+
+
 def build(
-    agent: Any, task: Task, observation: PyTree, atoms: int, key: PRNGKeyArray
+    config: networks.NetworkConfig,
+    head: HeadConfig,
+    task: Task,
+    observation: PyTree,
+    key: PRNGKeyArray,
 ) -> networks.Network:
-    """The network that an agent's settings ask for: ``atoms`` numbers for each action in a row.
+    """A network of action values: ``atoms`` numbers for each action in a row.
 
     Where it is dueling, those of the state's value stand before them.
     """
+    atoms, dueling, noise = head
     pooled, each, _ = networks.outputs_of(task.actions)
-    outputs = networks.Outputs((pooled + agent.dueling) * atoms, each * atoms, atoms)
-    network = networks.build(
-        agent.network, task, observation, agent.hidden, outputs, key, agent.input_gain
-    )
-    if not (agent.dueling or agent.noisy):
+    outputs = networks.Outputs((pooled + dueling) * atoms, each * atoms, atoms)
+    network = networks.build(config, task, observation, outputs, key)
+    if not dueling and noise is None:
         return network
     shared = isinstance(network, networks.PerAsset)
     last = (lambda n: n.network.head) if shared else (lambda n: n.mlp)
-    first, noise = atoms * agent.dueling, agent.noise_scale if agent.noisy else None
-    return eqx.tree_at(last, network, Streams(last(network), first, noise, key))
+    streams = Streams(last(network), atoms * dueling, noise, key)
+    return eqx.tree_at(last, network, streams)
 
 
 def read(
-    agent: Any, atoms: int, network: networks.Network, observation: PyTree
+    head: HeadConfig, network: networks.Network, observation: PyTree
 ) -> Float[Array, "batch action atom"]:
     """What a network from ``build`` says of each action."""
     outputs = network(observation)
-    z = outputs.reshape(outputs.shape[0], -1, atoms)
-    return duel(z) if agent.dueling else z
+    z = outputs.reshape(outputs.shape[0], -1, head.atoms)
+    return duel(z) if head.dueling else z
 
 
 def draw_noise(network: PyTree, key: PRNGKeyArray) -> PyTree:

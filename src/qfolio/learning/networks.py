@@ -10,8 +10,10 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require, require_sizes
-from qfolio.core.mdp import Actions, Box, Discrete, Simplex, Task, View
+from qfolio.core.market import MenuActions, View
+from qfolio.core.mdp import Actions, Box, Discrete, Simplex, Task
 from qfolio.learning.encoders import CNN, LSTM, MLP, RNN, Window, uniform
+from qfolio.learning.targets import Scalar
 
 
 class Flat(eqx.Module):
@@ -148,6 +150,20 @@ _READS = {"cnn": (2, 3), "rnn": (2,), "lstm": (2,)}
 Network = Flat | PerAsset
 
 
+class NetworkConfig(NamedTuple):
+    """What an agent's settings say of its networks; the names are those of the settings."""
+
+    network: str  # ``flat``, an encoder of windows or images, or for markets one that assets share
+    hidden: tuple[int, ...]  # units of each hidden layer
+    input_gain: Scalar = 0.0  # of the first layer, observations taken to ±1; 0: as it is
+
+    def check(self) -> None:
+        """Raises QfolioError where the settings make no sense."""
+        require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+        require_sizes(self)
+        require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+
+
 class Outputs(NamedTuple):
     """How many numbers a network gives: of the whole, and of each asset in a market."""
 
@@ -160,48 +176,37 @@ def outputs_of(actions: Actions) -> Outputs:
     """A number for each action, each weight or each coordinate."""
     if isinstance(actions, Simplex):
         return Outputs(1, 1)
-    if isinstance(actions, Discrete) and actions.each:
+    if isinstance(actions, MenuActions):
         return Outputs(actions.pooled, actions.each)
     return Outputs(actions.n)
 
 
 def saturation(
     actions: Actions, output: Float[Array, "batch output"], reach: float
-) -> Float[Array, ""]:
-    """What an actor pays for outputs that all come to the same action, those beyond ±``reach``.
+) -> Float[Array, " batch"]:
+    """How far an actor's outputs are beyond ±``reach``, squared; 0 where actions have no bound.
 
-    No gradient leads back from there. It is a tenth of the mean square of the way beyond, and 0
-    where actions have no bound.
+    Outputs beyond it all come to the same action, and no gradient leads back from there.
     """
     if not isinstance(actions, Box) or math.isinf(actions.bound):
-        return jnp.array(0.0)
-    return 0.1 * (jnp.maximum(jnp.abs(output) - reach, 0.0) ** 2).sum(-1).mean()
-
-
-def require_network(agent: Any) -> None:
-    """Raises QfolioError where the settings of an agent's networks make no sense."""
-    require(agent, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
-    require_sizes(agent)
-    require(agent, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-    require(agent, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        return jnp.zeros(len(output))
+    return (jnp.maximum(jnp.abs(output) - reach, 0.0) ** 2).sum(-1)
 
 
 def build(
-    kind: str,
+    config: NetworkConfig,
     task: Task,
     observation: PyTree,
-    hidden: tuple[int, ...],
     outputs: Outputs,
     key: PRNGKeyArray,
-    input_gain: Float[Array, ""] | float = 0.0,
 ) -> Network:
     """A network from batches of the task's observations to rows of numbers.
 
-    kind: ``flat``; or an encoder of windows or images, of ``hidden[0]`` outputs, with the remaining
-    layers behind it; or for markets one that assets share. observation: an example. input_gain: of
-    the first layer, with observations taken to ±1 (where no assets share it); 0 takes them as they
-    are. Raises QfolioError where the kind does not fit what is observed.
+    An encoder has ``hidden[0]`` outputs, and the remaining layers come behind it. The gain has no
+    effect on a network that assets share. observation: an example. Raises QfolioError where the
+    kind of network does not fit what is observed.
     """
+    kind, hidden, input_gain = config
     # Small weights on a bounded observation make a function too smooth for some tasks.
     gain = jnp.where(input_gain > 0, input_gain / jnp.array(task.observation_scale), 1.0)
     if kind == "flat":
@@ -218,7 +223,7 @@ def build(
         width, *rest = hidden
         encoder = _ENCODERS[kind](shape, width, encoder_key, gain)
         return Flat(observation, tuple(rest), outputs.pooled, key, encoder=encoder)
-    if isinstance(task.actions, Discrete) and not task.actions.each:
+    if isinstance(task.actions, Discrete) and not isinstance(task.actions, MenuActions):
         raise QfolioError(
             f"network={kind} is shared by assets and needs a menu with choices for each, such as "
             "menu=tilts:0.1; otherwise take network=flat."
@@ -228,7 +233,7 @@ def build(
 
 
 def _does_not_fit(kind: str, task: Task, shape: tuple[int, ...]) -> str:
-    name = type(task).__name__
+    name = task.name
     if kind not in _READS:
         return (
             f"network={kind} is shared by the assets of a market, and {name} is none; take "

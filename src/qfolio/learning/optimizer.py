@@ -1,7 +1,7 @@
 """Adam (Kingma & Ba 2015) with a cosine learning rate (Loshchilov & Hutter 2017)."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,32 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.core.fields import require
 from qfolio.core.mdp import Metrics
+from qfolio.learning.targets import Scalar
 
 Weights = TypeVar("Weights", bound=PyTree)
 
 Optimizer: TypeAlias = optax.ScaleByAdamState
+
+
+class CosineSchedule(NamedTuple):
+    """A learning rate that falls along a cosine; the names are those of the agents' settings."""
+
+    learning_rate: Scalar  # at the start
+    learning_rate_final: Scalar  # share of it that is left at the end
+    learning_rate_steps: Scalar  # gradient steps until then
+
+    def __call__(self, update: Int[Array, ""]) -> Float[Array, ""]:
+        """The learning rate of a gradient step."""
+        done = jnp.minimum(update / self.learning_rate_steps, 1.0)
+        weight = (1 + jnp.cos(jnp.pi * done)) / 2
+        final = self.learning_rate_final
+        return self.learning_rate * (final + weight * (1 - final))
+
+    def check(self) -> None:
+        """Raises QfolioError where a setting is out of range."""
+        scales = "learning_rate learning_rate_steps"
+        require(self, scales, lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        require(self, "learning_rate_final", lambda x: 0 <= x <= 1, "between 0 and 1")
 
 
 def begin(weights: Weights) -> Optimizer:
@@ -22,17 +44,23 @@ def begin(weights: Weights) -> Optimizer:
 
 
 def descend(
-    agent: Any,
-    weights: Weights,
-    gradient: Weights,
-    optimizer: Optimizer,
-    rate: Float[Array, ""] | None = None,
+    weights: Weights, gradient: Weights, optimizer: Optimizer, rate: Scalar
 ) -> tuple[Weights, Optimizer]:
-    """One step down the gradient, at ``rate`` or else the one that ``agent``'s settings tell."""
+    """One step down the gradient."""
     direction, optimizer = optax.scale_by_adam().update(gradient, optimizer)
-    if rate is None:
-        rate = learning_rate(agent, optimizer.count)
     return jax.tree.map(lambda w, d: w - rate * d, weights, direction), optimizer
+
+
+def minimize(
+    loss: Callable[..., tuple[Float[Array, ""], Metrics]],
+    weights: Weights,
+    optimizer: Optimizer,
+    rate: Scalar,
+    *others: Any,
+) -> tuple[Weights, Optimizer, Metrics]:
+    """One step down the gradient in ``weights`` of ``loss(weights, *others)``."""
+    gradient, metrics = jax.grad(loss, has_aux=True)(weights, *others)
+    return *descend(weights, gradient, optimizer, rate), metrics
 
 
 def repeat(
@@ -48,22 +76,7 @@ def repeat(
     return weights, {name: value.mean() for name, value in metrics.items()}
 
 
-def clip(gradient: Weights, norm: Float[Array, ""] | float) -> Weights:
+def clip(gradient: Weights, norm: Scalar) -> Weights:
     """The gradient, or where it is longer than ``norm``, its direction at that length."""
     factor = jnp.minimum(1.0, norm / jnp.maximum(optax.tree.norm(gradient), 1e-30))
     return jax.tree.map(lambda g: factor * g, gradient)
-
-
-def learning_rate(agent: Any, update: Int[Array, ""]) -> Float[Array, ""]:
-    """A cosine from ``learning_rate`` to its final share, over ``learning_rate_steps`` updates."""
-    done = jnp.minimum(update / agent.learning_rate_steps, 1.0)
-    weight = (1 + jnp.cos(jnp.pi * done)) / 2
-    final = agent.learning_rate_final
-    return agent.learning_rate * (final + weight * (1 - final))
-
-
-def require_schedule(agent: Any) -> None:
-    """Raises QfolioError where the settings of the learning rate are out of range."""
-    scales = "learning_rate learning_rate_steps"
-    require(agent, scales, lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-    require(agent, "learning_rate_final", lambda x: 0 <= x <= 1, "between 0 and 1")

@@ -1,11 +1,13 @@
 """Priorities of the rows of a replay buffer (Schaul et al. 2016): a tree of sums in arrays."""
 
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from qfolio.learning.targets import Scalar
 
 FAN = 16
 """Children of a node."""
@@ -71,20 +73,24 @@ class Priorities(eqx.Module):
         return node
 
     def update(
-        self, index: Int[Array, " n"], off: Float[Array, " n"], exponent: Float[Array, ""] | float
+        self, index: Int[Array, " n"], off: Float[Array, " n"], exponent: Scalar
     ) -> "Priorities":
         """Rows set to how far ``off`` their values were, to the power of ``exponent`` (α)."""
         return self.set(index, (off + 1e-6) ** exponent)  # a little more: any is drawn again
 
-    def importance(
-        self, index: Int[Array, " n"], exponent: Float[Array, ""] | float
-    ) -> Float[Array, " n"]:
+    def importance(self, index: Int[Array, " n"], exponent: Scalar) -> Float[Array, " n"]:
         """Weights (N P(i))^−exponent of rows drawn, the largest of them 1 (section 3.4)."""
         drawn = self.of(index)
         return (drawn.min() / drawn) ** exponent
 
 
-def importance_exponent_now(agent: Any, updates: Int[Array, ""]) -> Float[Array, ""]:
-    """β of the agent's settings: a line to 1, which is there when its learning rate is down."""
-    done = jnp.minimum(updates / agent.learning_rate_steps, 1.0)
-    return agent.importance_exponent + (1 - agent.importance_exponent) * done
+class ImportanceSchedule(NamedTuple):
+    """β, the exponent of importance weights, which rises to 1 in a line."""
+
+    importance_exponent: Scalar  # at the start
+    importance_steps: Scalar  # gradient steps until it is 1
+
+    def __call__(self, updates: Int[Array, ""]) -> Float[Array, ""]:
+        """β after so many gradient steps."""
+        done = jnp.minimum(updates / self.importance_steps, 1.0)
+        return self.importance_exponent + (1 - self.importance_exponent) * done

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require
 from qfolio.core.mdp import Transition
 from qfolio.learning.priorities import Priorities
-from qfolio.learning.targets import n_step
+from qfolio.learning.targets import Scalar, n_step
 
 Discount = Float[Array, "*#batch"] | float
 """Of what follows a batch of experience."""
@@ -50,6 +50,42 @@ class Experience(NamedTuple):
             step.observation, step.action, step.reward, step.next_observation, terminal,
             last if with_last else None,
         )  # fmt: skip
+
+
+class ReplayConfig(NamedTuple):
+    """What an agent's settings say of its buffer; the names are those of the settings."""
+
+    num_envs: int  # rows that are written at a time
+    batch_size: int
+    n_steps: int  # whose rewards a target adds up
+    replay_capacity: int  # rows
+    learning_starts: int  # rows that are stored before learning
+    prioritized: bool = False
+
+    def check(self) -> None:
+        """Raises QfolioError where the settings make no sense."""
+        counts = "num_envs batch_size n_steps"
+        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
+        require(self, "learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
+        joined = self.n_steps * self.num_envs
+        if max(self.learning_starts, joined) > self.replay_capacity:
+            raise QfolioError(
+                f"learning_starts is {self.learning_starts} and n_steps × environments is "
+                f"{joined}, and replay_capacity ({self.replay_capacity}) can hold fewer; lower the "
+                "ones or raise the other."
+            )
+
+    @property
+    def warm_up(self) -> int:
+        """Steps of all environments before the buffer has enough to learn from."""
+        return max(self.n_steps, math.ceil(self.learning_starts / self.num_envs)) - 1
+
+    def empty(self, row: PyTree) -> "Replay":
+        """A buffer for rows like ``row`` that holds nothing yet."""
+        return Replay.empty(
+            row, self.replay_capacity, self.num_envs, self.n_steps, self.prioritized
+        )
 
 
 class Replay(eqx.Module):
@@ -157,9 +193,7 @@ class Replay(eqx.Module):
         )
 
 
-def join(
-    replay: Replay, index: Int[Array, " n"], discount: Float[Array, ""] | float
-) -> tuple[Experience, Discount]:
+def join(replay: Replay, index: Int[Array, " n"], discount: Scalar) -> tuple[Experience, Discount]:
     """Rows of experience over the buffer's ``steps``, and the discount of what follows them.
 
     They end with the last of these steps or with the episode, and lead to the true next observation
@@ -176,23 +210,3 @@ def join(
         reward=reward, next_observation=end.next_observation, terminal=end.terminal
     )
     return joined, discount ** (stop + 1)
-
-
-def require_replay(agent: Any) -> None:
-    """Raises QfolioError where the settings of an agent's buffer make no sense."""
-    counts = "num_envs batch_size gradient_steps n_steps"
-    require(agent, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-    require(agent, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
-    require(agent, "learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
-    joined = agent.n_steps * agent.num_envs
-    if max(agent.learning_starts, joined) > agent.replay_capacity:
-        raise QfolioError(
-            f"learning_starts is {agent.learning_starts} and n_steps × environments is {joined}, "
-            f"and replay_capacity ({agent.replay_capacity}) can hold fewer; lower the ones or "
-            "raise the other."
-        )
-
-
-def warm_up(agent: Any) -> int:
-    """Steps of all environments before an agent's buffer has enough to learn from."""
-    return max(agent.n_steps, math.ceil(agent.learning_starts / agent.num_envs)) - 1

@@ -9,6 +9,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 Weights = TypeVar("Weights", bound=PyTree)
 
+Scalar = Float[Array, ""] | float
+"""A number that may be an input of a compiled program."""
+
 
 def chosen(
     values: Float[Array, "batch action *atom"], action: Int[Array, " batch"]
@@ -39,9 +42,7 @@ def td_target(
     return reward + jnp.where(terminal, 0.0, discount * following)
 
 
-def possible_values(
-    rewards: Float[Array, "2"], discount: Float[Array, ""] | float
-) -> Float[Array, "2"]:
+def possible_values(rewards: Float[Array, "2"], discount: Scalar) -> Float[Array, "2"]:
     """The lowest and the highest return over one step or more, of rewards between two numbers."""
     forever = rewards / jnp.maximum(1 - discount, 1e-9)
     lowest, highest = jnp.stack([rewards, forever], axis=1)
@@ -51,8 +52,8 @@ def possible_values(
 def squash(value: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """sign(v)(√(1 + |v|) − 1): like v/2 near zero, like a root far from it.
 
-    Value rescaling of Pohlen et al. (2018, proposition A.2) without its small linear term, which
-    bounds the slope of the inverse; here values are bounded instead.
+    Value rescaling of Pohlen et al. (2018, proposition A.2) without its small linear term. That
+    term bounds the slope of the inverse; here the slope grows with the root.
     """
     return value / (1 + jnp.sqrt(1 + jnp.abs(value)))
 
@@ -65,8 +66,8 @@ def unsquash(root: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 class Scale(NamedTuple):
     """Whether networks give values, or roots of them, among which small values weigh more.
 
-    Where there is chance, the mean of goals' roots is not the root of their mean: a value learned
-    so is nearer to zero than the mean.
+    Where there is chance, the mean of the targets' roots is not the root of their mean: a value
+    learned so is nearer to zero than the mean.
     """
 
     roots: bool
@@ -83,7 +84,7 @@ class Scale(NamedTuple):
 def n_step(
     reward: Float[Array, "step batch"],
     last: Bool[Array, "step batch"],
-    discount: Float[Array, ""] | float,
+    discount: Scalar,
 ) -> tuple[Float[Array, " batch"], Int[Array, " batch"]]:
     """Σ γᵏ rₖ up to the first step that is its episode's last, and the number of that step.
 
@@ -95,9 +96,7 @@ def n_step(
     return (counts * power * reward).sum(0), counts.sum(0).astype(jnp.int32) - 1
 
 
-def huber_loss(
-    error: Float[Array, "*batch"], delta: Float[Array, ""] | float
-) -> Float[Array, "*batch"]:
+def huber_loss(error: Float[Array, "*batch"], delta: Scalar) -> Float[Array, "*batch"]:
     """½e² up to |e| = δ and δ(|e| − ½δ) beyond (Huber 1964); δ = ∞ squares everything."""
     clipped = jnp.clip(error, -delta, delta)
     return clipped * (error - clipped / 2)
@@ -109,8 +108,8 @@ def advantages(
     next_value: Float[Array, "time environment"],
     terminated: Bool[Array, "time environment"],
     truncated: Bool[Array, "time environment"],
-    discount: Float[Array, ""] | float,
-    gae_lambda: Float[Array, ""] | float,
+    discount: Scalar,
+    gae_lambda: Scalar,
 ) -> Float[Array, "time environment"]:
     """Generalised advantage estimates (Schulman et al. 2016, eq. 16; ``gae_lambda`` is λ).
 
@@ -128,6 +127,6 @@ def advantages(
     return lax.scan(back, jnp.zeros_like(error[0]), (error, goes_on), reverse=True)[1]
 
 
-def follow(target: Weights, online: Weights, rate: Float[Array, ""] | float) -> Weights:
+def follow(target: Weights, online: Weights, rate: Scalar) -> Weights:
     """A target network, moved towards the online one by ``rate``; exact for rates of 0 and 1."""
     return jax.tree.map(lambda t, w: (1 - rate) * t + rate * w, target, online)

@@ -8,7 +8,7 @@ training and backtest.
 
 import abc
 from math import comb
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
-from qfolio.core.mdp import Actions, Discrete, ExogenousTask, Position, Simplex, View
+from qfolio.core.market import MenuActions, View
+from qfolio.core.mdp import Actions, Discrete, ExogenousTask, Position, Simplex
 from qfolio.portfolio.costs import drift, remainder_factor, with_cash
 
 REWARDS = ("log", "crra", "mean-variance", "differential-sharpe")
@@ -75,11 +76,11 @@ class Menu(eqx.Module):
         elif kind == "tilts" and 0 < value < 1:
             target = jnp.concatenate([cash, cash, equal, each, each])
             keep = jnp.zeros(len(target)).at[0].set(1.0).at[-assets:].set(1 - value)
-            self.actions = Discrete(len(target), pooled=3, each=2)
+            self.actions = MenuActions(len(target), pooled=3, each=2)
         elif kind == "overweight" and 0 < value < 1:
             target = jnp.concatenate([cash, cash, equal, (1 - value) * equal + value * each])
             keep = jnp.zeros(len(target)).at[0].set(1.0)
-            self.actions = Discrete(len(target), pooled=3, each=1)
+            self.actions = MenuActions(len(target), pooled=3, each=1)
         else:
             raise QfolioError(
                 f"menu is {text!r}; it must be like grid:10, tilts:0.1 or overweight:0.1."
@@ -102,8 +103,16 @@ class Market(ExogenousTask):
     Sharpe ratio (Moody & Saffell 1998, with a memory of 1/``sharpe_rate`` steps).
     """
 
-    cost: eqx.AbstractVar[float]
-    menu: eqx.AbstractVar[str]
+    if TYPE_CHECKING:  # as in Task
+
+        @property
+        def cost(self) -> float: ...
+
+        @property
+        def menu(self) -> str: ...
+    else:
+        cost: eqx.AbstractVar[float]
+        menu: eqx.AbstractVar[str]
 
     reward = "log"
     risk_aversion = 1.0

@@ -21,7 +21,8 @@ from jaxtyping import Array, Float, PyTree
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import new_folder, read_json, read_tree, write_json, write_tree
-from qfolio.core.mdp import Agent, View
+from qfolio.core.market import View
+from qfolio.core.mdp import Agent
 from qfolio.core.population import Population
 from qfolio.core.registry import build, name_of
 from qfolio.core.training import episode_steps
@@ -172,9 +173,10 @@ class Policy:
             )
         table = table.between(max(0, len(table) - self.rows), None)
         task = self._moved(table)
-        agent = dataclasses.replace(
-            self.agent,
-            learning_rate=self.agent.learning_rate * UPDATE_RATE,
+        of_now: Any = self.agent
+        agent: Agent = dataclasses.replace(
+            of_now,
+            learning_rate=of_now.learning_rate * UPDATE_RATE,
             learning_rate_final=1.0,  # the cosine may have come to its end
         )
         draws = [np.random.SeedSequence((i, self.updates + 1)) for i in range(self.seeds)]
@@ -398,7 +400,7 @@ def follow(
     return np.asarray(targets), np.asarray(after)
 
 
-@partial(eqx.filter_jit, donate="none")
+@eqx.filter_jit(donate="none")
 def _follow(
     task: Portfolio, agent: Agent, members: PyTree, first: Array, held: Array, count: int
 ) -> tuple[Float[Array, "portfolio time entry"], Float[Array, "portfolio time entry"]]:

@@ -21,6 +21,7 @@ from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.base import OneAsset, Synthetic
 from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.report.backtest.data import BacktestData, StrategySeries
+from qfolio.report.contrast import contrast_of
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
 from qfolio.report.words import agent_name, words_of
 from qfolio.solvers.followed import FollowedOptimum
@@ -46,7 +47,7 @@ def report_data(
     # In a market, training episodes have luck of their own: their returns do not compare.
     whole = known is None and episode_steps(run.task, run.agent) == run.task.horizon
     rows = run.metrics if whole else []
-    variant = run.agent.contrast()
+    variant = contrast_of(run.agent)
     names = ("greedy return", "") if variant is None else (variant.name, variant.variant_name)
     agent, task = summary["agent"], summary["task"]
     return ReportData(
@@ -180,8 +181,9 @@ def responses(
     held = jnp.linspace(*ends, task.levels if isinstance(task, Ar1) else _HELD)
 
     def wanted(policy: Policy, market: Any, held: Array) -> Array:
-        one = isinstance(task, OneAsset)
-        holding = task.hold(jnp.stack([1 - held, held])) if one else held[None]
+        holding: Any = held[None]
+        if isinstance(task, OneAsset):
+            holding = task.hold(jnp.stack([1 - held, held]))
         return policy(Position(market, holding))[-1]  # of weights, the asset's
 
     def table(policy: Policy) -> Array:
@@ -207,8 +209,10 @@ def _maps(run: Run, task: Pendulum) -> Maps:
     agent, weights = run.agent, run.first_weights()
     values = agent.action_values(weights, observation)
     torque = task.torque(agent.policy(weights, observation))
-    discount = float(agent.discount)
     optimum = task.optimum()
+    assert agent.discount is not None
+    assert isinstance(optimum.task, Pendulum)
+    discount = float(agent.discount)
     exact_value, exact_action = optimum.stationary(discount)
     return Maps(
         theta=theta,

@@ -1,7 +1,6 @@
 """The optimum of a task whose best policy is known: graded by following it on the same paths."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -28,7 +27,7 @@ class FollowedOptimum:
         return np.asarray(_follow(self.task, self.policy, keys))
 
 
-@partial(eqx.filter_jit, donate="none")
+@eqx.filter_jit(donate="none")
 def _follow(task: ExogenousTask, policy: Any, keys: Key[Array, " start"]) -> Array:
     def step(states: PyTree, time: Array) -> tuple[PyTree, Array]:
         # The keys of ``qfolio.core.evaluation.evaluate``: common random numbers.

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import cache_directory, read_arrays, write_arrays
-from qfolio.core.mdp import Step, Task
+from qfolio.core.mdp import Discrete, Step, Task
 
 
 class GridOptimum:
@@ -68,6 +68,11 @@ class GridOptimum:
     def _shape(self) -> tuple[int, int]:
         return len(self.axes[0]), len(self.axes[1])
 
+    @property
+    def _actions(self) -> Int[Array, " action"]:
+        assert isinstance(self.task.actions, Discrete)
+        return jnp.arange(self.task.actions.n)
+
     def _look_ahead(self, values: Array, states: PyTree, action: Array, discount: float) -> Array:
         """r + γ V(s') for one action in each of the states (k, …)."""
         after = self._step(states, jnp.broadcast_to(action, jax.tree.leaves(states)[0].shape))
@@ -80,7 +85,7 @@ class GridOptimum:
     def _action_values(self, values: Array, discount: float) -> Float[Array, "action n m"]:
         points = self.state(*(x.ravel() for x in jnp.meshgrid(*self.axes, indexing="ij")))
         look = lambda action: self._look_ahead(values, points, action, discount)  # noqa: E731
-        return lax.map(look, jnp.arange(self.task.actions.n)).reshape(-1, *self._shape)
+        return lax.map(look, self._actions).reshape(-1, *self._shape)
 
     def _solve(self, discount: float, steps: int) -> Float[Array, "steps n m"]:
         """Values with 0, 1, … steps − 1 steps to go."""
@@ -92,10 +97,9 @@ class GridOptimum:
 
     def _follow(self, values: Float[Array, "steps n m"], starts: PyTree) -> Float[Array, " start"]:
         """Returns of the policy that is greedy one exact step ahead of ``values``."""
-        actions = jnp.arange(self.task.actions.n)
 
         def step(states: PyTree, to_go: Array) -> tuple[PyTree, Array]:
-            q = jax.vmap(lambda a: self._look_ahead(to_go, states, a, 1.0))(actions)
+            q = jax.vmap(lambda a: self._look_ahead(to_go, states, a, 1.0))(self._actions)
             after = self._step(states, q.argmax(0))
             return after.state, after.reward
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from qfolio.core.fields import require, static
+from qfolio.core.mdp import Discrete
 from qfolio.solvers.grid import GridOptimum, cell
 from qfolio.tasks.finite import FiniteMDP
 from qfolio.tasks.pendulum import Pendulum, PendulumState
@@ -56,6 +57,8 @@ def interpolated(grid: GridOptimum, horizon: int = 200) -> FiniteMDP:
     has the number i · m + j; it starts at any.
     """
     n, m = len(grid.axes[0]), len(grid.axes[1])
+    actions = grid.task.actions
+    assert isinstance(actions, Discrete)
     points = grid.state(*(x.ravel() for x in jnp.meshgrid(*grid.axes, indexing="ij")))
 
     def outcomes(
@@ -71,7 +74,7 @@ def interpolated(grid: GridOptimum, horizon: int = 200) -> FiniteMDP:
         weights = [(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v]
         return jnp.stack(corners, -1), jnp.stack(weights, -1), after.reward
 
-    tables = jax.jit(jax.vmap(outcomes, out_axes=1))(jnp.arange(grid.task.actions.n))
+    tables = jax.jit(jax.vmap(outcomes, out_axes=1))(jnp.arange(actions.n))
     successors, weights, rewards = (np.asarray(table) for table in tables)
     weights = weights.astype(float) / weights.sum(-1, keepdims=True, dtype=float)
     assert successors.shape[0] == n * m

@@ -46,6 +46,10 @@ class GymnasiumTask(HostTask):
         require(self, "horizon", lambda x: 1 <= x < 2**31, "at least 0")
 
     @property
+    def name(self) -> str:
+        return self.id
+
+    @property
     def facts(self) -> "Facts":
         return _facts(self.id, self.kwargs)
 

@@ -49,6 +49,7 @@ _RAINBOW = {
     "noise_scale": 0.1,
     "gradient_steps": 2,
     "learning_rate_steps": 15_000.0,
+    "importance_steps": 15_000.0,
 }
 
 

@@ -32,7 +32,8 @@ class Synthetic(ExogenousTask):
         """Market states to draw a policy in, with what to call them."""
 
     def optimum(self) -> FollowedOptimum:
-        continuous = dataclasses.replace(self, menu="") if hasattr(self, "menu") else self
+        task: Any = self
+        continuous = dataclasses.replace(task, menu="") if hasattr(task, "menu") else task
         return FollowedOptimum(continuous, self.best())
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from qfolio.core.fields import number, require, static
-from qfolio.core.mdp import Box, Policy, Position, View
+from qfolio.core.market import View
+from qfolio.core.mdp import Box, Policy, Position
 from qfolio.portfolio.synthetic.base import Synthetic
 from qfolio.solvers.garleanu_pedersen import garleanu_pedersen
 
