@@ -46,7 +46,7 @@ def test_train_writes_the_whole_folder(run):
     assert header == "seed,episode,return,epsilon,loss,max_q"
     assert len(rows) == 16
     assert str(folder / "report.html") in printed
-    assert re.search(r"95 % interval", printed)
+    assert "An interval over seeds takes 5 seeds or more (--seeds); 2 are too few." in printed
 
 
 def test_evaluate_prints_json(run, monkeypatch, capsys):
@@ -55,8 +55,7 @@ def test_evaluate_prints_json(run, monkeypatch, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["starts"] == 32
     assert len(result["return_per_seed"]) == 2
-    low, high = result["return_ci95"]
-    assert low < result["return_mean"] < high
+    assert result["return_ci95"] is None  # of two seeds
     assert result["return_mean"] <= result["optimum"] < 0
 
 

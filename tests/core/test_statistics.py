@@ -3,6 +3,8 @@ import pytest
 from numpy.typing import NDArray
 
 from qfolio.core.statistics import (
+    FEWEST_SEEDS,
+    band,
     bootstrap_interval,
     holm,
     interquartile_mean,
@@ -87,9 +89,18 @@ def test_bootstrap_refuses_bad_arguments(values: list[float], options: dict[str,
 
 
 def test_mean_interval_by_hand() -> None:
-    # Mean 2, standard deviation 1, n = 3: 2 ± 4.3027 / √3.
-    low, high = mean_interval([1.0, 2.0, 3.0])
-    np.testing.assert_allclose([low, high], [2 - 2.48414, 2 + 2.48414], atol=1e-4)
+    # Mean 3, variance 5/2, n = 5: 3 ± 2.77645 √(1/2).
+    interval = mean_interval([1.0, 2.0, 3.0, 4.0, 5.0])
+    assert interval == pytest.approx((3 - 1.96324, 3 + 1.96324), abs=1e-4)
+
+
+def test_few_seeds_have_a_range_and_no_interval() -> None:
+    # Student's would say that a CartPole policy balances for −296 to 954 steps on average.
+    assert mean_interval([329.0, 182.0, 476.0]) is None
+    low, high = band([[329.0, 182.0, 476.0], [1.0, 1.0, 1.0]])
+    np.testing.assert_array_equal([low, high], [[182.0, 1.0], [476.0, 1.0]])
+    values = np.random.default_rng(4).normal(size=(2, FEWEST_SEEDS))
+    np.testing.assert_array_equal(band(values), bootstrap_interval(values))
 
 
 def test_strata_are_drawn_by_themselves() -> None:

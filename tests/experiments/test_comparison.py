@@ -13,15 +13,14 @@ from qfolio.commands.progress import BarProgress
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
+from qfolio.experiments.comparison.conclusion import conclusion, share
 from qfolio.experiments.comparison.operations import operations_per_step
 from qfolio.experiments.comparison.ranking import (
     Result,
     area,
-    conclusion,
     fewest_seeds,
     middle_steps,
     rank,
-    share,
     steps_within,
 )
 from qfolio.experiments.comparison.run import Comparison, Entrant
@@ -133,7 +132,9 @@ def test_ranking_by_return_where_no_optimum_is_known():
     assert ranking["agents"]["best"]["within"][2]["steps"] == 500  # 460 is within 10 % of 500
     assert ranking["agents"]["worse"]["within"][2]["steps"] is None
     first, second, last = conclusion(ranking)
-    assert first.startswith("best ends with the highest return: 495.0 (95 % interval ")
+    assert first == "best ends with the highest return: 495.0 (4 seeds, 480.0 to 500.0)."
+    assert ranking["agents"]["best"]["final"]["interval"] is None
+    assert ranking["pairs"][0]["probability_interval"] is None
     assert second == "With 4 seeds each it can be told apart from worse (115.0)."
     assert (
         last

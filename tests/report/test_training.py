@@ -334,15 +334,17 @@ def test_verdict() -> None:
     summary = {
         "return_per_seed": [-140.0, -142.0],
         "return_mean": -141.0,
-        "return_ci95": [-142.0, -140.0],
+        "return_ci95": None,
         "optimum": -136.9,
         "regret_per_seed": [0.02, 0.04],
     }
     text = verdict(summary).replace("\N{NARROW NO-BREAK SPACE}", " ").replace("\N{MINUS SIGN}", "-")
     assert text == (
-        "Two agents reached a mean return of -141.0 (95 % interval -142.0 to -140.0), "
+        "Two agents reached a mean return of -141.0 (2 seeds, -142.0 to -140.0), "
         "3.0 % below the exact optimum of -136.9."
     )
+    known = {**summary, "return_per_seed": [-141.0] * 5, "return_ci95": [-142.0, -140.0]}
+    assert "(95\N{NARROW NO-BREAK SPACE}% interval \N{MINUS SIGN}142.0 to" in verdict(known)
     assert "above the exact" in verdict({**summary, "regret_per_seed": [-0.01, -0.02]})
     assert "equal to the exact" in verdict({**summary, "regret_per_seed": [1e-5, -1e-5]})
     assert verdict({**summary, "return_per_seed": [0.0] * 64}).startswith("64 agents")

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from qfolio.core.registry import short
+from qfolio.core.statistics import FEWEST_SEEDS
 from qfolio.core.text import printable
 
 if TYPE_CHECKING:
@@ -84,7 +85,10 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
         low, high = result["return_ci95"]
         say(f"95 % interval of the mean return over seeds: {number(low)} to {number(high)}")
     else:
-        say("One seed has no interval; train several with --seeds.")
+        say(
+            f"An interval over seeds takes {FEWEST_SEEDS} seeds or more (--seeds); "
+            f"{len(returns)} {'is' if len(returns) == 1 else 'are'} too few."
+        )
 
 
 def number(value: float | None) -> str:
@@ -172,13 +176,15 @@ def describe_backtest(backtest: "Backtest") -> str:
 
 def print_assessment(assessment: "Assessment") -> None:
     """A row for each strategy, and what follows from it in words."""
+    from qfolio.portfolio.backtest.verdict import verdicts
+
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("a year, net")
-    for name in ("growth", "vol.", "Sharpe", "fall", "traded", "cost"):
+    for name in ("growth", "vol.", "Sharpe", "drawdown", "turnover", "cost drag"):
         table.add_column(name, justify="right", no_wrap=True)
     for name, strategy in assessment.strategies.items():
         value = {key: measure.mean for key, measure in strategy.measures.items()}
-        style = "bold" if strategy.kind == "agent" else None
+        style = None if strategy.kind == "baseline" else "bold"
         table.add_row(
             name,
             f"{value['growth']:.2%}",
@@ -190,14 +196,9 @@ def print_assessment(assessment: "Assessment") -> None:
             style=style,
         )
     console.print(table)
-    verdicts = [
-        difference.verdict
-        for strategy in assessment.strategies.values()
-        for difference in (strategy.to_reference, strategy.to_best_baseline)
-        if strategy.kind == "agent" and difference is not None
-    ]
-    for verdict in dict.fromkeys(verdicts):  # the two are one where equal weights are the best
-        say(verdict)
+    for sentences in verdicts(assessment).values():
+        for sentence in sentences:
+            say(sentence)
 
 
 def print_allocation(allocation: "Allocation", standing: "Standing", trained: str) -> None:
@@ -241,19 +242,23 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
 
 def print_ranking(content: dict[str, Any]) -> None:
     """A row for each agent, best first, and what follows from it in words."""
-    from qfolio.experiments.comparison.ranking import HEADLINE, amount, share, span
+    from qfolio.core.statistics import FEWEST_SEEDS
+    from qfolio.experiments.comparison.conclusion import amount, share, span
+    from qfolio.experiments.comparison.ranking import HEADLINE
 
     ranking = content["ranking"]
     write = share if ranking["measure"] == "regret" else amount
     table = Table(box=None, header_style="bold", pad_edge=False)
     near = f"steps to {HEADLINE:.0%}".replace("%", " %")
     table.add_column("agent", no_wrap=True)
-    for name in (ranking["measure"], "95 % interval", "worst", near, "s a seed", "parameters"):
+    spread = "95 % interval" if ranking["seeds"] >= FEWEST_SEEDS else "range of seeds"
+    for name in (ranking["measure"], spread, "worst", near, "s a seed", "parameters"):
         table.add_column(name, justify="right", no_wrap=True)
     for name in ranking["order"]:
         measures, result = ranking["agents"][name], content["results"][name]
         final = measures["final"]
-        ends = [write(end) for end in final["interval"] or ()]
+        few = min(final["per_seed"]), max(final["per_seed"])
+        ends = [write(end) for end in final["interval"] or few]
         within = next(x for x in measures["within"] if x["threshold"] == HEADLINE)
         table.add_row(
             Text(name),

@@ -102,7 +102,8 @@ def backtest(
         seeds: Agents of each kind; the preset says otherwise.
         seed: The first agent's seed.
         episodes: Training episodes of each agent and fold; the preset says otherwise.
-        trials: Earlier trials on these prices, which the deflated Sharpe ratio must count too.
+        trials: Earlier trials on these prices, for the deflated Sharpe ratio to count; those made
+            on the default table are counted already.
         assignments: Hyperparameters, for all agents that have them (learning_rate=1e-3) or one of
             them (dqn.discount=0.9), or of the task (window=20 reward=crra).
         out: A new folder; runs/… otherwise.

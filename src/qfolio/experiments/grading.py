@@ -26,9 +26,10 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
     if solution is not None:
         optimum = float(solution.returns(keys).mean())
         regret = ((optimum - returns) / abs(optimum)).tolist()
+    interval = mean_interval(returns)
     return {
         "return_mean": float(returns.mean()),
-        "return_ci95": list(mean_interval(returns)) if len(returns) > 1 else None,
+        "return_ci95": None if interval is None else list(interval),
         "return_per_seed": returns.tolist(),
         "optimum": optimum,
         "regret_per_seed": regret,

@@ -13,16 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qfolio.core.statistics import bootstrap_interval, interquartile_mean
-from qfolio.experiments.comparison.ranking import (
-    HEADLINE,
-    THRESHOLDS,
-    Result,
-    amount,
-    curve,
-    share,
-    span,
-)
+from qfolio.core.statistics import FEWEST_SEEDS, band, interquartile_mean
+from qfolio.experiments.comparison.conclusion import amount, share, span
+from qfolio.experiments.comparison.ranking import HEADLINE, THRESHOLDS, Result, curve
 from qfolio.report import palette, rendering
 from qfolio.report.data import Floats
 from qfolio.report.figures.style import (
@@ -41,6 +34,7 @@ from qfolio.report.rendering import (
     counted,
     duration,
     number,
+    over_seeds,
     percent,
     render,
     setting_groups,
@@ -139,6 +133,8 @@ def render_comparison(data: ComparisonData) -> str:
         lede=[tidy(sentence) for sentence in content["conclusion"]],
         notes=[tidy(sentence) for sentence in content["notes"]],
         looks=data.looks,
+        intervals=ranking["seeds"] >= FEWEST_SEEDS,
+        fewest=FEWEST_SEEDS,
         markers=palette.MARKER_PATHS,
         facts=_facts(data),
         reached=[(name, _reached(data, name)) for name in data.results],
@@ -248,7 +244,7 @@ def _draw_curve(axes: Axes, data: ComparisonData, name: str, pace: float, log: b
     colour = palette.LIGHT[look.colour]
     low, high, middle = (
         np.maximum(line, _floor(data)) if _logarithmic(data) else line
-        for line in (*bootstrap_interval(values), interquartile_mean(values))
+        for line in (*band(values), interquartile_mean(values))
     )
     axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
     style: dict[str, Any] = {
@@ -345,8 +341,13 @@ def _reached(data: ComparisonData, name: str) -> list[tuple[str, str]]:
     def interval(ends: list[float] | None) -> str:
         return "" if ends is None else " … ".join(map(data.write, ends))
 
+    def spread() -> str:
+        if final["interval"] is not None or seeds == 1:
+            return interval(final["interval"])
+        return over_seeds(final["per_seed"], None, data.write)
+
     return [
-        (data.write(final["iqm"]), interval(final["interval"])),
+        (data.write(final["iqm"]), spread()),
         (data.write(final["mean"]), ""),
         (data.write(final["worst"]), ""),
         ("not reached" if near["steps"] is None else rendering.amount(near["steps"]),

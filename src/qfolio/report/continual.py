@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qfolio.core.statistics import bootstrap_interval, interquartile_mean
+from qfolio.core.statistics import band, interquartile_mean
 from qfolio.experiments.continual import WAYS
 from qfolio.report import palette
 from qfolio.report.figures.style import (
@@ -158,7 +158,7 @@ def _draw_course(axes: Axes, content: Content, way: str, last: int) -> None:
         steps, curve = np.array([0, last]), np.repeat(curve, 2, axis=0)
     colour = palette.MUTED if COLOURS[way] == "muted" else palette.LIGHT[COLOURS[way]]
     low, high, middle = (
-        np.maximum(line, FLOOR) for line in (*bootstrap_interval(curve), interquartile_mean(curve))
+        np.maximum(line, FLOOR) for line in (*band(curve), interquartile_mean(curve))
     )
     axes.fill_between(steps, low, high, color=colour, alpha=0.16, linewidth=0)
     axes.plot(steps, middle, color=colour, linewidth=1.8, label=way, clip_on=False)

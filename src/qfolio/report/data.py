@@ -146,8 +146,7 @@ class ReportData:
         command: Command line that repeats or continues the training; may have several lines.
         summary: The results: task, agent, preset, seeds, episodes, env_steps, seconds_compile,
             seconds_train, steps_per_second, return_mean, return_ci95 (low, high;
-            None for one seed),
-            return_per_seed, optimum, regret_per_seed (fractions of the optimum),
+            None for few seeds), return_per_seed, optimum, regret_per_seed (shares of the optimum),
             overestimation_per_seed (None where no action values are estimated) and, in markets,
             rule: a few numbers that say what a policy does, "exact" and "per_seed".
         config: All settings, a nested dictionary.

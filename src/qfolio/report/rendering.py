@@ -2,11 +2,13 @@
 
 import json
 import math
+from collections.abc import Callable, Sequence
 from importlib import resources
 from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
+from qfolio.core.statistics import FEWEST_SEEDS, Floats
 from qfolio.report import palette
 
 THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
@@ -32,6 +34,7 @@ def render(template: str, **context: Any) -> str:
         loader=FunctionLoader(source),
     )
     environment.filters.update(number=number, percent=percent)
+    environment.globals.update(bands=bands)
     return environment.get_template(template).render(palette=palette, **context)
 
 
@@ -50,6 +53,26 @@ def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
 def percent(fraction: float, digits: int = 1, *, sign: bool = False) -> str:
     """Return a fraction as a percentage."""
     return f"{number(100 * fraction, digits, sign=sign)}{THIN_SPACE}%"
+
+
+def over_seeds(
+    values: Sequence[float] | Floats,
+    interval: Sequence[float] | None,
+    write: Callable[[float], str],
+) -> str:
+    """Return how far results vary over seeds: their 95 % interval, or the range of a few."""
+    if len(values) == 1:
+        return "one seed"
+    if interval is None:
+        return f"{len(values)} seeds, {write(min(values))} to {write(max(values))}"
+    return f"95{THIN_SPACE}% interval {write(interval[0])} to {write(interval[1])}"
+
+
+def bands(seeds: int) -> str:
+    """Return what the bands of learning curves are, see ``qfolio.core.statistics.band``."""
+    if seeds < FEWEST_SEEDS:
+        return "from the worst to the best seed"
+    return f"95{THIN_SPACE}% bootstrap intervals over seeds"
 
 
 def amount(count: float) -> str:

@@ -15,11 +15,11 @@ from qfolio.report.data import MarketData, ReportData, decimals
 from qfolio.report.figures import curves, pendulum, policies
 from qfolio.report.figures.style import LEAD, WIDE, svgs
 from qfolio.report.rendering import (
-    THIN_SPACE,
     amount,
     counted,
     duration,
     number,
+    over_seeds,
     percent,
     render,
     setting_groups,
@@ -92,10 +92,7 @@ def verdict(summary: dict[str, Any], market: MarketData | None = None) -> str:
     count = len(summary["return_per_seed"])
     agents = counted(count, "agent")
     digits = _digits(summary)
-    interval = ""
-    if count > 1:
-        low, high = (number(end, digits) for end in summary["return_ci95"])
-        interval = f" (95{THIN_SPACE}% interval {low} to {high})"
+    interval = f" ({_over_seeds(summary)})" if count > 1 else ""
     measure = market.measure if market else "return"
     span = f" over {number(market.horizon, 0)} steps" if market else ""
     mean = number(summary["return_mean"], digits)
@@ -103,6 +100,12 @@ def verdict(summary: dict[str, Any], market: MarketData | None = None) -> str:
     if count == 1:
         sentence += " A single seed says nothing about the spread, so no interval is given."
     return sentence
+
+
+def _over_seeds(summary: dict[str, Any]) -> str:
+    digits = _digits(summary)
+    values, interval = summary["return_per_seed"], summary["return_ci95"]
+    return over_seeds(values, interval, lambda value: number(value, digits))
 
 
 def _distance(summary: dict[str, Any]) -> str:
@@ -124,14 +127,10 @@ def _digits(summary: dict[str, Any]) -> int:
 def _facts(summary: dict[str, Any], market: MarketData | None) -> list[tuple[str, str, str]]:
     """Return the key figures: name, value and a remark."""
     several = len(summary["return_per_seed"]) > 1
-    spread = "one seed, no interval"
     digits = _digits(summary)
-    if several:
-        low, high = (number(end, digits) for end in summary["return_ci95"])
-        spread = f"95{THIN_SPACE}%: {low} to {high}"
     together = "all seeds together" if several else "while training"
     speed = ("Steps per second", amount(summary["steps_per_second"]), together)
-    facts = [("Return", number(summary["return_mean"], digits), spread)]
+    facts = [("Return", number(summary["return_mean"], digits), _over_seeds(summary))]
     if summary["optimum"] is not None:
         regret = percent(_mean_regret(summary), 2 if market else 1)
         facts += [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from qfolio.experiments.tuning.sensitivity import Effect, Sensitivity, sensitivi
 from qfolio.report import palette
 from qfolio.report.data import decimals
 from qfolio.report.figures.style import LEAD, NARROW, WIDE, new_figure, save_png, svgs
-from qfolio.report.rendering import THIN_SPACE, counted, number, percent, render, setting_groups
+from qfolio.report.rendering import counted, number, over_seeds, percent, render, setting_groups
 from qfolio.report.words import agent_name, words_of
 
 if TYPE_CHECKING:
@@ -96,11 +97,14 @@ class Sweep:
         )
         if len(gains) == 1:
             return f"{says}; a single seed tells no more."
-        low, high = mean_interval(gains)
-        kind = "better" if low > 0 else "worse" if high < 0 else "no clear difference"
+        interval = mean_interval(gains)
         gap = f"{number(gains.mean(), digits, sign=True)}"
-        ends = f"{number(low, digits, sign=True)} to {number(high, digits, sign=True)}"
-        return f"{says}: {kind} ({gap}; 95{THIN_SPACE}% interval {ends})."
+        spread = over_seeds(gains, interval, lambda gain: number(gain, digits, sign=True))
+        if interval is None:
+            return f"{says} ({gap}; {spread}): too few seeds for a verdict."
+        low, high = interval
+        kind = "better" if low > 0 else "worse" if high < 0 else "no clear difference"
+        return f"{says}: {kind} ({gap}; {spread})."
 
 
 def sweep(work: Tuning, summary: dict[str, Any], command: str) -> Sweep:
@@ -389,7 +393,7 @@ def _row(effect: Effect, data: Sweep) -> dict[str, Any]:
 
 
 def _finals(data: Sweep) -> list[tuple[str, list[str]]]:
-    """Return a row for the best and one for the preset: mean, interval, worst seed, regret."""
+    """Return a row for the best and one for the preset: mean, spread, worst seed, regret."""
     optimum = data.summary["optimum"]
     rows = []
     for name, key in (("Best", "return_per_seed"), ("Preset", "preset_return_per_seed")):
@@ -398,12 +402,9 @@ def _finals(data: Sweep) -> list[tuple[str, list[str]]]:
             rows.append((name, ["diverged", "–", "–", "–"]))
             continue
         digits = decimals(optimum or returns.mean())
-        interval = "–"
-        if len(returns) > 1:
-            low, high = mean_interval(returns)
-            interval = f"{number(low, digits)} to {number(high, digits)}"
+        spread = over_seeds(returns, mean_interval(returns), partial(number, digits=digits))
         regret = "–" if optimum is None else percent((optimum - returns.mean()) / abs(optimum), 1)
-        cells = [number(returns.mean(), digits), interval, number(returns.min(), digits), regret]
+        cells = [number(returns.mean(), digits), spread, number(returns.min(), digits), regret]
         rows.append((name, cells))
     return rows
 

@@ -1,6 +1,8 @@
 import dataclasses
 import json
+import re
 import shutil
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -13,7 +15,7 @@ from qfolio.portfolio.backtest.baselines import BASELINES
 from qfolio.portfolio.backtest.run import LATEST, Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.policy import follow
-from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices
 
 from listeners import Interrupt
 
@@ -70,6 +72,7 @@ def test_all_strategies_are_replayed_on_the_same_days(finished):
         assert entry.simulation.returns.shape == (seeds, 160), name
     assessment = finished.assess(entries)
     assert assessment.trials == 6
+    assert [s.kind for s in assessment.strategies.values()][:4] == ["agent", "ensemble"] * 2
     assert assessment.strategies["dqn"].to_reference.reference == "equal-weight"
 
 
@@ -204,6 +207,20 @@ def test_tables_say_what_was_replayed(finished):
     assert (finished.folder / "weights.csv").read_text().startswith("date,strategy,cash,A,B,'=<b>C")
     summary = json.loads((finished.folder / "summary.json").read_text())
     assert summary["strategies"]["pathwise"]["kind"] == "agent"
+    assert list(summary["verdicts"]) == ["dqn", "dqn-together", "pathwise", "pathwise-together"]
+    assert summary["strategies"]["dqn"]["to_reference"]["finding"] in ("better", "worse", "none")
+
+
+def test_looks_at_the_default_table_count_as_trials(finished):
+    """They count on top of --trials, and docs/results.md admits as many."""
+    entries, _ = finished.entries()
+    prices = dataclasses.replace(table(), source=DEFAULT_SOURCE)
+    known = create(prices=prices, trials=3)
+    assert known.assess(entries).earlier_trials == 3 + DEFAULT_TRIALS
+    assert finished.assess(entries).earlier_trials == 0
+    results = Path(__file__).parents[3] / "docs" / "results.md"
+    (said,) = re.findall(r"\*\*(\d+) earlier trials\*\*", results.read_text(encoding="utf-8"))
+    assert int(said) == DEFAULT_TRIALS
 
 
 def test_an_asset_joins_at_the_first_fold_that_it_covers():

@@ -1,4 +1,4 @@
-"""What follows from the results of several agents on one task: measures, a ranking, a conclusion.
+"""What follows from the results of several agents on one task: measures, a ranking, their pairs.
 
 A result is graded by its regret, the share of the exact optimum's return that it misses, or by its
 return where no optimum is known. Intervals are bootstraps over seeds (``qfolio.core.statistics``).
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.statistics import (
+    FEWEST_SEEDS,
     Floats,
     holm,
     interquartile_mean,
@@ -29,7 +30,7 @@ THRESHOLDS = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 """Shares of the optimum that a learning curve may come within."""
 
 HEADLINE = 0.1
-"""The threshold that stands in tables and sentences."""
+"""The threshold of tables and sentences."""
 
 LEVEL = 0.05
 """How often the comparison of all pairs may tell agents apart that are alike."""
@@ -149,95 +150,6 @@ def area(steps: Sequence[int], values: Floats, until: int) -> Floats:
     return np.asarray(np.trapezoid(heights, ends, axis=-1) / (ends[-1] - ends[0]))
 
 
-def conclusion(ranking: dict[str, Any]) -> list[str]:
-    """What may be said of a ranking, in sentences, and no more than that."""
-    first, seeds = ranking["order"][0], ranking["seeds"]
-    each = f"with {seeds} seed{'s' if seeds > 1 else ''} each"
-    beaten = {
-        row["second"]: row["told_apart"] and row["probability"] > 0.5
-        for row in ranking["pairs"]
-        if row["first"] == first
-    }
-    valued = {name: f"{name} ({figure(ranking, name)})" for name in beaten}
-    tied = [valued[name] for name, worse in beaten.items() if not worse]
-    worse = [valued[name] for name, worse in beaten.items() if worse]
-    best = (
-        f"{first} ends nearest to the exact optimum: its regret is"
-        if ranking["measure"] == "regret"
-        else f"{first} ends with the highest return:"
-    )
-    sentence = f"{each.capitalize()} it can be told apart from {listed(worse)}." if worse else ""
-    if tied:
-        sentence = f"{each.capitalize()} it cannot be told apart from {listed(tied, 'or')}"
-        sentence += f"; {listed(worse)} do{'es' * (len(worse) == 1)} worse." if worse else "."
-    if seeds < ranking["seeds_needed"]:
-        count = len(ranking["order"])
-        none = f"no two of {count} agents can" if count > 2 else "two agents cannot"
-        sentence = (
-            f"{each.capitalize()} {none} be told apart, whatever they reach; it takes "
-            f"{ranking['seeds_needed']} seeds or more."
-        )
-    return [f"{best} {figure(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
-
-
-def figure(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
-    """An agent's final regret or return as text."""
-    write = share if ranking["measure"] == "regret" else amount
-    final = ranking["agents"][name]["final"]
-    text = write(final["iqm"])
-    if interval and final["interval"] is not None:
-        text += f" (95 % interval {' to '.join(map(write, final['interval']))})"
-    return text
-
-
-def share(fraction: float) -> str:
-    """A fraction in percent, with the two digits that matter, down to a thousandth of a percent."""
-    size = abs(100 * fraction)
-    if size < 5e-4:
-        return "0 %"
-    digits = min(3, max(0, 1 - math.floor(math.log10(size))))
-    return f"{100 * fraction:,.{digits}f} %"
-
-
-def amount(value: float) -> str:
-    """A number with the four digits that matter."""
-    if abs(value) >= 1000:
-        return f"{value:,.0f}"
-    return f"{value:#.4g}" if abs(value) >= 1 else f"{value:.4g}"
-
-
-def span(seconds: float) -> str:
-    """Seconds as text, with the two digits that matter."""
-    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:,.0f} s"
-
-
-def listed(names: Sequence[str], word: str = "and") -> str:
-    """Names as a part of a sentence."""
-    return f" {word} ".join([*([", ".join(names[:-1])] if names[1:] else []), names[-1]])
-
-
-def _quickest(ranking: dict[str, Any]) -> str:
-    """Who comes near the optimum, or the best return, with the fewest steps and in least time."""
-    goal = "the optimum" if ranking["measure"] == "regret" else "the best return"
-    near = f"within {HEADLINE:.0%} of {goal}".replace("%", " %")
-    arrived = {
-        name: entry
-        for name in ranking["order"]
-        for entry in ranking["agents"][name]["within"]
-        if entry["threshold"] == HEADLINE and entry["steps"] is not None
-    }
-    if not arrived:
-        return f"No agent comes to stay {near}."
-    frugal = min(arrived, key=lambda name: arrived[name]["steps"])
-    quick = min(arrived, key=lambda name: arrived[name]["seconds"])
-    steps = f"{arrived[frugal]['steps']:,.0f}"
-    seconds = f"{span(arrived[quick]['seconds'])} a seed"
-    if len(arrived) == 1:
-        return f"Only {frugal} comes to stay {near}: after {steps} steps and {seconds}."
-    least = f"{quick} the least time" if quick != frugal else "the least time"
-    return f"To stay {near}, {frugal} needs the fewest steps ({steps}) and {least} ({seconds})."
-
-
 def fewest_seeds(pairs: int) -> int:
     """The number of seeds from which on the rank test can tell agents apart among so many pairs."""
     return next(n for n in range(1, 100) if 2 * pairs / math.comb(2 * n, n) <= LEVEL)
@@ -273,8 +185,8 @@ def _measures(
 
 
 def _spread(values: Floats) -> dict[str, Any]:
-    """Interquartile mean over seeds, and its interval, which one seed does not have."""
-    interval = list(stratified_interval([values])) if len(values) > 1 else None
+    """Interquartile mean over seeds, and its interval, which few seeds do not have."""
+    interval = list(stratified_interval([values])) if len(values) >= FEWEST_SEEDS else None
     return {"iqm": float(interquartile_mean(values)), "interval": interval}
 
 
@@ -302,7 +214,7 @@ def _pairs(scores: dict[str, Floats], order: Sequence[str], sign: float) -> list
     rows = []
     for (a, b), p in zip(pairs, p_values.tolist(), strict=True):
         both = [scores[a], scores[b]]
-        several = min(map(len, both)) > 1
+        several = min(map(len, both)) >= FEWEST_SEEDS
         row: dict[str, Any] = {"first": a, "second": b, "p": p, "told_apart": p <= LEVEL}
         statistics = {"probability": probability_of_improvement, "difference": difference}
         for key, statistic in statistics.items():

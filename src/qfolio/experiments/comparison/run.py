@@ -26,8 +26,9 @@ from qfolio.core.host import HostPopulation
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
+from qfolio.experiments.comparison.conclusion import conclusion, listed
 from qfolio.experiments.comparison.operations import operations_per_step
-from qfolio.experiments.comparison.ranking import Result, conclusion, listed, rank
+from qfolio.experiments.comparison.ranking import Result, rank
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.run import Run

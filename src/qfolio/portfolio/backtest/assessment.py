@@ -1,7 +1,7 @@
-"""What a whole backtest shows, and how much of it may be luck: numbers, intervals and sentences.
+"""What a whole backtest shows, and how much of it may be luck: numbers, intervals and tests.
 
-``measures.py``, ``bootstrap.py`` and ``sharpe.py`` say what each number is. In JSON, infinite and
-undefined numbers are null.
+``measures.py``, ``bootstrap.py`` and ``sharpe.py`` say what each number is, ``verdict.py`` what
+follows from them in words. In JSON, infinite and undefined numbers are null.
 """
 
 import dataclasses
@@ -10,15 +10,17 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.statistics import mean_interval
-from qfolio.portfolio.backtest.bootstrap import (
-    LEVEL,
-    block_length,
-    bootstrap_measures,
-    percentile_interval,
+from qfolio.portfolio.backtest.bootstrap import LEVEL, block_length, bootstrap_measures
+from qfolio.portfolio.backtest.differences import (
+    Difference,
+    Sampled,
+    as_range,
+    compare,
+    mean_over_seeds,
 )
 from qfolio.portfolio.backtest.measures import (
     MEASURES,
@@ -26,9 +28,7 @@ from qfolio.portfolio.backtest.measures import (
     Range,
     checked_dates,
     checked_track,
-    log_growth,
     measures,
-    paired_difference,
 )
 from qfolio.portfolio.backtest.sharpe import (
     deflated_sharpe,
@@ -38,87 +38,17 @@ from qfolio.portfolio.backtest.sharpe import (
     skewness_and_kurtosis,
 )
 
-MARGIN = 1e-6
-"""Of growth a year: less than this is rounding, and no evidence of anything."""
-
-_THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
-
-
-def verdict(agent: str, reference: str, difference: float, low: float, high: float) -> str:
-    """Say in words what an interval of the difference in annual log growth shows.
-
-    Only an interval that lies wholly on one side of zero, by more than ``MARGIN``, is evidence; one
-    that touches it is none.
-
-    Args:
-        agent: Whose growth it is.
-        reference: What it is compared to.
-        difference: Growth of the agent minus that of the reference, as a fraction.
-        low: Lower end of the 95 % interval.
-        high: Upper end.
-    """
-    if low > MARGIN:
-        finding = f"{agent} beats {reference} after costs"
-    elif high < -MARGIN:
-        finding = f"{agent} falls short of {reference} after costs"
-    else:
-        finding = f"No evidence that {agent} beats {reference} after costs"
-    # As many digits as it takes to tell an end from zero, since the sentence hangs on its sign.
-    ends = [abs(100 * end) for end in (low, high) if end and math.isfinite(end)]
-    digits = next((d for d in range(1, 7) if all(round(end, d) for end in ends)), 7)
-    middle, left, right = (
-        f"{_number(100 * value, digits, sign=True)}{_THIN_SPACE}%"
-        for value in (difference, low, high)
-    )
-    return (
-        f"{finding}: the difference in annual growth is {middle} "
-        f"(95{_THIN_SPACE}% interval {left} to {right})."
-    )
-
-
-def luck(agent: str, sharpe: float, threshold: float, deflated: float, trials: int) -> str:
-    """Say in words what a deflated Sharpe ratio shows.
-
-    It answers whether there is a return for the risk at all, after picking among trials. Whether
-    an agent is better than a baseline is another question, which ``verdict`` answers.
-
-    Args:
-        agent: Whose Sharpe ratio it is.
-        sharpe: The annual Sharpe ratio.
-        threshold: The annual Sharpe ratio expected of the best of the trials without skill.
-        deflated: The probability that the true Sharpe ratio exceeds the threshold.
-        trials: How many trials were counted.
-    """
-    bar = "zero"
-    if trials > 1:
-        bar = f"{threshold:.2f}, what the best of {trials} trials without skill shows on average,"
-    chance = float(np.floor(1000 * deflated) / 10)  # rounded down: 94.96 must not read as 95.0
-    finding = "is more than luck is likely to explain"
-    shortfall = ""
-    if not deflated >= LEVEL:
-        finding, shortfall = "may be luck", f", less than the usual 95{_THIN_SPACE}%"
-    return (
-        f"The Sharpe ratio of {agent}, {_number(sharpe, 2)} a year, {finding}: the probability "
-        f"that the true one exceeds {bar} is {_number(chance, 1)}{_THIN_SPACE}%{shortfall}."
-    )
-
-
-def _number(value: float, digits: int, sign: bool = False) -> str:
-    if math.isnan(value):
-        return "undefined"
-    text = "∞" if math.isinf(value) else f"{abs(value):.{digits}f}"
-    if not text.strip("0."):
-        return text
-    return ("\N{MINUS SIGN}" if value < 0 else "+" if sign else "") + text
+KINDS = ("agent", "ensemble", "baseline")
+"""An ensemble is all seeds of an agent, traded as one."""
 
 
 class Strategy(NamedTuple):
     """The track records of one strategy over the test days, one row per seed.
 
-    A baseline that draws nothing at random has one row.
+    A baseline that draws nothing at random has one row, and so has an ensemble.
     """
 
-    kind: str  # "agent" or "baseline"
+    kind: str  # one of KINDS
     returns: ArrayLike  # (seeds, periods), simple, net of costs
     turnover: ArrayLike  # (seeds, periods), bought plus sold over wealth
     cost: ArrayLike  # (seeds, periods), share of the wealth
@@ -131,19 +61,7 @@ class Measure:
     mean: float  # over seeds
     per_seed: tuple[float, ...]
     over_time: Range  # stationary bootstrap of the mean over seeds
-    over_seeds: Range | None  # Student's t of the mean; none for one seed
-
-
-@dataclasses.dataclass(frozen=True)
-class Difference:
-    """A strategy minus a reference on the same days, with 95 % intervals over days and seeds."""
-
-    reference: str
-    growth: float  # of annual log growth
-    growth_interval: Range
-    sharpe: float  # of annual Sharpe ratios
-    sharpe_interval: Range
-    verdict: str
+    over_seeds: Range | None  # Student's t of the mean; none below FEWEST_SEEDS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +74,7 @@ class SharpeTest:
     minimum_years: float  # track record needed until that probability reaches 95 %; may be inf
     threshold: float  # annual Sharpe ratio expected of the best trial if none has any skill
     deflated: float  # probability that the true Sharpe ratio exceeds the threshold
-    sentence: str
+    trials: int  # that the threshold counts; 1 for a baseline
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,7 +85,7 @@ class StrategyAssessment:
     seeds: int
     measures: dict[str, Measure]  # by the names in MEASURES
     to_reference: Difference | None  # none for the reference itself
-    to_best_baseline: Difference | None  # none for the best baseline itself
+    to_best_baseline: Difference | None  # none for it, and where the reference is the best
     sharpe_test: SharpeTest
 
 
@@ -182,9 +100,11 @@ class Assessment:
     level: float  # of all intervals
     resamples: int
     block_length: float  # mean, in periods
-    trials: int  # agents times seeds, and those that were reported beside
+    trials: int  # every seed of every agent, the ensembles, and earlier trials
+    earlier_trials: int
+    comparisons: int  # that Holm's correction counts
     reference: str
-    best_baseline: str  # by its Sharpe ratio over the same days
+    best_baseline: str  # by growth over the same days
     strategies: dict[str, StrategyAssessment]
 
     def to_json(self) -> dict[str, Any]:
@@ -200,17 +120,14 @@ def assess(
     *,
     periods_per_year: float,
     reference: str = "equal weight",
-    other_trials: int = 0,
+    earlier_trials: int = 0,
     resamples: int = 2000,
     seed: int = 0,
 ) -> Assessment:
     """Compute every statistic of a backtest.
 
-    Differences are to a reference and to the best baseline, the one with the highest Sharpe ratio
-    over the very days of the test. Nobody could have chosen it beforehand, so that comparison
-    favours the baseline and is conservative for an agent. Their intervals come from drawing days
-    and, independently for each strategy, its seeds: S − 1 of S with replacement, since S of S would
-    understate the variance of the mean by the factor (S − 1)/S (McCarthy & Snowden 1985).
+    Agents and ensembles are compared in growth with a reference and with the best baseline, the
+    one that grew most over the very days of the test; ``differences.py`` says how.
 
     One block length serves all strategies, since they share the resampled days: the longest that
     their returns (mean over seeds) or squared returns ask for. Squares persist for months, and
@@ -222,9 +139,9 @@ def assess(
         strategies: A name for each, at least one baseline among them; all on the same days.
         dates: Days on which the returns were earned, shape (periods,), strictly increasing.
         periods_per_year: For example 252 for days of trading.
-        reference: The name of the baseline to compare with in the first place.
-        other_trials: How many more trials there were on these days. Every seed of every agent is
-            counted already.
+        reference: The name of the baseline that was chosen beforehand to compare with.
+        earlier_trials: How many trials there were on these days before. Every seed of every agent
+            and every ensemble is counted already.
         resamples: How many histories the bootstrap draws.
         seed: Seed of the drawing.
 
@@ -258,20 +175,18 @@ def assess(
     for name, track in tracks.items():
         seeds = track.shape[1]
         start, end = end, end + seeds
-        sampled[name] = _Sampled(
+        sampled[name] = Sampled(
             measures(track[0], track[1], track[2], periods_per_year),
             {key: values[:, start:end] for key, values in drawn.items()},
             rng.integers(seeds, size=(resamples, max(seeds - 1, 1))),
         )
 
-    best = max(baselines, key=lambda name: _mean(sampled[name].observed["sharpe"]))
-    agents = [name for name in tracks if name not in baselines]
-    trials = other_trials + sum(tracks[name].shape[1] for name in agents)
-    known = [sharpe for name in agents for sharpe in sampled[name].observed["sharpe"]]
+    best = max(baselines, key=lambda name: mean_over_seeds(sampled[name].observed["growth"]))
+    judged = [name for name in tracks if name not in baselines]
+    trials = earlier_trials + sum(tracks[name].shape[1] for name in judged)
+    known = [sharpe for name in judged for sharpe in sampled[name].observed["sharpe"]]
     variance = _trial_variance(known, periods, periods_per_year)
-
-    def compare(name: str, other: str) -> Difference | None:
-        return None if name == other else _compare(name, sampled[name], other, sampled[other])
+    differences = compare(sampled, baselines, reference, best)
 
     return Assessment(
         first_date=str(days[0].astype("datetime64[D]")),
@@ -282,6 +197,8 @@ def assess(
         resamples=resamples,
         block_length=block,
         trials=trials,
+        earlier_trials=earlier_trials,
+        comparisons=sum(each.p is not None for each in differences.values()),
         reference=reference,
         best_baseline=best,
         strategies={
@@ -289,13 +206,12 @@ def assess(
                 kind=strategies[name][0],
                 seeds=track.shape[1],
                 measures={key: _measure(sampled[name], key) for key in MEASURES},
-                to_reference=compare(name, reference),
-                to_best_baseline=compare(name, best),
+                to_reference=differences.get((name, reference)),
+                to_best_baseline=None if best == reference else differences.get((name, best)),
                 sharpe_test=_sharpe_test(
-                    name,
                     _canonical(track)[0],
-                    _mean(sampled[name].observed["sharpe"]),
-                    trials if name in agents else 1,  # nobody searched among baselines' seeds
+                    mean_over_seeds(sampled[name].observed["sharpe"]),
+                    trials if name in judged else 1,  # nobody searched among baselines' seeds
                     variance,
                     periods_per_year,
                 ),
@@ -305,62 +221,30 @@ def assess(
     )
 
 
-class _Sampled(NamedTuple):
-    """The measures of one strategy by seed, as observed and as drawn again."""
-
-    observed: dict[str, Floats]  # (seeds,)
-    drawn: dict[str, Floats]  # (resamples, seeds): the same days for all
-    picks: NDArray[np.int64]  # (resamples, seeds drawn): which seeds, if they are drawn, too
-
-
-def _measure(strategy: _Sampled, key: str) -> Measure:
+def _measure(strategy: Sampled, key: str) -> Measure:
     values = strategy.observed[key]
-    several = values.size > 1 and bool(np.isfinite(values).all())
     return Measure(
-        mean=_mean(values),
+        mean=mean_over_seeds(values),
         per_seed=tuple(values.tolist()),
-        over_time=_range(strategy.drawn[key].mean(axis=1)),
-        over_seeds=mean_interval(np.sort(values), LEVEL) if several else None,
+        over_time=as_range(strategy.drawn[key].mean(axis=1)),
+        over_seeds=mean_interval(np.sort(values), LEVEL) if np.isfinite(values).all() else None,
     )
 
 
-def _compare(name: str, ours: _Sampled, other: str, theirs: _Sampled) -> Difference:
-    def difference(key: str) -> tuple[float, Range]:
-        scale = log_growth if key == "growth" else np.asarray
-        observed = [np.asarray(_mean(scale(each.observed[key]))) for each in (ours, theirs)]
-        drawn = [
-            np.take_along_axis(scale(each.drawn[key]), each.picks, axis=1).mean(axis=1)
-            for each in (ours, theirs)
-        ]
-        return float(paired_difference(*observed)), _range(paired_difference(*drawn))
-
-    growth, growth_interval = difference("growth")
-    sharpe, sharpe_interval = difference("sharpe")
-    sentence = verdict(name, other, growth, *growth_interval)
-    return Difference(other, growth, growth_interval, sharpe, sharpe_interval, sentence)
-
-
 def _sharpe_test(
-    name: str,
-    returns: Floats,
-    sharpe: float,
-    trials: int,
-    variance: float,
-    periods_per_year: float,
+    returns: Floats, sharpe: float, trials: int, variance: float, periods_per_year: float
 ) -> SharpeTest:
     """For returns of shape (seeds, periods) and their mean annual Sharpe ratio."""
     year = math.sqrt(periods_per_year)
     periods = returns.shape[1]
     moments = skewness_and_kurtosis(returns)
-    threshold = year * expected_maximum_sharpe(trials, variance)
-    deflated = deflated_sharpe(sharpe / year, periods, *moments, trials, variance)
     return SharpeTest(
         *moments,
         probabilistic=probabilistic_sharpe(sharpe / year, periods, *moments),
         minimum_years=minimum_track_record(sharpe / year, *moments) / periods_per_year,
-        threshold=threshold,
-        deflated=deflated,
-        sentence=luck(name, sharpe, threshold, deflated, trials),
+        threshold=year * expected_maximum_sharpe(trials, variance),
+        deflated=deflated_sharpe(sharpe / year, periods, *moments, trials, variance),
+        trials=trials,
     )
 
 
@@ -389,15 +273,6 @@ def _canonical(track: Floats) -> Floats:
     return track[:, sorted(range(track.shape[1]), key=lambda seed: track[:, seed].tobytes())]
 
 
-def _mean(values: Floats) -> float:
-    return float(np.sort(values).mean())
-
-
-def _range(samples: Floats) -> Range:
-    low, high = percentile_interval(samples)
-    return float(low), float(high)
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
@@ -412,8 +287,8 @@ def _tracks(
     """Every strategy as an array (returns, turnover and cost; seeds; periods)."""
     tracks = {}
     for name, (kind, *series) in strategies.items():
-        if kind not in ("agent", "baseline"):
-            raise QfolioError(f"{name} is of kind {kind!r}; it must be 'agent' or 'baseline'.")
+        if kind not in KINDS:
+            raise QfolioError(f"{name} is of kind {kind!r}; it must be {' or '.join(KINDS)}.")
         track = tracks[name] = checked_track(series[0], series[1], series[2], name)
         if track.ndim != 3:
             raise QfolioError(

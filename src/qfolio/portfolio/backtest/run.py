@@ -30,9 +30,10 @@ from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, Backte
 from qfolio.portfolio.backtest.folds import Fold, latest, spell, walk_forward
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
+from qfolio.portfolio.backtest.verdict import verdicts
 from qfolio.portfolio.policy import Policy, follow, state_template
 from qfolio.portfolio.prices.findings import day
-from qfolio.portfolio.prices.table import Prices, describe
+from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
 
 LATEST = "latest"
@@ -51,7 +52,7 @@ FOLDS_AT_ONCE = 8
 class Entry:
     """A strategy in the backtest."""
 
-    kind: str  # "agent" or "baseline"
+    kind: str  # one of assessment.KINDS
     decisions: np.ndarray  # (seed, day, entry), cash first
     simulation: Simulation  # of shape (seed, day)
 
@@ -122,7 +123,8 @@ class Backtest:
             seeds: Agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
             episodes: How long each agent without a preset trains in a fold.
             task: Settings of the portfolio task for agents without a preset.
-            trials: Earlier trials on these prices, which the deflated Sharpe ratio must count too.
+            trials: Earlier trials on these prices, for the deflated Sharpe ratio to count; those of
+                the default table (``prices.table.DEFAULT_TRIALS``) are known and come on top.
             command: What was typed to start it, for the report.
             out: A new or empty folder; without it nothing is written.
         """
@@ -250,7 +252,7 @@ class Backtest:
             entries[name] = self._entry("agent", self._decide(name))
             if self.config.seeds > 1:
                 together = self._decide(name, together=True)
-                entries[f"{name}{TOGETHER}"] = self._entry("agent", together)
+                entries[f"{name}{TOGETHER}"] = self._entry("ensemble", together)
         for name in baselines.BASELINES:
             decided = baselines.decisions(name, self.folds, self.prices.values, cap=self.config.cap)
             entries[name] = self._entry("baseline", decided.decisions[None])
@@ -281,7 +283,7 @@ class Backtest:
             self.dates[days],
             periods_per_year=self.prices.periods_per_year,
             reference=EQUAL_WEIGHT,
-            other_trials=self.config.trials,
+            earlier_trials=self.config.trials + trials_on(self.prices.source),
         )
 
     def write_tables(self, entries: dict[str, Entry], assessed: assessment.Assessment) -> None:
@@ -296,7 +298,7 @@ class Backtest:
         self._folder.write_returns(days, columns)
         weights = {name: entry.simulation.weights.mean(0) for name, entry in entries.items()}
         self._folder.write_weights(days, self.prices.assets, weights)
-        self._folder.write_summary(assessed.to_json())
+        self._folder.write_summary({**assessed.to_json(), "verdicts": verdicts(assessed)})
 
     def _name(self, agent: str | None) -> str:
         """Of an agent: the first, if none is named."""

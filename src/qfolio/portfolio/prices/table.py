@@ -25,6 +25,8 @@ DEFAULT_NOTE = (
     "20 US stocks, chosen in hindsight from those still listed in 2022 (survivors): strategies "
     "that hold them look better than they could have been at the time."
 )
+DEFAULT_TRIALS = 51
+"""Trials made on the default table before, as docs/results.md tells them one by one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +229,11 @@ def describe(prices: Prices) -> dict[str, Any]:
         "digest": prices.digest,
         "note": prices.note,
     }
+
+
+def trials_on(source: str) -> int:
+    """How many earlier trials are known on prices from a source; they count against luck."""
+    return DEFAULT_TRIALS if source == DEFAULT_SOURCE else 0
 
 
 def _read(

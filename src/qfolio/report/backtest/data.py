@@ -1,9 +1,9 @@
-"""What the report of a backtest shows, as arrays and settings."""
+"""What the report of a backtest is made from."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +12,13 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.report.data import Floats
 
-if TYPE_CHECKING:
-    pass
-
 
 @dataclass(frozen=True)
 class StrategySeries:
     """What one strategy did on D days of the test, with S seeds (1 for a baseline) and N assets.
 
     Attributes:
-        kind: 'agent' or 'baseline'.
+        kind: 'agent', 'ensemble' or 'baseline'.
         returns: Simple returns net of costs, shape (S, D).
         turnover: Value bought plus value sold as a share of the wealth, shape (S, D).
         cost: Share of the wealth that each day's trade cost, shape (S, D).
@@ -67,10 +64,8 @@ class BacktestData:
     notes: list[str]
 
 
-# What is drawn -------------------------------------------------------------------------------
-
-
 def require_fit(data: BacktestData) -> None:
+    """Raise QfolioError where strategies, assessment, dates and assets do not fit together."""
     if set(data.strategies) != set(data.assessment.strategies):
         raise QfolioError(
             "The series are of other strategies than the statistics; report those of one backtest."
@@ -86,7 +81,7 @@ def require_fit(data: BacktestData) -> None:
 
 
 def shown_order(data: BacktestData) -> list[str]:
-    """Agents first, then the baselines they are compared with, then the others."""
+    """Agents and ensembles first, then the baselines they are compared with, then the others."""
     test = data.assessment
-    agents = [name for name, series in data.strategies.items() if series.kind == "agent"]
+    agents = [name for name, series in data.strategies.items() if series.kind != "baseline"]
     return list(dict.fromkeys([*agents, test.reference, test.best_baseline, *data.strategies]))

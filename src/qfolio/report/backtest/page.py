@@ -12,34 +12,27 @@ import base64
 import hashlib
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
 from qfolio.report import palette
-from qfolio.report.figures.style import LEAD, save_png
-from qfolio.report.rendering import render, setting_groups, source
-
-if TYPE_CHECKING:
-    pass
-
+from qfolio.report.backtest.charts import AREAS, chart_data, days_per_point, latest_values
 from qfolio.report.backtest.data import BacktestData, require_fit, shown_order
-from qfolio.report.backtest.payload import AREAS, chart_data, days_per_point, looks_of
-from qfolio.report.backtest.prose import (
+from qfolio.report.backtest.facts import account, few_seeds, key_facts, unit_of
+from qfolio.report.backtest.looks import looks_of
+from qfolio.report.backtest.tables import (
     HEADINGS,
-    account,
     difference_rows,
     fold_rows,
-    key_facts,
-    latest_values,
     luck_rows,
     month_tables,
     statistics_rows,
-    unit_of,
-    verdict_rows,
 )
+from qfolio.report.backtest.verdicts import verdict_rows
 from qfolio.report.backtest.wealth import draw_wealth
+from qfolio.report.figures.style import LEAD, save_png
+from qfolio.report.rendering import render, setting_groups, source
 
 
 def write_backtest_report(folder: Path, data: BacktestData) -> None:
@@ -76,7 +69,10 @@ def render_backtest(data: BacktestData) -> str:
         scripts=[Markup(script) for script in scripts],
         hashes=[_hash(script) for script in scripts],
         payload=htmlsafe_json_dumps(payload, separators=(",", ":"), allow_nan=False),
-        strategies=[(name, data.strategies[name].kind, looks[name]) for name in names],
+        strategies=[
+            (name, "baseline" if data.strategies[name].kind == "baseline" else "agent", looks[name])
+            for name in names
+        ],
         markers=palette.MARKER_PATHS,
         verdicts=verdict_rows(names, data),
         facts=key_facts(data),
@@ -94,6 +90,7 @@ def render_backtest(data: BacktestData) -> str:
         said=account(data),
         settings=setting_groups(data.config),
         thinned=days_per_point(len(data.dates)),
+        few_seeds=few_seeds(data.assessment),
         averaged=math.ceil(len(data.dates) / AREAS),
         unit=unit_of(data.assessment.periods_per_year),
     )

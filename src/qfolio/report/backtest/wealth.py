@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from qfolio.report import palette
+from qfolio.report.backtest.data import BacktestData, shown_order
+from qfolio.report.backtest.looks import looks_of
+from qfolio.report.backtest.paths import across_seeds, median_drawdown, wealth_paths
 from qfolio.report.figures.style import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-from qfolio.report.backtest.data import BacktestData, shown_order
-from qfolio.report.backtest.payload import across_seeds, fall_below_peak, looks_of, wealth_paths
-
 
 def draw_wealth(data: BacktestData, width: float) -> Figure:
-    """Draw wealth on a log axis and the fall below its peak, in the light scheme."""
+    """Draw wealth on a log axis and the drawdown below it, in the light scheme."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentFormatter
 
     figure = new_figure(width, 5.4)
@@ -49,14 +49,14 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
         else:
             marker = {}
         handles += axes[0].plot(days, middle, **style, **marker, label=name)
-        axes[1].plot(days, -fall_below_peak(series), **{**style, "linewidth": 0.5 * look.width})
+        axes[1].plot(days, -median_drawdown(series), **{**style, "linewidth": 0.5 * look.width})
     axes[0].set_yscale("log")
     axes[0].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes[0].yaxis.set_major_formatter(FuncFormatter(lambda tick, _: f"{tick:g}"))
     axes[0].yaxis.set_minor_formatter(NullFormatter())
     axes[0].tick_params(axis="y", which="minor", length=0)
-    axes[0].set_title("Wealth, from 1 (log scale)")
-    axes[1].set_title("Below the peak so far")
+    axes[0].set_title("Wealth, starting at 1 (log scale)")
+    axes[1].set_title("Drawdown")
     axes[1].yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
     for panel in axes:
         panel.grid(axis="y")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qfolio.core.statistics import bootstrap_interval, interquartile_mean
+from qfolio.core.statistics import band, interquartile_mean
 from qfolio.report import palette
 from qfolio.report.data import (
     Curve,
@@ -119,7 +119,7 @@ def _draw_runs(
     kind: str | None = None,
     label: str | None = None,
 ) -> None:
-    """Draw runs of shape (P, S): a thin line per seed, the interquartile mean and its band."""
+    """Draw runs of shape (P, S): a thin line per seed, the interquartile mean, its band."""
     points, seeds = runs.shape
     marker = "o" if points == 1 else None
     if kind is not None:
@@ -129,7 +129,7 @@ def _draw_runs(
     if seeds > 1:
         alpha = max(0.1, min(0.35, 4 / seeds))
         axes.plot(episodes, runs, color=colour, linewidth=0.7, alpha=alpha, marker=marker)
-        low, high = bootstrap_interval(runs)
+        low, high = band(runs)
         axes.fill_between(episodes, low, high, color=colour, alpha=0.2, linewidth=0)
     middle = interquartile_mean(runs)
     # A single point must not vanish behind the edge or the legend.

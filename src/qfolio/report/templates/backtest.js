@@ -159,7 +159,7 @@
     return Plotly.react(chart,
       [...lines("wealth", data.dates, "y", true), ...lines("drawdown", data.dates, "y2", false)],
       layout(narrow.matches ? 480 : 590, {
-        titles: [["Wealth, from 1 (log scale)", 1], ["Below the peak so far", 0.26]],
+        titles: [["Wealth, starting at 1 (log scale)", 1], ["Drawdown", 0.26]],
         xaxis: { anchor: "y2" },
         yaxis: { type: "log", domain: [0.36, 1], tickvals: ticks, ticktext: ticks.map(tidy),
           range: [Math.log10(low / margin), Math.log10(high * margin)] },
@@ -176,7 +176,7 @@
       [...lines("cost", data.dates, "y", true), ...lines("turnover", data.months, "y2", false)],
       layout(narrow.matches ? 440 : 510, {
         titles: [["Share of the wealth lost to costs so far", 1],
-          [months ? "Traded in a month, share of the wealth" : "Traded, share of the wealth", 0.42]],
+          [months ? "Monthly turnover, over wealth" : "Turnover, over wealth", 0.42]],
         xaxis: { anchor: "y2" },
         yaxis: { domain: [0.56, 1], rangemode: "tozero", tickformat: ".0%", nticks: 5 },
         yaxis2: { domain: [0, 0.42], rangemode: "tozero", tickformat: ".0%", nticks: 5 },

@@ -1,67 +1,32 @@
-"""The numbers that the page's charts draw, few enough to be drawn at once."""
+"""The numbers behind the page's charts, thinned until a browser draws them at once."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qfolio.portfolio.backtest.measures import drawdown
 from qfolio.report import palette
-from qfolio.report.data import Floats
-
-if TYPE_CHECKING:
-    pass
-
 from qfolio.report.backtest.data import BacktestData, StrategySeries
+from qfolio.report.backtest.looks import SYMBOLS, Look
+from qfolio.report.backtest.paths import across_seeds, cost_share, median_drawdown, wealth_paths
+from qfolio.report.data import Floats
+from qfolio.report.rendering import number, percent
 
 POINTS = 1500
-"""Most points that a line of the page is drawn with; more days are thinned out evenly."""
+"""Most points of a line; longer tests are thinned evenly."""
 
 AREAS = 300
-"""Most points of the areas that show weights; each is the mean over some days in a row."""
+"""Most points of a chart of weights; each is a mean over consecutive days."""
 
 NAMED = 10
-"""How many assets the picture of a strategy's weights names; the others are taken together."""
-
-_DASHES = ("6 3", "2 2", "7 2 2 2", "9 3", "2 4", "7 2 2 2 2 2", "4 4")
-
-_SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "pentagon")
-
-
-@dataclass(frozen=True)
-class Look:
-    """How a strategy is drawn, in every figure alike: agents strong, baselines thin and grey."""
-
-    colour: str  # a key of palette.LIGHT and palette.DARK
-    width: float
-    dash: str  # lengths as in SVG; '' is solid
-    symbol: int | None  # place in _SYMBOLS; none for baselines
-
-
-def looks_of(names: list[str], data: BacktestData) -> dict[str, Look]:
-    looks, agents, others = {}, 0, 0
-    for name in names:
-        if data.strategies[name].kind == "agent":
-            dash = "" if agents < palette.AGENTS else "8 3"
-            colour = f"agent-{agents % palette.AGENTS + 1}"
-            looks[name] = Look(colour, 2.2, dash, agents % len(_SYMBOLS))
-            agents += 1
-        elif name == data.assessment.reference:
-            looks[name] = Look("muted", 1.5, "", None)
-        elif name == data.assessment.best_baseline:
-            looks[name] = Look("muted", 1.5, _DASHES[0], None)
-        else:
-            others += 1
-            looks[name] = Look("faint", 1.1, _DASHES[others % len(_DASHES)], None)
-    return looks
+"""How many assets a chart of weights names; the others are drawn as one."""
 
 
 def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> dict[str, Any]:
-    """Return the numbers of the charts, few enough to be drawn at once."""
+    """Return what the page's script draws, in the order of the names."""
     days = len(data.dates)
     # The last day of every stretch, and before them all the start.
     ends = np.arange(days - 1, -1, -days_per_point(days))[::-1]
@@ -77,7 +42,7 @@ def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> 
                 "colour": looks[name].colour,
                 "width": looks[name].width,
                 "dash": looks[name].dash,
-                "symbol": None if (place := looks[name].symbol) is None else _SYMBOLS[place],
+                "symbol": None if (place := looks[name].symbol) is None else SYMBOLS[place],
                 **_lines(data.strategies[name], ends, firsts),
             }
             for name in names
@@ -96,7 +61,7 @@ def _lines(
 ) -> dict[str, Any]:
     middle, low, high = (np.append(1, line[ends]) for line in across_seeds(wealth_paths(series)))
     # The deepest fall since the point before, so that thinning hides no trough.
-    deepest = np.maximum.reduceat(fall_below_peak(series), np.append(0, ends[:-1] + 1))
+    deepest = np.maximum.reduceat(median_drawdown(series), np.append(0, ends[:-1] + 1))
     several = len(series.returns) > 1
     return {
         "wealth": _compact(middle, positive=True),
@@ -104,7 +69,7 @@ def _lines(
         if several
         else None,
         "drawdown": _compact(np.append(0, -deepest)),
-        "cost": _compact(np.append(0, _paid(series)[ends])),
+        "cost": _compact(np.append(0, cost_share(series)[ends])),
         "turnover": _compact(np.add.reduceat(series.turnover.mean(axis=0), months)),
     }
 
@@ -141,26 +106,6 @@ def _areas(
     return result
 
 
-def wealth_paths(series: StrategySeries) -> Floats:
-    """Wealth after each day, from 1 at the start, of shape (seeds, days)."""
-    return np.cumprod(1 + series.returns, axis=1)
-
-
-def across_seeds(values: Floats) -> tuple[Floats, Floats, Floats]:
-    """The median, the least and the greatest over the seeds."""
-    return np.median(values, axis=0), values.min(axis=0), values.max(axis=0)
-
-
-def fall_below_peak(series: StrategySeries) -> Floats:
-    """How far the wealth lies below its peak so far: the median over the seeds, positive."""
-    return np.asarray(np.median(drawdown(series.returns), axis=0))
-
-
-def _paid(series: StrategySeries) -> Floats:
-    """By what share the costs so far have made the wealth smaller, the mean over the seeds."""
-    return np.asarray((1 - np.cumprod(1 - series.cost, axis=1)).mean(axis=0))
-
-
 def days_per_point(days: int) -> int:
     """How many days there are to a point of a line."""
     return math.ceil(days / POINTS)
@@ -181,3 +126,12 @@ def _compact(values: Floats, digits: int = 4, *, positive: bool = False) -> list
         else None
         for value in values.tolist()
     ]
+
+
+def latest_values(lines: dict[str, Any]) -> dict[str, str]:
+    """The values at the end, which the legends show until a pointer asks for others."""
+    wealth = lines["wealth"][-1] or 0
+    return {
+        "wealth": number(wealth, 0 if wealth >= 100 else 1 if wealth >= 10 else 2),
+        **{key: percent(lines[key][-1]) for key in ("drawdown", "cost", "turnover")},
+    }

@@ -1,0 +1,101 @@
+"""What may be said of a comparison, in sentences, and how its numbers are written."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from qfolio.experiments.comparison.ranking import HEADLINE
+
+
+def conclusion(ranking: dict[str, Any]) -> list[str]:
+    """What may be said of a ranking, in sentences, and no more than that."""
+    first, seeds = ranking["order"][0], ranking["seeds"]
+    each = f"with {seeds} seed{'s' if seeds > 1 else ''} each"
+    beaten = {
+        row["second"]: row["told_apart"] and row["probability"] > 0.5
+        for row in ranking["pairs"]
+        if row["first"] == first
+    }
+    valued = {name: f"{name} ({figure(ranking, name)})" for name in beaten}
+    tied = [valued[name] for name, worse in beaten.items() if not worse]
+    worse = [valued[name] for name, worse in beaten.items() if worse]
+    best = (
+        f"{first} ends nearest to the exact optimum: its regret is"
+        if ranking["measure"] == "regret"
+        else f"{first} ends with the highest return:"
+    )
+    sentence = f"{each.capitalize()} it can be told apart from {listed(worse)}." if worse else ""
+    if tied:
+        sentence = f"{each.capitalize()} it cannot be told apart from {listed(tied, 'or')}"
+        sentence += f"; {listed(worse)} do{'es' * (len(worse) == 1)} worse." if worse else "."
+    if seeds < ranking["seeds_needed"]:
+        count = len(ranking["order"])
+        none = f"no two of {count} agents can" if count > 2 else "two agents cannot"
+        sentence = (
+            f"{each.capitalize()} {none} be told apart, whatever they reach; it takes "
+            f"{ranking['seeds_needed']} seeds or more."
+        )
+    return [f"{best} {figure(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
+
+
+def figure(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
+    """An agent's final regret or return as text.
+
+    ``interval`` adds its 95 % interval, or the range of seeds too few for one.
+    """
+    write = share if ranking["measure"] == "regret" else amount
+    final = ranking["agents"][name]["final"]
+    text, values = write(final["iqm"]), final["per_seed"]
+    if interval and final["interval"] is not None:
+        text += f" (95 % interval {' to '.join(map(write, final['interval']))})"
+    elif interval and len(values) > 1:
+        text += f" ({len(values)} seeds, {write(min(values))} to {write(max(values))})"
+    return text
+
+
+def share(fraction: float) -> str:
+    """A fraction in percent, with the two digits that matter, down to a thousandth of a percent."""
+    size = abs(100 * fraction)
+    if size < 5e-4:
+        return "0 %"
+    digits = min(3, max(0, 1 - math.floor(math.log10(size))))
+    return f"{100 * fraction:,.{digits}f} %"
+
+
+def amount(value: float) -> str:
+    """A number with the four digits that matter."""
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    return f"{value:#.4g}" if abs(value) >= 1 else f"{value:.4g}"
+
+
+def span(seconds: float) -> str:
+    """Seconds as text, with the two digits that matter."""
+    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:,.0f} s"
+
+
+def listed(names: Sequence[str], word: str = "and") -> str:
+    """Names as a part of a sentence."""
+    return f" {word} ".join([*([", ".join(names[:-1])] if names[1:] else []), names[-1]])
+
+
+def _quickest(ranking: dict[str, Any]) -> str:
+    """Who comes near the optimum, or the best return, with the fewest steps and in least time."""
+    goal = "the optimum" if ranking["measure"] == "regret" else "the best return"
+    near = f"within {HEADLINE:.0%} of {goal}".replace("%", " %")
+    arrived = {
+        name: entry
+        for name in ranking["order"]
+        for entry in ranking["agents"][name]["within"]
+        if entry["threshold"] == HEADLINE and entry["steps"] is not None
+    }
+    if not arrived:
+        return f"No agent comes to stay {near}."
+    frugal = min(arrived, key=lambda name: arrived[name]["steps"])
+    quick = min(arrived, key=lambda name: arrived[name]["seconds"])
+    steps = f"{arrived[frugal]['steps']:,.0f}"
+    seconds = f"{span(arrived[quick]['seconds'])} a seed"
+    if len(arrived) == 1:
+        return f"Only {frugal} comes to stay {near}: after {steps} steps and {seconds}."
+    least = f"{quick} the least time" if quick != frugal else "the least time"
+    return f"To stay {near}, {frugal} needs the fewest steps ({steps}) and {least} ({seconds})."

@@ -1,0 +1,41 @@
+"""How a backtest's strategies are drawn, in every figure of its report alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from qfolio.report import palette
+from qfolio.report.backtest.data import BacktestData
+
+_DASHES = ("6 3", "2 2", "7 2 2 2", "9 3", "2 4", "7 2 2 2 2 2", "4 4")
+
+SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "pentagon")
+
+
+@dataclass(frozen=True)
+class Look:
+    """Agents and ensembles are strong and coloured, baselines thin and grey."""
+
+    colour: str  # a key of palette.LIGHT and palette.DARK
+    width: float
+    dash: str  # lengths as in SVG; '' is solid
+    symbol: int | None  # place in SYMBOLS; none for baselines
+
+
+def looks_of(names: list[str], data: BacktestData) -> dict[str, Look]:
+    """By strategy."""
+    looks, agents, others = {}, 0, 0
+    for name in names:
+        if data.strategies[name].kind != "baseline":
+            dash = "" if agents < palette.AGENTS else "8 3"
+            colour = f"agent-{agents % palette.AGENTS + 1}"
+            looks[name] = Look(colour, 2.2, dash, agents % len(SYMBOLS))
+            agents += 1
+        elif name == data.assessment.reference:
+            looks[name] = Look("muted", 1.5, "", None)
+        elif name == data.assessment.best_baseline:
+            looks[name] = Look("muted", 1.5, _DASHES[0], None)
+        else:
+            others += 1
+            looks[name] = Look("faint", 1.1, _DASHES[others % len(_DASHES)], None)
+    return looks

@@ -1,0 +1,27 @@
+"""Paths of a strategy over the days of the test, summarised over its seeds."""
+
+import numpy as np
+
+from qfolio.portfolio.backtest.measures import drawdown
+from qfolio.report.backtest.data import StrategySeries
+from qfolio.report.data import Floats
+
+
+def wealth_paths(series: StrategySeries) -> Floats:
+    """Wealth after each day, from 1 at the start, of shape (seeds, days)."""
+    return np.cumprod(1 + series.returns, axis=1)
+
+
+def across_seeds(values: Floats) -> tuple[Floats, Floats, Floats]:
+    """The median, the least and the greatest over the seeds."""
+    return np.median(values, axis=0), values.min(axis=0), values.max(axis=0)
+
+
+def median_drawdown(series: StrategySeries) -> Floats:
+    """Drawdown after each day, the median over the seeds; positive, of shape (days,)."""
+    return np.asarray(np.median(drawdown(series.returns), axis=0))
+
+
+def cost_share(series: StrategySeries) -> Floats:
+    """Share of the wealth that the costs so far have taken, the mean over the seeds, (days,)."""
+    return np.asarray((1 - np.cumprod(1 - series.cost, axis=1)).mean(axis=0))

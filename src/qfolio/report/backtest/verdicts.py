@@ -1,0 +1,70 @@
+"""The verdicts at the head of the page, and their intervals on a common axis."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from qfolio.portfolio.backtest.differences import Difference
+from qfolio.portfolio.backtest.verdict import evidence, finding, tested
+from qfolio.report.backtest.data import BacktestData
+from qfolio.report.rendering import percent
+
+
+def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
+    """Return each agent's verdicts, and where on a common axis (in %) their intervals lie."""
+    test = data.assessment
+    agents = [
+        (name, tested(test.strategies[name]))
+        for name in names
+        if test.strategies[name].kind != "baseline"
+    ]
+    ends = [
+        end
+        for _, differences in agents
+        for each in differences
+        for end in (each.growth, *each.growth_interval)
+        if math.isfinite(end)
+    ]
+    low, high = min(ends, default=0.0), max(ends, default=0.0)
+    ticks = _ticks(min(low, 0), max(high, 0))
+    low, high = min(low, ticks[0]), max(high, ticks[-1])
+    margin = 0.04 * (high - low) or 1.0  # any, where there is nothing to show
+
+    def place(value: float) -> float:
+        share = (value - low + margin) / (high - low + 2 * margin)
+        return round(100 * min(max(share, 0.0), 1.0), 2)
+
+    def row(name: str, each: Difference) -> dict[str, Any]:
+        left, right = (place(end) for end in each.growth_interval)
+        known = not any(map(math.isnan, (each.growth, *each.growth_interval)))
+        return {
+            "finding": finding(name, each),
+            "numbers": f"the difference in annual growth is {evidence(each, test)}.",
+            "span": (left, round(right - left, 2), place(each.growth)) if known else None,
+            "label": f"{percent(each.growth, sign=True)}, 95 % interval "
+            + " to ".join(percent(end, sign=True) for end in each.growth_interval),
+        }
+
+    return {
+        "agents": [
+            (name, [row(name, each) for each in differences]) for name, differences in agents
+        ],
+        "ticks": [(percent(tick, _digits(ticks), sign=True), place(tick)) for tick in ticks],
+        "zero": place(0),
+    }
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round numbers around an interval that contains zero, at most six."""
+    width = max(high - low, 1e-4)
+    power = 10 ** math.floor(math.log10(width))
+    step = next(k * power for k in (0.2, 0.5, 1, 2, 5, 10) if width / (k * power) <= 4)
+    return [k * step for k in range(math.ceil(low / step - 0.5), math.floor(high / step + 0.5) + 1)]
+
+
+def _digits(ticks: list[float]) -> int:
+    """How many decimals tell these fractions apart as percentages."""
+    return next(
+        (d for d in range(5) if all(abs(100 * t - round(100 * t, d)) < 1e-9 for t in ticks)), 5
+    )

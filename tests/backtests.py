@@ -1,0 +1,142 @@
+"""Made-up backtests to report, one of them hostile, and a page read as text."""
+
+import json
+from dataclasses import replace
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+
+from qfolio.portfolio.backtest.assessment import Strategy, assess
+from qfolio.report.backtest.data import BacktestData, StrategySeries
+
+ATTACK = "</script><script>hacked = 1</script><img src=x onerror='hacked = 1'>"
+LINK = "<a href=\"javascript:hacked = 1\">%{x}</a> & 'quotes' $x^2$"
+
+
+def make_series(
+    rng: np.random.Generator, kind: str, seeds: int, days: int, assets: int, drift: float
+) -> StrategySeries:
+    weights = rng.dirichlet(np.ones(assets + 1), size=days)
+    turnover = rng.uniform(0, 0.1, (seeds, days))
+    returns = drift + 0.01 * rng.normal(size=(seeds, days))
+    return StrategySeries(kind, returns, turnover, 0.001 * turnover, weights)
+
+
+def make_data(
+    strategies: dict[str, StrategySeries], dates: np.ndarray, assets: tuple[str, ...], **more: Any
+) -> BacktestData:
+    first, last = (str(dates[i].astype("datetime64[D]")) for i in (0, -1))
+    data = BacktestData(
+        title="A backtest",
+        command="qfolio backtest --seeds 3",
+        assessment=assess(
+            {
+                name: Strategy(series.kind, series.returns, series.turnover, series.cost)
+                for name, series in strategies.items()
+            },
+            dates,
+            periods_per_year=252,
+            resamples=400,
+            earlier_trials=5,
+        ),
+        dates=dates,
+        assets=assets,
+        strategies=strategies,
+        prices={
+            "source": "made up",
+            "rows": 1234,
+            "assets": len(assets),
+            "first": "1999-01-04",
+            "last": last,
+            "note": "These assets are survivors.",
+            "digest": "sha256:0123456789",
+        },
+        config={
+            "cost": 0.0025,
+            "lag": 1,
+            "train": "2y",
+            "test": "6m",
+            "expanding": False,
+            "cap": 0.3,
+            "agents": {"DQN": {"settings": {"discount": 0.98}}},
+        },
+        folds=[
+            {
+                "name": first,
+                "train_first": "1999-01-04",
+                "train_last": str(dates[0].astype("datetime64[D]") - 2),
+                "test_first": first,
+                "test_last": last,
+            }
+        ],
+        notes=[],
+    )
+    return replace(data, **more)
+
+
+def weekdays(start: str, count: int) -> np.ndarray:
+    return np.busday_offset(start, np.arange(count), roll="forward").astype("datetime64[s]")
+
+
+def usual(days: int = 300, seeds: int = 3, **more: Any) -> BacktestData:
+    rng = np.random.default_rng(3)
+    series = {
+        "equal weight": make_series(rng, "baseline", 1, days, 4, 0.0003),
+        "best of all": make_series(rng, "baseline", 1, days, 4, 0.003),
+        "third": make_series(rng, "baseline", 1, days, 4, -0.001),
+        "DQN": make_series(rng, "agent", seeds, days, 4, 0.0005),
+        "DQN-together": make_series(rng, "ensemble", 1, days, 4, 0.0005),
+        "pathwise": make_series(rng, "agent", seeds, days, 4, 0.02),
+    }
+    return make_data(series, weekdays("2001-01-02", days), ("A", "B", "C", "D"), **more)
+
+
+def hostile() -> BacktestData:
+    """Every text that a user can choose tries to inject markup."""
+    data = usual(60)
+    names = {"DQN": f"DQN {ATTACK}", "third": LINK}
+    strategies = {names.get(name, name): series for name, series in data.strategies.items()}
+    return make_data(
+        strategies,
+        data.dates,
+        (ATTACK, LINK, "C", "\u2028</SCRIPT>"),
+        title=f"Title {ATTACK}",
+        command=f"qfolio {ATTACK}",
+        notes=[f"Note {ATTACK}", LINK],
+        prices={**data.prices, "source": ATTACK, "note": ATTACK, "digest": ATTACK},
+        config={**data.config, "train": ATTACK, ATTACK: {ATTACK: [ATTACK]}},
+        folds=[{**data.folds[0], "name": ATTACK}],
+    )
+
+
+class Page(HTMLParser):
+    """The start tags of a page, its visible text, and the contents of its scripts."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.scripts: list[str] = []
+        self.words: list[str] = []
+        self._open = ""
+        self.feed(page)
+        self.text = " ".join("".join(self.words).split())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self._open = tag
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self._open = ""
+
+    def handle_data(self, data: str) -> None:
+        if self._open == "script":
+            self.scripts[-1] += data
+        elif self._open != "style":
+            self.words.append(data)
+
+    @property
+    def data(self) -> Any:
+        return json.loads(self.scripts[0])

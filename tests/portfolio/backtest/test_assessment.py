@@ -1,0 +1,221 @@
+"""The statistics of a whole backtest, from made-up track records."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.assessment import Strategy, assess
+from qfolio.portfolio.backtest.bootstrap import block_length
+from qfolio.portfolio.backtest.measures import MEASURES, measures
+from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe, probabilistic_sharpe
+
+from records import days, strategy
+
+
+def test_assess_by_hand_on_one_block() -> None:
+    rng = np.random.default_rng(9)
+    weak, strong, agent = (
+        strategy(rng, "baseline", 1), strategy(rng, "baseline", 1), strategy(rng, seeds=5),
+    )  # fmt: skip
+    strong = strong._replace(returns=np.asarray(strong.returns) + 0.01)
+    everything = {"equal weight": weak, "strong": strong, "dqn": agent}
+    result = assess(everything, days(300), periods_per_year=252, earlier_trials=2)
+    table = measures(agent.returns, agent.turnover, agent.cost, 252)
+    dqn = result.strategies["dqn"]
+    assert result.best_baseline == "strong"
+    assert (result.first_date, result.last_date) == ("2001-01-01", "2001-10-27")
+    assert result.trials == 5 + 2
+    assert result.earlier_trials == 2
+    for name in MEASURES:
+        measure = dqn.measures[name]
+        assert measure.per_seed == tuple(table[name])
+        assert measure.mean == pytest.approx(table[name].mean())
+        assert measure.over_seeds is not None
+        margin = 2.776445 * table[name].std(ddof=1) / math.sqrt(5)  # t of 4 degrees of freedom
+        assert measure.over_seeds[1] - measure.mean == pytest.approx(margin, rel=1e-5)
+        assert result.strategies["strong"].measures[name].over_seeds is None
+        assert measure.over_time[0] < measure.over_time[1]
+
+    baseline = measures(weak.returns, weak.turnover, weak.cost, 252)
+    difference = dqn.to_reference
+    assert difference is not None
+    assert difference.growth == pytest.approx(
+        np.log1p(table["growth"]).mean() - np.log1p(baseline["growth"][0])
+    )
+    assert difference.sharpe == pytest.approx(table["sharpe"].mean() - baseline["sharpe"][0])
+    assert difference.growth_interval[0] < difference.growth < difference.growth_interval[1]
+    assert difference.finding == "none"
+    best = dqn.to_best_baseline
+    assert best is not None
+    assert best.finding == "worse"
+    assert result.strategies["strong"].to_best_baseline is None
+    assert result.strategies["equal weight"].to_reference is None
+
+    variance = max(np.var(table["sharpe"], ddof=1) / 252, 1 / 299)
+    test = dqn.sharpe_test
+    threshold = expected_maximum_sharpe(7, variance)
+    assert test.threshold == pytest.approx(threshold * math.sqrt(252))
+    sharpe = table["sharpe"].mean() / math.sqrt(252)
+    assert test.deflated == pytest.approx(
+        probabilistic_sharpe(sharpe, 300, test.skewness, test.kurtosis, threshold)
+    )
+    assert test.deflated < test.probabilistic
+    alone = result.strategies["equal weight"].sharpe_test
+    assert alone.deflated == alone.probabilistic  # nobody picked it from anything
+
+
+def test_skewness_and_kurtosis_by_hand() -> None:
+    # One day of +3 among three of −1: variance 3, third moment 6, fourth 21.
+    returns = np.tile([[0.03, -0.01, -0.01, -0.01]], 5)
+    zeros = np.zeros((1, 20))
+    result = assess(
+        {"equal weight": ("baseline", returns, zeros, zeros)}, days(20), periods_per_year=252,
+        resamples=10,
+    )  # fmt: skip
+    test = result.strategies["equal weight"].sharpe_test
+    assert test.skewness == pytest.approx(6 / 3**1.5)
+    assert test.kurtosis == pytest.approx(21 / 9)
+
+
+def test_order_of_seeds_changes_nothing() -> None:
+    rng = np.random.default_rng(10)
+    base, agent = strategy(rng, "baseline", 1), strategy(rng, seeds=5)
+    order = [3, 0, 4, 2, 1]
+    shuffled = Strategy("agent", *(np.asarray(values)[order] for values in agent[1:]))
+    first, second = (
+        assess({"equal weight": base, "dqn": entry}, days(300), periods_per_year=252)
+        for entry in (agent, shuffled)
+    )
+    for name, measure in first.strategies["dqn"].measures.items():
+        other = second.strategies["dqn"].measures[name]
+        assert [measure.per_seed[seed] for seed in order] == list(other.per_seed)
+        assert measure == dataclasses.replace(other, per_seed=measure.per_seed)
+    for field in ("to_reference", "to_best_baseline", "sharpe_test"):
+        assert getattr(first.strategies["dqn"], field) == getattr(second.strategies["dqn"], field)
+
+
+def test_block_length_listens_to_the_size_of_moves() -> None:
+    # Calm and wild months in turn: no return tells the next, but its size does.
+    rng = np.random.default_rng(14)
+    size = np.repeat(np.exp(rng.normal(0, 1, 60)), 20)
+    returns = 0.01 * (size * rng.choice([-1, 1], 1200))[None]
+    zeros = np.zeros_like(returns)
+    entry = ("baseline", returns, zeros, zeros)
+    result = assess({"equal weight": entry}, days(1200), periods_per_year=252, resamples=10)
+    assert result.block_length > 15 > 2 * block_length(returns[0])
+
+
+def test_many_trials_raise_the_threshold_however_alike_the_seeds_are() -> None:
+    """Seeds of one agent hardly differ; a thousand other trials could still be lucky."""
+    rng = np.random.default_rng(3)
+    one = strategy(rng, seeds=1)
+    alike = one._replace(
+        returns=np.asarray(one.returns) + rng.normal(0, 1e-6, (5, 300)),
+        turnover=np.repeat(one.turnover, 5, 0),
+        cost=np.repeat(one.cost, 5, 0),
+    )
+    strategies = {"equal weight": strategy(rng, "baseline", 1), "dqn": alike}
+    result = assess(strategies, days(300), periods_per_year=252, earlier_trials=1000)
+    threshold = result.strategies["dqn"].sharpe_test.threshold
+    assert threshold == pytest.approx(math.sqrt(252) * expected_maximum_sharpe(1005, 1 / 299))
+    assert threshold > 2
+
+
+def test_trials_without_a_known_spread() -> None:
+    rng = np.random.default_rng(15)
+    strategies = {"equal weight": strategy(rng, "baseline", 1), "dqn": strategy(rng, seeds=1)}
+    result = assess(strategies, days(300), periods_per_year=252, earlier_trials=9)
+    threshold = result.strategies["dqn"].sharpe_test.threshold
+    assert threshold == pytest.approx(math.sqrt(252) * expected_maximum_sharpe(10, 1 / 299))
+    result = assess(strategies, days(300), periods_per_year=252)
+    assert result.trials == 1
+    assert result.strategies["dqn"].sharpe_test.threshold == 0
+
+
+def test_json_of_the_worst() -> None:
+    # A total loss, cash, and gains without any risk: nothing infinite reaches the file.
+    zeros, gains = np.zeros((2, 30)), np.full((2, 30), 0.01)
+    ruin = np.full((2, 30), 0.01)
+    ruin[:, 3] = -1
+    mixed = np.stack([gains[0], -gains[0]])
+    strategies = {
+        "equal weight": ("baseline", ruin[:1], zeros[:1], zeros[:1]),
+        "cash": ("baseline", zeros[:1], zeros[:1], zeros[:1]),
+        "ruin": ("agent", ruin, zeros, zeros),
+        "gains": ("agent", gains, zeros, zeros),
+        "mixed": ("agent", mixed, zeros, zeros),
+    }
+    result = assess(strategies, days(30), periods_per_year=252)
+    content = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    ruined = content["strategies"]["ruin"]
+    assert ruined["measures"]["growth"]["mean"] == -1
+    assert content["strategies"]["gains"]["measures"]["sharpe"]["mean"] is None
+    assert content["strategies"]["mixed"]["measures"]["sharpe"]["mean"] is None
+    assert content["strategies"]["cash"]["measures"]["sharpe"]["over_time"] == [0, 0]
+    assert content["best_baseline"] == "cash"
+    assert ruined["to_best_baseline"]["growth"] is None  # −∞
+    assert result.strategies["ruin"].to_best_baseline is not None
+    assert result.strategies["ruin"].to_reference is not None
+    assert ruined["to_reference"]["growth"] == 0  # both lost everything
+    assert ruined["to_reference"]["growth_interval"] == [0, 0]  # on whichever days, together
+    assert ruined["to_best_baseline"]["growth_interval"][0] is None
+
+
+def test_assess_is_repeatable_and_its_seed_counts() -> None:
+    rng = np.random.default_rng(16)
+    strategies = {"equal weight": strategy(rng, "baseline", 1), "dqn": strategy(rng)}
+    first, second, third = (
+        assess(strategies, days(300), periods_per_year=252, resamples=200, seed=seed)
+        for seed in (0, 0, 1)
+    )
+    assert first == second != third
+    assert first.to_json()["strategies"]["dqn"]["seeds"] == 3
+
+
+def test_few_seeds_have_no_interval() -> None:
+    """Student's interval of three seeds says nothing: it spans more than their whole range."""
+    rng = np.random.default_rng(9)
+    base = strategy(rng, "baseline", 1)
+    entries = {"equal weight": base, "four": strategy(rng, seeds=4), "five": strategy(rng, seeds=5)}
+    result = assess(entries, days(300), periods_per_year=252, resamples=10)
+    assert result.strategies["four"].measures["growth"].over_seeds is None
+    assert len(result.strategies["four"].measures["growth"].per_seed) == 4
+    assert result.strategies["five"].measures["growth"].over_seeds is not None
+
+
+def refusals() -> list[tuple[dict[str, object], dict[str, object], str]]:
+    good = ("baseline", np.zeros((1, 4)), np.zeros((1, 4)), np.zeros((1, 4)))
+    flat = ("agent", np.zeros(4), np.zeros(4), np.zeros(4))
+    long = ("agent", np.zeros((1, 5)), np.zeros((1, 5)), np.zeros((1, 5)))
+    short = ("baseline", np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)))
+    holes = ("agent", np.full((1, 4), np.nan), np.zeros((1, 4)), np.zeros((1, 4)))
+    return [
+        ({}, {}, "there are: none"),
+        ({"hold": good}, {}, "'equal weight' is not among the baselines.*there are: hold"),
+        ({"equal weight": ("agent", *good[1:])}, {}, "not among the baselines"),
+        (
+            {"equal weight": good, "dqn": ("robot", *good[1:])},
+            {},
+            "dqn is of kind 'robot'; it must be agent or ensemble or baseline",
+        ),
+        ({"equal weight": good, "dqn": flat}, {}, r"dqn have the shape \(4,\)"),
+        ({"equal weight": good, "dqn": long}, {}, "same periods.*equal weight 4, dqn 5"),
+        ({"equal weight": good, "dqn": holes}, {}, "returns of dqn hold missing"),
+        ({"equal weight": good}, {"dates": days(3)}, "4 returns and dates of shape"),
+        ({"equal weight": good}, {"dates": days(4)[::-1]}, "increase"),
+        ({"equal weight": good}, {"resamples": 0}, "one resample"),
+        ({"equal weight": good}, {"periods_per_year": 0.0}, "positive number of periods"),
+        ({"equal weight": short}, {"dates": days(1)}, "two periods"),
+    ]
+
+
+@pytest.mark.parametrize(("strategies", "options", "message"), refusals())
+def test_assess_refuses(
+    strategies: dict[str, object], options: dict[str, object], message: str
+) -> None:
+    with pytest.raises(QfolioError, match=message):
+        assess(strategies, **{"dates": days(4), "periods_per_year": 252.0} | options)  # type: ignore[arg-type]

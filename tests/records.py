@@ -1,0 +1,20 @@
+"""Made-up track records of strategies, for tests of a backtest's statistics."""
+
+import numpy as np
+
+from qfolio.portfolio.backtest.assessment import Strategy
+
+
+def days(count: int) -> np.ndarray:
+    return np.datetime64("2001-01-01") + np.arange(count)
+
+
+def strategy(
+    rng: np.random.Generator, kind: str = "agent", seeds: int = 3, count: int = 300
+) -> Strategy:
+    return Strategy(
+        kind,
+        0.0005 + 0.01 * rng.standard_normal((seeds, count)),
+        rng.random((seeds, count)) / 10,
+        rng.random((seeds, count)) / 1000,
+    )

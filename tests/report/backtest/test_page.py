@@ -1,0 +1,157 @@
+"""What the page of a backtest says, from made-up track records."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.verdict import verdicts
+from qfolio.report.backtest.data import BacktestData, StrategySeries
+from qfolio.report.backtest.page import render_backtest
+from qfolio.report.rendering import percent
+
+from backtests import Page, make_data, usual
+
+
+def plain(text: str) -> str:
+    return " ".join(text.split())
+
+
+def test_leads_with_the_verdicts_and_says_no_more(data: BacktestData, page: Page) -> None:
+    said = verdicts(data.assessment)
+    assert list(said) == ["DQN", "DQN-together", "pathwise"]
+    places = [page.text.index(plain(each)) for name in said for each in said[name]]
+    assert places == sorted(places)
+    assert places[-1] < page.text.index("Mind the data") < page.text.index("Cumulative wealth")
+    # Each claim is made once, and only the one that the interval allows.
+    assert page.text.count("after costs:") == 6
+    assert "No evidence that DQN beats equal weight after costs" in page.text
+    assert "pathwise beats best of all after costs" in page.text
+
+
+def test_says_what_the_test_is(page: Page) -> None:
+    for sentence in (
+        "made up: 4 assets, 1 234 rows from 1999-01-04",
+        "The test covers 300 days, from 2001-01-02 to",
+        "These assets are survivors.",
+        "25 bp of the value of every purchase and every sale",
+        "is carried out at the close of the next day",
+        "1, walk-forward: training on a rolling window of 2y, then a test of 6m",
+        "12: 2 agents × 3 seeds, 1 ensemble, and 5 earlier trials on these prices.",
+        "after Holm’s correction for 6 comparisons",
+        "no order gives an asset more than 30.0 %",
+        "Market impact",
+        "Taxes.",
+        "cash earns nothing",
+        "intervals of volatility and drawdown are too narrow",
+        "qfolio backtest --seeds 3",
+        "DQN.settings.discount",
+        "400 resampled histories",
+    ):
+        assert sentence in page.text, sentence
+    assert "Exceptions" not in page.text
+
+
+def test_table_has_every_figure_with_its_intervals(data: BacktestData) -> None:
+    page = render_backtest(data)
+    table = page.split('aria-label="Table of statistics"')[1].split("</table>")[0]
+    rows = re.findall(r"<tr class=\"(\w+)[^>]*><th[^>]*>(.*?)</th>(.*?)</tr>", table)
+    assert [(kind, name) for kind, name, _ in rows] == [
+        ("agent", "DQN"),
+        ("agent", "DQN-together"),
+        ("agent", "pathwise"),
+        ("baseline", "equal weight"),
+        ("baseline", "best of all"),
+        ("baseline", "third"),
+    ]
+    sharpe = data.assessment.strategies["DQN"].measures["sharpe"]
+    assert sharpe.over_seeds is None  # of three
+    cell = rows[0][2].split("<td>")[3].replace("\N{MINUS SIGN}", "-").replace("\u202f", "")
+    low, high = sharpe.over_time
+    left, right = min(sharpe.per_seed), max(sharpe.per_seed)
+    assert cell.startswith(f"{sharpe.mean:.2f}<small>{low:.2f} … {high:.2f}</small>")
+    assert f'<small class="seeds">{left:.2f} … {right:.2f}</small>' in cell
+    assert "seeds" not in rows[3][2]
+    assert "the range over seeds, which are too few for an interval" in Page(page).text
+    assert all(row.count("<td>") == 8 for _, _, row in rows)
+
+
+def test_five_seeds_have_intervals() -> None:
+    data = usual(days=30, seeds=5)
+    growth = data.assessment.strategies["DQN"].measures["growth"]
+    assert growth.over_seeds is not None
+    page = render_backtest(data)
+    ends = " … ".join(percent(end) for end in growth.over_seeds)
+    assert f'<small class="seeds">{ends}</small>' in page
+    assert "its interval over seeds" in Page(page).text
+
+
+def test_only_the_corrected_verdict_is_marked() -> None:
+    data = usual()
+    entry = data.assessment.strategies["DQN"]
+    assert entry.to_reference is not None
+    near = replace(
+        entry.to_reference, growth=0.01, growth_interval=(0.00004, 0.02), finding="better"
+    )
+    none = replace(near, finding="none")
+
+    def first_cell(difference: Any) -> str:
+        strategies = {**data.assessment.strategies, "DQN": replace(entry, to_reference=difference)}
+        changed = replace(data, assessment=replace(data.assessment, strategies=strategies))
+        table = render_backtest(changed).split('aria-label="Table of differences"')[1]
+        return table.split("<td", 2)[1]
+
+    assert first_cell(near).startswith(' class="higher">▲ +1.0')
+    assert "+0.004\u202f% … +2.0\u202f%" in first_cell(near)
+    assert first_cell(none).startswith(' class="">+1.0')
+
+
+def test_months_are_compounded() -> None:
+    days = np.array(["2020-11-30", "2020-12-01", "2020-12-02", "2021-01-04"], "datetime64[s]")
+    returns = np.array([[0.1, 0.1, 0.1, -0.5]])
+    still = np.zeros((1, 4))
+    weights = np.tile([0.0, 1.0], (4, 1))
+    series = {"equal weight": StrategySeries("baseline", returns, still, still, weights)}
+    page = render_backtest(make_data(series, days, ("A",)))
+    table = page.split('data-months="0"')[1].split("</table>")[0].replace("\N{MINUS SIGN}", "-")
+    rows = re.findall(r"<th scope=\"row\">(\d+)</th>(.*?)</tr>", table)
+    cells = {year: re.findall(r"<td[^>]*>(.*?)</td>", row) for year, row in rows}
+    assert cells["2020"] == [""] * 10 + ["10.0", "21.0", "33.1"]
+    assert cells["2021"] == ["-50.0"] + [""] * 11 + ["-50.0"]
+    assert "No agent was tested" in page
+
+
+def test_total_loss_one_seed_and_the_shortest_test() -> None:
+    data = usual(days=2, seeds=1)
+    ruined = replace(data.strategies["DQN"], returns=np.array([[0.1, -1.0]]))
+    strategies = {**data.strategies, "DQN": ruined}
+    page = Page(render_backtest(make_data(strategies, data.dates, data.assets)))
+    dqn = page.data["strategies"][0]
+    assert dqn["wealth"] == [1, 1.1, None]
+    assert dqn["band"] is None
+    assert "nan" not in "".join(page.words).lower()
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    data = usual(20)
+    fewer = {name: s for name, s in data.strategies.items() if name != "third"}
+    with pytest.raises(QfolioError, match="other strategies"):
+        render_backtest(replace(data, strategies=fewer))
+    with pytest.raises(QfolioError, match="do not fit 20 dates and 3 assets"):
+        render_backtest(replace(data, assets=("A", "B", "C")))
+
+
+def test_picture(folder: Path) -> None:
+    assert {path.name for path in folder.iterdir()} == {"report.html", "wealth.png"}
+    with Image.open(folder / "wealth.png") as image:
+        assert image.width > 1000
+        assert image.convert("RGB").getpixel((0, 0)) == (255, 255, 255)
+
+
+def test_page_is_repeatable(data: BacktestData) -> None:
+    assert render_backtest(data) == render_backtest(data)
