@@ -1,10 +1,10 @@
-"""Tasks and agents by name: qfolio's, those of installed packages, and a user's own.
+"""Tasks, agents and baselines by name: qfolio's, those of installed packages, and a user's own.
 
 A user's own class is named ``module:Name``; the module may lie in the current directory. An
-installed package offers its classes as entry points in the groups ``qfolio.tasks`` and
-``qfolio.agents``. What a person types is imported (``find``). A folder keeps the names, too, but a
-file may come from a stranger: only modules that have been imported already count there
-(``imported``, ``build``).
+installed package offers its classes as entry points in the groups ``qfolio.tasks``,
+``qfolio.agents`` and ``qfolio.baselines``. What a person types is imported (``find``). A folder
+keeps the names, too, but a file may come from a stranger: only modules that have been imported
+already count there (``imported``, ``build``).
 """
 
 import difflib
@@ -51,8 +51,17 @@ AGENTS = {
     "a2c": "qfolio.agents.a2c:A2C",
     "ppo": "qfolio.agents.ppo:PPO",
 }
+BASELINES = {
+    "equal-weight": "qfolio.portfolio.backtest.baselines:EqualWeight",
+    "buy-and-hold": "qfolio.portfolio.backtest.baselines:BuyAndHold",
+    "inverse-volatility": "qfolio.portfolio.backtest.baselines:InverseVolatility",
+    "minimum-variance": "qfolio.portfolio.backtest.baselines:MinimumVariance",
+    "maximum-ratio": "qfolio.portfolio.backtest.baselines:MaximumRatio",
+    "risk-budgeting": "qfolio.portfolio.backtest.baselines:RiskBudgeting",
+    "hierarchical-risk-parity": "qfolio.portfolio.backtest.baselines:HierarchicalRiskParity",
+}
 
-Kind = Literal["task", "agent"]
+Kind = Literal["task", "agent", "baseline"]
 
 
 class Entries(NamedTuple):
@@ -70,6 +79,7 @@ class Entries(NamedTuple):
 ENTRIES: dict[Kind, Entries] = {
     "task": Entries(TASKS, "qfolio.core.mdp:Task"),
     "agent": Entries(AGENTS, "qfolio.core.mdp:Agent"),
+    "baseline": Entries(BASELINES, "qfolio.portfolio.backtest.baselines:Baseline"),
 }
 
 GYM = "gym:"

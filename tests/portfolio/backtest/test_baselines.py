@@ -1,6 +1,9 @@
 """Classical allocators: what they decide, that they see no future, and what they earned."""
 
+import sys
+from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -9,10 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.baselines import BASELINES, decisions, weights
+from qfolio.core.registry import BASELINES
+from qfolio.portfolio.backtest.baselines import Baseline, Fitted, History, baseline
+from qfolio.portfolio.backtest.orders import Orders, orders
 from qfolio.portfolio.backtest.simulation import simulate
 
-FITTED = [name for name, make in BASELINES.items() if make]
+FITTED = [name for name in BASELINES if isinstance(baseline(name), Fitted)]
 
 
 class Fold(NamedTuple):
@@ -34,12 +39,44 @@ def prices(rows: int = 90, assets: int = 4) -> np.ndarray:
     return np.exp((generator.normal(size=(rows, assets)) * scales + scales / 5).cumsum(0))
 
 
+def days(rows: int) -> np.ndarray:
+    return np.datetime64("2020-01-01") + np.arange(rows)
+
+
+def ask(
+    one: str | Baseline, folds: Sequence[Fold], values: np.ndarray, **options: object
+) -> Orders:
+    name, made = (one, baseline(one)) if isinstance(one, str) else ("own", one)
+    return orders(name, made, folds, days(len(values)), values, **options)  # type: ignore[arg-type]
+
+
+def decisions(
+    name: str, folds: Sequence[Fold], values: np.ndarray, **options: object
+) -> np.ndarray:
+    return ask(name, folds, values, **options).decisions
+
+
+def weights(name: str, returns: np.ndarray, cap: float = 1.0) -> np.ndarray:
+    """Of the assets, fitted to returns."""
+    return fitted(
+        name, np.concatenate([np.ones((1, returns.shape[1])), 1 + returns]).cumprod(0), cap
+    )
+
+
+def fitted(name: str, prices: np.ndarray, cap: float = 1.0) -> np.ndarray:
+    rows, assets = prices.shape
+    history = History(days(rows), prices, slice(0, rows), np.ones(assets, bool), cap)
+    found = baseline(name).decide(history, np.eye(assets + 1)[0])
+    assert found is not None
+    return found[1:]
+
+
 FOLDS = walk(90, train=40, test=15)
 
 
 @cache
 def decided(name: str) -> np.ndarray:
-    return decisions(name, FOLDS, prices()).decisions
+    return decisions(name, FOLDS, prices())
 
 
 @pytest.mark.parametrize("name", FITTED)
@@ -51,8 +88,7 @@ def test_fits_each_fold_to_its_own_training(name: str) -> None:
     assert (rows[:, 0] == 0).all()
     assert (rows.reshape(3, 15, 5) == rows[::15][:, None]).all()
     assert (rows[0] != rows[15]).any()
-    training = prices()[15:56]
-    np.testing.assert_array_equal(rows[15, 1:], weights(name, training[1:] / training[:-1] - 1)[0])
+    np.testing.assert_array_equal(rows[15, 1:], fitted(name, prices()[15:56]))
 
 
 def test_what_allocators_mean() -> None:
@@ -69,9 +105,8 @@ def test_what_allocators_mean() -> None:
         "minimum-variance": [16, 4, 1],
         "maximum-ratio": [16, 16, 4],
     }.items():
-        found, notes = weights(name, returns)
-        np.testing.assert_allclose(found, np.array(expected) / sum(expected), atol=2e-3)
-        assert notes == ()
+        wanted = np.array(expected) / sum(expected)
+        np.testing.assert_allclose(weights(name, returns), wanted, atol=2e-3)
 
 
 def test_equal_weight_and_buy_and_hold() -> None:
@@ -91,7 +126,7 @@ def test_no_later_price_changes_a_decision(name: str, row: int, seed: int) -> No
     later = changed[row + 1 :]
     later *= np.random.default_rng(seed).lognormal(size=later.shape)
     # Whatever is decided at or before the row sees prices up to the row.
-    found = decisions(name, [f for f in FOLDS if f.decisions.start <= row], changed).decisions
+    found = decisions(name, [f for f in FOLDS if f.decisions.start <= row], changed)
     np.testing.assert_array_equal(found, decided(name)[: len(found)])
 
 
@@ -99,18 +134,18 @@ def test_no_later_price_changes_a_decision(name: str, row: int, seed: int) -> No
 def test_fits_see_their_training(name: str) -> None:
     changed = prices()
     changed[20:40, 0] *= np.random.default_rng(0).lognormal(sigma=0.2, size=20)
-    assert (decisions(name, FOLDS[:1], changed).decisions[0] != decided(name)[0]).any()
+    assert (decisions(name, FOLDS[:1], changed)[0] != decided(name)[0]).any()
 
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_cap(name: str) -> None:
-    found = decisions(name, FOLDS[:1], prices(), cap=0.3).decisions[0]
+    found = decisions(name, FOLDS[:1], prices(), cap=0.3)[0]
     assert (found[1:] <= 0.3 + 1e-12).all()
     assert found.sum() == pytest.approx(1)
     assert found[0] == 0
     if name in ("inverse-volatility", "minimum-variance"):
         assert found[1] == pytest.approx(0.3)  # would like more: the calmest
-    tight = decisions(name, FOLDS[:1], prices(), cap=0.2).decisions[0]
+    tight = decisions(name, FOLDS[:1], prices(), cap=0.2)[0]
     np.testing.assert_allclose(tight, 0.2)  # in cash, too
 
 
@@ -119,15 +154,15 @@ def test_cap_keeps_proportions() -> None:
     returns = np.linalg.qr(generator.normal(size=(500, 4)))[0]
     returns /= returns.std(0, ddof=1) * np.array([60, 25, 10, 5])  # weights .6, .25, .1, .05
     np.testing.assert_allclose(
-        weights("inverse-volatility", returns)[0], [0.6, 0.25, 0.1, 0.05], rtol=1e-6
+        weights("inverse-volatility", returns), [0.6, 0.25, 0.1, 0.05], rtol=1e-6
     )
     # The first is cut to .4; the other .6 go to .25, .1 and .05 as .375, .15 and .075. With a cap
     # of .35 the second would have .40625 and is cut, too; .3 are left for .1 and .05.
     np.testing.assert_allclose(
-        weights("inverse-volatility", returns, cap=0.4)[0], [0.4, 0.375, 0.15, 0.075], rtol=1e-6
+        weights("inverse-volatility", returns, cap=0.4), [0.4, 0.375, 0.15, 0.075], rtol=1e-6
     )
     np.testing.assert_allclose(
-        weights("inverse-volatility", returns, cap=0.35)[0], [0.35, 0.35, 0.2, 0.1], rtol=1e-6
+        weights("inverse-volatility", returns, cap=0.35), [0.35, 0.35, 0.2, 0.1], rtol=1e-6
     )
 
 
@@ -135,11 +170,11 @@ def test_cap_keeps_proportions() -> None:
 def test_assets_that_join_late(name: str) -> None:
     values = prices()
     values[:50, 1] = np.nan  # in the training of the second fold from its middle on
-    found = decisions(name, FOLDS, values).decisions
+    found = decisions(name, FOLDS, values)
     assert (found[:30, 2] == 0).sum() == (1 if name == "buy-and-hold" else 30)
-    without = decisions(name, FOLDS[:2], np.delete(values, 1, axis=1)).decisions
+    without = decisions(name, FOLDS[:2], np.delete(values, 1, axis=1))
     np.testing.assert_array_equal(np.delete(found[:30], 2, axis=1), without)
-    chosen = decisions(name, FOLDS, prices(), tradable=[[True, False, True, True]] * 3).decisions
+    chosen = decisions(name, FOLDS, prices(), tradable=[[True, False, True, True]] * 3)
     np.testing.assert_array_equal(chosen[:30], found[:30])
     with pytest.raises(QfolioError, match="Fold 0 has no asset to hold, or one without a price"):
         decisions(name, FOLDS, values, tradable=np.ones((3, 4)))
@@ -148,21 +183,105 @@ def test_assets_that_join_late(name: str) -> None:
 def test_failures_leave_a_note_and_equal_weights() -> None:
     values = prices()
     values[:60, 2] = 7.0  # no variance
-    found, notes = decisions("minimum-variance", FOLDS, values)
+    found, notes = ask("minimum-variance", FOLDS, values)
     np.testing.assert_array_equal(found[0], [0, *[0.25] * 4])
     assert (found[-1] != found[0]).any()
     assert notes[0].startswith("minimum-variance, fold 0: no solution, so weights are equal: ")
     assert "variance" in notes[0].split("equal:")[1]
-    falling = weights("maximum-ratio", -np.abs(np.random.default_rng(0).normal(size=(50, 3))))
-    np.testing.assert_array_equal(falling[0], [1 / 3] * 3)
-    assert "no solution" in falling[1][0]
-    twins = np.random.default_rng(0).normal(size=(50, 1)).repeat(2, axis=1)
-    assert weights("minimum-variance", twins)[1][0].startswith("skfolio warns: ")
+    falling = -np.abs(np.random.default_rng(0).normal(0, 0.1, size=(50, 3)))
+    with pytest.warns(UserWarning, match="no solution"):
+        np.testing.assert_array_equal(weights("maximum-ratio", falling), [1 / 3] * 3)
+
+
+def test_warnings_of_skfolio_are_notes() -> None:
+    twins = prices()[:, :1].repeat(2, axis=1)
+    (note,) = ask("minimum-variance", FOLDS[:1], twins).notes
+    assert note.startswith("minimum-variance, fold 0: ")
+
+
+class LastWinner(Baseline):
+    """A user's own: hold what rose most on the last day, and stay where it is held already."""
+
+    calendar = "row"
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[int, np.ndarray]] = []
+
+    def decide(self, history: History, held: np.ndarray) -> np.ndarray | None:
+        self.seen.append((len(history.prices), held))
+        assert len(history.dates) == len(history.prices)
+        winner = 1 + int((history.prices[-1] / history.prices[-2]).argmax())
+        return None if held[winner] > 0.9 else np.eye(len(held))[winner]
+
+
+def test_a_baseline_is_asked_row_by_row_and_sees_no_further() -> None:
+    own = LastWinner()
+    found = ask(own, FOLDS, prices()).decisions
+    assert [rows for rows, _ in own.seen] == list(range(41, 86))  # up to the row it decides at
+    relatives = prices()[1:] / prices()[:-1]
+    winners = relatives[39:84].argmax(1)
+    changes = np.flatnonzero(np.diff(winners, prepend=-1))
+    ordered = np.flatnonzero(~np.isnan(found[:, 0]))
+    np.testing.assert_array_equal(ordered, changes)
+    np.testing.assert_array_equal(found[ordered, 1:].argmax(1), winners[changes])
+
+
+def test_what_is_held_drifts_with_prices() -> None:
+    class Once(Baseline):
+        calendar = "row"
+
+        def decide(self, history: History, held: np.ndarray) -> np.ndarray | None:
+            seen.append(held)
+            return np.array([0.4, 0.6, 0, 0, 0]) if held[0] == 1 else None
+
+    seen: list[np.ndarray] = []
+    ask(Once(), FOLDS, prices())
+    worth = 0.6 * prices()[40:85, 0] / prices()[40, 0]
+    np.testing.assert_allclose([held[1] for held in seen[1:]], (worth / (0.4 + worth))[1:])
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ([0.5, 0.5], r"own at 2020-02-10 gives weights of the shape \(2,\)"),
+        ([0.5, 0, 0, 0, 0], "sum to 0.5"),
+        ([0.5, 0.7, -0.2, 0, 0], "least of them -0.2"),
+        ([np.nan] * 5, "sum to nan"),
+        ([0, 1, 0, 0, 0], "an asset 1, more than the cap of 0.8"),
+        ([0.5, 0, 0, 0, 0.5], "an asset that this fold may not hold"),
+    ],
+)
+def test_weights_that_cannot_be(wanted: list[float], message: str) -> None:
+    class Wrong(Baseline):
+        def decide(self, history: History, held: np.ndarray) -> np.ndarray:
+            return np.array(wanted)
+
+    with pytest.raises(QfolioError, match=message):
+        ask(Wrong(), FOLDS, prices(), cap=0.8, tradable=[[True, True, True, False]] * 3)
+
+
+def test_a_baseline_of_a_users_own_is_found_by_its_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "own_baselines.py").write_text(
+        "import numpy as np\n"
+        "from qfolio.portfolio.backtest.baselines import Baseline\n"
+        "class First(Baseline):\n"
+        "    def decide(self, history, held):\n"
+        "        return np.eye(len(held))[1]\n"
+        "class Unfinished(Baseline): pass\n"
+    )
+    found = decisions("own_baselines:First", FOLDS, prices())
+    np.testing.assert_array_equal(found, np.tile(np.eye(5)[1], (45, 1)))
+    with pytest.raises(QfolioError, match="Unfinished is not complete: it lacks decide"):
+        baseline("own_baselines:Unfinished")
 
 
 def test_errors_say_what_and_where() -> None:
-    with pytest.raises(QfolioError, match="no baseline 'best'; there are equal-weight"):
-        decisions("best", FOLDS, prices())
+    with pytest.raises(QfolioError, match="no baseline 'best'; there is equal-weight"):
+        baseline("best")
     with pytest.raises(QfolioError, match="no fold"):
         decisions("equal-weight", [], prices())
     with pytest.raises(QfolioError, match="Fold x trains on rows up to 41, but decides from row 4"):
@@ -186,7 +305,7 @@ def test_errors_say_what_and_where() -> None:
 def test_sharpe_ratios_of_skfolio_on_its_own_prices(name: str, sharpe: float) -> None:
     values = real_prices()
     folds = walk(len(values), train=1260, test=252)
-    found, notes = decisions(name, folds, values)
+    found, notes = ask(name, folds, values)
     assert notes == ()
     returns = simulate(values, found, first=1260, cost=0.0, lag=0).returns
     assert returns.mean() / returns.std(ddof=1) * np.sqrt(252) == pytest.approx(sharpe, abs=5e-4)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.registry import BASELINES
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio.backtest.baselines import BASELINES
 from qfolio.portfolio.backtest.run import LATEST, Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.policy import follow

@@ -1,203 +1,175 @@
-"""Classical allocators, with skfolio behind one function, that decide as an agent does.
+"""Baselines: the rules that agents are compared with.
 
-At the start of each fold an allocator is fitted to the returns of the fold's training rows; its
-weights are then the target of every day of the fold, so that drift is traded back daily. Buy and
-hold orders once, at the very first decision.
+A baseline decides as an agent does: it sees the rows up to a decision and what it holds, and names
+target weights. ``orders.py`` asks it over the folds of a test; skfolio fits the optimisers.
 """
 
 import warnings
-from collections.abc import Callable, Sequence
-from itertools import pairwise
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.registry import find
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 
-@runtime_checkable
-class Fold(Protocol):
-    """Rows of the price table: where to learn and where to decide."""
+class History(NamedTuple):
+    """What a baseline knows when it decides, with T rows up to the decision and N assets."""
+
+    dates: NDArray[np.datetime64]  # (T,)
+    prices: Floats  # (T, N), NaN before an asset's first price
+    train: slice  # rows of the fold's training window, which ends at its first decision or earlier
+    tradable: Bools  # (N,), assets that may be held; they have prices in the whole training window
+    cap: float  # most that one asset may weigh when it is ordered
 
     @property
-    def name(self) -> str: ...
-    @property
-    def train(self) -> slice: ...
-    @property
-    def decisions(self) -> slice: ...
+    def returns(self) -> Floats:
+        """Simple returns of the tradable assets over the training window, (rows − 1, assets)."""
+        window = self.prices[self.train][:, self.tradable]
+        return np.asarray(window[1:] / window[:-1] - 1)
 
 
-class Decided(NamedTuple):
-    """Decisions of shape (D, N + 1), cash first, NaN for no order, and what went wrong on the way.
+class Baseline(ABC):
+    """A rule that decides on weights; subclass it, and make it without arguments.
 
-    Notes are sentences for the person who reads the results.
+    A warning that ``decide`` raises becomes a note in the report, with the baseline and the fold.
+
+    Attributes:
+        calendar: When ``decide`` is called. "fold": at the first decision of each fold; what it
+            names is the target of every row of the fold, so that drift is traded back daily.
+            "row": at every row; None then leaves the holding to drift.
     """
 
-    decisions: Floats
-    notes: tuple[str, ...]
+    calendar: ClassVar[Literal["fold", "row"]] = "fold"
+
+    @abstractmethod
+    def decide(self, history: History, held: Floats) -> Floats | None:
+        """Name target weights, or give no order.
+
+        Args:
+            history: All rows up to the decision, and none after it.
+            held: Weights at the decision, cash first, of shape (N + 1,): the last order, drifted
+                with prices. All cash before the first order.
+
+        Returns:
+            Target weights of shape (N + 1,), cash first, or None for no order.
+        """
 
 
-def _inverse_volatility(cap: float) -> Any:
-    from skfolio.optimization import InverseVolatility
+class EqualWeight(Baseline):
+    """The same weight in every asset, rebalanced daily."""
 
-    return InverseVolatility()
-
-
-def _minimum_variance(cap: float) -> Any:
-    from skfolio.optimization import MeanRisk
-
-    return MeanRisk(max_weights=cap)
+    def decide(self, history: History, held: Floats) -> Floats:
+        return with_cash(equal_weights(history), history)
 
 
-def _maximum_ratio(cap: float) -> Any:
-    from skfolio.optimization import MeanRisk, ObjectiveFunction
+class BuyAndHold(Baseline):
+    """Equal weights bought once and never traded again."""
 
-    return MeanRisk(objective_function=ObjectiveFunction.MAXIMIZE_RATIO, max_weights=cap)
+    calendar = "row"
 
-
-def _risk_budgeting(cap: float) -> Any:
-    from skfolio.optimization import RiskBudgeting
-
-    return RiskBudgeting(max_weights=cap)
+    def decide(self, history: History, held: Floats) -> Floats | None:
+        return None if held[1:].any() else with_cash(equal_weights(history), history)
 
 
-def _hierarchical_risk_parity(cap: float) -> Any:
-    from skfolio.optimization import HierarchicalRiskParity
+class Fitted(Baseline):
+    """An optimiser of skfolio, fitted to the training window of each fold.
 
-    return HierarchicalRiskParity(max_weights=cap)
-
-
-BASELINES: dict[str, Callable[[float], Any] | None] = {
-    "equal-weight": None,
-    "buy-and-hold": None,
-    "inverse-volatility": _inverse_volatility,
-    "minimum-variance": _minimum_variance,
-    "maximum-ratio": _maximum_ratio,
-    "risk-budgeting": _risk_budgeting,
-    "hierarchical-risk-parity": _hierarchical_risk_parity,
-}
-"""Names, and what makes the skfolio estimator for a cap on weights; None has equal weights."""
-
-
-def weights(name: str, returns: ArrayLike, *, cap: float = 1.0) -> tuple[Floats, tuple[str, ...]]:
-    """Fit an allocator to returns; where that fails, weights are equal and a note says so.
-
-    Args:
-        name: One of BASELINES.
-        returns: Simple returns of shape (days, N), without gaps, N at least 1.
-        cap: Most that one asset may weigh, above 0. Where the allocator itself knows no such bound,
-            the excess goes to the assets below it, in proportion to their weights. Where the
-            assets cannot hold everything within the cap, all are at the cap and the rest is cash.
-
-    Returns:
-        Weights of the assets, of shape (N,), and notes.
-
-    Raises:
-        QfolioError: There is no such allocator.
+    Where it finds no solution, weights are equal and a warning says so. Where it knows no cap, the
+    excess goes to the assets below the cap, in proportion to their weights. Where the assets cannot
+    hold everything within the cap, all are at the cap and the rest is cash.
     """
-    sample = np.asarray(returns, dtype=float)
-    assets = sample.shape[1]
-    make = _maker(name)
-    equal = np.full(assets, min(1 / assets, cap))
-    if make is None or cap * assets <= 1 + 1e-9:
-        return equal, ()
 
-    from skfolio.exceptions import SkfolioError
+    @abstractmethod
+    def optimizer(self, cap: float) -> Any:
+        """Make the estimator of skfolio."""
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    def decide(self, history: History, held: Floats) -> Floats:
+        equal = equal_weights(history)
+        if history.cap * equal.size <= 1 + 1e-9:
+            return with_cash(equal, history)
+
+        from skfolio.exceptions import SkfolioError
+
         try:
             # skfolio says ValueError where no portfolio has a positive return or returns are few.
-            fitted = np.maximum(make(cap).fit(sample).weights_, 0)
-            if not 0 < fitted.sum() < np.inf:
+            found = np.maximum(self.optimizer(history.cap).fit(history.returns).weights_, 0)
+            if not 0 < found.sum() < np.inf:
                 raise ValueError("the weights found are not numbers")
         except (SkfolioError, ValueError) as error:
-            return equal, (f"no solution, so weights are equal: {_line(error)}",)
-    notes = dict.fromkeys(f"skfolio warns: {_line(w.message)}" for w in caught)
-    return _capped(fitted, cap), tuple(notes)
+            warnings.warn(f"no solution, so weights are equal: {error}", stacklevel=1)
+            return with_cash(equal, history)
+        return with_cash(_capped(found, history.cap), history)
 
 
-def decisions(
-    name: str,
-    folds: Sequence[Fold],
-    values: ArrayLike,
-    *,
-    tradable: ArrayLike | None = None,
-    cap: float = 1.0,
-) -> Decided:
-    """Decide for every day of the folds, seeing prices up to each fold's first decision only.
+class InverseVolatility(Fitted):
+    """Weights in inverse proportion to volatility."""
 
-    Args:
-        name: One of BASELINES.
-        folds: Folds whose decisions follow one another without a gap, in order of time. The
-            training rows of a fold end with the row of its first decision or earlier.
-        values: Prices of shape (rows, N); NaN before an asset's first price.
-        tradable: Which assets a fold may hold, of shape (folds, N); those with prices in all of
-            its training rows if None. The others have weight 0.
-        cap: Most that one asset may weigh when it is ordered, see `weights`.
+    def optimizer(self, cap: float) -> Any:
+        from skfolio.optimization import InverseVolatility
 
-    Returns:
-        Decisions for the rows from the first to the last fold's, and notes that name the fold.
-
-    Raises:
-        QfolioError: There is no such allocator, the folds have a gap or look ahead, a fold may
-            hold no asset, or an asset that it may hold has no price in its training rows.
-    """
-    prices = np.asarray(values, dtype=float)
-    rows, assets = prices.shape
-    hold = name == "buy-and-hold"
-    _check(folds)
-    parts, notes = [], []
-    for number, fold in enumerate(folds):
-        window = prices[fold.train]
-        priced = ~np.isnan(window).any(axis=0)
-        held = priced if tradable is None else np.asarray(tradable, dtype=bool)[number]
-        if not held.any() or (held & ~priced).any():
-            raise QfolioError(
-                f"Fold {fold.name} has no asset to hold, or one without a price in its training "
-                "rows; begin later or drop the assets that start late."
-            )
-        part = np.full((len(range(rows)[fold.decisions]), assets + 1), np.nan)
-        if not (hold and number):
-            window = window[:, held]
-            fitted, more = weights(name, window[1:] / window[:-1] - 1, cap=cap)
-            part[: 1 if hold else None] = _with_rest_in_cash(fitted, held)
-            notes += [f"{name}, fold {fold.name}: {note}" for note in more]
-        parts.append(part)
-    return Decided(np.concatenate(parts), tuple(notes))
+        return InverseVolatility()
 
 
-def _maker(name: str) -> Callable[[float], Any] | None:
-    if name not in BASELINES:
-        raise QfolioError(f"There is no baseline {name!r}; there are {', '.join(BASELINES)}.")
-    return BASELINES[name]
+class MinimumVariance(Fitted):
+    """The long-only portfolio of least variance."""
+
+    def optimizer(self, cap: float) -> Any:
+        from skfolio.optimization import MeanRisk
+
+        return MeanRisk(max_weights=cap)
 
 
-def _check(folds: Sequence[Fold]) -> None:
-    if not folds:
-        raise QfolioError("There is no fold to decide for; the prices are too few.")
-    for fold in folds:
-        if fold.train.stop > fold.decisions.start + 1:
-            raise QfolioError(
-                f"Fold {fold.name} trains on rows up to {fold.train.stop - 1}, but decides from "
-                f"row {fold.decisions.start} on; end its training there or earlier."
-            )
-    for one, following in pairwise(folds):
-        if one.decisions.stop != following.decisions.start:
-            raise QfolioError(
-                f"Fold {following.name} decides from row {following.decisions.start} on, but fold "
-                f"{one.name} before row {one.decisions.stop}; leave no gap between them."
-            )
+class MaximumRatio(Fitted):
+    """The long-only portfolio of the highest Sharpe ratio."""
+
+    def optimizer(self, cap: float) -> Any:
+        from skfolio.optimization import MeanRisk, ObjectiveFunction
+
+        return MeanRisk(objective_function=ObjectiveFunction.MAXIMIZE_RATIO, max_weights=cap)
 
 
-def _with_rest_in_cash(fitted: Floats, held: NDArray[np.bool_]) -> Floats:
-    row = np.zeros(len(held) + 1)
-    row[1:][held] = fitted
-    row[0] = max(0.0, 1 - fitted.sum())
-    return row
+class RiskBudgeting(Fitted):
+    """Equal contributions to the variance (risk parity)."""
+
+    def optimizer(self, cap: float) -> Any:
+        from skfolio.optimization import RiskBudgeting
+
+        return RiskBudgeting(max_weights=cap)
+
+
+class HierarchicalRiskParity(Fitted):
+    """Risk parity over a hierarchy of clusters (López de Prado, 2016)."""
+
+    def optimizer(self, cap: float) -> Any:
+        from skfolio.optimization import HierarchicalRiskParity
+
+        return HierarchicalRiskParity(max_weights=cap)
+
+
+def baseline(name: str) -> Baseline:
+    """Make the baseline of a name, or of ``module:Name``; raises QfolioError if there is none."""
+    made: Baseline = find("baseline", name)()
+    return made
+
+
+def equal_weights(history: History) -> Floats:
+    """Equal weights of the tradable assets, at most the cap."""
+    count = int(history.tradable.sum())
+    return np.full(count, min(1 / count, history.cap))
+
+
+def with_cash(weights: ArrayLike, history: History) -> Floats:
+    """Weights of the tradable assets as a target: cash first, which has what they leave."""
+    wanted = np.asarray(weights, dtype=float)
+    target = np.zeros(len(history.tradable) + 1)
+    target[1:][history.tradable] = wanted
+    target[0] = max(0.0, 1 - wanted.sum())
+    return target
 
 
 def _capped(proposed: Floats, cap: float) -> Floats:
@@ -211,7 +183,3 @@ def _capped(proposed: Floats, cap: float) -> Floats:
         share = capped[free].sum()
         capped[free] = capped[free] * (rest / share) if share > 0 else rest / free.sum()
     return capped
-
-
-def _line(message: Any) -> str:
-    return " ".join(str(message).split())

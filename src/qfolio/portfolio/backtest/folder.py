@@ -25,10 +25,10 @@ from qfolio.core.files import (
     write_json,
     write_tree,
 )
+from qfolio.core.registry import BASELINES
 from qfolio.core.text import csv_cell
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Row
-from qfolio.portfolio.backtest import baselines
 from qfolio.portfolio.prices.table import Prices
 
 # Names become folders.
@@ -74,7 +74,7 @@ class BacktestConfig(Config, frozen=True):
             raise QfolioError("prices is not described.")
         for name, entry in self.agents.items():
             Budget(entry.episodes)
-            if name in baselines.BASELINES:
+            if name in BASELINES:
                 raise QfolioError(
                     f"an agent cannot have the name of the baseline {name}; give it another."
                 )

@@ -18,16 +18,18 @@ from qfolio.core import devices, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
-from qfolio.core.registry import name_of
+from qfolio.core.registry import BASELINES, name_of
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.executor import Executor, Here, Job
 from qfolio.experiments.fit import Listener, Row
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio.backtest import assessment, baselines
+from qfolio.portfolio.backtest import assessment
+from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
 from qfolio.portfolio.backtest.folds import Fold, latest, spell, walk_forward
+from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.backtest.verdict import verdicts
@@ -253,8 +255,9 @@ class Backtest:
             if self.config.seeds > 1:
                 together = self._decide(name, together=True)
                 entries[f"{name}{TOGETHER}"] = self._entry("ensemble", together)
-        for name in baselines.BASELINES:
-            decided = baselines.decisions(name, self.folds, self.prices.values, cap=self.config.cap)
+        table, cap = self.prices, self.config.cap
+        for name in BASELINES:
+            decided = orders(name, baseline(name), self.folds, table.dates, table.values, cap=cap)
             entries[name] = self._entry("baseline", decided.decisions[None])
             notes += decided.notes
         return entries, notes

@@ -1,0 +1,155 @@
+"""What a baseline orders over the folds of a test, asked row by row without a look ahead."""
+
+import warnings
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.baselines import Baseline, Bools, Floats, History
+
+TOLERANCE = 1e-6
+"""How far weights may be off the simplex or above the cap."""
+
+
+class Fold(Protocol):
+    """Rows of the price table: where to learn and where to decide."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def train(self) -> slice: ...
+    @property
+    def decisions(self) -> slice: ...
+
+
+class Orders(NamedTuple):
+    """Decisions of shape (D, N + 1), cash first, NaN for no order, and what went wrong on the way.
+
+    Notes are sentences for the person who reads the results.
+    """
+
+    decisions: Floats
+    notes: tuple[str, ...]
+
+
+def orders(
+    name: str,
+    baseline: Baseline,
+    folds: Sequence[Fold],
+    dates: NDArray[np.datetime64],
+    values: ArrayLike,
+    *,
+    tradable: ArrayLike | None = None,
+    cap: float = 1.0,
+) -> Orders:
+    """Ask a baseline for its decisions on every row of the folds.
+
+    Args:
+        name: What notes and errors call the baseline.
+        baseline: Decides; handed the rows up to each decision only.
+        folds: Folds whose decisions follow one another without a gap, in order of time. The
+            training rows of a fold end with the row of its first decision or earlier.
+        dates: Of the rows, shape (rows,).
+        values: Prices of shape (rows, N); NaN before an asset's first price.
+        tradable: Which assets a fold may hold, of shape (folds, N); those with prices in all of
+            its training rows if None.
+        cap: Most that one asset may weigh when it is ordered.
+
+    Returns:
+        Decisions for the rows from the first to the last fold's, and notes that name the fold.
+
+    Raises:
+        QfolioError: The folds have a gap or look ahead, a fold may hold no asset, an asset that it
+            may hold has no price in its training rows, or the baseline names weights that are off
+            the simplex, above the cap or in an asset that may not be held.
+    """
+    prices = np.array(values, dtype=float)
+    prices.flags.writeable = False  # a baseline that wrote to it would change what others see
+    _check(folds)
+    ordered, row_ordered = np.eye(prices.shape[1] + 1)[0], folds[0].decisions.start
+    parts, notes = [], []
+    for number, fold in enumerate(folds):
+        chosen = None if tradable is None else np.asarray(tradable, dtype=bool)[number]
+        allowed = _tradable(fold, prices, chosen)
+        rows = range(len(prices))[fold.decisions]
+        part = np.full((len(rows), len(ordered)), np.nan)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for place, row in enumerate(rows[:1] if baseline.calendar == "fold" else rows):
+                known = slice(0, row + 1)
+                history = History(dates[known], prices[known], fold.train, allowed, cap)
+                held = _drifted(ordered, prices[row_ordered], prices[row])
+                wanted = baseline.decide(history, held)
+                if wanted is not None:
+                    ordered, row_ordered = _checked(name, wanted, history), row
+                    part[place] = ordered
+        if baseline.calendar == "fold":
+            part[:] = part[0]
+            row_ordered = row_ordered if np.isnan(part[0]).any() else rows[-1]
+        said = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
+        notes += [f"{name}, fold {fold.name}: {note}" for note in said]
+        parts.append(part)
+    return Orders(np.concatenate(parts), tuple(notes))
+
+
+def _tradable(fold: Fold, prices: Floats, chosen: Bools | None) -> Bools:
+    priced = np.asarray(~np.isnan(prices[fold.train]).any(axis=0))
+    allowed = priced if chosen is None else chosen
+    if not allowed.any() or (allowed & ~priced).any():
+        raise QfolioError(
+            f"Fold {fold.name} has no asset to hold, or one without a price in its training "
+            "rows; begin later or drop the assets that start late."
+        )
+    return allowed
+
+
+def _drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
+    """Weights ordered at one row's prices, as they are at another's."""
+    worth = weights.copy()
+    bought = weights[1:] > 0  # others may have no price yet
+    worth[1:][bought] *= now[bought] / then[bought]
+    return np.asarray(worth / worth.sum())
+
+
+def _checked(name: str, wanted: Floats, history: History) -> Floats:
+    """A baseline's target weights, or a QfolioError that says what is wrong with them."""
+    target = np.asarray(wanted, dtype=float)
+    where = f"The baseline {name} at {str(history.dates[-1])[:10]}"
+    if target.shape != (len(history.tradable) + 1,):
+        raise QfolioError(
+            f"{where} gives weights of the shape {target.shape}; it must be "
+            f"({len(history.tradable) + 1},), cash first."
+        )
+    if not abs(target.sum() - 1) <= TOLERANCE or target.min() < -TOLERANCE:
+        raise QfolioError(
+            f"{where} gives weights that sum to {target.sum():.8g}, the least of them "
+            f"{target.min():.3g}; they must sum to 1 and not be negative."
+        )
+    if (target[1:][~history.tradable] > 0).any():
+        raise QfolioError(f"{where} gives weight to an asset that this fold may not hold.")
+    if target[1:].max() > history.cap + TOLERANCE:
+        raise QfolioError(
+            f"{where} gives an asset {target[1:].max():.4g}, more than the cap of {history.cap:g}."
+        )
+    return target
+
+
+def _check(folds: Sequence[Fold]) -> None:
+    if not folds:
+        raise QfolioError("There is no fold to decide for; the prices are too few.")
+    for fold in folds:
+        if fold.train.stop > fold.decisions.start + 1:
+            raise QfolioError(
+                f"Fold {fold.name} trains on rows up to {fold.train.stop - 1}, but decides from "
+                f"row {fold.decisions.start} on; end its training there or earlier."
+            )
+    for one, following in pairwise(folds):
+        if one.decisions.stop != following.decisions.start:
+            raise QfolioError(
+                f"Fold {following.name} decides from row {following.decisions.start} on, but fold "
+                f"{one.name} before row {one.decisions.stop}; leave no gap between them."
+            )
