@@ -272,8 +272,8 @@ def test_one_seed_one_evaluation_and_no_extras(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "One agent reached" in page
     assert "no interval" in page
-    assert "95" not in page.split("How the return grew")[1].split("Terms")[0].split("<svg")[0]
-    assert "What it learned" not in page
+    assert "95" not in page.split("<h2>Learning curve")[1].split("Terms")[0].split("<svg")[0]
+    assert "The learned policy" not in page
     assert "without double DQN" not in page
 
 
