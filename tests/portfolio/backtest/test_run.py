@@ -300,18 +300,21 @@ def test_backtests_that_cannot_be(settings, message, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "content"),
+    ("name", "content", "message"),
     [
-        ("config.json", "{}"), ("config.json", '{"format": 2, "task": "pendulum"}'),
-        ("prices.safetensors", ""), ("config.json", None),
+        ("config.json", "{}", "in another format"),
+        ("config.json", '{"kind": "backtest", "format": 1}', "in another format"),
+        ("config.json", '{"kind": "comparison", "format": 2}', "is a comparison, not a backtest"),
+        ("prices.safetensors", "", "prices.safetensors is no safetensors file or is damaged"),
+        ("config.json", None, "config.json is damaged"),
     ],
-)  # fmt: skip
-def test_damaged_folders(finished, tmp_path, name, content):
+)
+def test_damaged_folders(finished, tmp_path, name, content, message):
     folder = shutil.copytree(finished.folder, tmp_path / "copy")
-    if content is None:
+    if content is None:  # a name that would lead out of the folder
         config = json.loads((folder / name).read_text())
         config["agents"] = {"../../elsewhere": config["agents"]["dqn"]}
         content = json.dumps(config)
     (folder / name).write_text(content)
-    with pytest.raises(QfolioError):
+    with pytest.raises(QfolioError, match=message):
         Backtest.open(folder)

@@ -1,4 +1,4 @@
-"""The stationary bootstrap of track records: what another stretch of the same market would show."""
+"""The stationary bootstrap of track records: how measures vary in other samples of a market."""
 
 import math
 
@@ -18,12 +18,9 @@ from qfolio.portfolio.backtest.measures import (
 )
 
 LEVEL = 0.95
-"""Coverage of every interval here, and the level a probability must reach to count as evidence."""
+"""Coverage of all intervals, and the probability from which on something counts as evidence."""
 
 _CHUNK = 2_000_000  # resampled days held at a time: tens of megabytes, whatever the resamples
-
-
-# Resampling time -----------------------------------------------------------------------------
 
 
 def block_length(series: ArrayLike) -> float:
@@ -97,7 +94,7 @@ def bootstrap_measures(
     resamples: int,
     rng: np.random.Generator,
 ) -> dict[str, Floats]:
-    """Compute ``measures`` on histories drawn again by the stationary bootstrap.
+    """Compute ``measures`` on histories resampled by the stationary bootstrap.
 
     The same days are drawn for all series. Averages over a resampled history need only how often
     each day was drawn, so they are one matrix product; the drawdown alone follows the order.

@@ -1,4 +1,4 @@
-"""Walk-forward folds: train on the past, decide over the next stretch, move on."""
+"""Walk-forward folds: train on a window, test on the rows after it, move on."""
 
 import re
 from typing import NamedTuple
@@ -9,19 +9,19 @@ from qfolio.core.errors import QfolioError
 
 
 class Fold(NamedTuple):
-    """Rows of a price table that a policy learns from, and rows at which it then decides."""
+    """The training window of a policy, and the rows at which it then decides."""
 
-    name: str  # date, and where there is one the time, of the first return that it earns
+    name: str  # date of the first return that it earns, with the time where rows are intraday
     train: slice
     decisions: slice
-    recent: slice  # the last rows of training, as many as it has at least
+    recent: slice  # the final ``train``-length window
 
     def tradable(self, values: np.ndarray) -> np.ndarray:
-        """Assets with a price in every recent row of training, shape (asset,)."""
+        """Assets with a price in every row of the recent window, shape (asset,)."""
         return ~np.isnan(values[self.recent]).any(0)
 
     def complete(self, values: np.ndarray) -> "Fold":
-        """The fold, trained on the rows in which all of its tradable assets have prices only."""
+        """The fold, with a training window in which all of its tradable assets have prices."""
         gaps = np.isnan(values[self.train][:, self.tradable(values)]).any(1)
         begin = self.train.start + int(gaps.sum())  # prices are missing before a start only
         return self._replace(train=slice(begin, self.train.stop))
@@ -30,17 +30,18 @@ class Fold(NamedTuple):
 def walk_forward(
     dates: np.ndarray, train: str, test: str, lag: int, expanding: bool = False
 ) -> list[Fold]:
-    """Folds one after the other, without a gap between their returns.
+    """Consecutive folds, without a gap between their returns.
 
-    Training ends at the row of the first decision, so that no reward in it is earned after that
-    row: a decision at row t earns the move to row t + lag + 1 (this purges the last lag + 1
-    decisions). Windows of observations lie within the rows of training. The first fold trains on
-    the first stretch of the table; with ``expanding`` later ones keep its start.
+    Training ends at the row of the first decision. A decision at row t earns the return to row
+    t + lag + 1, so the last lag + 1 decisions are purged and no reward is earned later. Windows of
+    observations lie within the training window. The first fold trains on the first rows of the
+    table; with ``expanding``, later folds keep that start.
 
     Args:
         dates: Shape (row,), ascending.
         train, test: Lengths such as "5y", "6m", "8w" or "500d"; d counts rows.
         lag: Rows between a decision and its execution.
+        expanding: Training windows keep the first row of the table (default: they roll).
 
     Raises:
         QfolioError: A length cannot be read, or the table is too short for one fold.
@@ -68,7 +69,7 @@ def walk_forward(
 
 
 def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) -> Fold:
-    """What a policy for tomorrow learns from: the last stretch of the table, or all of it."""
+    """The training window of tomorrow's policy: the end of the table, or all of it."""
     end = len(dates)
     recent = _before(dates, end - 1, train)
     begin = 0 if expanding else recent
@@ -76,7 +77,7 @@ def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) ->
 
 
 def spell(date: np.datetime64, dates: np.ndarray) -> str:
-    """A date as text; with its time where rows are less than a day apart."""
+    """A date as text, with the time where rows are less than a day apart."""
     days = dates.astype("datetime64[D]")
     if (days[1:] > days[:-1]).all():
         return str(date.astype("datetime64[D]"))

@@ -22,12 +22,12 @@ MEASURES = (
 def measures(
     returns: ArrayLike, turnover: ArrayLike, cost: ArrayLike, periods_per_year: float
 ) -> dict[str, Floats]:
-    """Describe track records by the usual measures, all of them per year.
+    """Compute the usual measures of track records, annualised.
 
     Args:
         returns: Simple returns net of costs, shape (..., periods), each at least −1.
-        turnover: Value bought plus value sold as a share of the wealth, same shape.
-        cost: Share of the wealth that a period's trade cost, at least 0 and below 1, same shape.
+        turnover: Value bought plus value sold, over wealth, same shape.
+        cost: Share of wealth that a period's trade cost, at least 0 and below 1, same shape.
         periods_per_year: For example 252 for days of trading.
 
     Returns:
@@ -37,7 +37,7 @@ def measures(
         - volatility: standard deviation (n − 1) of the returns;
         - sharpe: mean over standard deviation, the risk-free rate taken as 0;
         - sortino: mean over the downside deviation, the root mean square of min(return, 0);
-        - drawdown: the deepest fall below an earlier peak (or the start), between 0 and 1;
+        - drawdown: the maximum drawdown below an earlier peak (or the start), between 0 and 1;
         - calmar: growth over drawdown;
         - turnover: mean times periods per year;
         - cost_drag: growth without costs minus growth with them, where a return without costs is
@@ -54,7 +54,7 @@ def measures(
 
 
 def drawdown(returns: ArrayLike) -> Floats:
-    """Return how far the wealth lies below its peak so far, as a share of the peak.
+    """Return how far wealth is below its running peak, as a share of the peak.
 
     Args:
         returns: Simple returns of shape (..., periods).
@@ -96,7 +96,7 @@ def monthly(returns: ArrayLike, dates: ArrayLike) -> tuple[list[int], Floats]:
 
 
 def per_period(track: Floats, centre: Floats) -> Floats:
-    """What has to be averaged over time for every measure but the drawdown: (7, ..., periods)."""
+    """Quantities whose means over time give all measures but the drawdown: (7, ..., periods)."""
     returns, turnover, cost = track
     deviation = returns - centre[..., None]  # centred, or the variance would lose its digits
     ruined = returns == -1

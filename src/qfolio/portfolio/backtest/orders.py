@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,7 @@ TOLERANCE = 1e-6
 """How far weights may be off the simplex or above the cap."""
 
 
+@runtime_checkable
 class Fold(Protocol):
     """Rows of the price table: where to learn and where to decide."""
 
@@ -115,7 +116,7 @@ def _drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
     return np.asarray(worth / worth.sum())
 
 
-def _checked(name: str, wanted: Floats, history: History) -> Floats:
+def _checked(name: str, wanted: ArrayLike, history: History) -> Floats:
     """A baseline's target weights, or a QfolioError that says what is wrong with them."""
     target = np.asarray(wanted, dtype=float)
     where = f"The baseline {name} at {str(history.dates[-1])[:10]}"

@@ -7,8 +7,6 @@ import numpy as np
 from qfolio.portfolio.backtest.bootstrap import LEVEL
 from qfolio.portfolio.backtest.measures import Floats, deviations, ratio_or_zero
 
-# Sharpe ratios and luck ----------------------------------------------------------------------
-#
 # Every Sharpe ratio in these formulas is per period, never annual: an annual one would count each
 # period as a whole year of evidence.
 

@@ -1,9 +1,9 @@
 """Replay of decisions on real prices, in double precision, with exact costs.
 
 The one rule of timing: a decision at row t sees prices up to row t and names target weights at the
-prices of row t. That is an order in shares, scaled to what the wealth affords. It is carried out at
-the close of row t + lag, when prices have moved what is held and what is wanted alike, and the cost
-of that trade is charged to the return of row t + lag + 1.
+prices of row t. That is an order in shares, scaled to what the wealth affords. It is executed at
+the close of row t + lag, after prices have moved the holding and the order alike, and the cost of
+that trade is charged to the return of row t + lag + 1.
 """
 
 import operator
@@ -17,10 +17,10 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.costs import remainder_factor, traded, with_cash
 
 TOLERANCE = 1e-6
-"""How far weights may be off the simplex; within this they are put back on it."""
+"""How far weights may be off the simplex; within it they are projected back."""
 
 BLOCK = 60_000
-"""Numbers in an array that is worked on at a time: a core's cache holds several such arrays."""
+"""Numbers per array in a block of work: several such arrays fit into a core's cache."""
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -28,7 +28,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Simulation:
-    """What became of D decisions; every array begins with the decisions' leading axes."""
+    """The result of D decisions; every array begins with the decisions' leading axes."""
 
     returns: Floats
     """Net returns, of shape (..., D)."""
