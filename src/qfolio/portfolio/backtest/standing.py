@@ -5,7 +5,6 @@ from pathlib import Path
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json
-from qfolio.portfolio.backtest.assessment import MARGIN
 from qfolio.portfolio.backtest.run import TOGETHER
 
 
@@ -15,7 +14,7 @@ class Standing:
 
     agent: its name.
     verdict: the sentence of the report; empty where the backtest is not finished.
-    worse: True where the agent grew less than equal weights, beyond what chance explains.
+    worse: Whether the verdict is that it falls short of equal weights.
     """
 
     agent: str
@@ -32,19 +31,18 @@ class Standing:
         path = folder / "summary.json"
         if not path.exists():
             return Standing(agent, "", False)
-        strategies = read_json(path).get("strategies", {})
+        summary = read_json(path)
+        strategies = summary.get("strategies", {})
         try:
             agents = [name for name, entry in strategies.items() if entry["kind"] == "agent"]
             if agent not in agents:
-                known = ", ".join(name for name in agents if not name.endswith(TOGETHER))
-                raise QfolioError(f"The backtest has no agent {agent!r}; there is {known}.")
-            name = f"{agent}{TOGETHER}" if f"{agent}{TOGETHER}" in agents else agent
-            difference = strategies[name]["to_reference"]
-            _, high = difference["growth_interval"]
-            # An end that is no finite number is null: the wealth is gone.
-            worse = high is None or high < -MARGIN
-            return Standing(agent, str(difference["verdict"]), worse)
-        except (AttributeError, KeyError, TypeError, ValueError):
+                raise QfolioError(
+                    f"The backtest has no agent {agent!r}; there is {', '.join(agents)}."
+                )
+            name = f"{agent}{TOGETHER}" if f"{agent}{TOGETHER}" in strategies else agent
+            worse = strategies[name]["to_reference"]["finding"] == "worse"
+            return Standing(agent, str(summary["verdicts"][name][0]), worse)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
             raise QfolioError(
                 f"{path} is damaged; write it again with qfolio backtest --resume {folder}."
             ) from None
