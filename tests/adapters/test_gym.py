@@ -107,7 +107,8 @@ def play(env, **reset):
 
 
 @pytest.mark.parametrize(
-    "task", [{"lag": 0}, {"menu": "tilts:0.1", "cap": 0.5}, {"reward": "differential-sharpe"}]
+    "task",
+    [{"lag": 0}, {"menu": "tilts:0.1", "max_weight": 0.5}, {"reward": "differential-sharpe"}],
 )
 def test_gymnasium_finds_nothing_to_warn_of(task):
     check_env(environment(table(features=1), **task).unwrapped)
@@ -115,7 +116,7 @@ def test_gymnasium_finds_nothing_to_warn_of(task):
 
 
 @pytest.mark.parametrize("lag", [0, 1, 3])
-@pytest.mark.parametrize("task", [{}, {"menu": "tilts:0.3"}, {"cap": 0.4}])
+@pytest.mark.parametrize("task", [{}, {"menu": "tilts:0.3"}, {"max_weight": 0.4}])
 def test_its_wealth_is_that_of_the_replay(lag, task):
     env, prices = environment(lag=lag, **task), table()
     for start in (env.unwrapped.first, 20, env.unwrapped.last):
@@ -133,7 +134,7 @@ def test_its_wealth_is_that_of_the_replay(lag, task):
         rewards = [reward for _, reward, _ in steps]
         np.testing.assert_allclose(rewards, replay.growth, atol=1e-12)
         np.testing.assert_allclose(decisions.sum(1), 1, atol=1e-12)
-        assert decisions[:, 1:].max() <= task.get("cap", 1.0) + 1e-7
+        assert decisions[:, 1:].max() <= task.get("max_weight", 1.0) + 1e-7
         assert infos[-1]["date"] == str(prices.dates[start + HORIZON])[:10]
         assert infos[-1]["return_date"] == str(prices.dates[start + HORIZON + lag])[:10]
     assert env.unwrapped.last + HORIZON + lag == ROWS - 1
@@ -161,7 +162,7 @@ def test_numbers_become_the_nearest_weights():
         env.reset(seed=0)
         info = env.step(np.array(scores, np.float32))[-1]
         np.testing.assert_allclose(info["target"], weights, atol=1e-7)
-    capped = environment(cap=0.4)
+    capped = environment(max_weight=0.4)
     capped.reset(seed=0)
     for scores, weights in (
         ([0.0, 1, 0, 0], [0.2, 0.4, 0.2, 0.2]),

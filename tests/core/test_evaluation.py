@@ -1,3 +1,4 @@
+import equinox as eqx
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -6,6 +7,7 @@ import pytest
 
 from qfolio.agents.dqn import DQN
 from qfolio.core.evaluation import evaluate, play, start_keys, tail_steps
+from qfolio.core.mdp import Step
 from qfolio.tasks.pendulum import Pendulum
 
 from probes import Endless, OneState
@@ -50,6 +52,38 @@ def test_overestimation_by_hand():
     weights = constant(agent, OneState(), [0.0, 1.25])
     greedy = evaluate(OneState(), agent, weights, start_keys(4), 3)
     np.testing.assert_allclose(greedy.overestimation, 0.25, rtol=1e-5)
+    np.testing.assert_allclose(greedy.returns, 1.0)
+
+
+class Table(Endless):
+    """Rewards of 1 from a table whose rows are at an end after ``rows`` steps of a start at 0."""
+
+    rows: int = eqx.field(static=True, default=10)
+
+    def reset(self, key):
+        return jnp.where(jax.random.bernoulli(key), 0, 5)
+
+    def observe(self, state):
+        return jnp.ones(1)
+
+    def step(self, state, action, key):
+        paid = jnp.where(state < self.rows, 1.0, 100.0)  # which nobody will ever earn
+        return Step(state + 1, paid, jnp.array(False))
+
+    def steps_left(self, state):
+        return self.rows - state
+
+
+def test_what_cannot_follow_is_not_counted():
+    """Starts whose discounted return would need steps behind the end of a task's data are left out;
+    where that is all of them, the overestimation is unknown."""
+    agent, keys = DQN(discount=0.5), start_keys(8)
+    weights = constant(agent, Table(), [3.0, 1.0])
+    greedy = evaluate(Table(), agent, weights, keys, tail_steps(0.5))
+    np.testing.assert_allclose(greedy.overestimation, 3.0 - 2.0, rtol=0.01)
+    np.testing.assert_allclose(greedy.returns, 1.0)
+    greedy = evaluate(Table(rows=7), agent, weights, keys, tail_steps(0.5))
+    assert np.isnan(greedy.overestimation)
     np.testing.assert_allclose(greedy.returns, 1.0)
 
 

@@ -12,7 +12,8 @@ from qfolio.agents.pathwise import Pathwise
 from qfolio.core import population
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio import policy as module
-from qfolio.portfolio.policy import Policy, follow, on_table, train
+from qfolio.portfolio.following import follow, on_table
+from qfolio.portfolio.policy import Policy, train
 from qfolio.portfolio.prices.table import Prices
 
 from listeners import Tell
@@ -129,7 +130,7 @@ def test_it_goes_on_from_where_it_was(policy):
     assert updated.updates == 1
     assert updated.rows == policy.rows
     np.testing.assert_array_equal(updated.task.scale, policy.task.scale)
-    assert int(updated.task.first) == WINDOW
+    assert int(updated.task.first_decision) == WINDOW
     logs = np.diff(np.log(table().values), axis=0)[-59:]
     np.testing.assert_allclose(updated.task.log_relatives[1:], logs, atol=1e-6)
     if isinstance(policy.agent, DQN):
@@ -183,7 +184,7 @@ def test_an_asset_needs_a_price_all_over_the_window(policy):
     with pytest.raises(QfolioError, match="begins on 2020-03-15, when there was no price of 'b'"):
         policy.weights(joined(last - WINDOW + 1))
     # What it may not hold may be younger, but needs a price to be sold at.
-    task = dataclasses.replace(policy.task, largest=policy.task.largest.at[1].set(0.0))
+    task = dataclasses.replace(policy.task, limits=policy.task.limits.at[1].set(0.0))
     without = Policy(task, policy.agent, policy.members, policy.assets, policy.features)
     assert without.weights(joined(last), {"b": 0.5})["b"] == 0
     with pytest.raises(QfolioError, match="no price of 'b'"):

@@ -32,7 +32,7 @@ class Fixed(Agent):
     """Plays a policy that is given, to be graded as an agent is."""
 
     policy_of: object = None
-    environments = 1
+    num_envs = 1
     episode_steps = 0
     discount = None
 
@@ -99,6 +99,26 @@ def test_figures_of_the_exact_rules():
                       "from 0.0 in good times": 1, "from 1.0 in good times": 1}  # fmt: skip
     stay_out = Regime(cost=0.03).rule(Regime(cost=0.03).best())
     assert stay_out["from 0.0 in good times"] == 0
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "found"),
+    [
+        (0.05, 0.97, {"low": 0.05, "high": 0.97}),
+        (0.41, 0.59, {"low": 0.41, "high": 0.59}),
+        (0.0, 0.6, {"low": None, "high": 0.6}),
+        (0.0, 1.0, {"low": None, "high": None}),  # a policy that never trades
+        (0.5, 0.5, {"low": 0.5, "high": 0.5}),
+    ],
+)
+def test_edges_are_found_wherever_they_are_or_reported_as_none(low, high, found):
+    """A holding of 0.1 or 0.9 that stands as it is is no edge."""
+
+    def policy(state):
+        weight = jnp.clip(state.holding.weights[1], low, high)
+        return jnp.stack([1 - weight, weight])
+
+    assert NoTrade().rule(policy) == pytest.approx(found, abs=1e-6)
 
 
 def test_merton_scenarios_have_the_moments_that_are_stated():

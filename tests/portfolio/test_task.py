@@ -6,14 +6,14 @@ import pytest
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
-from qfolio.core.evaluation import start_keys
+from qfolio.core.evaluation import evaluate, start_keys
 from qfolio.core.market import MenuActions
 from qfolio.core.mdp import Discrete, Position, Simplex
 from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.costs import drift
+from qfolio.portfolio.following import follow
 from qfolio.portfolio.market import Menu
-from qfolio.portfolio.policy import follow
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
@@ -39,7 +39,7 @@ def portfolio(prices=None, **settings):
 def test_rewards_are_the_log_returns_of_the_replay(lag, menu):
     """The task pays, in float32, what the float64 replay of the same decisions earns."""
     task, prices = portfolio(lag=lag, menu=menu, cost=0.01), table()
-    state = Position(task.first, task.hold(jnp.array([1.0, 0, 0, 0])))
+    state = Position(task.first_decision, task.hold(jnp.array([1.0, 0, 0, 0])))
     rng, decisions, rewards = np.random.default_rng(1), [], []
     for _ in range(20):
         action = jnp.array(rng.integers(task.actions.n) if menu else rng.dirichlet(np.ones(4)))
@@ -56,9 +56,9 @@ def test_rewards_are_the_log_returns_of_the_replay(lag, menu):
 def test_no_order_is_free_at_any_lag():
     task = portfolio(menu="tilts:0.5", lag=2, cost=0.1)
     held = task.hold(jnp.array([0.1, 0.2, 0.3, 0.4]))
-    state = Position(task.first, held)
+    state = Position(task.first_decision, held)
     reward = task.step(state, jnp.array(0), jax.random.key(0)).reward
-    moved = task.relatives(task.first, task.first + 1)
+    moved = task.relatives(task.first_decision, task.first_decision + 1)
     after = drift(held.weights, moved.waiting)
     np.testing.assert_allclose(reward, jnp.log(after[0] + after[1:] @ moved.earning), atol=1e-6)
 
@@ -87,15 +87,28 @@ def test_a_part_knows_nothing_of_the_rest():
     later[:10] *= 5.0
     other = Prices(prices.dates, prices.assets, later)
     one, two = (portfolio(p, lag=1).part(10, 40) for p in (prices, other))
-    assert (int(one.first), int(one.last)) == (10 + WINDOW, 40 - 2)
+    assert (int(one.first_decision), int(one.last_decision)) == (10 + WINDOW, 40 - 2)
     np.testing.assert_array_equal(one.scale, two.scale)
-    for row in range(int(one.first), int(one.last) + 1):
+    for row in range(int(one.first_decision), int(one.last_decision) + 1):
         np.testing.assert_array_equal(one.features(jnp.array(row)), two.features(jnp.array(row)))
         for x, y in zip(one.relatives(row, row + 1), two.relatives(row, row + 1), strict=True):
             np.testing.assert_array_equal(x, y)
     starts = jax.vmap(one.reset_market)(start_keys(500))
-    assert starts.min() == one.first
-    assert starts.max() == one.last - one.horizon + 1
+    assert starts.min() == one.first_decision
+    assert starts.max() == one.last_decision - one.horizon + 1
+
+
+def test_no_value_is_judged_by_rows_behind_the_part():
+    """The last decision's outcome is the last that is known; nothing repeats it."""
+    task = portfolio().part(0, 40)
+    state = Position(task.last_decision, task.hold(jnp.ones(4) / 4))
+    assert int(task.steps_left(state)) == 1
+    agent = DQN(network="flat", hidden=(4,), discount=0.9)
+    chosen = portfolio(menu="tilts:0.2").part(0, 40)
+    weights = agent.weights(agent.init(chosen, jax.random.key(0)))
+    known = evaluate(chosen, agent, weights, start_keys(64), 14).overestimation
+    assert np.isfinite(known)  # of starts up to row 15
+    assert np.isnan(evaluate(chosen, agent, weights, start_keys(64), 25).overestimation)
 
 
 AGENTS = {
@@ -167,7 +180,7 @@ def test_agents_do_not_depend_on_the_order_of_columns(trained):
 def test_limits():
     values = table().values.copy()
     values[:30, 1] = np.nan
-    task = portfolio(Prices(table().dates, ("a", "b", "c"), values), cap=0.4)
+    task = portfolio(Prices(table().dates, ("a", "b", "c"), values), max_weight=0.4)
     np.testing.assert_allclose(task.limits, [0.4, 0, 0.4])
     target = task.target(jnp.array([1.0, 0, 0, 0]), jnp.array([0.1, 0.5, 0.3, 0.1]))
     np.testing.assert_allclose(target, [0.5, 0.4, 0, 0.1], atol=1e-6)
@@ -201,32 +214,13 @@ def test_menus_that_are_none(menu):
         _ = portfolio(menu=menu).actions
 
 
-def test_utilities_by_hand():
-    growth, moments = jnp.array(1.02), jnp.array([0.001, 4e-4])
-    utility = lambda **settings: portfolio(**settings).utility(growth, moments)  # noqa: E731
-    np.testing.assert_allclose(utility()[0], np.log(1.02), rtol=1e-5)
-    np.testing.assert_allclose(
-        utility(reward="crra", risk_aversion=3.0)[0], (1.02**-2 - 1) / -2, rtol=1e-4
-    )
-    np.testing.assert_allclose(
-        utility(reward="crra", risk_aversion=1.0)[0], np.log(1.02), rtol=1e-5
-    )
-    np.testing.assert_allclose(
-        utility(reward="mean-variance", risk_aversion=3.0)[0], 0.02 - 1.5 * 0.02**2, rtol=1e-4
-    )
-    # Moody & Saffell (1998): (B ΔA − ½ A ΔB) / (B − A²)^1.5
-    ratio, after = utility(reward="differential-sharpe", sharpe_rate=0.1)
-    change = np.array([0.02 - 0.001, 0.02**2 - 4e-4])
-    expected = (4e-4 * change[0] - 0.5 * 0.001 * change[1]) / (4e-4 - 1e-6) ** 1.5
-    np.testing.assert_allclose(ratio, expected, rtol=1e-3)
-    np.testing.assert_allclose(after, np.array(moments) + 0.1 * change, rtol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"window": 0}, "window is 0"), ({"lag": -1}, "lag is -1"), ({"cost": 0.5}, "cost is 0.5"),
-        ({"reward": "profit"}, "reward is profit"), ({"cap": 0.0}, "cap is 0"),
+        ({"reward": "profit"}, "no reward 'profit'"), ({"max_weight": 0.0}, "max_weight is 0"),
+        ({"cost_model": "free"}, "no cost model 'free'"),
+        ({"reward": "crra", "risk_aversion": -1.0}, "risk_aversion is -1.0"),
         ({"window": 58}, "60 rows are too few"),
     ],
 )  # fmt: skip

@@ -15,8 +15,8 @@ import numpy as np
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import TASKS, find
-from qfolio.portfolio.backtest.simulation import simulate
-from qfolio.portfolio.costs import drift
+from qfolio.portfolio.backtest.simulation import Simulation, simulate
+from qfolio.portfolio.costs import Context, grown
 from qfolio.portfolio.prices.table import load
 
 try:
@@ -43,7 +43,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
     assets held now (the rest is cash).
 
     **Action**: N + 1 numbers, cash first, of which the nearest point of the simplex is taken as
-    target weights (Euclidean projection, no asset above ``cap``); so weights stand for themselves.
+    target weights (Euclidean projection, no asset above ``max_weight``); so weights stand for
+    themselves.
     With ``menu`` ("grid:10", "tilts:0.1"), the number of an allocation instead.
 
     **Step**: a decision at row t is executed at the close of row t + lag, and its reward is that of
@@ -60,7 +61,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         scaled_by: The table that the scale of observations comes from, if not ``prices``: to test
             on later prices, give those that were trained on.
         render_mode: "ansi" for a line of text, or None.
-        task: Settings of the portfolio task: window, lag, cost, cap, menu, reward, horizon, ….
+        task: Settings of the portfolio task, such as window, lag, cost, max_weight, menu, reward.
 
     ``reset`` draws the first row, unless told ``options={"start": row}``.
     """
@@ -94,8 +95,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             scale = Portfolio.of(other, **chosen)
             self.task = _programs().scaled(self.task, scale)
         assets, channels = len(self.prices.assets), self.task.center.shape[0]
-        self.first = int(self.task.first)
-        self.last = int(self.task.last) - self.task.horizon + 1
+        self.first = int(self.task.first_decision)
+        self.last = int(self.task.last_decision) - self.task.horizon + 1
         self.observation_space = spaces.Dict(
             {
                 "features": spaces.Box(
@@ -126,7 +127,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             )
         self._row, self._steps, self._wealth = int(start), 0, 1.0
         self._held = np.eye(len(self.prices.assets) + 1)[0]
-        self._moments = np.asarray(self.task.hold(self._held).moments, float)
+        self._memory = _programs().memory(self.task)
         self._target, self._cost, self._turnover = self._held, 0.0, 0.0
         return self._observe(), self._info()
 
@@ -137,13 +138,14 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         row, lag = self._row, self.task.lag
         self._target = _programs().target(self.task, self._held, self._checked(action))
         values = self.prices.values[row : row + lag + 2]
+        costs = self.task.costs
         traded = simulate(
-            values, self._target[None], first=0, cost=self.task.cost, lag=lag, start=self._held
+            values, self._target[None], first=0, cost=costs, lag=lag, start=self._held
         )
-        growth = 1 + float(traded.returns[0])
-        reward, self._moments = _programs().utility(self.task, growth, self._moments)
-        self._held = drift(self._target, np.nan_to_num(values[1] / values[0], nan=1.0))
-        self._wealth *= growth
+        reward, self._memory = _programs().reward(self.task, self._memory, traded)
+        coming = np.nan_to_num(values[1] / values[0], nan=1.0)
+        self._held = grown(self._target, costs.carry(coming, Context()))
+        self._wealth *= 1 + float(traded.returns[0])
         self._cost, self._turnover = float(traded.cost[0]), float(traded.turnover[0])
         self._row, self._steps = row + 1, self._steps + 1
         over = self._steps >= self.task.horizon
@@ -207,6 +209,7 @@ class _Programs:
 
         from qfolio.core import devices, simplex
         from qfolio.core.mdp import Position
+        from qfolio.portfolio.rewards import Outcome
 
         devices.configure()
 
@@ -214,12 +217,18 @@ class _Programs:
         def target(task: Any, held: Any, action: Any) -> Any:
             if not task.menu:
                 action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
-            return task.intent(Position(task.first, task.hold(held)), action)
+            return task.intent(Position(task.first_decision, task.hold(held)), action)
 
         self._target = target
-        self._utility = jax.jit(lambda task, growth, moments: task.utility(growth, moments))
+
+        @jax.jit
+        def reward(task: Any, memory: Any, growth: Any, cost: Any, weights: Any) -> Any:
+            return task.reward_function(memory, Outcome(growth, cost, weights))
+
+        self._reward = reward
         self._features = jax.jit(lambda task, row: task.features(row))
         self._double = partial(jax.enable_x64, True)
+        self._doubled = lambda tree: jax.tree.map(lambda x: np.asarray(x, float), tree)
         where = lambda task: (task.center, task.scale)  # noqa: E731
         self.scaled = lambda task, by: eqx.tree_at(where, task, where(by))
 
@@ -228,10 +237,17 @@ class _Programs:
             weights = np.asarray(self._target(task, held, action), float)
         return np.asarray(weights / weights.sum())
 
-    def utility(self, task: Any, growth: float, moments: np.ndarray) -> tuple[float, np.ndarray]:
+    def memory(self, task: Any) -> Any:
+        """The reward's state at the start of an episode."""
         with self._double():
-            reward, moments = self._utility(task, np.asarray(growth), moments)
-            return float(reward), np.asarray(moments)
+            return self._doubled(task.reward_function.init())
+
+    def reward(self, task: Any, memory: Any, traded: Simulation) -> tuple[float, Any]:
+        """Of a single day's replay, and the reward's state after it."""
+        outcome = 1 + traded.returns[0], traded.cost[0], traded.weights[0]
+        with self._double():
+            reward, memory = self._reward(task, memory, *outcome)
+            return float(reward), self._doubled(memory)
 
     def features(self, task: Any, row: int) -> np.ndarray:
         return np.array(self._features(task, np.int32(row)))

@@ -18,10 +18,10 @@ from qfolio.core.registry import find
 from qfolio.core.settings import names
 from qfolio.experiments import presets
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
-from qfolio.portfolio.costs import drift
+from qfolio.portfolio.costs import Context, drift, grown
 from qfolio.portfolio.prices.table import Prices
 
-OWN = ("cost", "lag", "cap", "window")
+OWN = ("cost", "lag", "max_weight", "window")
 """Settings of the portfolio task that are parameters of the estimator."""
 
 
@@ -71,8 +71,8 @@ class PortfolioPolicy(BaseOptimization):
     lag : int, default=1
         Rows between a decision and its execution.
 
-    cap : float, default=1.0
-        Most that one asset may weigh.
+    max_weight : float, default=1.0
+        Largest weight of one asset.
 
     settings : dict, default=None
         Settings of the agent or of the portfolio task in place of the preset's, by name.
@@ -126,7 +126,7 @@ class PortfolioPolicy(BaseOptimization):
         window: int | None = None,
         cost: float = 0.001,
         lag: int = 1,
-        cap: float = 1.0,
+        max_weight: float = 1.0,
         settings: dict[str, Any] | None = None,
         portfolio_params: dict[str, Any] | None = None,
         fallback: Any = None,
@@ -148,7 +148,7 @@ class PortfolioPolicy(BaseOptimization):
         self.window = window
         self.cost = cost
         self.lag = lag
-        self.cap = cap
+        self.max_weight = max_weight
         self.settings = settings
 
     @property
@@ -237,7 +237,8 @@ class PortfolioPolicy(BaseOptimization):
         of_agent = {name: value for name, value in changes.items() if name in mine}
         of_task = {name: value for name, value in changes.items() if name not in mine}
         window = {} if self.window is None else {"window": self.window}
-        task = {"cost": self.cost, "lag": self.lag, "cap": self.cap, **window, **of_task}
+        own = {"cost": self.cost, "lag": self.lag, "max_weight": self.max_weight}
+        task = {**own, **window, **of_task}
         return chosen._replace(settings={**chosen.settings, **of_agent}), task
 
     def _learned(self) -> Prices:
@@ -289,13 +290,15 @@ class PortfolioPolicy(BaseOptimization):
         prices = _prices(np.concatenate([still, before, returns]), self._assets())
         values = prices.values
         # Row window + lag is the last before X, and row window that of the first decision.
-        start = drift(self._held(), values[window] / values[window + lag])
+        since = task.costs.carry(values[window + lag] / values[window], Context(rows=lag))
+        start = grown(self._held(), 1 / since)
         decisions = np.full((days, 1 + returns.shape[1]), np.nan)  # NaN: no order
         if missing < days:
             first = window + missing
-            held = drift(start, values[first] / values[window])
+            moved = task.costs.carry(values[first] / values[window], Context(rows=missing))
+            held = grown(start, moved)
             decisions[missing:], _ = self.policy_.decide(prices, first, held, days - missing)
-        return simulate(values, decisions, first=window, cost=task.cost, lag=lag, start=start)
+        return simulate(values, decisions, first=window, cost=task.costs, lag=lag, start=start)
 
 
 class PolicyPortfolio(Portfolio):

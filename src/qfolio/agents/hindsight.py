@@ -59,10 +59,10 @@ def require_exogenous(task: Task) -> None:
             "all_actions needs a market, whose prices do not answer to actions; "
             f"{task.name} is none."
         )
-    if getattr(task, "reward", "") == "differential-sharpe":
+    if task.path_dependent:
         raise QfolioError(
-            "all_actions draws holdings without a past, and differential-sharpe rewards "
-            "what comes after one; take reward=crra, or all_actions=false."
+            "all_actions draws holdings without a past, and this reward (such as "
+            "differential-sharpe) depends on it; take reward=crra, or all_actions=false."
         )
 
 

@@ -105,15 +105,14 @@ def _cells(optimum: str, value: float, regret: float, over: float | None) -> tup
 
 def print_rule(rule: dict[str, Any]) -> None:
     """What the learned policies do, beside what is best, from ``Run.grade``."""
+    from qfolio.report.rule import rows
+
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("rule")
     for name in ("exact", "learned, mean", "farthest seed"):
         table.add_column(name, justify="right")
-    for name, exact in rule["exact"].items():
-        learned = [seed[name] for seed in rule["per_seed"]]
-        farthest = max(learned, key=lambda value: abs(value - exact))
-        mean = sum(learned) / len(learned)
-        table.add_row(name, f"{exact:.4f}", f"{mean:.4f}", f"{farthest:.4f}")
+    for name, *values in rows(rule):
+        table.add_row(name, *("none" if value is None else f"{value:.4f}" for value in values))
     console.print(table)
 
 

@@ -26,7 +26,7 @@ class Greedy(NamedTuple):
     """Greedy episodes from some starts."""
 
     returns: Float[Array, " start"]  # undiscounted, over the task's horizon
-    overestimation: Float[Array, ""]  # NaN where the agent estimates no action values
+    overestimation: Float[Array, ""]  # NaN without action values, or where what follows is unknown
 
 
 def tail_steps(discount: float | None) -> int:
@@ -43,9 +43,11 @@ def evaluate(
 
     The return counts the horizon. The overestimation is the mean over the states visited in it of
     max_a Q(s, a) less the discounted return that really followed (van Hasselt et al. 2016,
-    section 3); the tail is there so that what follows is not cut off.
+    section 3); the tail is there so that what follows is not cut off. Starts after which the task
+    itself ends within the tail, such as the last rows of a price table, do not count for it.
     """
     starts = jax.vmap(task.reset)(keys)
+    known = jax.vmap(task.steps_left)(starts) >= task.horizon + tail
 
     def step(carry: tuple[PyTree, Array], time: Array) -> tuple[tuple[PyTree, Array], tuple]:
         states, alive = carry
@@ -70,7 +72,8 @@ def evaluate(
 
     _, discounted = lax.scan(back, jnp.zeros(keys.shape), rewards, reverse=True)
     first = slice(0, task.horizon)
-    error = jnp.where(visited, best - discounted, 0.0)[first].sum() / visited[first].sum()
+    counted = visited & known
+    error = jnp.where(counted, best - discounted, 0.0)[first].sum() / counted[first].sum()
     return Greedy(rewards[first].sum(0), error)
 
 

@@ -7,14 +7,14 @@ know only this file.
 
 import abc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 
 class Discrete(eqx.Module):
@@ -140,12 +140,19 @@ class Task(eqx.Module):
         """The exact solution, where one is known."""
         return None
 
+    def steps_left(self, state: PyTree) -> Int[Array, ""]:
+        """How many steps can follow a state, which may be more than a time limit leaves."""
+        return jnp.array(jnp.iinfo(jnp.int32).max)
+
     def intent(self, state: PyTree, action: Array) -> Array:
         """What an action asks for, where it is a number from a menu; else the action itself."""
         return action
 
-    def rule(self, policy: Policy) -> dict[str, float]:
-        """The few numbers that say what a policy does, in tasks where there are such."""
+    def rule(self, policy: Policy) -> Mapping[str, float | None]:
+        """The few numbers that say what a policy does, in tasks where there are such.
+
+        None where a policy has no such number, such as an edge that it never trades to.
+        """
         return {}
 
 
@@ -163,6 +170,11 @@ class ExogenousTask(Task):
     ``settle`` (hindsight learning for exogenous inputs, Sinclair et al. 2023). Agents may use it on
     moves that they have seen; ``reset_market`` and ``next_market`` are the loop's alone.
     """
+
+    @property
+    def path_dependent(self) -> bool:
+        """Whether a reward depends on earlier ones, so that a holding needs a past."""
+        return False
 
     @abc.abstractmethod
     def reset_market(self, key: PRNGKeyArray) -> PyTree:

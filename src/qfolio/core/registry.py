@@ -60,6 +60,13 @@ BASELINES = {
     "risk-budgeting": "qfolio.portfolio.backtest.baselines:RiskBudgeting",
     "hierarchical-risk-parity": "qfolio.portfolio.backtest.baselines:HierarchicalRiskParity",
 }
+REWARDS = {
+    "log": "qfolio.portfolio.rewards:Log",
+    "crra": "qfolio.portfolio.rewards:CRRA",
+    "mean-variance": "qfolio.portfolio.rewards:MeanVariance",
+    "differential-sharpe": "qfolio.portfolio.rewards:DifferentialSharpe",
+}
+COSTS = {"proportional": "qfolio.portfolio.costs:Proportional"}
 
 Kind = Literal["task", "agent", "baseline"]
 

@@ -1,4 +1,7 @@
-"""Proportional trading costs, charged exactly: the same functions for training and backtest.
+"""What trading and holding cost, charged exactly: the same lines for training and backtest.
+
+A ``CostModel`` says what is left of the wealth after a trade and what is held grows to; a market's
+``cost_model=NAME`` names one. ``Proportional`` is the one that there is: a share of what is traded.
 
 Weights have a last axis of N + 1 entries, cash first, and sum to 1. Every function works on numpy
 and on jax arrays (under jit, vmap and grad, too) and broadcasts over leading axes.
@@ -13,9 +16,63 @@ for the financial portfolio management problem", 2017, eq. 14), which solves
 where the sums run over the assets, without cash.
 """
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+
+
+class Context(NamedTuple):
+    """What a market knows at a trade, or of a stretch of holding, besides relatives."""
+
+    rows: Any = 1  # how many pass: from the decision to its trade, or while holding
+
+
+class CostModel(Protocol):
+    """Costs of trading and of holding; every method takes numpy and jax arrays, traced ones too.
+
+    A field that is called like a setting of the market (such as ``cost``) takes its value.
+    """
+
+    def trade(self, before: Any, after: Any, context: Context) -> tuple[Any, dict[str, Any]]:
+        """What is left of each unit of wealth after a rebalancing, and what it cost.
+
+        Args:
+            before: Weights before the trade, of shape (..., N + 1), not negative, of sum 1.
+            after: Weights after it, likewise.
+            context: Of the trade.
+
+        Returns:
+            Remainder factors of shape (...), exactly 1 where nothing is traded; and the shares of
+            wealth paid, of the same shape, by kind of cost, whose sum is 1 less the factor.
+        """
+        ...
+
+    def carry(self, relatives: Any, context: Context) -> Any:
+        """What a unit of cash and of each asset grows to while it is held.
+
+        Args:
+            relatives: New price over old price of each asset, of shape (..., N).
+            context: Of the stretch; ``rows`` is a number or of shape (...).
+
+        Returns:
+            Growth factors of shape (..., N + 1), cash first.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Proportional:
+    """A share of what is traded, one way; holding costs nothing and cash earns nothing."""
+
+    cost: float = 0.001
+
+    def trade(self, before: Any, after: Any, context: Context) -> tuple[Any, dict[str, Any]]:
+        remainder = remainder_factor(before, after, self.cost)
+        return remainder, {"proportional": 1 - remainder}
+
+    def carry(self, relatives: Any, context: Context) -> Any:
+        return with_cash(relatives)
 
 
 def remainder_factor(before: Any, after: Any, cost: Any, *, highest: float = 0.2) -> Any:
@@ -96,7 +153,7 @@ def traded(before: Any, after: Any, remainder: Any) -> Any:
 
 
 def drift(weights: Any, relatives: Any) -> Any:
-    """Weights after prices have moved and nobody has traded.
+    """Weights after prices have moved and nobody has traded, where cash earns nothing.
 
     Args:
         weights: Weights of shape (..., N + 1).
@@ -105,8 +162,13 @@ def drift(weights: Any, relatives: Any) -> Any:
     Returns:
         Weights of shape (..., N + 1).
     """
-    grown = weights * with_cash(relatives)
-    return grown / grown.sum(-1, keepdims=True)
+    return grown(weights, with_cash(relatives))
+
+
+def grown(weights: Any, growth: Any) -> Any:
+    """Weights after each entry has grown by its factor, both of shape (..., N + 1)."""
+    worth = weights * growth
+    return worth / worth.sum(-1, keepdims=True)
 
 
 def with_cash(relatives: Any) -> Any:

@@ -2,16 +2,16 @@
 
 Weights have an entry for cash, then one for each asset. A decision names target weights at today's
 prices: an order in shares, scaled to what the wealth affords when it is executed, and free of cost
-where it equals what is held. The arithmetic of trading is in ``costs.py``, the same for
-training and backtest.
+where it equals what is held. What a trade costs is in ``costs.py``, the same for training and
+backtest; what may be held in ``feasible.py``; what a step is worth in ``rewards.py``.
 """
 
 import abc
+import dataclasses
 from math import comb
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
@@ -19,18 +19,19 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import MenuActions, View
 from qfolio.core.mdp import Actions, Discrete, ExogenousTask, Position, Simplex
-from qfolio.portfolio.costs import drift, remainder_factor, with_cash
-
-REWARDS = ("log", "crra", "mean-variance", "differential-sharpe")
+from qfolio.core.registry import COSTS, REWARDS, find
+from qfolio.portfolio.costs import Context, CostModel, grown
+from qfolio.portfolio.feasible import CappedSimplex, Feasible
+from qfolio.portfolio.rewards import Outcome, Reward
 
 MENU_LIMIT = 2000
 
 
 class Holding(NamedTuple):
-    """The portfolio as last decided, drifted to now, and running moments of past returns."""
+    """The portfolio as last decided, drifted to now, and the state of the reward."""
 
     weights: Float[Array, " entry"]
-    moments: Float[Array, "2"]  # of the differential Sharpe ratio
+    reward: PyTree
 
 
 class Relatives(NamedTuple):
@@ -98,9 +99,8 @@ class Market(ExogenousTask):
     """Cash and assets; a market says how prices move, and the rest is here.
 
     cost: of trading one way, as a share of what is traded. menu: text of a ``Menu`` for agents that
-    choose among allocations; without, an action is the target weights. reward: log growth, CRRA
-    utility or mean–variance utility of each step's growth (by ``risk_aversion``), or differential
-    Sharpe ratio (Moody & Saffell 1998, with a memory of 1/``sharpe_rate`` steps).
+    choose among allocations; without, an action is the target weights. reward, cost_model: names of
+    a ``Reward`` and of a ``CostModel``.
     """
 
     if TYPE_CHECKING:  # as in Task
@@ -110,18 +110,17 @@ class Market(ExogenousTask):
 
         @property
         def menu(self) -> str: ...
+
+        @property
+        def limits(self) -> Float[Array, " asset"]: ...
     else:
         cost: eqx.AbstractVar[float]
         menu: eqx.AbstractVar[str]
+        limits: eqx.AbstractVar[Float[Array, " asset"]]  # largest weights; 0: cannot be traded
 
     reward = "log"
-    risk_aversion = 1.0
-    sharpe_rate = 0.01
-
-    @property
-    @abc.abstractmethod
-    def limits(self) -> Float[Array, " asset"]:
-        """The largest weight of each asset; 0 where it cannot be traded."""
+    cost_model = "proportional"
+    lag = 0  # rows from a decision to its execution
 
     @abc.abstractmethod
     def features(self, market: PyTree) -> Float[Array, "asset time channel"]:
@@ -137,15 +136,27 @@ class Market(ExogenousTask):
             return Menu(self.menu, self.limits).actions
         return Simplex(self.limits.shape[0])
 
-    def target(self, held: Float[Array, " entry"], action: Array) -> Float[Array, " entry"]:
-        """Target weights of an action; what is above an asset's limit stays in cash."""
-        weights = Menu(self.menu, self.limits).weights(held, action) if self.menu else action
-        return self._limited(weights)
+    @property
+    def feasible(self) -> Feasible:
+        """The weights that may be ordered."""
+        return CappedSimplex(self.limits)
 
-    def _limited(self, weights: Float[Array, " entry"]) -> Float[Array, " entry"]:
-        allowed = jnp.minimum(weights[1:], self.limits)
-        cash = weights[:1] + (weights[1:] - allowed).sum(keepdims=True)
-        return jnp.concatenate([cash, allowed])
+    @property
+    def costs(self) -> CostModel:
+        return _named(self, "cost model", COSTS, self.cost_model)
+
+    @property
+    def reward_function(self) -> Reward:
+        return _named(self, "reward", REWARDS, self.reward)
+
+    @property
+    def path_dependent(self) -> bool:
+        return self.reward_function.path_dependent
+
+    def target(self, held: Float[Array, " entry"], action: Array) -> Float[Array, " entry"]:
+        """The target weights that an action means, brought to what may be ordered."""
+        weights = Menu(self.menu, self.limits).weights(held, action) if self.menu else action
+        return self.feasible.project(weights, held)
 
     def intent(self, state: Position, action: Array) -> Float[Array, " entry"]:
         return self.target(state.holding.weights, action)
@@ -154,43 +165,29 @@ class Market(ExogenousTask):
         return View(self.features(state.market), state.holding.weights[1:])
 
     def draw_holding(self, key: PRNGKeyArray) -> Holding:
-        """From nearly equal weights to nearly all in one."""
-        spread_key, key = jax.random.split(key)
-        spread = jax.random.uniform(spread_key, maxval=4.0)
-        weights = jax.nn.softmax(spread * jax.random.gumbel(key, (self.limits.shape[0] + 1,)))
-        return self.hold(self._limited(weights))
+        return self.hold(self.feasible.draw(key))
 
     def hold(self, weights: Float[Array, " entry"]) -> Holding:
         """A holding without a past."""
-        return Holding(weights, jnp.array([0.0, 1e-4]))
+        return Holding(weights, self.reward_function.init())
 
     def settle(
         self, market: PyTree, next_market: PyTree, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
+        costs, moved = self.costs, self.relatives(market, next_market)
         target = self.target(holding.weights, action)
-        moved = self.relatives(market, next_market)
-        before, after = drift(holding.weights, moved.waiting), drift(target, moved.waiting)
-        remainder = remainder_factor(before, after, self.cost)
-        growth = remainder * (after * with_cash(moved.earning)).sum()
-        reward, moments = self.utility(growth, holding.moments)
-        return reward, Holding(drift(target, moved.coming), moments)
+        wait = Context(rows=self.lag)
+        waiting = costs.carry(moved.waiting, wait)
+        before, after = grown(holding.weights, waiting), grown(target, waiting)
+        remainder, paid = costs.trade(before, after, wait)
+        growth = remainder * (after * costs.carry(moved.earning, Context())).sum()
+        outcome = Outcome(growth, sum(paid.values()), after)
+        reward, state = self.reward_function(holding.reward, outcome)
+        return reward, Holding(grown(target, costs.carry(moved.coming, Context())), state)
 
-    def utility(
-        self, growth: Float[Array, ""], moments: Float[Array, "2"]
-    ) -> tuple[Float[Array, ""], Float[Array, "2"]]:
-        """Reward of one step's wealth ratio, and the moments after it."""
-        gain = growth - 1
-        if self.reward == "log":
-            return jnp.log(growth), moments
-        if self.reward == "crra":
-            power = 1 - jnp.asarray(self.risk_aversion)
-            log = abs(power) < 1e-6  # the limit
-            safe = jnp.where(log, 1.0, power)
-            utility = jnp.expm1(safe * jnp.log(growth)) / safe
-            return jnp.where(log, jnp.log(growth), utility), moments
-        if self.reward == "mean-variance":
-            return gain - self.risk_aversion / 2 * gain**2, moments
-        mean, square = moments
-        change = jnp.stack([gain - mean, gain**2 - square])
-        ratio = (square * change[0] - mean * change[1] / 2) / (square - mean**2) ** 1.5
-        return ratio, moments + self.sharpe_rate * change
+
+def _named(market: Market, kind: str, table: dict[str, str], name: str) -> Any:
+    """The part of a market that a setting names, with the settings that the two share."""
+    part: Any = find(kind, table, name)
+    shared = [field.name for field in dataclasses.fields(part) if hasattr(market, field.name)]
+    return part(**{name: getattr(market, name) for name in shared})

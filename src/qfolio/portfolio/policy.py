@@ -1,41 +1,31 @@
 """A learned portfolio policy: from prices and holdings to target weights.
 
-The policy is the mean over the agents of all seeds. It lives in a folder: what it was trained with
-(JSON), its weights, and the whole learning state, from which it can go on learning.
+The policy is the mean over the agents of all seeds. ``policy_folder.py`` keeps it on disk.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import new_folder, read_json, read_tree, write_json, write_tree
-from qfolio.core.market import View
 from qfolio.core.mdp import Agent
 from qfolio.core.population import Population
-from qfolio.core.registry import build, name_of
 from qfolio.core.training import episode_steps
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Listener, fit
 from qfolio.experiments.presets import Preset, preset
-from qfolio.portfolio.costs import drift
+from qfolio.portfolio.following import follow, on_table
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
-
-FORMAT = 2
-"""Of a policy's folder; raised whenever an older folder can no longer be read."""
 
 UPDATE_RATE = 0.1
 """Share of the learning rate with which a policy goes on learning."""
@@ -206,7 +196,12 @@ class Policy:
     @property
     def rows(self) -> int:
         """Of the part of a table that it was trained on."""
-        return int(self.task.last) - int(self.task.first) + self.task.window + self.task.lag + 2
+        return (
+            int(self.task.last_decision - self.task.first_decision)
+            + self.task.window
+            + self.task.lag
+            + 2
+        )
 
     def table(self, prices: Any, **options: Any) -> Prices:
         """The prices with the policy's assets in its order; see ``weights``."""
@@ -232,7 +227,7 @@ class Policy:
             )
         table = table.select(self.assets)
         # An asset that may be held needs a price all over the window, the others one at its end.
-        tradable, last = np.asarray(self.task.largest) > 0, len(table) - 1
+        tradable, last = np.asarray(self.task.limits) > 0, len(table) - 1
         begin = last - self.task.window
         late = table.first_rows > np.where(tradable, begin, last)
         if late.any():
@@ -276,55 +271,16 @@ class Policy:
 
     def save(self, folder: Path | str) -> None:
         """Writes it into a new or empty folder."""
-        with new_folder(Path(folder)) as place:
-            write_json(
-                place / "policy.json",
-                {
-                    "format": FORMAT,
-                    "kind": "policy",
-                    "agent": name_of(self.agent),
-                    "settings": settings.describe(self.agent),
-                    "task": settings.describe(self.task),
-                    "assets": list(self.assets),
-                    "features": list(self.features),
-                    "seeds": self.seeds,
-                    "rows": self.rows,
-                    "updates": self.updates,
-                    "learned": str(self.learned),
-                    "learns": self.learner is not None,
-                },
-            )
-            kept = jax.tree.map(np.asarray, _kept(self.task, self.members))
-            write_tree(place / "policy.safetensors", kept)
-            if self.learner is not None:
-                write_tree(place / "learning.safetensors", self.learner)
+        from qfolio.portfolio import policy_folder
+
+        policy_folder.save(self, Path(folder))
 
     @classmethod
     def open(cls, folder: Path | str) -> "Policy":
         """What ``save`` wrote. Raises QfolioError where the folder holds no policy."""
-        path = Path(folder) / "policy.json"
-        config = read_json(path)
-        if config.get("format") != FORMAT or config.get("kind") != "policy":
-            raise QfolioError(f"{folder} holds no policy of this version.")
-        try:
-            agent: Agent = build("agent", config["agent"], config["settings"])
-            chosen = settings.convert(Portfolio, config["task"])
-            assets, features = tuple(config["assets"]), tuple(config["features"])
-            seeds, rows, updates = (int(config[name]) for name in ("seeds", "rows", "updates"))
-            learned, learns = np.datetime64(config["learned"], "s"), bool(config["learns"])
-            bounds = (len(assets) > 0, 1 <= seeds < 2**20, 1 <= rows < 2**31, updates >= 0)
-            if not all(bounds) or not all(isinstance(name, str) for name in assets + features):
-                raise ValueError
-        except (KeyError, TypeError, ValueError, AttributeError):
-            raise QfolioError(f"{path} is damaged: a setting is missing or odd.") from None
-        task = _blank(len(assets), len(features), rows, **chosen)
-        state = state_template(task, agent, seeds)
-        template = _kept(task, agent.weights(state))
-        kept = read_tree(path.with_name("policy.safetensors"), template)
-        members = kept.pop("members")
-        task = dataclasses.replace(task, **jax.tree.map(jnp.asarray, kept))
-        learner = read_tree(path.with_name("learning.safetensors"), state) if learns else None
-        return cls(task, agent, members, assets, features, learner, updates, learned)
+        from qfolio.portfolio import policy_folder
+
+        return policy_folder.read(Path(folder))
 
     def _moved(self, table: Prices) -> Portfolio:
         """The task on all rows of another table, with the scale of the old one."""
@@ -333,93 +289,6 @@ class Policy:
         part = task.part(0, len(table) - 1, tradable)
         where = lambda t: (t.center, t.scale)  # noqa: E731
         return eqx.tree_at(where, part, where(self.task))
-
-
-def _kept(task: Portfolio, members: PyTree) -> dict[str, PyTree]:
-    """What a policy decides by, but for its settings."""
-    return {
-        "members": members,
-        "center": task.center,
-        "scale": task.scale,
-        "largest": task.largest,
-    }
-
-
-def _blank(assets: int, features: int, rows: int, **chosen: Any) -> Portfolio:
-    """A task that was trained on so many rows, of whose table nothing is left."""
-    task = Portfolio(
-        log_relatives=jnp.zeros((0, assets)),
-        extra=jnp.zeros((0, assets, features)),
-        largest=jnp.zeros(assets),
-        center=jnp.zeros(1 + features),
-        scale=jnp.ones(1 + features),
-        first=jnp.array(0, jnp.int32),
-        last=jnp.array(0, jnp.int32),
-        **chosen,
-    )
-    shown = (jnp.zeros((task.window, assets)), jnp.zeros((task.window, assets, features)))
-    last = jnp.array(rows - task.lag - 2, jnp.int32)
-    where = lambda t: (t.log_relatives, t.extra, t.first, t.last)  # noqa: E731
-    return eqx.tree_at(where, task, (*shown, jnp.array(task.window, jnp.int32), last))
-
-
-def state_template(task: Portfolio, agent: Agent, seeds: int) -> PyTree:
-    """Shapes of the agents' whole states, with a leading seed axis."""
-    state = jax.eval_shape(lambda: agent.init(task, jax.random.key(0)))
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((seeds, *x.shape), x.dtype), state)
-
-
-def on_table(task: Portfolio, prices: Prices) -> Portfolio:
-    """The same task, scaled by what it was trained on, over all rows of another table."""
-    other = Portfolio.arrays(prices)
-    rows = jnp.array(len(prices) - 1, jnp.int32)
-    where = lambda t: (t.log_relatives, t.extra, t.first, t.last)  # noqa: E731
-    return eqx.tree_at(where, task, (*other, jnp.array(task.window, jnp.int32), rows))
-
-
-def follow(
-    task: Portfolio,
-    agent: Agent,
-    members: PyTree,
-    first: int,
-    held: np.ndarray,
-    count: int,
-    *,
-    together: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Greedy decisions from row ``first`` on: of each member by itself, or of all together.
-
-    Together, they hold one portfolio and follow the mean of their targets.
-
-    held: at row ``first``, shape (seed, entry), or (1, entry) if together. The results are target
-    weights, and what is held one row after each decision, both (seed or 1, count, entry).
-    """
-    portfolios = jax.tree.map(lambda x: x[None] if together else x[:, None], members)
-    start = jnp.array(first, jnp.int32), jnp.asarray(held, jnp.float32)
-    targets, after = _follow(task, agent, portfolios, *start, count)
-    return np.asarray(targets), np.asarray(after)
-
-
-@eqx.filter_jit(donate="none")
-def _follow(
-    task: Portfolio, agent: Agent, members: PyTree, first: Array, held: Array, count: int
-) -> tuple[Float[Array, "portfolio time entry"], Float[Array, "portfolio time entry"]]:
-    """members: with leading axes (portfolio, member); a portfolio follows the mean of its own."""
-
-    def step(members: PyTree, held: Array, row: Array) -> tuple[Array, tuple[Array, Array]]:
-        view = View(task.features(row)[None], held[None, 1:])
-
-        def one(weights: PyTree) -> Array:
-            return task.target(held, agent.policy(weights, view)[0])
-
-        target = jax.vmap(one)(members).mean(0)
-        after = drift(target, task.relatives(row, row).coming)
-        return after, (target, after)
-
-    def path(members: PyTree, held: Array) -> tuple[Array, Array]:
-        return lax.scan(partial(step, members), held, first + jnp.arange(count))[1]
-
-    return jax.vmap(path)(members, held)
 
 
 def _learn(population: Population, episodes: int, listeners: Sequence[Listener]) -> None:

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
-from qfolio.core.mdp import Actions, Simplex
-from qfolio.portfolio.market import REWARDS, Market, Relatives
+from qfolio.core.mdp import Actions, Position, Simplex
+from qfolio.portfolio.market import Market, Relatives
 from qfolio.portfolio.prices.table import Prices
 
 Row = Int[Array, ""]
@@ -32,15 +32,16 @@ class Portfolio(Market):
 
     log_relatives: Float[Array, "row asset"]  # log of price over the row before; 0 where unknown
     extra: Float[Array, "row asset channel"]  # other features
-    largest: Float[Array, " asset"]  # possible weight of each asset; 0 where it cannot be traded
+    limits: Float[Array, " asset"]  # largest weight of each asset; 0 where it cannot be traded
     center: Float[Array, " channel"]  # of the observed channels, from the rows of the part
     scale: Float[Array, " channel"]
-    first: Row  # decisions are made from here
-    last: Row  # to here
+    first_decision: Row
+    last_decision: Row
     window: int = static(60)  # rows that are observed
     lag: int = static(1)  # rows from a decision to its execution
     cost: float = constant(0.001)  # of trading one way, as a share of what is traded
-    cap: float = constant(1.0)  # largest weight of one asset
+    cost_model: str = static("proportional")
+    max_weight: float = constant(1.0)  # of one asset
     menu: str = static("")
     reward: str = static("log")
     risk_aversion: float = number(3.0)
@@ -56,11 +57,11 @@ class Portfolio(Market):
         task = Portfolio(
             log_relatives=log_relatives,
             extra=extra,
-            largest=jnp.ones(values.shape[1]),
+            limits=jnp.ones(values.shape[1]),
             center=jnp.zeros(channels),
             scale=jnp.ones(channels),
-            first=jnp.array(0, jnp.int32),
-            last=jnp.array(0, jnp.int32),
+            first_decision=jnp.array(0, jnp.int32),
+            last_decision=jnp.array(0, jnp.int32),
             **settings,
         )
         return task.part(0, len(values) - 1, ~np.isnan(values[0]))
@@ -76,16 +77,9 @@ class Portfolio(Market):
     def __check_init__(self) -> None:
         require(self, "window horizon", lambda x: 1 <= x <= 100_000, "from 1 to 100,000")
         require(self, "lag", lambda x: 0 <= x <= 1000, "from 0 to 1000 rows")
-        require(self, "cap", lambda x: 0 < x <= 1, "above 0 and at most 1")
-        require(self, "reward", lambda x: x in REWARDS, f"one of {', '.join(REWARDS)}")
-        for name, low, high in (
-            ("cost", 0, 0.2),
-            ("risk_aversion", 0, 100),
-            ("sharpe_rate", 0, 0.5),
-        ):
-            value = getattr(self, name)
-            if isinstance(value, float) and not low <= value <= high:
-                raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")
+        require(self, "max_weight", lambda x: 0 < x <= 1, "above 0 and at most 1")
+        require(self, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
+        _ = self.costs, self.reward_function  # which check their own settings
 
     def part(self, first: int, last: int, tradable: np.ndarray | None = None) -> "Portfolio":
         """The same task on the prices of rows ``first`` to ``last`` alone.
@@ -102,7 +96,7 @@ class Portfolio(Market):
                 "more rows."
             )
         rows = slice(first + 1, last + 1)
-        usable = np.ones(self.largest.shape[0], bool) if tradable is None else tradable
+        usable = np.ones(self.limits.shape[0], bool) if tradable is None else tradable
         if not usable.any():
             raise QfolioError("No asset can be traded over these rows.")
         channels = np.concatenate(
@@ -111,10 +105,10 @@ class Portfolio(Market):
         center, scale = channels.mean((0, 1)), channels.std((0, 1))
         center[0] = 0.0  # the sign of a return means something
         return eqx.tree_at(
-            lambda t: (t.largest, t.center, t.scale, t.first, t.last),
+            lambda t: (t.limits, t.center, t.scale, t.first_decision, t.last_decision),
             self,
             (
-                jnp.asarray(np.where(usable, self.cap, 0.0), jnp.float32),
+                jnp.asarray(np.where(usable, self.max_weight, 0.0), jnp.float32),
                 jnp.asarray(center, jnp.float32),
                 jnp.asarray(np.where(scale > 0, scale, 1.0), jnp.float32),
                 jnp.array(first + self.window, jnp.int32),
@@ -123,20 +117,20 @@ class Portfolio(Market):
         )
 
     @property
-    def limits(self) -> Float[Array, " asset"]:
-        return self.largest
-
-    @property
     def actions(self) -> Actions:
-        return super().actions if self.menu else Simplex(self.largest.shape[0], self.cap)
+        return super().actions if self.menu else Simplex(self.limits.shape[0], self.max_weight)
 
     def reset_market(self, key: PRNGKeyArray) -> Row:
-        starts = self.last - self.first + 1 - self.horizon + 1
-        return self.first + jnp.floor(jax.random.uniform(key) * starts).astype(jnp.int32)
+        starts = self.last_decision - self.first_decision + 1 - self.horizon + 1
+        drawn = jnp.floor(jax.random.uniform(key) * starts).astype(jnp.int32)
+        return self.first_decision + drawn
 
     def next_market(self, market: Row, key: PRNGKeyArray) -> Row:
         # One row on, the last decision's outcome is known; episodes end there at the latest.
-        return jnp.minimum(market + 1, self.last + 1)
+        return jnp.minimum(market + 1, self.last_decision + 1)
+
+    def steps_left(self, state: Position) -> Int[Array, ""]:
+        return self.last_decision + 1 - state.market
 
     def features(self, market: Row) -> Float[Array, "asset time channel"]:
         start = market - self.window + 1
@@ -146,9 +140,16 @@ class Portfolio(Market):
         return jnp.swapaxes((channels - self.center) / self.scale, 0, 1)
 
     def relatives(self, market: Row, next_market: Row) -> Relatives:
+        # The rows up to market + lag + 1 are there: no decision is settled that lacks one.
         after = lax.dynamic_slice_in_dim(self.log_relatives, market + 1, self.lag + 1)
         return Relatives(
             waiting=jnp.exp(after[: self.lag].sum(0)),
             earning=jnp.exp(after[self.lag]),
             coming=jnp.exp(after[0]),
         )
+
+    def coming(self, row: Row) -> Float[Array, " asset"]:
+        """Relatives from a row to the next; 1 where the table ends, as nothing is known of it."""
+        rows = self.log_relatives.shape[0]
+        following = lax.dynamic_index_in_dim(self.log_relatives, row + 1, keepdims=False)
+        return jnp.where(row + 1 < rows, jnp.exp(following), 1.0)

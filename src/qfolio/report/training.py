@@ -24,6 +24,7 @@ from qfolio.report.rendering import (
     render,
     setting_groups,
 )
+from qfolio.report.rule import rows
 
 
 def write_report(folder: Path, data: ReportData) -> None:
@@ -179,15 +180,11 @@ def _agents(data: ReportData) -> list[tuple[str, list[str]]]:
 
 def _rule(rule: dict[str, Any] | None) -> list[tuple[str, str, str, str]]:
     """Return what each number of a rule is called, its exact value, the mean and the farthest."""
-    if rule is None:
-        return []
-    rows = []
-    for name, exact in rule["exact"].items():
-        learned = [seed[name] for seed in rule["per_seed"]]
-        farthest = max(learned, key=lambda value: abs(value - exact))
-        mean = float(np.mean(learned))
-        rows.append((_signed(name), number(exact, 3), number(mean, 3), number(farthest, 3)))
-    return rows
+
+    def say(value: float | None) -> str:
+        return "none" if value is None else number(value, 3)
+
+    return [(_signed(x.name), say(x.exact), say(x.mean), say(x.farthest)) for x in rows(rule)]
 
 
 def _signed(text: str) -> str:

@@ -14,7 +14,7 @@ from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.run import LATEST, Backtest
 from qfolio.portfolio.backtest.simulation import simulate
-from qfolio.portfolio.policy import follow
+from qfolio.portfolio.following import follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices
 
 from listeners import Interrupt

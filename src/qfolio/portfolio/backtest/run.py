@@ -33,7 +33,9 @@ from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.backtest.verdict import verdicts
-from qfolio.portfolio.policy import Policy, follow, state_template
+from qfolio.portfolio.following import follow
+from qfolio.portfolio.policy import Policy
+from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
@@ -316,7 +318,7 @@ class Backtest:
 
     def _task(self, name: str) -> Portfolio:
         config = self.config
-        own = {"lag": config.lag, "cost": config.cost, "cap": config.cap}
+        own = {"lag": config.lag, "cost": config.cost, "max_weight": config.cap}
         entry = config.agents[name].task
         return Portfolio.of(self.prices, **settings.convert(Portfolio, {**entry, **own}))
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.costs import remainder_factor, traded, with_cash
+from qfolio.portfolio.costs import Context, CostModel, Proportional, traded
 
 TOLERANCE = 1e-6
 """How far weights may be off the simplex; within it they are projected back."""
@@ -59,7 +59,7 @@ def simulate(
     decisions: ArrayLike,
     *,
     first: int,
-    cost: float,
+    cost: float | CostModel,
     lag: int = 1,
     start: ArrayLike | None = None,
 ) -> Simulation:
@@ -70,7 +70,8 @@ def simulate(
         decisions: Target weights of shape (..., D, N + 1), cash first, for D rows in succession;
             a row of NaN gives no order.
         first: Row of the first decision.
-        cost: Cost of trading one way, as a fraction of the value traded, 0 ≤ cost < 1.
+        cost: Cost of trading one way, as a fraction of the value traded, 0 ≤ cost < 1; or a model
+            of the costs of trading and holding.
         lag: Rows between a decision and its trade, 0 or more.
         start: Weights held at row ``first``, of shape (N + 1,) or (..., N + 1); all cash if None.
 
@@ -92,8 +93,10 @@ def simulate(
             f"(…, days, {assets + 1}), cash first."
         )
     *leading, days, entries = orders.shape
-    if not 0 <= cost < 1:
-        raise QfolioError(f"The cost is {cost}; it must be a fraction, at least 0 and below 1.")
+    if isinstance(cost, float | int):
+        if not 0 <= cost < 1:
+            raise QfolioError(f"The cost is {cost}; it must be a fraction, at least 0 and below 1.")
+        cost = Proportional(float(cost))
     if lag < 0 or first < 0:
         raise QfolioError(f"Lag and first row are {lag} and {first}; both must be at least 0.")
     if first + lag + days >= rows:
@@ -110,7 +113,8 @@ def simulate(
             f"be {(entries,)} or {(*leading, entries)}, cash first."
         ) from None
 
-    market = _Market(prices[first : first + lag + days + 1], begun[first:], first, days, lag)
+    shown = prices[first : first + lag + days + 1]
+    market = _Market(shown, begun[first:], first, days, lag, cost)
     orders, held = orders.reshape(-1, days, entries), held.reshape(-1, entries)
     result = [*(np.empty(orders.shape[:2]) for _ in range(3)), np.empty(orders.shape)]
     # glibc gives large freed arrays back to the system, which is slower than the arithmetic on
@@ -121,35 +125,41 @@ def simulate(
     for low in range(0, len(orders), together):
         some = slice(low, low + together)
         part = [array[some] for array in result]
-        _replay(market, orders[some], held[some], float(cost), columns, part)
+        _replay(market, orders[some], held[some], columns, part)
     return Simulation(*(array.reshape(*leading, *array.shape[1:]) for array in result))
 
 
 class _Market:
-    """The prices from the first decision to the last return, with cash before the assets.
+    """The prices from the first decision to the last return, and what holding and trading cost.
 
-    Relatives have the assets as first axis, in memory, too: numpy then adds up a few long rows
-    instead of many short ones.
+    What a unit of cash and of each asset grows to has the entries as first axis, in memory, too:
+    numpy then adds up a few long rows instead of many short ones.
     """
 
-    def __init__(self, prices: Floats, begun: Bools, first: int, days: int, lag: int) -> None:
-        self.prices = with_cash(prices)
+    def __init__(
+        self, prices: Floats, begun: Bools, first: int, days: int, lag: int, costs: CostModel
+    ) -> None:
+        self.prices, self.costs = prices, costs
         self.begun = None if begun.all() else np.insert(begun, 0, True, axis=1)
         self.first, self.days, self.lag = first, days, lag
-        to_trade = self.prices[lag : lag + days] / self.prices[:days]
-        after_trade = self.prices[lag + 1 :] / self.prices[lag:-1]
+        day = np.arange(days)
+        to_trade, after_trade = self.moved(day, day), self.grown(day + lag, day + lag + 1)
         self.to_trade, self.after_trade = (r.T.copy()[:, None] for r in (to_trade, after_trade))
 
     def moved(self, decided: NDArray[np.intp], trade: NDArray[np.intp]) -> Floats:
-        """Relatives from days of decisions to the trades of later days' decisions."""
-        return self.prices[trade + self.lag] / self.prices[decided]
+        """Growth from days of decisions to the trades of later days' decisions, cash first."""
+        return self.grown(decided, trade + self.lag)
+
+    def grown(self, start: NDArray[np.intp], end: NDArray[np.intp]) -> Floats:
+        """What a unit of each entry grows to from one row to another."""
+        relatives = self.prices[end] / self.prices[start]
+        return np.asarray(self.costs.carry(relatives, Context(rows=end - start)))
 
 
 def _replay(
     market: _Market,
     orders: Floats,
     held: Floats,
-    cost: float,
     columns: int,
     result: list[Floats],
 ) -> None:
@@ -186,10 +196,12 @@ def _replay(
         before = grown[..., :-1] / growth[:, :-1]
 
         before, after = np.moveaxis(before, 0, -1), np.moveaxis(after, 0, -1)
-        remainder = np.where(given, remainder_factor(before, after, cost), 1)
+        trade = Context(rows=market.lag)
+        remainder, costs = market.costs.trade(before, after, trade)
+        remainder = np.where(given, remainder, 1)
         returns[:, now] = remainder * growth[:, 1:] - 1
         turnover[:, now] = np.where(given, traded(before, after, remainder), 0)
-        paid[:, now] = 1 - remainder
+        paid[:, now] = np.where(given, sum(costs.values()), 0)
         weights[:, now] = after
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Policy, Position
-from qfolio.portfolio.costs import remainder_factor
+from qfolio.portfolio.costs import Context
 from qfolio.portfolio.market import Relatives
 from qfolio.portfolio.synthetic.base import OneAsset, require_cost
 from qfolio.solvers.ar1 import ar1
@@ -82,7 +82,7 @@ class Ar1(OneAsset):
             at = lambda column: jnp.interp(state.market.signal, signals, column)  # noqa: E731
             later = jax.vmap(at, 1)(after)
             held = jnp.broadcast_to(state.holding.weights, choices.shape)
-            remainder = remainder_factor(held, choices, self.cost)
+            remainder, _ = self.costs.trade(held, choices, Context())
             return choices[(jnp.log(remainder) + later).argmax()]
 
         return policy

@@ -8,7 +8,9 @@ import abc
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from qfolio.core.fields import require
@@ -50,5 +52,15 @@ class OneAsset(Market, Synthetic):
 
     def weight(self, policy: Policy, market: Any, weight: float) -> float:
         """The asset's target weight for a holder of ``weight``."""
-        held = jnp.array([1 - weight, weight], jnp.float32)
-        return float(policy(Position(market, self.hold(held)))[1])
+        return float(policy(self._state(market, weight))[1])
+
+    def weights(
+        self, policy: Policy, market: Any, weights: Float[np.ndarray, " holder"]
+    ) -> Float[np.ndarray, " holder"]:
+        """The asset's target weight for each of several holders."""
+        states = jax.vmap(lambda weight: self._state(market, weight))(weights)
+        return np.asarray(jax.vmap(policy)(states)[:, 1])
+
+    def _state(self, market: Any, weight: Float[Array, ""] | float) -> Position:
+        weight = jnp.asarray(weight, jnp.float32)
+        return Position(market, self.hold(jnp.stack([1 - weight, weight])))

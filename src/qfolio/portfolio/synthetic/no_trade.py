@@ -10,10 +10,16 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Policy, Position
-from qfolio.portfolio.costs import drift, remainder_factor
+from qfolio.portfolio.costs import Context, grown
 from qfolio.portfolio.market import Holding, Relatives
 from qfolio.portfolio.synthetic.base import OneAsset, require_cost
 from qfolio.solvers.no_trade import NoTradeRegion, no_trade_region_discrete
+
+PROBES = 1001
+"""Holdings, from all cash to all in the asset, of which a policy's edges are read."""
+
+NO_TRADE = 1e-4
+"""Changes of weight up to this count as none."""
 
 
 class NoTrade(OneAsset):
@@ -63,13 +69,13 @@ class NoTrade(OneAsset):
         self, market: Array, next_market: Array, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
         target = self.target(holding.weights, action)
-        remainder = remainder_factor(holding.weights, target, self.cost)
+        remainder, _ = self.costs.trade(holding.weights, target, Context())
         nodes, chances = np.polynomial.hermite_e.hermegauss(self.NODES)
         gains = jnp.expm1(self._log_relative(jnp.asarray(nodes, jnp.float32)))
         weights = jnp.asarray(chances / chances.sum(), jnp.float32)
         growth = (weights * jnp.log1p(target[1] * gains)).sum()
-        moved = jnp.exp(next_market)[None]
-        return jnp.log(remainder) + growth, self.hold(drift(target, moved))
+        moved = self.costs.carry(jnp.exp(next_market)[None], Context())
+        return jnp.log(remainder) + growth, self.hold(grown(target, moved))
 
     def region(self) -> NoTradeRegion:
         """The exact region, for steps of ``dt``."""
@@ -84,10 +90,20 @@ class NoTrade(OneAsset):
 
         return policy
 
-    def rule(self, policy: Policy) -> dict[str, float]:
-        """The edges: where a holder of too little, and of too much, stops trading."""
-        quiet = jnp.array(0.0)
-        return {"low": self.weight(policy, quiet, 0.1), "high": self.weight(policy, quiet, 0.9)}
+    def rule(self, policy: Policy) -> dict[str, float | None]:
+        """The edges: what holders of too little, and of too much, trade to at last.
+
+        Holdings are probed from all cash up, and from all in the asset down, until one stands as it
+        is; the edge is where the one before it trades to. None where even the extreme stands.
+        """
+        held = np.linspace(0, 1, PROBES, dtype=np.float32)
+        wanted = self.weights(policy, jnp.array(0.0), held)
+        buys, sells = wanted > held + NO_TRADE, wanted < held - NO_TRADE
+        too_little, too_much = buys.argmin() - 1, PROBES - sells[::-1].argmin()
+        return {
+            "low": float(wanted[too_little]) if buys[0] else None,
+            "high": float(wanted[too_much]) if sells[-1] else None,
+        }
 
     def scenes(self) -> list[tuple[str, Any]]:
         return [("at any time", jnp.array(0.0))]

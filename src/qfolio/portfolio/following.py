@@ -1,0 +1,98 @@
+"""Following a learned policy along a price table: decisions from greedy agents, row by row."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.market import View
+from qfolio.core.mdp import Agent
+from qfolio.portfolio.costs import Context, grown
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+
+TOLERANCE = 1e-4
+"""How far targets may be off what may be ordered; they are computed in float32."""
+
+
+def on_table(task: Portfolio, prices: Prices) -> Portfolio:
+    """The same task, scaled by what it was trained on, over all rows of another table."""
+    other = Portfolio.arrays(prices)
+    rows = jnp.array(len(prices) - 1, jnp.int32)
+    where = lambda t: (t.log_relatives, t.extra, t.first_decision, t.last_decision)  # noqa: E731
+    return eqx.tree_at(where, task, (*other, jnp.array(task.window, jnp.int32), rows))
+
+
+def follow(
+    task: Portfolio,
+    agent: Agent,
+    members: PyTree,
+    first: int,
+    held: np.ndarray,
+    count: int,
+    *,
+    together: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Greedy decisions from row ``first`` on: of each member by itself, or of all together.
+
+    Together, they hold one portfolio and follow the mean of their targets. Behind the table's last
+    row nothing moves.
+
+    Args:
+        members: What each agent learned, with a leading seed axis.
+        held: Weights at row ``first``, shape (seed, entry), or (1, entry) if together.
+        count: Number of decisions.
+
+    Returns:
+        Target weights, and what is held one row after each decision, both of shape
+        (seed or 1, count, entry).
+
+    Raises:
+        QfolioError: Targets are not numbers, or may not be ordered.
+    """
+    portfolios = jax.tree.map(lambda x: x[None] if together else x[:, None], members)
+    start = jnp.array(first, jnp.int32), jnp.asarray(held, jnp.float32)
+    results = _follow(task, agent, portfolios, *start, count)
+    targets, after = (np.asarray(result) for result in results)
+    _require_feasible(task, agent, targets, first)
+    return targets, after
+
+
+@eqx.filter_jit(donate="none")
+def _follow(
+    task: Portfolio, agent: Agent, members: PyTree, first: Array, held: Array, count: int
+) -> tuple[Float[Array, "portfolio time entry"], Float[Array, "portfolio time entry"]]:
+    """members: with leading axes (portfolio, member); a portfolio follows the mean of its own."""
+
+    def step(members: PyTree, held: Array, row: Array) -> tuple[Array, tuple[Array, Array]]:
+        view = View(task.features(row)[None], held[None, 1:])
+
+        def one(weights: PyTree) -> Array:
+            return task.target(held, agent.policy(weights, view)[0])
+
+        target = jax.vmap(one)(members).mean(0)
+        after = grown(target, task.costs.carry(task.coming(row), Context()))
+        return after, (target, after)
+
+    def path(members: PyTree, held: Array) -> tuple[Array, Array]:
+        return lax.scan(partial(step, members), held, first + jnp.arange(count))[1]
+
+    return jax.vmap(path)(members, held)
+
+
+def _require_feasible(task: Portfolio, agent: Agent, targets: np.ndarray, first: int) -> None:
+    """A replay would take weights that are not numbers for no order, without a word."""
+    for said, amount in task.feasible.violations(targets).items():
+        wrong = ~(amount <= TOLERANCE)
+        if wrong.any():
+            seed, day = np.argwhere(wrong)[0]
+            raise QfolioError(
+                f"{type(agent).__name__} names target weights at row {first + day} of the prices "
+                f"that may not be ordered: {said} {amount[seed, day]:.3g}; train it anew, with a "
+                "lower learning_rate if they are not numbers."
+            )

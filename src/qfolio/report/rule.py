@@ -1,0 +1,31 @@
+"""The few numbers that say what learned policies do, beside those of the exact one."""
+
+from typing import Any, NamedTuple
+
+
+class Row(NamedTuple):
+    """One number; None where a policy has none."""
+
+    name: str
+    exact: float | None
+    mean: float | None  # of the seeds that have one
+    farthest: float | None  # the seed that is farthest from exact; one without, if there is any
+
+
+def rows(rule: dict[str, Any] | None) -> list[Row]:
+    """What a summary's rule says."""
+    if rule is None:
+        return []
+    found = []
+    for name, exact in rule["exact"].items():
+        learned = [seed[name] for seed in rule["per_seed"]]
+        known = [value for value in learned if value is not None]
+        mean = sum(known) / len(known) if known else None
+        if exact is None:
+            farthest = known[0] if known else None
+        elif len(known) < len(learned):
+            farthest = None
+        else:
+            farthest = max(known, key=lambda value: abs(value - exact))
+        found.append(Row(name, exact, mean, farthest))
+    return found

@@ -1,0 +1,63 @@
+"""What a policy is told that it holds, against the replay in double precision."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.pathwise import Pathwise
+from qfolio.core.errors import QfolioError
+from qfolio.core.population import Population
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.following import follow, on_table
+from qfolio.portfolio.policy import Policy
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+
+ROWS, LAG = 40, 3
+
+
+@pytest.fixture(scope="module")
+def prices():
+    rng = np.random.default_rng(0)
+    values = 100 * np.exp(np.cumsum(rng.normal(0, 0.02, (ROWS, 3)), axis=0))
+    dates = np.datetime64("2020-01-01") + np.arange(ROWS)
+    return Prices(dates, ("a", "b", "c"), values)
+
+
+@pytest.fixture(scope="module")
+def policy(prices):
+    """Undertrained: what it decides depends on what it holds."""
+    task = Portfolio.of(prices, window=5, horizon=10, lag=LAG)
+    agent = Pathwise(rollout_length=10, num_envs=2, hidden=(4, 4), learning_rate=0.1)
+    population = Population(task, agent, [0, 1])
+    population.advance(10)
+    return Policy(task, agent, population.weights(), prices.assets)
+
+
+def test_holdings_are_those_of_the_replay_up_to_the_last_row(policy, prices):
+    """Orders that are carried out a row later lie, by then, where prices have moved them."""
+    first, held = ROWS - 12, np.array([0.4, 0.3, 0.2, 0.1])
+    targets, after = policy.decide(prices, first, held, 12)
+    replay = simulate(prices.values, targets[:10], first=first, cost=0.0, lag=1)
+    np.testing.assert_allclose(after[:10], replay.weights, atol=1e-6)
+    moved = np.append(1, prices.values[-1] / prices.values[-2])
+    np.testing.assert_allclose(after[10], targets[10] * moved / (targets[10] @ moved), atol=1e-6)
+    # Nothing is known to move behind the last row.
+    np.testing.assert_allclose(after[11], targets[11], atol=1e-6)
+    # What is held decides what is ordered: from where the replay is, the policy decides the same.
+    again, _ = policy.decide(prices, ROWS - 3, replay.weights[-2], 3)
+    np.testing.assert_allclose(again, targets[-3:], atol=1e-6)
+
+
+class Diverged(Pathwise):
+    def policy(self, weights, observation):
+        return super().policy(weights, observation).at[:, 1].set(jnp.nan)
+
+
+def test_targets_that_are_not_numbers_are_no_silent_holding(policy, prices):
+    task = on_table(policy.task, prices)
+    agent = Diverged(rollout_length=10, num_envs=2, hidden=(4, 4))
+    with pytest.raises(
+        QfolioError, match=r"Diverged names target weights at row 30 .* off 1 by nan"
+    ):
+        follow(task, agent, policy.members, 30, np.eye(4)[:2], 2)
