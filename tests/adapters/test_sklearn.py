@@ -15,6 +15,7 @@ from skfolio.model_selection import (
 from skfolio.optimization import EqualWeighted
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
+from sklearn.utils.estimator_checks import estimator_checks_generator
 
 from qfolio.adapters import sklearn as module
 from qfolio.adapters.sklearn import PortfolioPolicy
@@ -49,6 +50,49 @@ def decided(monkeypatch):
     simulate = module.simulate
     monkeypatch.setattr(module, "simulate", spy)
     return seen
+
+
+class Checked(PortfolioPolicy):
+    """With this tag, scikit-learn draws no negative returns, and so none below −100 %."""
+
+    def __sklearn_tags__(self):
+        tags = super().__sklearn_tags__()
+        tags.input_tags.positive_only = True
+        return tags
+
+
+UNFIT = {
+    "check_positive_only_tag_during_fit": "returns may be negative, but not below −100 %",
+    "check_fit_score_takes_y": "skfolio's fit_predict takes no y",
+    "check_fit2d_1sample": "one row is refused by a sentence that names window and horizon",
+    "check_methods_sample_order_invariance": "what is held depends on the order of days",
+    "check_methods_subset_invariance": "what is held depends on the days before",
+}
+SLOW = {  # which compile a training for each of several shapes
+    "check_estimators_overwrite_params", "check_dont_overwrite_parameters",
+    "check_n_features_in_after_fitting", "check_estimators_dtypes", "check_dtype_object",
+    "check_estimators_nan_inf", "check_f_contiguous_array_estimator", "check_fit2d_1feature",
+    "check_estimators_pickle", "check_pipeline_consistency", "check_n_features_in",
+    "check_fit_check_is_fitted", "check_estimators_fit_returns_self", "check_dict_unchanged",
+    "check_readonly_memmap_input", "check_fit2d_predict1d", "check_fit1d",
+    "check_fit_idempotent",
+}  # fmt: skip
+
+
+def checks():
+    """What scikit-learn asks of every estimator."""
+    tiny = {**TINY, "num_envs": 1, "rollout_length": 2, "horizon": 2, "hidden": (2,)}
+    estimator = Checked(episodes=1, update_episodes=1, seeds=1, window=2, lag=0, settings=tiny)
+    for number, (one, check) in enumerate(estimator_checks_generator(estimator)):
+        name = check.func.__name__
+        if name not in UNFIT:
+            marks = [pytest.mark.slow] if name in SLOW else []
+            yield pytest.param(one, check, id=f"{name}-{number}", marks=marks)
+
+
+@pytest.mark.parametrize(("estimator", "check"), checks())
+def test_scikit_learns_own_checks(estimator, check):
+    check(estimator)
 
 
 def test_it_keeps_scikit_learns_conventions():

@@ -1,11 +1,25 @@
 """The cost model against its equation, on numpy and on jax."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.portfolio.costs import drift, newton_steps, remainder_factor, traded
+from qfolio.core.mdp import Position
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.costs import (
+    CostModel,
+    Proportional,
+    drift,
+    newton_steps,
+    remainder_factor,
+    traded,
+    with_cash,
+)
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
 
 COSTS = (0.0, 0.0001, 0.001, 0.0025, 0.01, 0.05, 0.2)
 
@@ -199,3 +213,50 @@ def test_drift() -> None:
     np.testing.assert_allclose(drifted, [0.2, 0.6, 0.2], rtol=1e-15)
     unmoved = drift(weights(1, 4, 3, 6), np.ones((3, 5)))
     np.testing.assert_allclose(unmoved, weights(1, 4, 3, 6), rtol=1e-15)
+
+
+@dataclass(frozen=True)
+class WithInterest(CostModel):
+    """A user's own: cash earns 1 % a row, and each trade costs a fee whatever its size."""
+
+    cost: float = 0.0
+    fee: float = 0.001
+
+    def trade(self, before, after, context):
+        remainder, paid = Proportional(self.cost).trade(before, after, context)
+        trades = abs(after - before).sum(-1) > 1e-6
+        return remainder - self.fee * trades, {**paid, "fee": self.fee * trades}
+
+    def carry(self, relatives, context):
+        growth = with_cash(relatives)
+        xp = growth.__array_namespace__()
+        interest = xp.asarray(1.01**context.rows, dtype=growth.dtype)
+        cash = xp.broadcast_to(interest, growth.shape[:-1])[..., None]
+        return xp.concat([cash, growth[..., 1:]], axis=-1)
+
+
+@pytest.mark.parametrize("lag", [0, 1, 3])
+def test_training_and_replay_charge_what_a_model_of_ones_own_says(lag: int) -> None:
+    """By hand: shares keep their number, cash earns, and who waits for a trade earns on."""
+    values = np.exp(np.cumsum(np.random.default_rng(0).normal(0, 0.02, (30, 2)), axis=0))
+    prices = Prices(np.datetime64("2020-01-01") + np.arange(30), ("a", "b"), values)
+    task = Portfolio.of(
+        prices, window=5, horizon=10, lag=lag, cost=0.01, cost_model=f"{__name__}:WithInterest"
+    )
+    assert task.costs == WithInterest(cost=0.01)
+    state = Position(task.first_decision, task.hold(jnp.array([1.0, 0, 0])))
+    decisions = np.random.default_rng(1).dirichlet(np.ones(3), 12)
+    rewards = []
+    for decision in decisions:
+        step = task.step(state, jnp.asarray(decision, jnp.float32), jax.random.key(0))
+        rewards.append(float(step.reward))
+        state = step.state
+    replay = simulate(values, decisions, first=5, cost=WithInterest(cost=0.01), lag=lag)
+    np.testing.assert_allclose(rewards, replay.growth, atol=3e-6)
+    # The first trade, out of cash, by hand.
+    moved = np.append(1.01**lag, values[5 + lag] / values[5])
+    wanted = decisions[0] * moved / (decisions[0] @ moved)
+    left = remainder_factor(np.array([1.0, 0, 0]), wanted, 0.01) - 0.001
+    grown = wanted @ np.append(1.01, values[6 + lag] / values[5 + lag])
+    assert replay.returns[0] == pytest.approx(left * grown - 1, abs=1e-12)
+    assert replay.cost[0] == pytest.approx(1 - left, abs=1e-12)

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.core import registry
 from qfolio.core.mdp import Position
 from qfolio.portfolio.market import Market
 from qfolio.portfolio.rewards import (
@@ -96,11 +95,9 @@ class Diversified(Reward):
         return outcome.growth - 1 - jnp.minimum(state, 1) * fine, state + 1
 
 
-def test_a_reward_of_ones_own(monkeypatch):
-    monkeypatch.setitem(registry.REWARDS, "mine", f"{__name__}:Diversified")
-
+def test_a_reward_of_ones_own():
     class Rewarded(Ar1):
-        reward: str = eqx.field(static=True, default="mine")
+        reward: str = eqx.field(static=True, default=f"{__name__}:Diversified")
         risk_aversion: float = eqx.field(default=0.5)
 
     task = Rewarded(cost=0.1)

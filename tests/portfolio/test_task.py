@@ -219,7 +219,7 @@ def test_menus_that_are_none(menu):
     [
         ({"window": 0}, "window is 0"), ({"lag": -1}, "lag is -1"), ({"cost": 0.5}, "cost is 0.5"),
         ({"reward": "profit"}, "no reward 'profit'"), ({"max_weight": 0.0}, "max_weight is 0"),
-        ({"cost_model": "free"}, "no cost model 'free'"),
+        ({"cost_model": "free"}, "no cost 'free'"),
         ({"reward": "crra", "risk_aversion": -1.0}, "risk_aversion is -1.0"),
         ({"window": 58}, "60 rows are too few"),
     ],

@@ -1,10 +1,10 @@
-"""Tasks, agents and baselines by name: qfolio's, those of installed packages, and a user's own.
+"""What qfolio knows by name: its own classes, those of installed packages, and a user's own.
 
 A user's own class is named ``module:Name``; the module may lie in the current directory. An
 installed package offers its classes as entry points in the groups ``qfolio.tasks``,
-``qfolio.agents`` and ``qfolio.baselines``. What a person types is imported (``find``). A folder
-keeps the names, too, but a file may come from a stranger: only modules that have been imported
-already count there (``imported``, ``build``).
+``qfolio.agents``, ``qfolio.baselines``, ``qfolio.rewards`` and ``qfolio.costs``. What a person
+types is imported (``find``). A folder keeps the names, too, but a file may come from a stranger:
+only modules that have been imported already count there (``imported``, ``build``).
 """
 
 import difflib
@@ -68,7 +68,7 @@ REWARDS = {
 }
 COSTS = {"proportional": "qfolio.portfolio.costs:Proportional"}
 
-Kind = Literal["task", "agent", "baseline"]
+Kind = Literal["task", "agent", "baseline", "reward", "cost"]
 
 
 class Entries(NamedTuple):
@@ -87,6 +87,8 @@ ENTRIES: dict[Kind, Entries] = {
     "task": Entries(TASKS, "qfolio.core.mdp:Task"),
     "agent": Entries(AGENTS, "qfolio.core.mdp:Agent"),
     "baseline": Entries(BASELINES, "qfolio.portfolio.backtest.baselines:Baseline"),
+    "reward": Entries(REWARDS, "qfolio.portfolio.rewards:Reward"),
+    "cost": Entries(COSTS, "qfolio.portfolio.costs:CostModel"),
 }
 
 GYM = "gym:"

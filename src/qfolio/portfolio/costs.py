@@ -16,8 +16,9 @@ for the financial portfolio management problem", 2017, eq. 14), which solves
 where the sums run over the assets, without cash.
 """
 
+import abc
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,12 +29,14 @@ class Context(NamedTuple):
     rows: Any = 1  # how many pass: from the decision to its trade, or while holding
 
 
-class CostModel(Protocol):
+class CostModel(abc.ABC):
     """Costs of trading and of holding; every method takes numpy and jax arrays, traced ones too.
 
-    A field that is called like a setting of the market (such as ``cost``) takes its value.
+    A model is a dataclass with a default for each field; one that is called like a setting of the
+    market (such as ``cost``) takes its value.
     """
 
+    @abc.abstractmethod
     def trade(self, before: Any, after: Any, context: Context) -> tuple[Any, dict[str, Any]]:
         """What is left of each unit of wealth after a rebalancing, and what it cost.
 
@@ -46,8 +49,8 @@ class CostModel(Protocol):
             Remainder factors of shape (...), exactly 1 where nothing is traded; and the shares of
             wealth paid, of the same shape, by kind of cost, whose sum is 1 less the factor.
         """
-        ...
 
+    @abc.abstractmethod
     def carry(self, relatives: Any, context: Context) -> Any:
         """What a unit of cash and of each asset grows to while it is held.
 
@@ -58,11 +61,10 @@ class CostModel(Protocol):
         Returns:
             Growth factors of shape (..., N + 1), cash first.
         """
-        ...
 
 
 @dataclass(frozen=True)
-class Proportional:
+class Proportional(CostModel):
     """A share of what is traded, one way; holding costs nothing and cash earns nothing."""
 
     cost: float = 0.001

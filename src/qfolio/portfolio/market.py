@@ -19,7 +19,7 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import MenuActions, View
 from qfolio.core.mdp import Actions, Discrete, ExogenousTask, Position, Simplex
-from qfolio.core.registry import COSTS, REWARDS, find
+from qfolio.core.registry import Kind, build
 from qfolio.portfolio.costs import Context, CostModel, grown
 from qfolio.portfolio.feasible import CappedSimplex, Feasible
 from qfolio.portfolio.rewards import Outcome, Reward
@@ -143,11 +143,11 @@ class Market(ExogenousTask):
 
     @property
     def costs(self) -> CostModel:
-        return _named(self, "cost model", COSTS, self.cost_model)
+        return _part(self, "cost", self.cost_model)
 
     @property
     def reward_function(self) -> Reward:
-        return _named(self, "reward", REWARDS, self.reward)
+        return _part(self, "reward", self.reward)
 
     @property
     def path_dependent(self) -> bool:
@@ -186,8 +186,8 @@ class Market(ExogenousTask):
         return reward, Holding(grown(target, costs.carry(moved.coming, Context())), state)
 
 
-def _named(market: Market, kind: str, table: dict[str, str], name: str) -> Any:
+def _part(market: Market, kind: Kind, name: str) -> Any:
     """The part of a market that a setting names, with the settings that the two share."""
-    part: Any = find(kind, table, name)
+    part = build(kind, name, {})
     shared = [field.name for field in dataclasses.fields(part) if hasattr(market, field.name)]
-    return part(**{name: getattr(market, name) for name in shared})
+    return dataclasses.replace(part, **{name: getattr(market, name) for name in shared})

@@ -1,8 +1,9 @@
 """What a market pays for a step: a utility of net growth, or of the path that led to it.
 
 A reward has a state of its own, for those that depend on what came before, and is a function of the
-step's outcome alone. ``reward=NAME`` of a market names one of them; a field that is called like a
-setting of the market (``risk_aversion``, ``sharpe_rate``) takes its value.
+step's outcome alone. ``reward=NAME`` of a market names one of them, or a user's own as module:Name.
+Every field has a default, and one that is called like a setting of the market (``risk_aversion``,
+``sharpe_rate``) takes its value.
 """
 
 import abc

@@ -1,5 +1,7 @@
 """Presets for portfolios of real assets."""
 
+from typing import Any
+
 from qfolio.experiments.presets.preset import Preset, Presets
 
 _TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
@@ -36,6 +38,66 @@ _PATHWISE = {
 }
 
 
+# The agents below estimate gradients from what their own actions earned. They take few steps, as
+# there is far more noise than signal in daily returns, discount fast, as a trade is paid for and
+# earns within days, and explore near what they hold, as each trade costs.
+_ON_POLICY = {
+    "network": "mlp",
+    "hidden": (16, 16),
+    "num_envs": 16,
+    "rollout_length": 50,
+    "discount": 0.9,
+    "learning_rate": 1e-3,
+    "learning_rate_final": 0.0,
+    "initial_std": 0.1,
+    "reward_scale": 100.0,
+}
+
+
+_PPO = {
+    **_ON_POLICY,
+    "epochs": 2,
+    "batch_size": 400,
+    "gae_lambda": 0.9,
+    "learning_rate_steps": 120.0,
+}
+
+
+_A2C = {**_ON_POLICY, "rollout_length": 25, "gae_lambda": 0.9, "learning_rate_steps": 100.0}
+
+
+_REINFORCE = {**_ON_POLICY, "learning_rate_steps": 60.0}
+
+
+_OFF_POLICY = {
+    "network": "mlp",
+    "hidden": (16, 16),
+    "num_envs": 8,
+    "batch_size": 64,
+    "replay_capacity": 8192,
+    "learning_starts": 3200,
+    "tau": 0.05,
+    "discount": 0.9,
+    "learning_rate": 3e-4,
+    "learning_rate_final": 0.0,
+    "learning_rate_steps": 600.0,
+    "reward_scale": 100.0,
+}
+
+
+_DDPG = {**_OFF_POLICY, "exploration_noise": 0.02}
+
+
+_TD3 = {**_DDPG, "target_noise": 0.02, "target_noise_clip": 0.05}
+
+
+_SAC = {**_OFF_POLICY, "initial_temperature": 0.1}
+
+
+def _on_weights(agent: str, settings: dict[str, Any], episodes: int) -> dict[str, Preset]:
+    return {"fast": Preset(agent, settings, episodes, seeds=5, task=_TASK)}
+
+
 def of_any(agent: str) -> Preset:
     """An agent's own defaults, on the task that the other agents have."""
     return Preset(agent, {}, episodes=800, seeds=5, task=_TASK)
@@ -51,7 +113,11 @@ PRESETS: Presets = {
             task={**_TASK, "menu": "overweight:0.1"},
         ),
     },
-    ("portfolio", "pathwise"): {
-        "fast": Preset("pathwise", _PATHWISE, episodes=800, seeds=5, task=_TASK)
-    },
+    ("portfolio", "pathwise"): _on_weights("pathwise", _PATHWISE, episodes=800),
+    ("portfolio", "ppo"): _on_weights("ppo", _PPO, episodes=480),
+    ("portfolio", "a2c"): _on_weights("a2c", _A2C, episodes=800),
+    ("portfolio", "reinforce"): _on_weights("reinforce", _REINFORCE, episodes=960),
+    ("portfolio", "ddpg"): _on_weights("ddpg", _DDPG, episodes=160),
+    ("portfolio", "td3"): _on_weights("td3", _TD3, episodes=160),
+    ("portfolio", "sac"): _on_weights("sac", _SAC, episodes=160),
 }

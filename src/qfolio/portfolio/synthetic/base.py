@@ -34,16 +34,22 @@ class Synthetic(ExogenousTask):
         """Market states to draw a policy in, with what to call them."""
 
     def optimum(self) -> FollowedOptimum:
-        task: Any = self
-        continuous = dataclasses.replace(task, menu="") if hasattr(task, "menu") else task
-        return FollowedOptimum(continuous, self.best())
+        return FollowedOptimum(self, self.best())
 
 
 def require_cost(task: Any) -> None:
     require(task, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
 
 
-class OneAsset(Market, Synthetic):
+class SyntheticMarket(Market, Synthetic):
+    """Cash and assets with a known best policy."""
+
+    def optimum(self) -> FollowedOptimum:
+        # The best policy names weights, also where an agent is to choose from a menu.
+        return FollowedOptimum(dataclasses.replace(self, menu=""), self.best())
+
+
+class OneAsset(SyntheticMarket):
     """Cash and one asset."""
 
     @property

@@ -10,12 +10,12 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.core.fields import static
 from qfolio.core.mdp import Policy, Position
-from qfolio.portfolio.market import Market, Relatives
-from qfolio.portfolio.synthetic.base import Synthetic
+from qfolio.portfolio.market import Relatives
+from qfolio.portfolio.synthetic.base import SyntheticMarket
 from qfolio.solvers.merton import growth_optimal
 
 
-class Merton(Market, Synthetic):
+class Merton(SyntheticMarket):
     """Three assets whose returns are drawn from a fixed set of log-normal scenarios, with cash.
 
     The best weights maximise E log(b·x) over the simplex (Merton 1969; with the constraint, the

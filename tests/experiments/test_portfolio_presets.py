@@ -1,0 +1,40 @@
+"""Each preset for portfolios fits the task: its agent begins, acts and decides on it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.core import settings
+from qfolio.core.mdp import Discrete, Simplex
+from qfolio.experiments.presets import PRESETS
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+
+AGENTS = [agent for task, agent in PRESETS if task == "portfolio"]
+
+
+def test_every_kind_of_agent_has_one():
+    assert {"dqn", "pathwise", "ppo", "a2c", "reinforce", "ddpg", "td3", "sac"} <= {*AGENTS}
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_its_actions_are_those_of_the_task(name):
+    values = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (160, 3)).cumsum(0))
+    prices = Prices(np.datetime64("2020-01-01") + np.arange(160), ("a", "b", "c"), values)
+    preset = PRESETS["portfolio", name]["fast"]
+    task = Portfolio.of(prices, **settings.convert(Portfolio, preset.task))
+    agent = preset.build()
+    assert preset.episodes % agent.num_envs == 0
+    assert isinstance(task.actions, Discrete if name == "dqn" else Simplex)
+
+    def decide(key):
+        state = agent.init(task, key)
+        states = jax.vmap(task.reset)(jax.random.split(key, agent.num_envs))
+        views = jax.vmap(task.observe)(states)
+        greedy = agent.policy(agent.weights(state), views)
+        return jax.vmap(task.intent)(states, greedy), agent.act(state, views, key)
+
+    targets, actions = jax.eval_shape(decide, jax.random.key(0))
+    assert targets.shape == (agent.num_envs, 4)
+    assert actions.dtype == (jnp.int32 if name == "dqn" else jnp.float32)
