@@ -90,7 +90,7 @@ def checks():
             yield pytest.param(one, check, id=f"{name}-{number}", marks=marks)
 
 
-@pytest.mark.parametrize(("estimator", "check"), checks())
+@pytest.mark.parametrize(("estimator", "check"), list(checks()))
 def test_scikit_learns_own_checks(estimator, check):
     check(estimator)
 

@@ -46,7 +46,8 @@ class SyntheticMarket(Market, Synthetic):
 
     def optimum(self) -> FollowedOptimum:
         # The best policy names weights, also where an agent is to choose from a menu.
-        return FollowedOptimum(dataclasses.replace(self, menu=""), self.best())
+        task: Any = self  # whose menu is a field, which an abstract one is not to the type checker
+        return FollowedOptimum(dataclasses.replace(task, menu=""), self.best())
 
 
 class OneAsset(SyntheticMarket):
