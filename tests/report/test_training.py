@@ -519,7 +519,7 @@ def test_weights_are_drawn_beside_the_exact_ones() -> None:
     assert sorted(seeds) == [0.2, 0.4, 0.5, 0.6]
     assert mean == pytest.approx([0.55, 0.3])
     assert exact == [0.55, 0.45]
-    assert "One row for each asset" in render_page(data)
+    assert "One row per asset" in render_page(data)
 
 
 def test_policy_needs_a_market() -> None:
