@@ -224,7 +224,7 @@ def test_progress_and_settings():
         ({"seed": -1}, "seed is -1"),
         ({"seed": 2**32 - 1}, "seed is 4294967295"),
         ({"windw": 3}, "did you mean window"),
-        ({"agent": "dqm"}, "no preset"),
+        ({"agent": "dqm"}, "did you mean dqn"),
     ):
         with pytest.raises(QfolioError, match=said):
             learned("pathwise", **options)
