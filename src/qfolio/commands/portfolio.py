@@ -73,6 +73,8 @@ def backtest(
     test: str = "1y",
     rolling: bool = False,
     cap: float = 1.0,
+    cost_model: str = "proportional",
+    baselines: Name = None,
     seeds: Count = None,
     seed: int = 0,
     episodes: Count = None,
@@ -89,30 +91,34 @@ def backtest(
     """Train agents walk-forward on a price table and compare them with classical allocators.
 
     Args:
-        file: CSV or Parquet with prices (qfolio prices checks it); the 20 US stocks that come with
-            qfolio if none is given.
-        agents: Which, with commas between: dqn, pathwise, or your own as module:Name.
-        preset: fast (the default).
-        cost_bps: Cost of buying or selling, in basis points of what is traded.
+        file: CSV or Parquet with prices, which qfolio prices checks (default: 20 US stocks that
+            come with skfolio).
+        agents: Agents, separated by commas: dqn, pathwise, ppo, a2c, reinforce, sac, ddpg, td3, or
+            your own as module:Name.
+        preset: Preset of the agents.
+        cost_bps: Cost of buying or selling, in basis points of the value traded.
         lag: Rows between the close that a decision sees and the close at which it trades.
-        train: Rows to learn from before the first fold: 5y, 6m, 8w or 500d (d counts rows).
-        test: Rows to trade before learning anew.
-        rolling: Learn from the last --train only, instead of all rows so far.
-        cap: Most that one asset may weigh when it is ordered, from 0 to 1.
-        seeds: Agents of each kind; the preset says otherwise.
-        seed: The first agent's seed.
-        episodes: Training episodes of each agent and fold; the preset says otherwise.
+        train: Length of the first training window: 5y, 6m, 8w or 500d (d counts rows).
+        test: Length of a fold, after which agents are trained anew.
+        rolling: Train on a window of fixed length, instead of all rows so far.
+        cap: Largest weight of one asset, from 0 to 1.
+        cost_model: Cost of trading and holding: proportional, or your own as module:Name.
+        baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight
+            is always among them (default: all of qfolio's).
+        seeds: Agents of each kind (default: the preset's number).
+        seed: Seed of the first agent; the others' follow it.
+        episodes: Training episodes of each agent in a fold (default: the preset's number).
         trials: Earlier trials on these prices, for the deflated Sharpe ratio to count; those made
             on the default table are counted already.
-        assignments: Hyperparameters, for all agents that have them (learning_rate=1e-3) or one of
-            them (dqn.discount=0.9), or of the task (window=20 reward=crra).
-        out: A new folder; runs/… otherwise.
-        resume: Go on with the backtest in this folder.
+        assignments: Hyperparameters of all agents that have them (learning_rate=1e-3) or of one
+            (dqn.discount=0.9), or of the task (window=20 reward=crra).
+        out: New folder for the backtest (default: one in runs/).
+        resume: Folder of a backtest to go on with.
         trust: Modules of your own code that the folder may name (default: none).
-        missing: What becomes of a missing price.
-        late: What becomes of assets that start later than others.
-        features: Columns of further numbers that agents may see.
-        date: The column of dates, where its name does not tell.
+        missing: How to treat missing prices.
+        late: How to treat assets that start later than others.
+        features: Columns that hold features for agents to see, not prices.
+        date: Column of dates (default: found by its name).
     """
     options = dict(locals())
     from qfolio.core import devices
@@ -140,6 +146,10 @@ def backtest(
             lag=lag,
             cost=cost_bps * BASIS_POINT,
             cap=cap,
+            cost_model=_known("cost", cost_model),
+            baselines=list(registry.BASELINES)
+            if baselines is None
+            else [_known("baseline", name) for name in _split(baselines).values()],
             seeds=max((p.seeds for p in chosen.values()), default=1) if seeds is None else seeds,
             seed=seed,
             trials=trials,
@@ -156,7 +166,7 @@ def backtest(
     with console.bar("compiling") as update:
         run.run(BacktestProgress(update))
     if run.interrupted:
-        stop(again("qfolio backtest --resume", folder, *run.agents.values()))
+        stop(again("qfolio backtest --resume", folder, *run.parts))
     _report(run, folder)
 
 
@@ -243,12 +253,18 @@ def allocate(
 
 
 def _split(text: str) -> dict[str, str]:
-    """The agents that ``--agents`` names, by what the backtest calls them."""
+    """What an option names with commas between, by what the backtest calls it."""
     agents = [name.strip() for name in text.split(",") if name.strip()]
     names = {registry.short(agent): agent for agent in agents}
     if len(names) < len(agents):
-        raise QfolioError(f"--agents {text} names an agent twice.")
+        raise QfolioError(f"{text} names one twice.")
     return names
+
+
+def _known(kind: registry.Kind, name: str) -> str:
+    """The name of a part that a person has typed, whose module may now be imported."""
+    registry.find(kind, name)
+    return name
 
 
 def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
@@ -266,6 +282,7 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
 
     used = set()
     changed = {}
+    own_options = {"lag", "cost", "cost_model", "max_weight"}
     for name, preset in presets.items():
         kind = registry.find("agent", preset.agent)
         own, task = {}, {}
@@ -275,8 +292,8 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
                 continue
             if rest in settings.names(kind):
                 own[rest] = value
-            elif rest in settings.names(Portfolio) - {"lag", "cost", "cap"}:
-                task[rest] = value
+            elif rest in settings.names(Portfolio) - own_options:
+                task[rest] = _known("reward", value) if rest == "reward" else value
             else:
                 continue
             used.add(key)
@@ -287,7 +304,7 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
     for key in chosen.keys() - used:
         raise QfolioError(
             f"--set {key}: none of {', '.join(presets)} has this setting, nor the portfolio task "
-            "(lag, cost and cap have options of their own)."
+            "(its lag, costs and cap have options of their own)."
         )
     return changed
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qfolio.core.registry import find
+from qfolio.core.registry import imported
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -152,8 +152,12 @@ class HierarchicalRiskParity(Fitted):
 
 
 def baseline(name: str) -> Baseline:
-    """Make the baseline of a name, or of ``module:Name``; raises QfolioError if there is none."""
-    made: Baseline = find("baseline", name)()
+    """Make the baseline of a name, or of ``module:Name`` where that module has been imported.
+
+    Raises:
+        QfolioError: There is none, or only a file names its module.
+    """
+    made: Baseline = imported("baseline", name)()
     return made
 
 

@@ -59,6 +59,8 @@ class BacktestConfig(Config, frozen=True):
     lag: int
     cost: float
     cap: float
+    cost_model: str
+    baselines: list[str]
     seeds: int
     seed: int
     trials: Annotated[int, msgspec.Meta(ge=0, le=10**9)]

@@ -18,7 +18,7 @@ from qfolio.core import devices, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
-from qfolio.core.registry import BASELINES, name_of
+from qfolio.core.registry import BASELINES, name_of, short
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.executor import Executor, Here, Job
@@ -86,6 +86,11 @@ class Backtest:
             for name, entry in config.agents.items()
         }
         self.tasks = {name: self._task(name) for name in self.agents}
+        self.baselines = {short(name): baseline(name) for name in config.baselines}
+        if both := self.agents.keys() & self.baselines.keys():
+            raise QfolioError(
+                f"{min(both)} is an agent and a baseline; give the agent another name."
+            )
         self.interrupted = False
         self._policies: dict[tuple[str, str], Any] = {}  # of a backtest without a folder
         self._records: dict[tuple[str, str], list[Row]] = {}  # likewise
@@ -105,6 +110,8 @@ class Backtest:
         lag: int = 1,
         cost: float = 0.001,
         cap: float = 1.0,
+        cost_model: str = "proportional",
+        baselines: Sequence[str] = tuple(BASELINES),
         seeds: int = 5,
         seed: int = 0,
         episodes: int | None = None,
@@ -124,6 +131,9 @@ class Backtest:
             lag: Rows from a decision to its execution.
             cost: Of trading one way, as a fraction.
             cap: Most that one asset may weigh.
+            cost_model: What trades and holdings cost, in training and replay alike: a name of the
+                registry, or your own as ``module:Name``.
+            baselines: What agents are compared with, likewise; equal weights always are.
             seeds: Agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
             episodes: How long each agent without a preset trains in a fold.
             task: Settings of the portfolio task for agents without a preset.
@@ -144,6 +154,8 @@ class Backtest:
             lag=int(lag),
             cost=float(cost),
             cap=float(cap),
+            cost_model=cost_model,
+            baselines=list(dict.fromkeys([EQUAL_WEIGHT, *baselines])),
             seeds=int(seeds),
             seed=int(seed),
             trials=int(trials),
@@ -216,6 +228,14 @@ class Backtest:
                 done += 1
             self.interrupted = stop.is_set()
 
+    @property
+    def parts(self) -> list[object]:
+        """Agents, baselines, rewards and cost models, which may be of a user's own modules."""
+        tasks = [
+            part for task in self.tasks.values() for part in (task.costs, task.reward_function)
+        ]
+        return [*self.agents.values(), *self.baselines.values(), *tasks]
+
     def policy(self, agent: str | None = None) -> Policy:
         """The policy for tomorrow of an agent (default: the first)."""
         name = self._name(agent)
@@ -258,8 +278,8 @@ class Backtest:
                 together = self._decide(name, together=True)
                 entries[f"{name}{TOGETHER}"] = self._entry("ensemble", together)
         table, cap = self.prices, self.config.cap
-        for name in BASELINES:
-            decided = orders(name, baseline(name), self.folds, table.dates, table.values, cap=cap)
+        for name, made in self.baselines.items():
+            decided = orders(name, made, self.folds, table.dates, table.values, cap=cap)
             entries[name] = self._entry("baseline", decided.decisions[None])
             notes += decided.notes
         return entries, notes
@@ -318,7 +338,12 @@ class Backtest:
 
     def _task(self, name: str) -> Portfolio:
         config = self.config
-        own = {"lag": config.lag, "cost": config.cost, "max_weight": config.cap}
+        own = {
+            "lag": config.lag,
+            "cost": config.cost,
+            "cost_model": config.cost_model,
+            "max_weight": config.cap,
+        }
         entry = config.agents[name].task
         return Portfolio.of(self.prices, **settings.convert(Portfolio, {**entry, **own}))
 
@@ -419,7 +444,7 @@ class Backtest:
             self.prices.values,
             decisions,
             first=self.folds[0].decisions.start,
-            cost=self.config.cost,
+            cost=next(iter(self.tasks.values())).costs,
             lag=self.config.lag,
         )
         return Entry(kind, decisions, simulation)
