@@ -381,9 +381,12 @@ def test_reinforce_learns_from_whole_episodes_alone(time_limit_terminal):
     state = agent.init(task, jax.random.key(0))
     rollout = a_rollout(agent, task, state, jax.random.key(1))
     column = lambda *steps: jnp.zeros(6, bool).at[jnp.array(steps)].set(True)  # noqa: E731
+    truncated = jnp.zeros((6, 2), bool).at[2, 1].set(True)
+    after = jnp.roll(rollout.observation, -1, 0)
     rollout = rollout._replace(
         terminated=jnp.stack([column(1, 3), column(0)], 1),
-        truncated=jnp.zeros((6, 2), bool).at[2, 1].set(True),
+        truncated=truncated,
+        next_observation=jnp.where(truncated[..., None], rollout.next_observation, after),
     )
     value = lambda x: np.asarray(jax.vmap(state.weights.value)(x))  # noqa: E731
     reward, following = np.asarray(rollout.reward), value(rollout.next_observation)

@@ -48,7 +48,8 @@ def descend(
 ) -> tuple[Weights, Optimizer]:
     """One step down the gradient."""
     direction, optimizer = optax.scale_by_adam().update(gradient, optimizer)
-    return jax.tree.map(lambda w, d: w - rate * d, weights, direction), optimizer
+    updates = jax.tree.map(lambda d: -rate * d, direction)
+    return optax.apply_updates(weights, updates), optimizer
 
 
 def minimize(
@@ -78,5 +79,4 @@ def repeat(
 
 def clip(gradient: Weights, norm: Scalar) -> Weights:
     """The gradient, or where it is longer than ``norm``, its direction at that length."""
-    factor = jnp.minimum(1.0, norm / jnp.maximum(optax.tree.norm(gradient), 1e-30))
-    return jax.tree.map(lambda g: factor * g, gradient)
+    return optax.clip_by_global_norm(norm).update(gradient, optax.EmptyState())[0]
