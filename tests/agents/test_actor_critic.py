@@ -411,8 +411,8 @@ def test_the_soft_target_counts_the_next_steps_entropy():
         lambda c: critic_loss(c, batch, target, jnp.inf)[0], start.critics, 0.01
     )
     assert_close(updated(agent, start, batch).critics, expected, 1e-5)
-    # A last reward of −1, with two actions that are as likely, is the most that can follow.
-    most = -1 + 0.7 * math.log(2)
+    # A last reward of −1, with a policy that is as random as now, is the most that can follow.
+    most = -1 + 0.7 * entropy.mean()
     assert ((q + 0.7 * entropy) > most).any()
     target = batch.reward + 0.9 * jnp.minimum(q + 0.7 * entropy, most) * ~batch.terminal
     expected = adams_first_step(
@@ -423,25 +423,18 @@ def test_the_soft_target_counts_the_next_steps_entropy():
 
 
 @pytest.mark.parametrize(
-    ("actions", "entropy"),
-    [
-        (Box(2, 3.0), 2 * math.log(6)),
-        (Box(1), 2 + math.log(2 * math.pi * math.e) / 2),  # the largest standard deviation is e²
-        (Simplex(2), math.log(0.5)),
-        (Discrete(4), math.log(4)),
-    ],
+    ("wanted", "entropy", "most"), [(-1.0, 2.0, 2.0), (-1.0, -2.0, 0.0), (1.0, -2.0, 1.0)]
 )
-def test_entropy_to_come_is_believed_where_no_reward_has_been_seen(actions, entropy):
-    """With rewards of 0 the soft value of a uniform policy is α H for ever."""
+def test_entropy_to_come_is_believed_where_no_reward_has_been_seen(wanted, entropy, most):
+    """With rewards of 0 a policy that stays as random as it is has the value of α H for ever."""
     agent = SAC(hidden=(8,), discount=0.9)
     steps = batch_of(2)._replace(reward=jnp.zeros(2), terminal=jnp.zeros(2, bool))
     batch = Batch(steps, 0.9, jnp.zeros(2))
-    forever = 0.5 * entropy / (1 - 0.9)
-    following = jnp.array([forever, 0.0])
-    target = agent.target(batch, following, agent.bonus(actions, jnp.array(0.5)))
-    np.testing.assert_allclose(target, 0.9 * following, rtol=1e-5)
-    more = agent.target(batch, jnp.full(2, 999.0), agent.bonus(actions, jnp.array(0.5)))
-    np.testing.assert_allclose(more, 0.9 * max(forever, 0.0), rtol=1e-5)
+    entropies = jnp.array([entropy - 1, entropy + 1])
+    bonus = agent.bonus(jnp.array(wanted), entropies, jnp.array(0.5))
+    forever = 0.5 * most / (1 - 0.9)
+    target = agent.target(batch, jnp.array([forever, 999.0]), bonus)
+    np.testing.assert_allclose(target, 0.9 * forever, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("spread", "rises"), [(0.01, False), (2.0, True)])

@@ -25,7 +25,7 @@ from qfolio.agents.actor_critic import (
     critic_loss,
 )
 from qfolio.core.fields import number, require
-from qfolio.core.mdp import Actions, Box, Discrete, Metrics, Simplex, Task
+from qfolio.core.mdp import Actions, Discrete, Metrics, Simplex, Task
 from qfolio.learning import optimizer
 from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed
 from qfolio.learning.networks import Outputs, outputs_of
@@ -70,13 +70,6 @@ def target_entropy(actions: Actions, spread: Scalar) -> Float[Array, ""]:
     if isinstance(actions, Simplex):
         return actions.assets * jnp.log(spread) - math.lgamma(actions.assets + 1)
     return actions.n * jnp.log(2 * actions.unit * spread)
-
-
-def largest_entropy(actions: Actions) -> Float[Array, ""]:
-    """An upper bound of a policy's entropy: uniform, or as wide as it may be without bounds."""
-    if isinstance(actions, Box) and math.isinf(actions.bound):
-        return jnp.array(actions.n * (LOG_STD[1] + math.log(2 * math.pi * math.e) / 2))
-    return target_entropy(actions, 1.0)
 
 
 def expectations(
@@ -181,7 +174,7 @@ class SAC(ActorCritic[Learned]):
         )
         value = following + temperature * entropy
         wanted = target_entropy(learned.actor.actions, self.spread)
-        target = self.target(batch, value, self.bonus(learned.actor.actions, temperature))
+        target = self.target(batch, value, self.bonus(wanted, entropy, temperature))
         critics, critic_adam, metrics = optimizer.minimize(
             critic_loss,
             learned.critics,
@@ -207,13 +200,14 @@ class SAC(ActorCritic[Learned]):
         return learned, metrics | more | last
 
     def bonus(
-        self, actions: Actions, temperature: Float[Array, ""]
+        self,
+        wanted: Float[Array, ""],
+        entropy: Float[Array, " batch"],
+        temperature: Float[Array, ""],
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The least and the most that a step's entropy is worth.
+        """The least and the most that a later step's entropy is worth.
 
-        The policy may be as random as its actions allow, and is as certain as the target entropy
-        wants it.
+        The policy may stay as random as it is now, or come to the entropy that is ``wanted``.
         """
-        wanted = target_entropy(actions, self.spread)
-        most = jnp.maximum(wanted, largest_entropy(actions))
+        most = jnp.maximum(wanted, entropy.mean())
         return temperature * jnp.minimum(wanted, 0.0), temperature * jnp.maximum(most, 0.0)
