@@ -54,7 +54,7 @@ def own(tmp_path, monkeypatch, prices):
         (name,) = re.findall(r"`(\w+)\.py`", before)
         (tmp_path / f"{name}.py").write_text(code)
         names.append(name)
-    assert names == ["corridor", "constant"]
+    assert names == ["corridor", "constant", "momentum", "downside", "interest"]
     yield lambda: [sys.modules.pop(name, None) for name in names]
     for name in names:
         sys.modules.pop(name, None)
@@ -62,7 +62,7 @@ def own(tmp_path, monkeypatch, prices):
 
 def test_the_page_about_own_parts(own, monkeypatch, capsys):
     shown = "".join(code for _, code in blocks("docs/own_parts.md", "sh")).splitlines()
-    corridor, table, merton, rate, backtest, evaluate, resume = shown
+    corridor, table, merton, rate, backtest, own_backtest, evaluate, resume = shown
 
     def run(command):
         return qfolio(monkeypatch, *shlex.split(command)[1:])
@@ -81,6 +81,14 @@ def test_the_page_about_own_parts(own, monkeypatch, capsys):
     backtest = backtest.replace("backtest", "backtest prices.csv", 1).replace("--set", few)
     assert run(changed(backtest, agents="constant:Constant")) == 0
     assert "Constant" in Path("runs/backtest/report.html").read_text()
+    own_backtest = own_backtest.replace("backtest", "backtest prices.csv", 1).replace("--set", few)
+    assert run(own_backtest) == 0
+    summary = json.loads(Path("runs/own/summary.json").read_text())
+    assert set(summary["strategies"]) == {
+        "pathwise", "equal-weight", "minimum-variance", "Momentum"
+    }  # fmt: skip
+    config = json.loads(Path("runs/own/config.json").read_text())
+    assert config["agents"]["pathwise"]["task"]["reward"] == "downside:Downside"
     policy = [
         "allocate",
         "runs/backtest",
@@ -98,6 +106,11 @@ def test_the_page_about_own_parts(own, monkeypatch, capsys):
         assert qfolio(monkeypatch, *command) == 2
         assert "add --trust constant" in capsys.readouterr().err
         assert qfolio(monkeypatch, *command, "--trust", "constant") == 0
+    own()
+    assert qfolio(monkeypatch, "backtest", "--resume", "runs/own") == 2
+    assert "--trust" in capsys.readouterr().err
+    trusted = ["--trust", "momentum", "downside", "interest"]
+    assert qfolio(monkeypatch, "backtest", "--resume", "runs/own", *trusted) == 0
     own()
     assert run(evaluate) == 0
     own()

@@ -20,6 +20,7 @@ from qfolio.portfolio.market import Market
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.base import OneAsset, Synthetic
 from qfolio.portfolio.synthetic.no_trade import NoTrade
+from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.contrast import contrast_of
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
@@ -109,7 +110,16 @@ def backtest_data(
             for fold in backtest.folds
         ],
         notes=list(notes),
+        training={name: folds for name in backtest.agents if (folds := _training(backtest, name))},
     )
+
+
+def _training(backtest: Backtest, agent: str) -> list[FoldTraining]:
+    """How an agent's training went in each fold; nothing where a fold's records are missing."""
+    records = (backtest.records(agent, fold.name) for fold in backtest.folds)
+    folds = [FoldTraining.of(np.array([row["return"] for row in rows])) for rows in records]
+    known = [fold for fold in folds if fold is not None]
+    return known if len(known) == len(folds) else []
 
 
 def greedy_episode(run: Run, task: Pendulum, start: int = EPISODE_START) -> Episode:

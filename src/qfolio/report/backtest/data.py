@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.assessment import Assessment
+from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.data import Floats
 
 
@@ -50,6 +51,7 @@ class BacktestData:
             (in rows), cap, train, test (lengths) and expanding, the page also says them in words.
         folds: For each fold name, train_first, train_last, test_first and test_last (ISO dates).
         notes: What did not go as planned, in sentences.
+        training: By agent, how training went in each fold; none where records are missing.
     """
 
     title: str
@@ -62,6 +64,7 @@ class BacktestData:
     config: dict[str, Any]
     folds: list[dict[str, Any]]
     notes: list[str]
+    training: dict[str, list[FoldTraining]] = field(default_factory=dict)
 
 
 def require_fit(data: BacktestData) -> None:

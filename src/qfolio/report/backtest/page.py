@@ -18,6 +18,7 @@ from markupsafe import Markup
 
 from qfolio.report import palette
 from qfolio.report.backtest.charts import AREAS, chart_data, days_per_point, latest_values
+from qfolio.report.backtest.convergence import convergence_sentences, draw_convergence
 from qfolio.report.backtest.data import BacktestData, require_fit, shown_order
 from qfolio.report.backtest.facts import account, few_seeds, key_facts, unit_of
 from qfolio.report.backtest.looks import looks_of
@@ -31,7 +32,7 @@ from qfolio.report.backtest.tables import (
 )
 from qfolio.report.backtest.verdicts import verdict_rows
 from qfolio.report.backtest.wealth import draw_wealth
-from qfolio.report.figures.style import LEAD, save_png
+from qfolio.report.figures.style import LEAD, WIDE, save_png, svgs
 from qfolio.report.rendering import render, setting_groups, source
 
 
@@ -87,6 +88,8 @@ def render_backtest(data: BacktestData) -> str:
         months=month_tables(names, data),
         folds=fold_rows(data.folds),
         fold_names=any(fold["name"] != fold["test_first"] for fold in data.folds),
+        training=svgs(draw_convergence, data.training, WIDE) if data.training else None,
+        converged=convergence_sentences(data.training),
         said=account(data),
         settings=setting_groups(data.config),
         thinned=days_per_point(len(data.dates)),

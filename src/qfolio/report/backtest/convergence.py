@@ -1,0 +1,86 @@
+"""Whether training converged: the returns of training episodes, fold by fold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from qfolio.core.statistics import Floats
+from qfolio.report import palette
+from qfolio.report.data import Numbers
+from qfolio.report.figures.style import NARROW, colours, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+POINTS = 20
+"""Of a curve: the training's episodes, in the order of time, in as many parts of one length."""
+
+EVIDENCE = 2.0
+"""Standard errors by which returns must rise to be called rising."""
+
+
+@dataclass(frozen=True)
+class FoldTraining:
+    """The training of an agent in a fold.
+
+    Attributes:
+        curve: Mean return of the training episodes in each part of the training, all seeds, shape
+            (POINTS,).
+        rising: Whether the returns of the last quarter lie above those of the third by more than
+            ``EVIDENCE`` standard errors.
+    """
+
+    curve: Floats
+    rising: bool
+
+    @classmethod
+    def of(cls, returns: Numbers) -> FoldTraining | None:
+        """From the returns of all episodes in the order of time; None where they are too few."""
+        if len(returns) < 2 * POINTS:
+            return None
+        values = np.asarray(returns, dtype=float)
+        third, last = np.array_split(values, 4)[2:]
+        error = np.sqrt(third.var(ddof=1) / len(third) + last.var(ddof=1) / len(last))
+        curve = np.array([part.mean() for part in np.array_split(values, POINTS)])
+        return cls(curve, bool(last.mean() - third.mean() > EVIDENCE * error))
+
+
+def convergence_sentences(training: Mapping[str, Sequence[FoldTraining]]) -> list[str]:
+    """For each agent, in how many folds its returns were still rising at the end."""
+    sentences = []
+    for name, folds in training.items():
+        rising = sum(fold.rising for fold in folds)
+        found = (
+            f"in {rising} of {len(folds)} folds the returns were still rising: train longer"
+            if rising
+            else f"in none of {len(folds)} folds were the returns still rising"
+        )
+        sentences.append(f"{name}: {found}.")
+    return sentences
+
+
+def draw_convergence(training: Mapping[str, Sequence[FoldTraining]], width: float) -> Figure:
+    """Draw a panel for each agent and a line for each fold, later ones darker."""
+    columns = min(len(training), 1 if width <= NARROW else 3)
+    rows = -(-len(training) // columns)
+    figure = new_figure(width, 2.1 * rows + 0.3)
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True)
+    share = 100 * (np.arange(POINTS) + 0.5) / POINTS
+    shades = colours("folds", [palette.HAIRLINE, palette.ACCENT])
+    for axes, (name, folds) in zip(panels.flat, training.items(), strict=False):
+        for i, fold in enumerate(folds):
+            shade = shades((i + 1) / len(folds))
+            axes.plot(share, fold.curve, color=shade, linewidth=0.9)
+        axes.set_title(name)
+        axes.grid(axis="y")
+        axes.set_xlim(0, 100)
+        axes.locator_params(nbins=5)
+    for axes in panels.flat[len(training) :]:
+        axes.set_visible(False)
+    for axes in panels[-1]:
+        axes.set_xlabel("share of training, %")
+    return figure
