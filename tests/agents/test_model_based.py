@@ -97,9 +97,7 @@ def test_numbered_actions_are_told_apart():
 def test_the_models_gradient_against_differences():
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(1), 4)
-        members = jax.vmap(lambda key: MLP((3 + 11, 8, 3 + 2), key, activation=jax.nn.silu))(
-            keys[:2]
-        )
+        members = jax.vmap(lambda key: MLP((3 + 11, 8, 3 + 2), key, activation="silu"))(keys[:2])
         model = Model(members, jnp.array([1.0, 1, 8]), Discrete(11))
         step = Experience(
             observation=jax.random.normal(keys[0], (5, 3)),

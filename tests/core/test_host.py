@@ -240,7 +240,7 @@ def test_coordinates_reach_from_bound_to_bound():
     np.testing.assert_allclose(given, [[0, 10], [4, 50], [2, 40], [0, 50]])
     agent = PPO(
         num_envs=8, rollout_length=16, batch_size=64, epochs=8, hidden=(16,), learning_rate=1e-2,
-        learning_rate_final=0.0, learning_rate_steps=960.0, discount=0.5, std=0.5,
+        learning_rate_final=0.0, learning_rate_steps=960.0, discount=0.5, initial_std=0.5,
     )  # fmt: skip
     population = trained(task(Aim), agent, [0], 16 * 60)
     assert population.evaluate(start_keys(3)).returns.min() > -0.3  # of two steps; at first −4

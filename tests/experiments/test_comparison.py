@@ -425,7 +425,7 @@ def test_the_report():
     assert "Mind &lt;b&gt;." in text
     assert "cannot be told apart from b (1.6\N{NARROW NO-BREAK SPACE}%)" in text
     # c is told apart from both, a and b are not: of six pairs, four are bold.
-    table = text[text.index('class="grid"') : text.index("What they took")]
+    table = text[text.index('class="grid"') : text.index("Computational cost")]
     assert len(re.findall(r"<b>(?:100|0)</b>", table)) == 4
     assert len(re.findall(r"<td class=\"(?:win|loss)\d\">\d", table)) + 4 >= 5
     # Offline, without scripts, and in the colours of the page.

@@ -127,7 +127,7 @@ class MBPO(SAC):
         actions = task.actions
         entries = actions.n if isinstance(actions, Discrete) else uniform(actions, key, 1).shape[1]
         layers = (observation.size + entries, *self.model_hidden, observation.size + 2)
-        make = lambda key: MLP(layers, key, GAIN, jax.nn.silu)  # noqa: E731
+        make = lambda key: MLP(layers, key, GAIN, "silu")  # noqa: E731
         model = Model(
             jax.vmap(make)(jax.random.split(model_key, self.ensemble_size)),
             jnp.broadcast_to(jnp.array(task.observation_scale), observation.shape),

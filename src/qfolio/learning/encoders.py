@@ -18,8 +18,8 @@ from qfolio.core.errors import QfolioError
 Gain = Float[Array, "*inputs"] | float
 """Factors of an encoder's first weights, one for each channel or for all."""
 
-Activation = Callable[[Array], Array]
-"""What a layer's units give."""
+ACTIVATIONS = {"relu": jax.nn.relu, "silu": jax.nn.silu}
+"""What a layer's units give, by name: functions of jax cannot be pickled."""
 
 
 class MLP(eqx.Module):
@@ -31,14 +31,14 @@ class MLP(eqx.Module):
 
     weights: list[Float[Array, "inputs outputs"]]
     biases: list[Float[Array, " outputs"]]
-    activation: Activation = eqx.field(static=True)
+    activation: str = eqx.field(static=True)
 
     def __init__(
         self,
         sizes: tuple[int, ...],
         key: PRNGKeyArray,
         input_gain: Float[Array, "*inputs"] | float = 1.0,
-        activation: Activation = jax.nn.relu,
+        activation: str = "relu",
     ) -> None:
         self.weights, self.biases, self.activation = [], [], activation
         for inputs, outputs in pairwise(sizes):
@@ -50,8 +50,9 @@ class MLP(eqx.Module):
 
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         *hidden, last = zip(self.weights, self.biases, strict=True)
+        activate = ACTIVATIONS[self.activation]
         for weight, bias in hidden:
-            x = self.activation(x @ weight + bias)
+            x = activate(x @ weight + bias)
         weight, bias = last
         return x @ weight + bias
 

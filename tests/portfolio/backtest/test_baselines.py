@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.registry import BASELINES
+from qfolio.core.registry import BASELINES, find
 from qfolio.portfolio.backtest.baselines import Baseline, Fitted, History, baseline
 from qfolio.portfolio.backtest.orders import Orders, orders
 from qfolio.portfolio.backtest.simulation import simulate
@@ -273,6 +273,9 @@ def test_a_baseline_of_a_users_own_is_found_by_its_module(
         "        return np.eye(len(held))[1]\n"
         "class Unfinished(Baseline): pass\n"
     )
+    with pytest.raises(QfolioError, match="add --trust own_baselines"):
+        baseline("own_baselines:First")  # a file may have named it
+    find("baseline", "own_baselines:First")  # a person has
     found = decisions("own_baselines:First", FOLDS, prices())
     np.testing.assert_array_equal(found, np.tile(np.eye(5)[1], (45, 1)))
     with pytest.raises(QfolioError, match="Unfinished is not complete: it lacks decide"):
