@@ -141,6 +141,7 @@ SMALLER = {
 }
 
 
+@pytest.mark.slow
 def test_the_examples_of_the_readme(prices, tmp_path):
     dates = pd.date_range("2020-01-01", periods=len(prices), freq="B")
     returns = pd.DataFrame(np.expm1(prices), index=dates, columns=["AAPL", "B", "C"])

@@ -154,6 +154,7 @@ def test_each_seed_draws_counts_of_its_own():
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.3
 
 
+@pytest.mark.slow
 def test_learns_values_from_imagined_steps():
     """The probe that test_actor_critic.py explains, with few real steps."""
     steps = 800

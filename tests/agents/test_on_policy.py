@@ -286,7 +286,14 @@ def test_one_state():
     np.testing.assert_allclose(weights.value(jnp.ones((1, 1))), 1, rtol=0.02)
 
 
-@pytest.mark.parametrize("agent", [REINFORCE, A2C, PPO])
+@pytest.mark.parametrize(
+    "agent",
+    [
+        REINFORCE,
+        pytest.param(A2C, marks=pytest.mark.slow),
+        pytest.param(PPO, marks=pytest.mark.slow),
+    ],
+)
 def test_two_states(agent):
     weights = learned(agent, TwoStates())
     states = jnp.array([[1.0], [-1.0]])
@@ -295,7 +302,7 @@ def test_two_states(agent):
     np.testing.assert_allclose(weights.value(states), 1, rtol=0.02)
 
 
-@pytest.mark.parametrize("agent", [A2C, PPO])
+@pytest.mark.parametrize("agent", [A2C, pytest.param(PPO, marks=pytest.mark.slow)])
 def test_reward_delay(agent):
     values = learned(agent, RewardDelay()).value(jnp.eye(2))
     np.testing.assert_allclose(values, [DISCOUNT, 1], rtol=0.02)
@@ -314,7 +321,7 @@ def test_numbers(agent):
     np.testing.assert_allclose(mode, [[1], [-1]], atol=0.02)
 
 
-@pytest.mark.parametrize("agent", [A2C, PPO])
+@pytest.mark.parametrize("agent", [pytest.param(A2C, marks=pytest.mark.slow), PPO])
 def test_weights(agent):
     weights = learned(agent, AimWeights(), steps=8000)
     views = jax.vmap(AimWeights().observe)(jnp.array([0.5, -0.5]))
@@ -325,8 +332,8 @@ def test_weights(agent):
     ("name", "task", "network"),
     [
         ("ppo", Merton(), "mlp"),
-        ("a2c", Ar1(menu="tilts:0.1"), "flat"),
-        ("reinforce", Merton(menu="tilts:0.1"), "mlp"),
+        pytest.param("a2c", Ar1(menu="tilts:0.1"), "flat", marks=pytest.mark.slow),
+        pytest.param("reinforce", Merton(menu="tilts:0.1"), "mlp", marks=pytest.mark.slow),
     ],
 )
 def test_markets(name, task, network):

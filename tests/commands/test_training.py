@@ -94,6 +94,7 @@ def test_watch_opens_a_window(run):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+@pytest.mark.slow
 def test_live_shows_episodes_while_training(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "qfolio", "train", "--live", "--no-compare", "--episodes", "4",

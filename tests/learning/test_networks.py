@@ -167,7 +167,7 @@ def train(population, steps):
     return population
 
 
-@pytest.mark.parametrize("kind", ["rnn", "lstm"])
+@pytest.mark.parametrize("kind", [pytest.param("rnn", marks=pytest.mark.slow), "lstm"])
 def test_an_agent_recalls_what_it_saw_first(kind):
     agent = DQN(**{**LEARNER, "network": kind, "hidden": (16,)})
     population = train(Population(Recall(), agent, [100]), 800)
@@ -176,6 +176,7 @@ def test_an_agent_recalls_what_it_saw_first(kind):
     np.testing.assert_allclose(agent.action_values(weights, seen), [[-1, 1], [1, -1]], atol=0.02)
 
 
+@pytest.mark.slow
 def test_an_agent_learns_to_catch_what_it_sees():
     agent = DQN(
         **{**LEARNER, "network": "cnn", "hidden": (64,), "num_envs": 32, "batch_size": 64,

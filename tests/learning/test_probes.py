@@ -51,15 +51,27 @@ def test_one_state(double):
     np.testing.assert_allclose(values, [[0.0, 1.0]], atol=0.02)
 
 
-@pytest.mark.parametrize("changes", [{}, {"double": True}, *OPTIONS.values()],
-                         ids=["plain", "double", *OPTIONS])  # fmt: skip
+def variants(*quick):
+    """Plain DQN and all its options, of which only these are tried in the quick tests."""
+    cases = {"plain": {}, "double": {"double": True}, **OPTIONS}
+    return [
+        pytest.param(changes, id=name, marks=() if name in quick else pytest.mark.slow)
+        for name, changes in cases.items()
+    ]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    variants(
+        "plain", "dueling", "prioritized", "roots", "noisy", "rainbow categorical", "quantile"
+    ),
+)
 def test_two_states(changes):
     values = learned_values(TwoStates(), [[1.0], [-1.0]], **changes)
     np.testing.assert_allclose(values, [[-1, 1], [1, -1]], atol=0.02)
 
 
-@pytest.mark.parametrize("changes", [{}, {"double": True}, *OPTIONS.values()],
-                         ids=["plain", "double", *OPTIONS])  # fmt: skip
+@pytest.mark.parametrize("changes", variants("plain", "double", "n_steps", "categorical"))
 def test_reward_delay(changes):
     values = learned_values(RewardDelay(), [[1.0, 0.0], [0.0, 1.0]], **changes)
     np.testing.assert_allclose(values, [[DISCOUNT] * 2, [1, 1]], rtol=0.02)
@@ -74,7 +86,14 @@ def test_a_time_limit_is_not_the_end(changes):
     np.testing.assert_allclose(values, 1 / (1 - DISCOUNT), rtol=0.02)
 
 
-@pytest.mark.parametrize("name", ["n_steps", "rainbow categorical", "rainbow quantile"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "n_steps",
+        pytest.param("rainbow categorical", marks=pytest.mark.slow),
+        pytest.param("rainbow quantile", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("horizon", [1, 2])
 def test_returns_over_steps_bootstrap_through_a_time_limit(name, horizon):
     """Where the episode is cut before the three steps are over, by the right power of γ."""

@@ -122,7 +122,13 @@ AGENTS = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=AGENTS)
+QUICK = ("dqn", "pathwise")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in AGENTS],
+)
 def trained(request):
     agent, menu = AGENTS[request.param]
     task = portfolio(menu=menu).part(0, 40)

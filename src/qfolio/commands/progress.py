@@ -113,7 +113,8 @@ class _JobProgress(Listener):
 
     def on_chunk(self, training: Training, rows: list[Row]) -> None:
         done = self.done + self.share * training.share
-        self.whole.note(self.agent, done, known=not math.isnan(training.seconds_left))
+        learning = not math.isnan(training.seconds_left)
+        self.whole.note(self.agent, done, known=learning or self.done > 0)
 
 
 class SearchProgress:

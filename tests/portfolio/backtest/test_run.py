@@ -239,6 +239,7 @@ def test_an_asset_joins_at_the_first_fold_that_it_covers():
     assert entries["equal-weight"].decisions[0, day, 2] == pytest.approx(1 / 3)
 
 
+@pytest.mark.slow
 def test_the_cap_holds():
     backtest = create(cap=0.4, agents={"pathwise": AGENTS["pathwise"]})
     backtest.run()
