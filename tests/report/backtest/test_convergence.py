@@ -40,7 +40,9 @@ def test_the_page_says_whether_training_converged():
     folds = [FoldTraining.of(training(slope, i)) for i, slope in enumerate((2.0, 0.0))]
     data = make_data(series, weekdays("2020-01-01", 300), ("A", "B", "C"), training={"dqn": folds})
     page = render_backtest(data)
-    assert "dqn: in 1 of 2 folds the returns were still rising: train longer." in page
+    assert (
+        "dqn: in 1 of 2 folds the returns were still rising; training for longer may help." in page
+    )
     assert page.count("Returns of training episodes, fold by fold") == 1
     without = render_backtest(make_data(series, weekdays("2020-01-01", 300), ("A", "B", "C")))
     assert "Did training converge?" not in without

@@ -32,7 +32,7 @@ from qfolio.report.backtest.tables import (
 )
 from qfolio.report.backtest.verdicts import verdict_rows
 from qfolio.report.backtest.wealth import draw_wealth
-from qfolio.report.figures.style import LEAD, WIDE, save_png, svgs
+from qfolio.report.figures.style import LEAD, save_png, svgs
 from qfolio.report.rendering import render, setting_groups, source
 
 
@@ -88,7 +88,7 @@ def render_backtest(data: BacktestData) -> str:
         months=month_tables(names, data),
         folds=fold_rows(data.folds),
         fold_names=any(fold["name"] != fold["test_first"] for fold in data.folds),
-        training=svgs(draw_convergence, data.training, WIDE) if data.training else None,
+        training=svgs(draw_convergence, data.training, LEAD) if data.training else None,
         converged=convergence_sentences(data.training),
         said=account(data),
         settings=setting_groups(data.config),
