@@ -55,7 +55,8 @@ def convergence_sentences(training: Mapping[str, Sequence[FoldTraining]]) -> lis
     for name, folds in training.items():
         rising = sum(fold.rising for fold in folds)
         found = (
-            f"in {rising} of {len(folds)} folds the returns were still rising; training for longer may help"
+            f"in {rising} of {len(folds)} folds the returns were still rising; "
+            "training for longer may help"
             if rising
             else f"in none of {len(folds)} folds were the returns still rising"
         )
