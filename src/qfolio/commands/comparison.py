@@ -34,17 +34,17 @@ def compare(
     """Train several agents on one task, with the same seeds, and write a report that compares them.
 
     Args:
-        task: What to learn; pendulum otherwise.
-        agents: Which, with commas between, each with a preset behind a colon if it is not
+        task: Task to learn (default: pendulum).
+        agents: Agents, separated by commas, each with a preset behind a colon if it is not
             --preset: dqn,pathwise or dqn:fast,dqn:report. Your own are module:Name or
             module:Name:PRESET.
-        preset: Of agents that name none: fast if there is one, or the first.
-        episodes: Training episodes of each agent's seeds; the presets say how many otherwise.
-        steps: Environment steps of each agent's seeds, instead of episodes.
-        seeds: How many of each agent, 10 unless given.
-        seed: The first one, 0 unless given.
-        out: A new folder; runs/… otherwise.
-        resume: Go on with the comparison in this folder.
+        preset: Preset of agents that name none (default: fast if there is one, else the first).
+        episodes: Training episodes of each seed (default: the presets' numbers).
+        steps: Environment steps of each seed, instead of episodes.
+        seeds: Number of seeds of each agent (default: 10).
+        seed: First seed; the others follow it (default: 0).
+        out: New folder for the comparison (default: one in runs/).
+        resume: Folder of a comparison to go on with.
         trust: Modules of your own code that the folder may name (default: none).
     """
     given = (task, agents, preset, episodes, steps, seeds, seed, out)

@@ -40,19 +40,19 @@ def continual(
     """Change a task after training and compare ways to go on: how soon each recovers, at what cost.
 
     Args:
-        task: What to learn: pendulum, the default.
-        change: What becomes of it, for example --change mass=2; numbers only.
-        agent: Which algorithm; the first that has presets for the task otherwise.
-        preset: Of the agent; fast otherwise.
-        episodes: Training episodes before the change, and after it; the preset says otherwise.
-        seeds: How many agents are trained side by side; the preset says otherwise.
-        seed: The first one's, 0 unless given.
-        rate: Share of its first learning rate that an agent goes on with, 0.3 otherwise.
-        renewal: Share of the first training that a renewed agent learns for, 0.5 otherwise.
-        epsilon: How much a renewed agent explores at first, 0.3 otherwise.
-        assignments: Hyperparameters, and the task's settings before the change.
-        out: A new folder for the report; runs/… otherwise.
-        resume: Go on in this folder; only what was under way when it was stopped is done again.
+        task: Task to learn (default: pendulum).
+        change: Change of the task's numbers, for example --change mass=2.
+        agent: Algorithm (default: the first that has presets for the task).
+        preset: Preset of the agent (default: fast).
+        episodes: Training episodes before the change, and after it (default: the preset's number).
+        seeds: Number of seeds trained side by side (default: the preset's number).
+        seed: First seed; the others follow it (default: 0).
+        rate: Share of the first learning rate that an agent goes on with (default: 0.3).
+        renewal: Share of the first training that a renewed agent learns for (default: 0.5).
+        epsilon: Exploration that a renewed agent begins with (default: 0.3).
+        assignments: Settings of the agent, and of the task before the change.
+        out: New folder for the report (default: one in runs/).
+        resume: Folder to go on with; only what was under way when it was stopped is done again.
         trust: Modules of your own code that the folder may name (default: none).
     """
     given = (task, agent, preset, episodes, seeds, seed, rate, renewal, epsilon, out)

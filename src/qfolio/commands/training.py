@@ -47,29 +47,29 @@ def train(
     """Train agents on a task, grade them against the exact optimum and write a report.
 
     Args:
-        task: What to learn: pendulum (the default), pendulum/grid, pendulum/hidden, catch; a finite
-            process: finite/cliff, finite/frozen-lake, finite/random; a market with a known optimum:
-            market/kelly, market/merton, market/regime, market/ar1, market/no-trade,
-            market/garleanu-pedersen; or any environment of Gymnasium by its ID, such as
-            gym:CartPole-v1; or a task of your own as module:Name.
-        agent: Which algorithm: dqn, reinforce, a2c, ppo, ddpg, td3, sac, mbpo; where states are
-            numbered, q-learning, sarsa, expected-sarsa, double-q, dyna-q; in markets pathwise; or
-            your own as module:Name. Without, the first that has presets for the task.
-        preset: fast (the default); of dqn on the pendulum also best, categorical, rainbow, and
-            report (the run that qfolio grew out of).
-        episodes: Training episodes of each agent; the preset says how many otherwise. Those of
-            fast and best are short: 28 and 40 steps.
-        steps: Instead of episodes, steps of each agent's environments.
-        seeds: How many agents are trained side by side; the preset says otherwise.
-        seed: The first agent's seed, 0 unless given; the others' follow it.
-        out: A new folder for the run; runs/… otherwise.
-        assignments: Hyperparameters, for example --set discount=0.98 hidden=256,256 (the settings
-            of a report and docs/dqn.md list them).
-        resume: Go on with the run in this folder, up to --episodes or --steps if given.
+        task: Task to learn (default: pendulum): pendulum, pendulum/grid, pendulum/hidden or catch;
+            a finite process, finite/cliff, finite/frozen-lake or finite/random; a market with a
+            known optimum, market/kelly, market/merton, market/regime, market/ar1, market/no-trade
+            or market/garleanu-pedersen; an environment of Gymnasium by its ID, such as
+            gym:CartPole-v1; or your own as module:Name.
+        agent: Algorithm (default: the first that has presets for the task): dqn, reinforce, a2c,
+            ppo, ddpg, td3, sac or mbpo; for numbered states q-learning, sarsa, expected-sarsa,
+            double-q or dyna-q; for markets pathwise; or your own as module:Name.
+        preset: Preset of the agent (default: fast). DQN on the pendulum also has best, categorical,
+            rainbow and report, the run that qfolio grew out of.
+        episodes: Training episodes of each seed (default: the preset's number). Those of fast and
+            best are short: 28 and 40 steps.
+        steps: Environment steps of each seed, instead of episodes.
+        seeds: Number of seeds trained side by side (default: the preset's number).
+        seed: First seed; the others follow it (default: 0).
+        out: New folder for the run (default: one in runs/).
+        assignments: Settings of agent and task, for example --set discount=0.98 hidden=256,256; a
+            report and docs/dqn.md list them.
+        resume: Folder of a run to go on with, up to --episodes or --steps if given.
         trust: Modules of your own code that the folder may name (default: none).
         compare: Train two more agents with one thing changed, for the report (DQN: double DQN; in
-            markets, one action at a time instead of all at once).
-        live: Show an episode in a window now and then, while training.
+            markets: one action at a time instead of all at once).
+        live: Show an episode in a window now and then while training.
     """
     from qfolio.core import devices
 
@@ -121,9 +121,9 @@ def evaluate(
     """Grade a run's greedy policies from fixed start states against the optimum.
 
     Args:
-        folder: A run folder.
-        episodes: Start states, the same for every run and every agent; 1,024 unless given, and 100
-            where Gymnasium steps the environment.
+        folder: Folder of a run.
+        episodes: Number of start states, the same for every run and agent (default: 1,024, or 100
+            where Gymnasium steps the environment).
         trust: Modules of your own code that the folder may name (default: none).
         as_json: Print JSON instead of a table.
     """
