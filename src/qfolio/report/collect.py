@@ -15,7 +15,8 @@ from qfolio.core.mdp import Agent, Policy, Position
 from qfolio.core.training import episode_steps
 from qfolio.experiments.run import Run
 from qfolio.portfolio.backtest.assessment import Assessment
-from qfolio.portfolio.backtest.run import Backtest, Entry
+from qfolio.portfolio.backtest.replay import Entry
+from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.market import Market
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.base import OneAsset, Synthetic

@@ -7,7 +7,6 @@ float64, beside classical allocators under the same rules.
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +29,10 @@ from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
 from qfolio.portfolio.backtest.folds import Fold, latest, spell, walk_forward
 from qfolio.portfolio.backtest.orders import orders
-from qfolio.portfolio.backtest.simulation import Simulation, simulate
+from qfolio.portfolio.backtest.replay import Entry, Stretch, decide
+from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.backtest.verdict import verdicts
-from qfolio.portfolio.following import follow
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
@@ -50,15 +49,6 @@ TOGETHER = "-together"
 
 FOLDS_AT_ONCE = 8
 """Folds that train at once where members advance in lockstep; what is done after them stays."""
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A strategy in the backtest."""
-
-    kind: str  # one of assessment.KINDS
-    decisions: np.ndarray  # (seed, day, entry), cash first
-    simulation: Simulation  # of shape (seed, day)
 
 
 class Backtest:
@@ -412,32 +402,13 @@ class Backtest:
     # Deciding ------------------------------------------------------------------------------------
 
     def _decide(self, name: str, together: bool = False) -> np.ndarray:
-        """Decisions over all folds, (seed, day, entry); each goes on with what the last one held.
-
-        With ``together`` it is the mean of all seeds that trades, as one. The agents see their
-        portfolio in float32; the replay is in float64.
-        """
+        """Decisions over all folds, (seed, day, entry); see ``decide``."""
+        stretches = [
+            Stretch(self._part(self.tasks[name], fold), self._members(name, fold.name), fold)
+            for fold in self.folds
+        ]
         seeds = 1 if together else self.config.seeds
-        held = np.zeros((seeds, 1 + len(self.prices.assets)))
-        held[:, 0] = 1.0
-        longest = max(fold.decisions.stop - fold.decisions.start for fold in self.folds)
-        parts = []
-        for fold in self.folds:
-            task = self._part(self.tasks[name], fold)
-            count = fold.decisions.stop - fold.decisions.start
-            # One length serves all folds; what lies behind a fold's end is cut off.
-            targets, after = follow(
-                task,
-                self.agents[name],
-                self._members(name, fold.name),
-                fold.decisions.start,
-                held,
-                longest,
-                together=together,
-            )
-            parts.append(targets[:, :count])
-            held = after[:, count - 1]
-        return np.concatenate(parts, axis=1)
+        return decide(self.agents[name], stretches, seeds, together=together)
 
     def _entry(self, kind: str, decisions: np.ndarray) -> Entry:
         simulation = simulate(

@@ -1,0 +1,50 @@
+"""What trained agents decide over the folds of a backtest."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import PyTree
+
+from qfolio.core.mdp import Agent
+from qfolio.portfolio.backtest.folds import Fold
+from qfolio.portfolio.backtest.simulation import Simulation
+from qfolio.portfolio.following import follow
+from qfolio.portfolio.task import Portfolio
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A strategy in the backtest."""
+
+    kind: str  # one of assessment.KINDS
+    decisions: np.ndarray  # (seed, day, entry), cash first
+    simulation: Simulation  # of shape (seed, day)
+
+
+class Stretch(NamedTuple):
+    """A fold to decide over."""
+
+    task: Portfolio  # the part of the table that the fold trained on
+    members: PyTree  # what the agents learned there, with a leading seed axis
+    fold: Fold
+
+
+def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: bool) -> np.ndarray:
+    """Decisions over all folds, (seed, day, entry); each goes on with what the last one held.
+
+    With ``together`` it is the mean of all seeds that trades, as one, and ``seeds`` is 1. The
+    agents see their portfolio in float32; the replay is in float64.
+    """
+    held = np.zeros((seeds, 1 + len(stretches[0].task.limits)))
+    held[:, 0] = 1.0
+    days = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
+    parts = []
+    for (task, members, fold), count in zip(stretches, days, strict=True):
+        # One length serves all folds; what lies behind a fold's end is cut off.
+        start = fold.decisions.start
+        targets, after = follow(task, agent, members, start, held, max(days), together=together)
+        parts.append(targets[:, :count])
+        held = after[:, count - 1]
+    return np.concatenate(parts, axis=1)
