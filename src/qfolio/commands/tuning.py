@@ -136,10 +136,10 @@ def _new(
         raise QfolioError(f"--set and --search both name {both[0]}; name it in one of them.")
     budget = budget or preset.budget
     scheduled: dict[str, Any] = {}
-    if "learning_rate_steps" in preset.settings and budget.unit == preset.budget.unit:
+    if budget.unit == preset.budget.unit:
         share = budget.amount / preset.budget.amount
-        updates = preset.settings["learning_rate_steps"] * share
-        scheduled = {"learning_rate_steps": round(updates, 1)}
+        schedules = {"learning_rate_steps", "importance_steps"} & preset.settings.keys()
+        scheduled = {name: round(preset.settings[name] * share, 1) for name in schedules}
     agent = preset.build(**{**scheduled, **chosen})
     now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
     name = f"tune-{re.sub('[/:]', '-', task_name)}-{registry.short(agent_name)}-{now}"
