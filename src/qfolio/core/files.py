@@ -127,13 +127,6 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def require_types(content: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Raises QfolioError for the first name whose value is missing or of another type."""
-    for name, kind in wanted.items():
-        if name not in content or not isinstance(content[name], kind):
-            raise QfolioError(f"{name} is missing or of the wrong type.")
-
-
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Named arrays as safetensors, which hold numbers only and cannot carry code.
 

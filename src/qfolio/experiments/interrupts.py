@@ -57,14 +57,15 @@ def exit_on_ctrl_c() -> None:
     threading.Thread(target=_listen, args=(receiver, sender), daemon=True).start()
 
 
-def leave(message: str) -> None:
-    """Ends the process with ``EXIT_CODE``, without waiting for jax's threads."""
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
+def _leave() -> None:
+    """Ends the process with ``EXIT_CODE``, without waiting for jax's threads.
+
+    Nothing is flushed: what is printed is flushed at once, and a main thread that waits for the
+    reader of a pipe would hold its lock.
+    """
     cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
     with contextlib.suppress(OSError):
-        os.write(2, f"{cursor}{message}\n".encode() if message else cursor.encode())
+        os.write(2, f"{cursor}qfolio: interrupted\n".encode())
     os._exit(EXIT_CODE)
 
 
@@ -84,4 +85,4 @@ def _listen(receiver: socket.socket, sender: socket.socket) -> None:
     while numbers := receiver.recv(64):
         for number in numbers:
             if number == signal.SIGINT and not (_trainings and _first(_trainings[0])):
-                leave("qfolio: interrupted")
+                _leave()
