@@ -17,14 +17,14 @@ if "QFOLIO_TEST_OPTIMIZED" not in os.environ:
     flags = "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
 
-with install_import_hook("qfolio", "typechecker.check"):
-    from qfolio.agents.dqn import DQN
-    from qfolio.core import devices
-    from qfolio.tasks.pendulum import Pendulum
+install_import_hook("qfolio", "typechecker.check")  # before the first import of the package
 
-import jax
+import jax  # noqa: E402
 
-from qfolio.core.population import programs_of
+from qfolio.agents.dqn import DQN  # noqa: E402
+from qfolio.core import devices  # noqa: E402
+from qfolio.core.population import programs_of  # noqa: E402
+from qfolio.tasks.pendulum import Pendulum  # noqa: E402
 
 devices.configure()
 

@@ -31,7 +31,7 @@ class Portfolio(Market):
     """
 
     log_relatives: Float[Array, "row asset"]  # log of price over the row before; 0 where unknown
-    extra: Float[Array, "row asset channel"]  # other features
+    extra: Float[Array, "row asset feature"]
     limits: Float[Array, " asset"]  # largest weight of each asset; 0 where it cannot be traded
     center: Float[Array, " channel"]  # of the observed channels, from the rows of the part
     scale: Float[Array, " channel"]
