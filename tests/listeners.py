@@ -9,7 +9,10 @@ class Tell(Listener):
     """Calls a function with the training and the rows of each chunk."""
 
     def __init__(self, function):
-        self.on_chunk = function
+        self.function = function
+
+    def on_chunk(self, training, rows):
+        self.function(training, rows)
 
 
 class Interrupt(Listener):

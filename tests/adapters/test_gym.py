@@ -239,9 +239,9 @@ def test_it_says_what_is_wrong():
             env.unwrapped.step(action)
     menu = environment(menu="tilts:0.1")
     menu.reset(seed=0)
-    for action in (9, -1, 0.5):
+    for number in (9, -1, 0.5):
         with pytest.raises(QfolioError, match="from 0 to 8"):
-            menu.unwrapped.step(action)
+            menu.unwrapped.step(number)
     with pytest.raises(QfolioError, match="did you mean window"):
         environment(windw=5)
     with pytest.raises(QfolioError, match="render_mode"):
@@ -267,5 +267,7 @@ def test_a_line_of_text():
 def test_without_gymnasium_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     spec = importlib.util.spec_from_file_location("without_gymnasium", gym.__file__)
+    assert spec is not None
+    assert spec.loader is not None
     with pytest.raises(QfolioError, match=r"pip install 'qfolio\[gym\]'"):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -31,7 +32,7 @@ DISCOUNT = 0.8
 ANY = [-jnp.inf, jnp.inf]  # rewards that allow every value
 STATES = jnp.array([[0.5], [-0.5]])
 BEST = jnp.array([[1.0], [-1.0]])
-SMALL = {
+SMALL: dict[str, Any] = {
     "hidden": (64, 64), "num_envs": 4, "batch_size": 64, "replay_capacity": 4000,
     "learning_starts": 400, "discount": DISCOUNT, "tau": 0.05, "learning_rate": 3e-3,
     "learning_rate_final": 0.0,
@@ -140,6 +141,7 @@ def test_a_soft_choice_among_numbered_actions(rescale):
     agent = SAC(**SMALL, spread=0.5, value_rescaling=rescale)
     end = learned(OneState(), agent, 1500)
     values = agent.action_values(sac.Policy(end.actor, end.critics), jnp.ones((1, 1)))
+    assert values is not None
     np.testing.assert_allclose(values, [[0, 1]], atol=0.02)
     # Values 0 and 1 at temperature α: the second is chosen with p = σ(1/α), of entropy log 1.5.
     p = 0.86

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 from qfolio.agents.dqn import DQN
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_tree, write_tree
+from qfolio.core.market import MenuActions
 from qfolio.core.mdp import Transition
 from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
@@ -22,6 +24,7 @@ from qfolio.learning.distributional import (
 )
 from qfolio.learning.encoders import MLP
 from qfolio.learning.exploration import epsilon_greedy
+from qfolio.learning.networks import Flat
 from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import (
@@ -38,6 +41,8 @@ from qfolio.tasks.gymnasium import GymnasiumTask
 from qfolio.tasks.pendulum import Pendulum
 
 VALUES, ROOTS = Scale(roots=False), Scale(roots=True)
+
+structure: Any = jax.tree.structure  # the type of what it gives declares no ==
 
 
 def rollout(agent, observation=1.0, reward=1.0, terminated=False, truncated=False):
@@ -155,6 +160,10 @@ def test_selecting_and_evaluating_have_no_gradient(task, agent, values):
     jax.tree.map(close, online, expected)
 
 
+def first_layer(network):
+    return network.mlp.weights[0]
+
+
 def test_the_target_network_is_copied_every_period(task):
     agent = DQN(
         hidden=(8,), num_envs=1, batch_size=4, target_update_interval=3, tau=1.0,
@@ -164,7 +173,7 @@ def test_the_target_network_is_copied_every_period(task):
     same = []
     for i in range(6):
         state, _ = agent.learn(Pendulum(), state, rollout(agent), jax.random.key(i))
-        same.append(bool((state.target.mlp.weights[0] == state.online.mlp.weights[0]).all()))
+        same.append(bool((first_layer(state.target) == first_layer(state.online)).all()))
     assert same == [False, False, True, False, False, True]
 
 
@@ -184,7 +193,7 @@ def test_the_report_presets_copies_come_at_the_end_of_each_episode():
         while population.steps < step:
             population.advance(step - population.steps)
         state = population.fetch().agent
-        copied.append(bool((state.target.mlp.weights[0] == state.online.mlp.weights[0]).all()))
+        copied.append(bool((first_layer(state.target) == first_layer(state.online)).all()))
     assert copied == [True, False, True, False, False, True]
 
 
@@ -192,8 +201,8 @@ def test_the_target_network_follows_softly(task):
     agent = DQN(hidden=(8,), num_envs=1, batch_size=4, target_update_interval=1, tau=0.25)
     before = agent.init(task, jax.random.key(0))
     after, _ = agent.learn(Pendulum(), before, rollout(agent), jax.random.key(1))
-    expected = 0.75 * before.target.mlp.weights[0] + 0.25 * after.online.mlp.weights[0]
-    np.testing.assert_allclose(after.target.mlp.weights[0], expected, rtol=1e-5, atol=1e-7)
+    expected = 0.75 * first_layer(before.target) + 0.25 * first_layer(after.online)
+    np.testing.assert_allclose(first_layer(after.target), expected, rtol=1e-5, atol=1e-7)
 
 
 def test_epsilon_decays_with_finished_episodes(task):
@@ -395,10 +404,13 @@ def test_action_values_are_the_means_in_units_of_reward(task, noisy, values):
     )  # fmt: skip
     online = agent.init(task, jax.random.key(0)).online
     observation = jax.random.normal(jax.random.key(1), (6, 3))
+    assert isinstance(online, Flat)
     outputs = online(observation).reshape(6, 12, -1)
     z = outputs[:, :1] + outputs[:, 1:] - outputs[:, 1:].mean(1, keepdims=True)
     means = jax.nn.softmax(z) @ jnp.arange(5.0) if values == "categorical" else z[..., 0]
-    np.testing.assert_allclose(agent.action_values(online, observation), 2 * means, rtol=1e-4)
+    found = agent.action_values(online, observation)
+    assert found is not None
+    np.testing.assert_allclose(found, 2 * means, rtol=1e-4)
     np.testing.assert_array_equal(agent.policy(online, observation), means.argmax(1))
 
 
@@ -502,12 +514,14 @@ def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):
     expected = np.ones(16)
     expected[12:] = 0
     expected[np.asarray(index)] = (np.asarray(losses.off) + 1e-6) ** 0.6
+    assert after.replay.priorities is not None
     np.testing.assert_allclose(after.replay.priorities.of(jnp.arange(16)), expected, rtol=1e-4)
     _, metrics = agent.learn(task, after, step, jax.random.key(2))
     replay = agent.observe(after, step).replay
     index = replay.draw(jax.random.key(2), 6)
     losses = agent._losses(after.online, after.target, replay.at(index), 0.99, jax.random.key(0))
     beta = 0.4 + 0.6 / 10
+    assert replay.priorities is not None
     weight = replay.priorities.importance(index, beta)
     assert float(weight.min()) < 1
     np.testing.assert_allclose(metrics["loss"], (weight * losses.each).mean(), rtol=1e-4)
@@ -543,14 +557,17 @@ def test_every_option_fits_a_market(network):
         values="quantile", atoms=3, huber_delta=1.0,
     )  # fmt: skip
     state = agent.init(market, jax.random.key(0))
-    assert jax.tree.structure(learned_abstractly(agent, market, state)) == jax.tree.structure(state)
+    assert structure(learned_abstractly(agent, market, state)) == structure(state)
     view = jax.vmap(market.observe)(jax.vmap(market.reset)(jax.random.split(jax.random.key(0), 5)))
     values = agent.action_values(state.online, view)
+    assert values is not None
+    assert isinstance(market.actions, MenuActions)
     assert values.shape == (5, market.actions.n)
     if network == "mlp":
         mirrored = jax.tree.map(lambda x: x[:, ::-1], view)
         pooled, each = market.actions.pooled, market.actions.each
         other = agent.action_values(state.online, mirrored)
+        assert other is not None
         np.testing.assert_allclose(other[:, :pooled], values[:, :pooled], atol=1e-5)
         blocks, mirror = (v[:, pooled:].reshape(5, each, 3) for v in (values, other))
         assert np.ptp(blocks, axis=2).min() > 1e-4
@@ -564,7 +581,7 @@ def test_all_actions_can_duel():
         dueling=True, double=True, all_actions=True, market_baseline=True,
     )  # fmt: skip
     state = agent.init(market, jax.random.key(0))
-    assert jax.tree.structure(learned_abstractly(agent, market, state)) == jax.tree.structure(state)
+    assert structure(learned_abstractly(agent, market, state)) == structure(state)
 
 
 def test_priorities_are_part_of_what_is_saved(task, agent, tmp_path):

@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,7 +21,7 @@ from qfolio.tasks.pendulum import Pendulum
 
 from probes import Aim
 
-SMALL = {
+SMALL: dict[str, Any] = {
     "hidden": (64, 64), "model_hidden": (64, 64), "num_envs": 4, "batch_size": 64,
     "ensemble_size": 3,
     "replay_capacity": 2000, "learning_starts": 200, "discount": 0.8, "tau": 0.05,
@@ -72,7 +73,7 @@ def steps(n=4, actions=None):
 def test_the_models_loss_by_hand():
     """Errors in units of the batch's standard deviations, which are all 1."""
     model, step = constant_model(), steps()
-    truth = [[1.0, 1, 1, 0], [1, -1, 3, 0], [3, 1, 1, 0], [3, -1, 3, 1]]
+    truth = np.array([[1.0, 1, 1, 0], [1, -1, 3, 0], [3, 1, 1, 0], [3, -1, 3, 1]])
     np.testing.assert_allclose(model.truth(step), truth)
     counts = jnp.zeros((4, 3)).at[0].set(jnp.array([1.0, 0, 2])).at[3, 1].set(1.0)
     first = 1.0 / 4  # the first step, by the first member: only the second change is wrong, by 1

@@ -1,6 +1,7 @@
 """REINFORCE, A2C and PPO: formulas by hand, gradients, and values known by hand."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from qfolio.tasks.pendulum import Pendulum
 from probes import Aim, AimWeights, Endless, OneState, RewardDelay, TwoStates
 
 DISCOUNT = 0.9
-SMALL = {"hidden": (16,), "num_envs": 3, "rollout_length": 4, "episode_steps": 4}
+SMALL: dict[str, Any] = {"hidden": (16,), "num_envs": 3, "rollout_length": 4, "episode_steps": 4}
 AGENTS = {
     "reinforce": REINFORCE(**SMALL),
     "a2c": A2C(**SMALL, gae_lambda=0.8),
@@ -389,11 +390,11 @@ def test_reinforce_learns_from_whole_episodes_alone(time_limit_terminal):
     rollout = a_rollout(agent, task, state, jax.random.key(1))
     column = lambda *steps: jnp.zeros(6, bool).at[jnp.array(steps)].set(True)  # noqa: E731
     truncated = jnp.zeros((6, 2), bool).at[2, 1].set(True)
-    after = jnp.roll(rollout.observation, -1, 0)
+    shifted = jnp.roll(rollout.observation, -1, 0)
     rollout = rollout._replace(
         terminated=jnp.stack([column(1, 3), column(0)], 1),
         truncated=truncated,
-        next_observation=jnp.where(truncated[..., None], rollout.next_observation, after),
+        next_observation=jnp.where(truncated[..., None], rollout.next_observation, shifted),
     )
     value = lambda x: np.asarray(jax.vmap(state.weights.value)(x))  # noqa: E731
     reward, following = np.asarray(rollout.reward), value(rollout.next_observation)

@@ -328,7 +328,7 @@ def test_wrong_settings(kind, changes, message):
 @pytest.mark.slow
 def test_a_network_learns_on_numbered_states():
     task = FiniteMDP(
-        np.eye(3)[[[1, 0], [2, 0], [2, 2]]], [[0, 0.5], [1, 0], [0, 0]], terminal=[2], horizon=6
+        np.eye(3)[[[1, 0], [2, 0], [2, 2]]], [[0, 0.5], [1.0, 0], [0.0, 0]], terminal=[2], horizon=6
     )
     agent = DQN(
         hidden=(32,), num_envs=4, batch_size=32, replay_capacity=1000, learning_starts=100,
@@ -340,5 +340,6 @@ def test_a_network_learns_on_numbered_states():
         population.advance(1500 - population.steps)
     weights = jax.tree.map(lambda x: jnp.array(x[0]), population.weights())
     values = agent.action_values(weights, jnp.arange(2))
+    assert values is not None
     exact = task.optimum().action_values(DISCOUNT)[:2]
     np.testing.assert_allclose(values, exact, rtol=0.02, atol=0.01)

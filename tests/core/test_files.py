@@ -89,6 +89,7 @@ def test_a_lock_says_who_holds_it(tmp_path):
     command = [sys.executable, "-c", hold, str(tmp_path)]
     other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
+        assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         host = json.loads((tmp_path / ".holder").read_text())["host"]
         says = rf"is in use by process {other.pid} on {host} since \d{{4}}-.*; wait until"

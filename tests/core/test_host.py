@@ -83,7 +83,7 @@ class Numbered(Tiny):
 class Aim(Tiny):
     """Two numbers within bounds of their own: the reward says how far they are from (1, 30)."""
 
-    action_space = gymnasium.spaces.Box(np.float32([0, 10]), np.float32([4, 50]))
+    action_space = gymnasium.spaces.Box(*np.array([[0, 10], [4, 50]], np.float32))
 
     def outcome(self, action):
         assert self.action_space.contains(np.float32(action)), action
@@ -108,7 +108,9 @@ class Faulty(Tiny):
         seen, info = super().reset(seed=seed)
         if self.fault == "fails to start":
             raise RuntimeError("no licence")
-        return (np.float32([np.nan, 0]) if self.fault == "starts with NaN" else seen), info
+        if self.fault == "starts with NaN":
+            seen = np.array([np.nan, 0], np.float32)
+        return seen, info
 
     def step(self, action):
         self.t += 1
@@ -206,6 +208,7 @@ def test_bootstraps_through_the_time_limit():
     )  # fmt: skip
     weights = trained(task(Endless), agent, [0], 1500).weights()
     values = agent.action_values(jax.tree.map(lambda x: jnp.array(x[0]), weights), jnp.ones((1, 2)))
+    assert values is not None
     np.testing.assert_allclose(values, [[5.0, 5.0]], rtol=0.02)
 
 

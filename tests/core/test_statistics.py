@@ -1,3 +1,6 @@
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -129,10 +132,11 @@ def test_intervals_cover_what_they_should() -> None:
     held = np.zeros(3)
     for seed in range(400):
         x, y = rng.normal(size=(2, 10))
-        for i, (strata, statistic, truth) in enumerate(
-            [([x], interquartile_mean, 0.0), ([x, y], probability_of_improvement, 0.5),
-             ([x, y + 1], probability_of_improvement, 0.23975)]
-        ):  # fmt: skip
+        cases: list[tuple[list[Any], Callable[..., Any], float]] = [
+            ([x], interquartile_mean, 0.0), ([x, y], probability_of_improvement, 0.5),
+            ([x, y + 1], probability_of_improvement, 0.23975),
+        ]  # fmt: skip
+        for i, (strata, statistic, truth) in enumerate(cases):
             low, high = stratified_interval(strata, statistic, resamples=300, seed=seed)
             held[i] += low <= truth <= high
     assert (held / 400 > 0.885).all()

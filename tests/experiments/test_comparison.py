@@ -3,6 +3,7 @@ import dataclasses
 import json
 import math
 import re
+from typing import Any
 
 import jax
 import numpy as np
@@ -37,9 +38,11 @@ from qfolio.tasks.pendulum import Pendulum
 from listeners import Interrupt, Tell
 from shell import qfolio
 
-TASK = {"horizon": 20}
-TINY = {"hidden": (8,), "num_envs": 2, "batch_size": 8, "replay_capacity": 200,
-        "learning_starts": 16, "episode_steps": 0}  # fmt: skip
+TASK: dict[str, Any] = {"horizon": 20}
+TINY: dict[str, Any] = {
+    "hidden": (8,), "num_envs": 2, "batch_size": 8, "replay_capacity": 200,
+    "learning_starts": 16, "episode_steps": 0,
+}  # fmt: skip
 
 
 def tiny(seeds=3, episodes=6, **rates):
@@ -253,7 +256,12 @@ def test_resuming_gives_the_same(finished, tmp_path, stop):
     run = Comparison.open(tmp_path / "run")
     assert list(run.results) == ["slow"]
     trained = []
-    run.run(lambda name: trained.append(name) or Listener())
+
+    def listener(name):
+        trained.append(name)
+        return Listener()
+
+    run.run(listener)
     assert trained == ["quick"]
     for name, expected in finished[0].results.items():
         assert run.results[name].returns == expected.returns

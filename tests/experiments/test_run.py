@@ -274,8 +274,9 @@ def test_unfinished_files_of_a_killed_process_are_swept(task, agent, tmp_path):
 def test_whole_numbers_mean_the_same_as_fractions(task, tmp_path):
     """Settings come back from config.json as floats, and must train alike."""
     agent = DQN(
-        hidden=[8], num_envs=2, batch_size=8, learning_starts=4, reward_scale=3, huber_delta=1
-    )
+        hidden=[8], num_envs=2, batch_size=8,  # type: ignore[arg-type]
+        learning_starts=4, reward_scale=3, huber_delta=1,
+    )  # fmt: skip
     create(task, agent, tmp_path / "run", episodes=8).train()
     create(task, agent, tmp_path / "again", episodes=4).train()
     Run.open(tmp_path / "again").train(Budget(8))

@@ -5,6 +5,7 @@ import math
 import os
 import signal
 import sys
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,7 +22,7 @@ from qfolio.experiments.presets import preset
 from qfolio.experiments.run import Run
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Trial, best_of
-from qfolio.experiments.tuning.run import Tuning, tuning_keys
+from qfolio.experiments.tuning.run import Progress, Tuning, tuning_keys
 from qfolio.experiments.tuning.search import dimension
 from qfolio.experiments.tuning.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
 from qfolio.report.tuning import Sweep, render_page, write_tuning_report
@@ -202,7 +203,7 @@ def test_tuning_never_sees_the_graded_starts():
 
 def test_a_search_goes_on_where_it_was_left(tmp_path, task, agent):
     folder = tmp_path / "s"
-    progress = []
+    progress: list[Progress] = []
     start(folder, task, agent).run(progress.append)
     assert [(p.done, p.trials) for p in progress] == [(2, 2), (4, 2)]
     again = Tuning.open(folder, trials=7, batch=2)
@@ -258,13 +259,15 @@ def test_configurations_of_several_programs(tmp_path, task, agent):
 
 def test_diverged_trials_are_pruned_and_never_best(tmp_path, task, agent):
     work = start(tmp_path / "s", task, agent, f"learning_rate=0.001|{BOOM}", trials=6)
-    progress = []
+    progress: list[Progress] = []
     work.run(progress.append)
     lost = [trial for trial in work.journal.trials() if trial.values["learning_rate"] != "0.001"]
     assert 0 < len(lost) < 6
     assert all(trial.returns == (None, None) and math.isnan(trial.value) for trial in lost)
     assert progress[-1].diverged == len(lost)
-    assert best_of(work.journal.trials()).values == {"learning_rate": "0.001"}
+    best = best_of(work.journal.trials())
+    assert best is not None
+    assert best.values == {"learning_rate": "0.001"}
 
 
 def test_a_search_where_all_diverge_says_so(tmp_path, task, agent):
@@ -343,7 +346,12 @@ def test_an_error_gives_the_batch_back(tmp_path, task, agent, monkeypatch):
 def test_ctrl_c_stops_after_the_chunk(share, known, tmp_path, task, agent):
     """A batch that is finished by then counts; one that is not is tried again."""
     work = start(tmp_path / "s", task, agent)
-    work.run(chunk_listener=lambda now: now >= share and os.kill(os.getpid(), signal.SIGINT))
+
+    def press(now):
+        if now >= share:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    work.run(chunk_listener=press)
     assert work.interrupted
     assert (len(work.journal.trials()), work.journal.in_hand()) == (known, 0)
 
@@ -404,6 +412,7 @@ def made_up(count=80, seed=0):
 def test_sensitivity_finds_what_matters():
     space, trials = made_up()
     found = sensitivity(space, trials, optimum=-100.0)
+    assert found is not None
     effects = {effect.dimension.name: effect for effect in found.effects}
     assert found.effects[0].dimension.name == "learning_rate"
     assert effects["learning_rate"].share > 0.8
@@ -415,7 +424,9 @@ def test_sensitivity_finds_what_matters():
     assert effects["discount"].width == 1
     assert effects["hidden"].robust.all()
     text = " ".join(verdicts(found, trials))
-    good = sum(-trial.value <= 107 + (-best_of(trials).value - 102) for trial in trials[:40])
+    best = best_of(trials)
+    assert best is not None
+    good = sum(-trial.value <= 107 + (-best.value - 102) for trial in trials[:40])
     assert f"Of 40 configurations drawn at random, {good} lost no more than 5 points" in text
     assert "What matters most: learning_rate" in text
     assert "hidden hardly do" in text or "hidden and discount hardly do" in text
@@ -466,7 +477,7 @@ def page(optimum=-100.0, **changes) -> Sweep:
     } | changes  # fmt: skip
     config = {"task": "pendulum", "agent": "<dqn>", "preset": "fast", "seeds": 2,
               "episodes": 2144, "steps": None, "batch": 16}  # fmt: skip
-    own = {"discount": 0.95, "learning_rate": 1e-3, "hidden": "32"}
+    own: dict[str, Any] = {"discount": 0.95, "learning_rate": 1e-3, "hidden": "32"}
     found = sensitivity(space, trials, optimum)
     return Sweep(config, space, trials, own, summary, found, "qfolio train\nqfolio tune")
 
@@ -531,6 +542,7 @@ def test_tune_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert "4/4" in printed
     command = next(line for line in printed.splitlines() if line.startswith("qfolio train"))
     best = best_of(Tuning.open(folder).journal.trials())
+    assert best is not None
     assert "--episodes 4" in command
     assert (folder / "report.html").exists()
     summary = json.loads((folder / "summary.json").read_text())

@@ -23,7 +23,7 @@ def gaussian(draws=None):
 def test_categorical_against_its_probabilities():
     chances = np.array([0.5, 0.2, 0.3])
     policy = Categorical(jnp.broadcast_to(jnp.log(chances) + 7, (DRAWS, 3)))
-    draws = np.asarray(policy.sample(KEY))
+    draws = policy.sample(KEY)
     np.testing.assert_allclose(np.bincount(draws) / DRAWS, chances, atol=0.006)
     np.testing.assert_allclose(policy.log_prob(draws)[:50], np.log(chances)[draws[:50]], rtol=1e-5)
     np.testing.assert_allclose(policy.entropy()[0], stats.entropy(chances), rtol=1e-5)
@@ -52,8 +52,8 @@ def test_gaussian_against_scipy():
 
 def test_squashed_is_the_change_of_variables():
     policy = Squashed(gaussian(1000), 2.0)
-    action, log_prob = policy.sample_and_log_prob(KEY)
-    action = np.asarray(action, np.float64)
+    drawn, log_prob = policy.sample_and_log_prob(KEY)
+    action = np.asarray(drawn, np.float64)
     np.testing.assert_array_equal(action, policy.sample(KEY))
     inside = np.abs(action).max(1) < 1.99  # beyond, float32 cannot be inverted
     x = np.arctanh(action / 2)
@@ -134,6 +134,7 @@ def test_what_an_output_means():
     np.testing.assert_array_equal(policy_of(Discrete(3), output, jnp.zeros(0)).mode(), [1])
 
     bounded = policy_of(Box(3, 2.0), output, jnp.log(jnp.array([0.5, 1.0, 2.0])))
+    assert isinstance(bounded, Gaussian)
     np.testing.assert_allclose(bounded.mode(), 2 * output, rtol=1e-6)
     np.testing.assert_allclose(jnp.exp(bounded.log_std), [1, 2, 4], rtol=1e-6)
     free = policy_of(Box(3), output, jnp.zeros(3))

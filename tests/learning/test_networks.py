@@ -1,3 +1,5 @@
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -40,7 +42,7 @@ def test_an_image_is_convolved_as_xla_does_it():
     found = lax.conv_general_dilated(
         x, kernel, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
-    found = np.maximum(found + cnn.first.biases[0], 0).reshape(5, -1)
+    found = jnp.maximum(found + cnn.first.biases[0], 0).reshape(5, -1)
     expected = found @ cnn.second.weights[0] + cnn.second.biases[0]
     np.testing.assert_allclose(cnn(x), expected, atol=1e-5)
 
@@ -51,7 +53,7 @@ def test_a_window_is_convolved_as_xla_does_it():
     found = lax.conv_general_dilated(
         x, kernel, (1,), "VALID", dimension_numbers=("NWC", "WIO", "NWC")
     )
-    found = np.maximum(found + cnn.first.biases[0], 0).reshape(4, -1)
+    found = jnp.maximum(found + cnn.first.biases[0], 0).reshape(4, -1)
     expected = found @ cnn.second.weights[0] + cnn.second.biases[0]
     np.testing.assert_allclose(cnn(x), expected, atol=1e-5)
 
@@ -106,10 +108,10 @@ def test_the_input_gain_is_of_each_channel(kind):
     task = Scaled()
     observation = task.observe(task.reset(KEY))
     plain, gained = (
-        networks.build(NetworkConfig(kind, (16,), gain), task, observation, Outputs(3), KEY).encoder
+        networks.build(NetworkConfig(kind, (16,), gain), task, observation, Outputs(3), KEY)
         for gain in (0.0, 2.0)
     )
-    first = lambda e: (e.first if kind == "cnn" else e.inputs).weights[0]  # noqa: E731
+    first = lambda n: (n.encoder.first if kind == "cnn" else n.encoder.inputs).weights[0]  # noqa: E731
     ratio = first(gained) / first(plain)
     np.testing.assert_allclose(ratio[::2], 2.0, rtol=1e-6)
     np.testing.assert_allclose(ratio[1::2], 0.5, rtol=1e-6)
@@ -154,7 +156,7 @@ class Recall(TwoStates):
         return Step(state, state * (2.0 * action - 1.0), TERMINATED)
 
 
-LEARNER = {
+LEARNER: dict[str, Any] = {
     "num_envs": 4, "batch_size": 32, "replay_capacity": 1000, "learning_starts": 100,
     "target_update_interval": 1, "tau": 0.05, "learning_rate": 3e-3, "learning_rate_steps": 800.0,
     "learning_rate_final": 0.0, "epsilon_end": 0.2,
@@ -173,7 +175,9 @@ def test_an_agent_recalls_what_it_saw_first(kind):
     population = train(Population(Recall(), agent, [100]), 800)
     weights = jax.tree.map(lambda x: jnp.array(x[0]), population.weights())
     seen = jax.vmap(Recall().observe)(jnp.array([1.0, -1.0]))
-    np.testing.assert_allclose(agent.action_values(weights, seen), [[-1, 1], [1, -1]], atol=0.02)
+    values = agent.action_values(weights, seen)
+    assert values is not None
+    np.testing.assert_allclose(values, [[-1, 1], [1, -1]], atol=0.02)
 
 
 @pytest.mark.slow

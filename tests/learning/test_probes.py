@@ -1,3 +1,5 @@
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,7 @@ QUANTILE = {"values": "quantile", "atoms": 16, "huber_delta": 1.0}
 RAINBOW = {
     "double": True, "dueling": True, "n_steps": 3, "prioritized": True, "noisy": True,
 }  # fmt: skip
-OPTIONS = {
+OPTIONS: dict[str, dict[str, Any]] = {
     "dueling": {"dueling": True},
     "n_steps": {"n_steps": 3},
     "prioritized": {"prioritized": True},
@@ -74,7 +76,7 @@ def test_two_states(changes):
 @pytest.mark.parametrize("changes", variants("plain", "double", "n_steps", "categorical"))
 def test_reward_delay(changes):
     values = learned_values(RewardDelay(), [[1.0, 0.0], [0.0, 1.0]], **changes)
-    np.testing.assert_allclose(values, [[DISCOUNT] * 2, [1, 1]], rtol=0.02)
+    np.testing.assert_allclose(values, [[DISCOUNT] * 2, [1.0, 1]], rtol=0.02)
 
 
 @pytest.mark.parametrize("changes", [{}, {"tau": 1.0, "target_update_interval": 10}])

@@ -121,6 +121,7 @@ def test_the_last_step_is_kept_where_it_is_asked_for():
     )  # fmt: skip
     assert Experience.of(rollout).last is None
     kept = Experience.of(rollout, with_last=True)
+    assert kept.last is not None
     assert (kept.last.tolist(), kept.terminal.tolist()) == ([True, True], [True, False])
 
 
@@ -185,6 +186,7 @@ def test_new_rows_have_the_highest_priority_there_was():
     priorities = priorities.set(jnp.array([0]), jnp.array([0.1]))
     replay = Replay(replay.rows, replay.position, replay.size, priorities, replay.like, 2, 1)
     replay = replay.add(jnp.array([4, 5]))
+    assert replay.priorities is not None
     np.testing.assert_allclose(replay.priorities.of(jnp.arange(8)), [0.1, 0.5, 1, 1, 5, 5, 0, 0])
 
 

@@ -1,6 +1,7 @@
 """The trades that lead from holdings to target weights."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +13,15 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.prices.table import Prices
 
 PRICES = Prices(
-    np.array(["2024-12-30", "2024-12-31"], "datetime64[s]"), ("A", "B"), [[10, 50], [20, 40]]
+    np.array(["2024-12-30", "2024-12-31"], "datetime64[s]"),
+    ("A", "B"),
+    np.array([[10.0, 50], [20, 40]]),
 )
 
 
 def plan(weights, shares, cash, cost=0.01, **options):
     names = ("cash", "A", "B")
-    policy = SimpleNamespace(
+    policy: Any = SimpleNamespace(
         weights=lambda prices, held: dict(zip(names, weights, strict=True)),
         task=SimpleNamespace(cost=cost),
     )

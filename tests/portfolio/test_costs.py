@@ -127,7 +127,7 @@ def test_number_of_steps() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_no_trade_and_no_cost_are_free_to_the_last_bit(dtype: type) -> None:
+def test_no_trade_and_no_cost_are_free_to_the_last_bit(dtype: type[np.floating]) -> None:
     before, after = weights(1, 500, 21).astype(dtype), weights(2, 500, 21).astype(dtype)
     for kind in (np.asarray, jnp.asarray):
         held, wanted = kind(before), kind(after)

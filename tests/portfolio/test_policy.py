@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import jax
 import numpy as np
@@ -19,7 +20,7 @@ from qfolio.portfolio.prices.table import Prices
 from listeners import Tell
 
 ROWS, WINDOW = 80, 5
-AGENTS = {
+AGENTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "dqn": (
         DQN(network="mlp", hidden=(8, 8), all_actions=True, num_envs=2, batch_size=8,
             learning_starts=20, replay_capacity=64, learning_rate=0.01),

@@ -8,12 +8,14 @@ from dataclasses import replace
 from functools import lru_cache
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -485,10 +487,11 @@ def test_market_compares_two_agents_that_estimate_values() -> None:
 def test_market_text_is_escaped() -> None:
     data, attack = make_market(), "<script>alert(1)</script>"
     assert data.market is not None
+    assert isinstance(data.market.policy, Responses)
     drawn = replace(data.market.policy, scenes=(attack, attack))
     drawn = replace(drawn, exact=drawn.exact.repeat(2, 0), learned=drawn.learned.repeat(2, 1))
     rule = {"exact": {attack: 1.0}, "per_seed": [{attack: 1.0}] * 3}
-    words = dict.fromkeys(("about", "measure", "meaning", "rule"), attack)
+    words: dict[str, Any] = dict.fromkeys(("about", "measure", "meaning", "rule"), attack)
     market = replace(data.market, **words, policy=drawn)
     page = render_page(replace(data, summary={**data.summary, "rule": rule}, market=market))
     assert "<script" not in page.lower()
@@ -498,13 +501,15 @@ def test_market_text_is_escaped() -> None:
 def test_policy_is_drawn_beside_the_exact_one() -> None:
     data = make_market()
     (axes,) = draw_policy(data, 7.2).axes
-    lines = {
-        tuple(np.round(line.get_ydata(), 6)) for line in axes.lines if len(line.get_ydata()) > 2
-    }
-    drawn = data.market.policy  # type: ignore[union-attr]
+    heights = [np.asarray(line.get_ydata()) for line in axes.lines]
+    lines = {tuple(np.round(y, 6)) for y in heights if len(y) > 2}
+    assert data.market is not None
+    drawn = data.market.policy
+    assert isinstance(drawn, Responses)
     wanted = [drawn.exact[0], *drawn.learned[:, 0], drawn.learned[:, 0].mean(0)]
     assert lines == {tuple(np.round(line, 6)) for line in wanted}
     (region,) = axes.patches
+    assert isinstance(region, Rectangle)
     assert region.get_x() == LOW
     assert region.get_width() == pytest.approx(HIGH - LOW)
 
@@ -513,9 +518,10 @@ def test_weights_are_drawn_beside_the_exact_ones() -> None:
     data = make_market()
     learned = np.array([[0.5, 0.4], [0.6, 0.2]])
     drawn = Weights(("one", "two"), np.array([0.55, 0.45]), learned)
-    data = replace(data, market=replace(data.market, policy=drawn))  # type: ignore[arg-type]
+    assert data.market is not None
+    data = replace(data, market=replace(data.market, policy=drawn))
     (axes,) = draw_policy(data, 7.2).axes
-    seeds, mean, exact = (list(line.get_xdata()) for line in axes.lines)
+    seeds, mean, exact = (np.asarray(line.get_xdata()).tolist() for line in axes.lines)
     assert sorted(seeds) == [0.2, 0.4, 0.5, 0.6]
     assert mean == pytest.approx([0.55, 0.3])
     assert exact == [0.55, 0.45]
@@ -571,6 +577,7 @@ def test_learned_and_exact_policies(task, agent) -> None:
     drawn = responses(task, agent, members, task.optimum().policy, "in {}")
     position = isinstance(task, GarleanuPedersen)
     if isinstance(task, NoTrade):
+        assert drawn.region is not None
         np.testing.assert_allclose(drawn.exact[0], np.clip(drawn.held, *drawn.region), atol=1e-6)
     elif position:
         slopes = np.diff(drawn.exact) / np.diff(drawn.held)

@@ -91,7 +91,7 @@ def test_the_hidden_pendulum_is_the_pendulum():
     rows = [np.zeros(2), np.zeros(2)]
     steps = [jax.jit(task.step) for task in (hidden, plain)]
     for action in np.random.default_rng(0).integers(0, 11, 12):
-        rows.append(plain.observe(state)[:2])
+        rows.append(np.asarray(plain.observe(state)[:2]))
         np.testing.assert_allclose(hidden.observe(seen), rows[-3:], atol=1e-6)
         after, expected = (
             step(at, jnp.array(action), KEY) for step, at in zip(steps, (seen, state), strict=True)

@@ -1,4 +1,5 @@
 import dataclasses
+from typing import Any
 
 import gymnasium
 import jax
@@ -22,7 +23,7 @@ from qfolio.tasks.finite import Cliff, FiniteMDP, FrozenLake, Garnet
 from qfolio.tasks.grid_pendulum import GridPendulum, interpolated
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 
-TWO = {
+TWO: dict[str, Any] = {
     # From state 0, action 0 stays or goes on to state 1, action 1 ends; from 1 either goes to 0.
     "transitions": [[[0.5, 0.5, 0], [0, 0, 1]], [[1, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 0, 0]]],
     "rewards": [[1.0, 2.0], [0.0, 3.0], [9.0, 9.0]],
@@ -34,7 +35,7 @@ def test_values_by_hand():
     optimum = FiniteMDP(**TWO).optimum()
     # Staying in: V0 = 1 + γ (V0 + V1) / 2, V1 = 3 + γ V0.
     v0 = (1 + 0.5 * 0.9 * 3) / (1 - 0.5 * 0.9 - 0.5 * 0.81)
-    exact = [[v0, 2.0], [0.9 * v0, 3 + 0.9 * v0], [0, 0]]
+    exact = [[v0, 2.0], [0.9 * v0, 3 + 0.9 * v0], [0.0, 0]]
     np.testing.assert_allclose(optimum.action_values(0.9), exact, rtol=1e-12)
     # For γ = 0 ending pays more.
     np.testing.assert_allclose(optimum.action_values(0.0), [[1, 2], [0, 3], [0, 0]])
@@ -104,7 +105,8 @@ def test_the_tables_are_gymnasiums(name, task, options):
     # By state and action: probability and reward of each next state, and whether it is the end.
     for state in np.flatnonzero(~task.terminal):
         for action in range(4):
-            theirs, ours = {}, {}
+            theirs: dict[tuple, float] = {}
+            ours: dict[tuple, float] = {}
             for p, after, reward, ended in env.P[state][action]:
                 key = (int(after), float(reward), bool(ended))
                 theirs[key] = theirs.get(key, 0.0) + p
@@ -160,7 +162,7 @@ def test_an_episode_ends_in_a_terminal_state():
 def test_rewards_of_outcomes_and_changed_settings():
     rewards = np.broadcast_to(np.arange(3.0), (3, 2, 3))
     task = FiniteMDP(**{**TWO, "rewards": rewards})
-    np.testing.assert_allclose(task.optimum().action_values(0.0), [[0.5, 2], [0, 0], [0, 0]])
+    np.testing.assert_allclose(task.optimum().action_values(0.0), [[0.5, 2], [0.0, 0], [0.0, 0]])
     longer = dataclasses.replace(task, horizon=7)
     np.testing.assert_array_equal(longer.successors, task.successors)
     assert longer.horizon == 7

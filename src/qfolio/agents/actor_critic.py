@@ -32,7 +32,7 @@ class Critics(eqx.Module):
     They read an observation and an action, or an observation alone where actions are numbered.
     """
 
-    networks: Network  # with a leading critic axis
+    networks: Callable[[PyTree], Array]  # with a leading critic axis
     scale: Scale = eqx.field(static=True)  # of what the networks give
 
     def __init__(
@@ -84,7 +84,7 @@ class Batch(NamedTuple):
 class Actor(eqx.Module):
     """A policy: a network, and the actions that its outputs stand for."""
 
-    network: Network
+    network: Callable[[PyTree], Array]
     actions: Actions
 
 

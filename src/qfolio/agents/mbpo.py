@@ -7,6 +7,7 @@ steps. Members differ by where they began and by their data: each counts a real 
 … times (on-line bootstrap, Oza & Russell 2001). docs/model_based.md lists formulas and deviations.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -38,7 +39,7 @@ class Model(eqx.Module):
     Small rewards decide where large ones are avoided, and a root is finer near zero.
     """
 
-    members: MLP
+    members: Callable[[Array], Array]
     scale: Float[Array, " seen"]  # range of each component of an observation
     actions: Actions
 

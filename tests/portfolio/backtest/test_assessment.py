@@ -55,7 +55,7 @@ def test_assess_by_hand_on_one_block() -> None:
     assert result.strategies["strong"].to_best_baseline is None
     assert result.strategies["equal weight"].to_reference is None
 
-    variance = max(np.var(table["sharpe"], ddof=1) / 252, 1 / 299)
+    variance = max(float(np.var(table["sharpe"], ddof=1)) / 252, 1 / 299)
     test = dqn.sharpe_test
     threshold = expected_maximum_sharpe(7, variance)
     assert test.threshold == pytest.approx(threshold * math.sqrt(252))

@@ -116,7 +116,7 @@ def test_blocks_cover_where_independent_days_do_not() -> None:
             length = block_length(row) if block is None else block
             drawn = bootstrap_measures(row[None], zeros, zeros, 252, length, 200, rng)
             low, high = percentile_interval(drawn["growth"][:, 0])
-            hits += low <= 0 <= high
+            hits += bool(low <= 0 <= high)
         return hits / len(series)
 
     assert coverage(1.0) == pytest.approx(0.74, abs=0.08)
@@ -161,7 +161,7 @@ def test_intervals_are_those_of_arch() -> None:
         table = measures(sample, 0 * sample, 0 * sample, 252)
         return np.array([table[name] for name in names])
 
-    theirs = StationaryBootstrap(8.0, returns[0], seed=12).apply(statistics, reps=4000)
+    theirs = StationaryBootstrap(8, returns[0], seed=12).apply(statistics, reps=4000)
     for name, column in zip(names, theirs.T, strict=True):
         spread = column.std()
         assert drawn[name].std() == pytest.approx(spread, rel=0.06), name

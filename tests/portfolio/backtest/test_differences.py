@@ -1,6 +1,7 @@
 """Comparisons of strategies: paired, two-sided, and corrected for how many there are."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ from qfolio.core.statistics import holm
 from qfolio.portfolio.backtest.assessment import Strategy, assess
 from qfolio.portfolio.backtest.differences import (
     MARGIN,
-    Difference,
     Sampled,
     tails_to,
     tails_to_best,
@@ -62,8 +62,8 @@ def test_beating_the_best_is_beating_every_baseline() -> None:
     assert tails_to_best(ours, [calm, wild]).better == tails_to(ours, wild).better > 0.05
 
 
-def both(result: object, name: str) -> list[Difference]:
-    entry = result.strategies[name]  # type: ignore[attr-defined]
+def both(result: Any, name: str) -> list[Any]:
+    entry = result.strategies[name]
     return [each for each in (entry.to_reference, entry.to_best_baseline) if each is not None]
 
 

@@ -160,7 +160,12 @@ def test_what_was_trained_stays(finished, tmp_path):
     resumed = Backtest.open(tmp_path / "run")
     with pytest.raises(QfolioError, match="not finished"):
         resumed.policy()
-    resumed.run(lambda job, done, share: jobs.append(job) or [])
+
+    def note(job, done, share):
+        jobs.append(job)
+        return []
+
+    resumed.run(note)
     assert not resumed.interrupted
     # Each fold once: what was finished is not trained again.
     folds = [fold for job in jobs for fold in job.folds]

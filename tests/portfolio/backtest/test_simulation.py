@@ -172,13 +172,13 @@ def test_two_days_by_hand() -> None:
     # By row 2, A doubles: .6 + .6 = 1.2 for each unit of wealth.
     # Row 1 decides for all A; at row 2 that sells .6 of B for .54, which buys .486 of A:
     # 1.086 of 1.2 remains, and stays so, as A does not move into row 3.
-    result = simulate(values, [[0, 0.5, 0.5], [0, 1, 0]], first=0, cost=0.1, lag=1)
+    result = simulate(values, [[0, 0.5, 0.5], [0.0, 1, 0]], first=0, cost=0.1, lag=1)
     np.testing.assert_allclose(result.wealth, [1, 1.2, 1.086], rtol=1e-14)
     np.testing.assert_allclose(result.returns, [0.2, -0.095], atol=1e-14)
     np.testing.assert_allclose(result.growth, np.log([1.2, 0.905]), atol=1e-14)
     np.testing.assert_allclose(result.cost, [0.1, 0.095], atol=1e-14)
     np.testing.assert_allclose(result.turnover, [0.9, 0.5 + 0.486 / 1.2], atol=1e-14)
-    np.testing.assert_allclose(result.weights, [[0, 1 / 3, 2 / 3], [0, 1, 0]], atol=1e-14)
+    np.testing.assert_allclose(result.weights, [[0, 1 / 3, 2 / 3], [0.0, 1, 0]], atol=1e-14)
 
 
 def test_first_decision_may_hold_on() -> None:

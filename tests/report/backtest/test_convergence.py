@@ -15,17 +15,23 @@ def training(slope_at_end, seed=0):
     return steps + np.random.default_rng(seed).normal(0, 0.1, 400)
 
 
+def fold_of(returns):
+    fold = FoldTraining.of(returns)
+    assert fold is not None
+    return fold
+
+
 @pytest.mark.parametrize(("slope", "rising"), [(0.5, True), (0.0, False), (-0.5, False)])
 def test_rising_is_what_the_last_quarter_gains(slope, rising):
     returns = training(slope)
-    fold = FoldTraining.of(returns)
+    fold = fold_of(returns)
     assert fold.rising == rising
     assert fold.curve.shape == (POINTS,)
     assert fold.curve[0] == pytest.approx(returns[:20].mean())
 
 
 def test_noise_alone_does_not_rise():
-    folds = [FoldTraining.of(np.random.default_rng(i).normal(size=400)) for i in range(100)]
+    folds = [fold_of(np.random.default_rng(i).normal(size=400)) for i in range(100)]
     assert sum(fold.rising for fold in folds) <= 8  # 2.3 expected
 
 
@@ -37,7 +43,7 @@ def test_the_page_says_whether_training_converged():
     rng = np.random.default_rng(0)
     series = {"dqn": make_series(rng, "agent", 2, 300, 3, 0.0),
               "equal weight": make_series(rng, "baseline", 1, 300, 3, 0.0)}  # fmt: skip
-    folds = [FoldTraining.of(training(slope, i)) for i, slope in enumerate((2.0, 0.0))]
+    folds = [fold_of(training(slope, i)) for i, slope in enumerate((2.0, 0.0))]
     data = make_data(series, weekdays("2020-01-01", 300), ("A", "B", "C"), training={"dqn": folds})
     page = render_backtest(data)
     assert (
