@@ -132,9 +132,12 @@ def bootstrap_measures(
     return {name: np.concatenate([part[name] for part in parts]) for name in MEASURES}
 
 
-def percentile_interval(samples: Floats, level: float = LEVEL) -> tuple[Floats, Floats]:
-    """Return the middle part of the samples along the first axis, bounded by two of them."""
+def percentile_interval(samples: Floats, level: float = LEVEL) -> Floats:
+    """Return the ends, shape (2, …), of the middle part of the samples along the first axis.
+
+    Both ends are samples.
+    """
     count = len(samples)
     tail = max(math.floor((count + 1) * (1 - level) / 2), 1)
     ordered = np.sort(samples, axis=0)  # no interpolation: an end may be infinite
-    return ordered[tail - 1], ordered[count - tail]
+    return ordered[[tail - 1, count - tail]]

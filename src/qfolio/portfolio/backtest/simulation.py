@@ -24,6 +24,7 @@ BLOCK = 60_000
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Rows = NDArray[np.intp] | np.intp
 
 
 @dataclass(frozen=True)
@@ -146,11 +147,11 @@ class _Market:
         to_trade, after_trade = self.moved(day, day), self.grown(day + lag, day + lag + 1)
         self.to_trade, self.after_trade = (r.T.copy()[:, None] for r in (to_trade, after_trade))
 
-    def moved(self, decided: NDArray[np.intp], trade: NDArray[np.intp]) -> Floats:
+    def moved(self, decided: Rows, trade: Rows) -> Floats:
         """Growth from days of decisions to the trades of later days' decisions, cash first."""
         return self.grown(decided, trade + self.lag)
 
-    def grown(self, start: NDArray[np.intp], end: NDArray[np.intp]) -> Floats:
+    def grown(self, start: Rows, end: Rows) -> Floats:
         """What a unit of each entry grows to from one row to another."""
         relatives = self.prices[end] / self.prices[start]
         return np.asarray(self.costs.carry(relatives, Context(rows=end - start)))
