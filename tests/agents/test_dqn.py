@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equinox import filter_jit as jit
 
 from qfolio.agents.dqn import DQN
 from qfolio.core.errors import QfolioError
@@ -49,13 +50,13 @@ def rollout(agent, observation=1.0, reward=1.0, terminated=False, truncated=Fals
     shape = (1, agent.num_envs)
     return Transition(
         state=None,
-        observation=jnp.full((*shape, 3), observation),
-        action=jnp.zeros(shape, jnp.int32),
-        reward=jnp.full(shape, reward),
+        observation=np.full((*shape, 3), observation, np.float32),
+        action=np.zeros(shape, np.int32),
+        reward=np.full(shape, reward, np.float32),
         next_state=None,
-        next_observation=jnp.full((*shape, 3), observation + 1),
-        terminated=jnp.full(shape, terminated),
-        truncated=jnp.full(shape, truncated),
+        next_observation=np.full((*shape, 3), observation + 1, np.float32),
+        terminated=np.full(shape, terminated),
+        truncated=np.full(shape, truncated),
     )
 
 
@@ -94,13 +95,18 @@ def test_huber_loss_by_hand():
 
 def gradients(agent, state, target):
     """Of the loss of a batch in the online and the target network."""
-    batch = agent.observe(state, rollout(agent)).replay.sample(jax.random.key(2), 8)
+    batch = sampled(agent, state)
 
     def loss(online, target):
         losses = agent._losses(online, target, batch, agent.discount, jax.random.key(3))
         return losses.each.mean()
 
-    return jax.grad(loss, argnums=(0, 1))(state.online, target)
+    return jax.jit(jax.grad(loss, argnums=(0, 1)))(state.online, target)
+
+
+def sampled(agent, state):
+    replay = jit(agent.observe)(state, rollout(agent)).replay
+    return jit(replay.sample)(jax.random.key(2), 8)
 
 
 def largest(gradient):
@@ -108,8 +114,8 @@ def largest(gradient):
 
 
 def test_observing_learns_nothing(task, agent):
-    state = agent.init(task, jax.random.key(0))
-    after = agent.observe(state, rollout(agent))
+    state = jit(agent.init)(task, jax.random.key(0))
+    after = jit(agent.observe)(state, rollout(agent))
     jax.tree.map(np.testing.assert_array_equal, after.online, state.online)
     assert after.replay.size == agent.num_envs
 
@@ -120,14 +126,14 @@ def test_observing_learns_nothing(task, agent):
 )
 def test_what_counts_as_the_end(task, terminated, truncated, wrong, expected):
     agent = DQN(num_envs=2, time_limit_terminal=wrong, episode_steps=0)
-    state = agent.init(task, jax.random.key(0))
-    state = agent.observe(state, rollout(agent, terminated=terminated, truncated=truncated))
+    state = jit(agent.init)(task, jax.random.key(0))
+    state = jit(agent.observe)(state, rollout(agent, terminated=terminated, truncated=truncated))
     assert state.replay.unpack(state.replay.rows).terminal[:2].tolist() == [expected] * 2
 
 
 def test_the_gradient_reaches_the_online_network_only(task, agent):
-    state = agent.init(task, jax.random.key(0))
-    other = agent.init(task, jax.random.key(1)).online
+    state = jit(agent.init)(task, jax.random.key(0))
+    other = jit(agent.init)(task, jax.random.key(1)).online
     assert largest(gradients(agent, state, other)[0]) > 0
     assert largest(gradients(agent, state, other)[1]) == 0
 
@@ -138,13 +144,13 @@ def test_selecting_and_evaluating_have_no_gradient(task, agent, values):
     changes = {"values": values, "double": True, "dueling": True, "atoms": 7, "huber_delta": 1.0}
     changes |= {"v_min": -1000.0, "v_max": 1000.0}
     agent = dataclasses.replace(agent, **changes, discount=0.9)
-    state = agent.init(task, jax.random.key(0))
-    other = agent.init(task, jax.random.key(1)).online
+    state = jit(agent.init)(task, jax.random.key(0))
+    other = jit(agent.init)(task, jax.random.key(1)).online
     online, target = gradients(agent, state, other)
     assert largest(online) > 0
     assert largest(target) == 0
     # Scaling what the targets are made of moves the targets, not the way that the gradient takes.
-    batch = agent.observe(state, rollout(agent)).replay.sample(jax.random.key(2), 8)
+    batch = sampled(agent, state)
 
     def targets_moved_by_hand(online):
         frozen = jax.tree.map(jax.lax.stop_gradient, state.online)
@@ -155,7 +161,7 @@ def test_selecting_and_evaluating_have_no_gradient(task, agent, values):
         target = batch.reward[:, None] + 0.9 * kind.outcomes(following)
         return kind.loss(z, target, following)[0].mean()
 
-    expected = jax.grad(targets_moved_by_hand)(state.online)
+    expected = jax.jit(jax.grad(targets_moved_by_hand))(state.online)
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)  # noqa: E731
     jax.tree.map(close, online, expected)
 
@@ -169,10 +175,10 @@ def test_the_target_network_is_copied_every_period(task):
         hidden=(8,), num_envs=1, batch_size=4, target_update_interval=3, tau=1.0,
         learning_rate=1e-2,
     )  # fmt: skip
-    state = agent.init(task, jax.random.key(0))
+    state = jit(agent.init)(task, jax.random.key(0))
     same = []
     for i in range(6):
-        state, _ = agent.learn(Pendulum(), state, rollout(agent), jax.random.key(i))
+        state, _ = jit(agent.learn)(Pendulum(), state, rollout(agent), jax.random.key(i))
         same.append(bool((first_layer(state.target) == first_layer(state.online)).all()))
     assert same == [False, False, True, False, False, True]
 
@@ -199,19 +205,19 @@ def test_the_report_presets_copies_come_at_the_end_of_each_episode():
 
 def test_the_target_network_follows_softly(task):
     agent = DQN(hidden=(8,), num_envs=1, batch_size=4, target_update_interval=1, tau=0.25)
-    before = agent.init(task, jax.random.key(0))
-    after, _ = agent.learn(Pendulum(), before, rollout(agent), jax.random.key(1))
+    before = jit(agent.init)(task, jax.random.key(0))
+    after, _ = jit(agent.learn)(Pendulum(), before, rollout(agent), jax.random.key(1))
     expected = 0.75 * first_layer(before.target) + 0.25 * first_layer(after.online)
     np.testing.assert_allclose(first_layer(after.target), expected, rtol=1e-5, atol=1e-7)
 
 
 def test_epsilon_decays_with_finished_episodes(task):
     agent = DQN(num_envs=1, epsilon_start=1.0, epsilon_end=0.5, epsilon_decay=0.9)
-    state = agent.init(task, jax.random.key(0))
+    state = jit(agent.init)(task, jax.random.key(0))
     values = []
     for _ in range(8):
         values.append(float(agent.monitor(state)["epsilon"]))
-        state = agent.observe(state, rollout(agent, truncated=True))
+        state = jit(agent.observe)(state, rollout(agent, truncated=True))
     expected = [max(0.5, 0.9**i) for i in range(8)]
     np.testing.assert_allclose(values, expected, rtol=1e-5)
 
@@ -219,11 +225,11 @@ def test_epsilon_decays_with_finished_episodes(task):
 @pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
 def test_explores_with_probability_epsilon(task, epsilon):
     agent = DQN(num_envs=1, epsilon_start=epsilon, epsilon_end=epsilon)
-    state = agent.init(task, jax.random.key(0))
+    state = jit(agent.init)(task, jax.random.key(0))
     n, actions = 20_000, task.actions.n
     observation = jnp.ones((n, 3))
-    taken = np.asarray(agent.act(state, observation, jax.random.key(1)))
-    greedy = int(agent.policy(state.online, observation)[0])
+    taken = np.asarray(jit(agent.act)(state, observation, jax.random.key(1)))
+    greedy = int(jit(agent.policy)(state.online, observation)[0])
     share = np.bincount(taken, minlength=actions) / n
     expected = np.full(actions, epsilon / actions)
     expected[greedy] += 1 - epsilon
@@ -239,15 +245,15 @@ def test_the_learning_rate_falls_along_a_cosine():
 def test_adam_equals_its_formula(task):
     """One update against Adam written out (Kingma & Ba 2015, algorithm 1)."""
     agent = DQN(hidden=(8,), num_envs=1, batch_size=4, learning_rate=0.01)
-    before = agent.init(task, jax.random.key(0))
-    after, _ = agent.learn(Pendulum(), before, rollout(agent), jax.random.key(1))
-    replay = agent.observe(before, rollout(agent)).replay
-    batch = replay.sample(jax.random.key(1), 4)
+    before = jit(agent.init)(task, jax.random.key(0))
+    after, _ = jit(agent.learn)(Pendulum(), before, rollout(agent), jax.random.key(1))
+    replay = jit(agent.observe)(before, rollout(agent)).replay
+    batch = jit(replay.sample)(jax.random.key(1), 4)
     loss = lambda w: agent._losses(w, before.target, batch, 0.99, jax.random.key(0))  # noqa: E731
-    gradient = jax.grad(lambda w: loss(w).each.mean())(before.online)
+    gradient = jax.jit(jax.grad(lambda w: loss(w).each.mean()))(before.online)
     # At the first step Adam's direction is g / (|g| + ε).
-    step = jax.tree.map(lambda g: 0.01 * g / (jnp.abs(g) + 1e-8), gradient)
-    expected = jax.tree.map(lambda w, d: w - d, before.online, step)
+    step = jax.tree.map(lambda g: 0.01 * g / (np.abs(g) + 1e-8), gradient)
+    expected = jax.tree.map(lambda w, d: np.asarray(w) - d, before.online, step)
     close = lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5)  # noqa: E731
     jax.tree.map(close, after.online, expected)
 
@@ -313,7 +319,7 @@ def test_categorical_projection_by_hand():
     outcomes = jnp.array([[0.25, 1.0], [-5.0, 9.0], [2.0, 1.5]])
     shares = jnp.array([[0.4, 0.6], [0.3, 0.7], [0.5, 0.5]])
     expected = [[0.3, 0.7, 0.0], [0.3, 0.0, 0.7], [0.0, 0.25, 0.75]]
-    np.testing.assert_allclose(project(outcomes, shares, support), expected, atol=1e-6)
+    np.testing.assert_allclose(jit(project)(outcomes, shares, support), expected, atol=1e-6)
 
 
 def test_categorical_projection_equals_the_published_algorithm():
@@ -322,30 +328,32 @@ def test_categorical_projection_equals_the_published_algorithm():
     outcomes = rng.normal(1.0, 3.0, (200, 51))
     shares = rng.dirichlet(np.ones(51), 200)
     with jax.enable_x64(True):
-        result = project(jnp.array(outcomes), jnp.array(shares), jnp.array(support))
+        result = jit(project)(jnp.array(outcomes), jnp.array(shares), jnp.array(support))
         np.testing.assert_allclose(result, projected_by_hand(outcomes, shares, support), atol=1e-12)
 
 
 @pytest.mark.parametrize("spacing", ["equal", "unequal"])
 def test_the_projection_keeps_means_within_the_support(spacing):
     rng = np.random.default_rng(1)
-    support = jnp.linspace(-3.0, 5.0, 9)
+    support = np.linspace(-3.0, 5.0, 9)
     if spacing == "unequal":
-        support = jnp.sort(support.at[1:-1].set(rng.uniform(-3, 5, 7)))
-    outcomes = jnp.array(rng.uniform(-3, 5, (50, 7)))
-    shares = jnp.array(rng.dirichlet(np.ones(7), 50))
-    means = (project(outcomes, shares, support) * support).sum(1)
+        support[1:-1] = np.sort(rng.uniform(-3, 5, 7))
+    outcomes = rng.uniform(-3, 5, (50, 7))
+    shares = rng.dirichlet(np.ones(7), 50)
+    means = (
+        np.asarray(jit(project)(*map(jnp.asarray, (outcomes, shares, support)))) * support
+    ).sum(1)
     np.testing.assert_allclose(means, (outcomes * shares).sum(1), atol=1e-5)
 
 
 def test_the_categorical_priority_is_the_divergence():
     kind = Categorical(VALUES, 5, -2.0, 2.0)
-    z = jax.random.normal(jax.random.key(0), (3, 5))
+    z = jnp.asarray(np.random.default_rng(0).normal(size=(3, 5)), jnp.float32)
     target = kind.outcomes(z)
-    loss, off = kind.loss(z, target, z)  # the target is the estimate itself
+    loss, off = jit(kind.loss)(z, target, z)  # the target is the estimate itself
     np.testing.assert_allclose(off, 0.0, atol=1e-6)
-    assert (loss > 0.1).all()
-    assert (kind.loss(z, target + 1, z)[1] > 0.01).all()
+    assert (np.asarray(loss) > 0.1).all()
+    assert (np.asarray(jit(kind.loss)(z, target + 1, z)[1]) > 0.01).all()
 
 
 def test_values_of_roots_by_hand():
@@ -354,7 +362,7 @@ def test_values_of_roots_by_hand():
     z, target = jnp.array([[1.0]]), jnp.array([[8.0]])
     np.testing.assert_allclose(expected.mean(z), [3.0])
     np.testing.assert_allclose(expected.outcomes(z), [[3.0]])
-    np.testing.assert_allclose(expected.loss(z, target, z), [[0.5], [1.0]], rtol=1e-6)
+    np.testing.assert_allclose(jit(expected.loss)(z, target, z), [[0.5], [1.0]], rtol=1e-6)
 
     categorical = Categorical(ROOTS, 5, -8.0, 8.0)
     np.testing.assert_allclose(categorical.support, [-8, -3, 0, 3, 8], atol=1e-6)
@@ -365,8 +373,8 @@ def test_values_of_roots_by_hand():
     z, target = jnp.array([[2.0, 0.0]]), jnp.array([[15.0, 3.0]])  # whose roots are 3 and 1
     np.testing.assert_allclose(quantile.mean(z), [4.0])
     np.testing.assert_allclose(quantile.outcomes(z), [[8.0, 0.0]])
-    loss, off = quantile.loss(z, target, z)
-    np.testing.assert_allclose(loss, quantile_huber_loss(z, jnp.array([[3.0, 1.0]]), 10.0))
+    loss, off = jit(quantile.loss)(z, target, z)
+    np.testing.assert_allclose(loss, jit(quantile_huber_loss)(z, jnp.array([[3.0, 1.0]]), 10.0))
     np.testing.assert_allclose(off, [9.0 - 4.0])
 
 
@@ -375,8 +383,9 @@ def test_quantile_huber_loss_by_hand():
     quantiles, outcomes = jnp.array([[2.0, 0.0]]), jnp.array([[3.0, 1.0]])
     squared = (0.25 * 0.5 + 0.75 * 0.5) / 2 + (0.75 * 4.5 + 0.75 * 0.5) / 2
     clipped = (0.25 * 0.5 + 0.75 * 0.5) / 2 + (0.75 * 2.5 + 0.75 * 0.5) / 2
-    np.testing.assert_allclose(quantile_huber_loss(quantiles, outcomes, 10.0), [squared])
-    np.testing.assert_allclose(quantile_huber_loss(quantiles, outcomes, 1.0), [clipped])
+    loss = jax.jit(quantile_huber_loss)
+    np.testing.assert_allclose(loss(quantiles, outcomes, 10.0), [squared])
+    np.testing.assert_allclose(loss(quantiles, outcomes, 1.0), [clipped])
 
 
 def test_quantiles_that_minimise_the_loss_are_the_quantiles():
@@ -402,25 +411,30 @@ def test_action_values_are_the_means_in_units_of_reward(task, noisy, values):
         hidden=(8, 8), dueling=True, noisy=noisy, values=values, atoms=5, v_min=0.0, v_max=4.0,
         reward_scale=0.5,
     )  # fmt: skip
-    online = agent.init(task, jax.random.key(0)).online
-    observation = jax.random.normal(jax.random.key(1), (6, 3))
+    online = jit(agent.init)(task, jax.random.key(0)).online
+    observation = jnp.asarray(np.random.default_rng(1).normal(size=(6, 3)), jnp.float32)
     assert isinstance(online, Flat)
-    outputs = online(observation).reshape(6, 12, -1)
+    outputs = np.asarray(jit(online)(observation)).reshape(6, 12, -1)
     z = outputs[:, :1] + outputs[:, 1:] - outputs[:, 1:].mean(1, keepdims=True)
-    means = jax.nn.softmax(z) @ jnp.arange(5.0) if values == "categorical" else z[..., 0]
-    found = agent.action_values(online, observation)
+    shares = np.exp(z) / np.exp(z).sum(-1, keepdims=True)
+    means = shares @ np.arange(5.0) if values == "categorical" else z[..., 0]
+    found = jit(agent.action_values)(online, observation)
     assert found is not None
     np.testing.assert_allclose(found, 2 * means, rtol=1e-4)
-    np.testing.assert_array_equal(agent.policy(online, observation), means.argmax(1))
+    np.testing.assert_array_equal(jit(agent.policy)(online, observation), means.argmax(1))
 
 
 def test_noise_is_factorised_and_of_the_size_that_it_starts_with():
     """Fortunato et al. 2018, eq. 10, 11: f(x) f(y) on a weight, f(y) on a bias; E f² = √(2/π)."""
-    plain = MLP((64, 32), jax.random.key(0))
-    noisy = heads.NoisyMLP(plain, 0.5)
-    draws = jax.vmap(noisy.draw)(jax.random.split(jax.random.key(1), 500))
-    weight = np.asarray(draws.weights[0] - plain.weights[0]) / (0.5 / 8)
-    bias = np.asarray(draws.biases[0] - plain.biases[0]) / (0.5 / 8)
+
+    @jax.jit
+    def drawn():
+        plain = MLP((64, 32), jax.random.key(0))
+        noisy = heads.NoisyMLP(plain, 0.5)
+        draws = jax.vmap(noisy.draw)(jax.random.split(jax.random.key(1), 500))
+        return draws.weights[0] - plain.weights[0], draws.biases[0] - plain.biases[0]
+
+    weight, bias = (np.asarray(difference) / (0.5 / 8) for difference in drawn())
     by_input = weight / bias[:, None, :]
     np.testing.assert_allclose(by_input, by_input[:, :, :1] + 0 * by_input, rtol=2e-2, atol=1e-3)
     moment = np.sqrt(2 / np.pi)
@@ -431,26 +445,26 @@ def test_noise_is_factorised_and_of_the_size_that_it_starts_with():
 
 def test_noise_is_drawn_anew_for_each_act_and_explores(task):
     agent = DQN(hidden=(8, 8), noisy=True, epsilon_start=0.0, epsilon_end=0.0)
-    state = agent.init(task, jax.random.key(0))
+    state = jit(agent.init)(task, jax.random.key(0))
     observation = jnp.ones((1, 3))
-    act = lambda key: agent.act(state, observation, key)[0]  # noqa: E731
-    actions = jax.vmap(act)(jax.random.split(jax.random.key(1), 200))
-    assert len(set(actions.tolist())) > 1
+    keys = jax.random.split(jax.random.key(1), 200)
+    act = jit(jax.vmap(lambda state, key: agent.act(state, observation, key)[0], (None, 0)))
+    assert len(set(act(state, keys).tolist())) > 1
     quiet = dataclasses.replace(agent, noise_scale=0.0)
-    state = quiet.init(task, jax.random.key(0))
-    actions = jax.vmap(act)(jax.random.split(jax.random.key(1), 50))
-    assert set(actions.tolist()) == {int(quiet.policy(state.online, observation)[0])}
+    state = jit(quiet.init)(task, jax.random.key(0))
+    greedy = int(jit(quiet.policy)(state.online, observation)[0])
+    assert set(act(state, keys).tolist()) == {greedy}
 
 
 def test_exploring_goes_on_with_the_last_action(task):
     """With ε = 1 and full persistence every action is the last one of its environment."""
     agent = DQN(hidden=(8,), num_envs=3, replay_capacity=7, persistence=1.0, learning_starts=3)
-    state = agent.init(task, jax.random.key(0))
+    state = jit(agent.init)(task, jax.random.key(0))
     for turn in range(5):  # the ring of 9 rows begins anew
         last = jnp.array([turn, 1, 2]) % 3
         steps = rollout(agent)
-        state = agent.observe(state, steps._replace(action=last[None]))
-        seen = agent.act(state, jnp.ones((3, 3)), jax.random.key(turn))
+        state = jit(agent.observe)(state, steps._replace(action=last[None]))
+        seen = jit(agent.act)(state, jnp.ones((3, 3)), jax.random.key(turn))
         np.testing.assert_array_equal(seen, last)
 
 
@@ -458,7 +472,7 @@ def test_how_often_the_last_action_comes_again():
     """ε · persistence, and else ε-greedy: 0.6 · 0.5 = 0.3, and 0.7 · (0.6 / 4) by chance."""
     values, last = jnp.array([[0.0, 9.0, 0.0, 0.0]]), jnp.array([2])
     draw = lambda key: epsilon_greedy(key, values, 0.6, last, 0.5)[0]  # noqa: E731
-    actions = jax.vmap(draw)(jax.random.split(jax.random.key(0), 20_000))
+    actions = jit(jax.vmap(draw))(jax.random.split(jax.random.key(0), 20_000))
     shares = np.bincount(actions, minlength=4) / len(actions)
     by_chance = np.array([0.0, 0.7 * 0.4, 0.3, 0.0]) + 0.7 * 0.6 / 4
     np.testing.assert_allclose(shares, by_chance, atol=0.01)
@@ -466,7 +480,7 @@ def test_how_often_the_last_action_comes_again():
 
 def test_sizes_of_noise_are_learned(task, agent):
     agent = dataclasses.replace(agent, noisy=True)
-    state = agent.init(task, jax.random.key(0))
+    state = jit(agent.init)(task, jax.random.key(0))
     gradient, _ = gradients(agent, state, state.online)
     noisy = gradient.mlp.streams[0]
     assert largest(noisy.weight_scales) > 0
@@ -476,15 +490,16 @@ def test_sizes_of_noise_are_learned(task, agent):
 def test_targets_are_without_noise(task, agent):
     """Only the values that are compared with them are noisy."""
     agent = dataclasses.replace(agent, noisy=True, double=True, noise_scale=0.0)
-    quiet = agent.init(task, jax.random.key(0)).online
-    loud = dataclasses.replace(agent, noise_scale=5.0).init(task, jax.random.key(0)).online
+    quiet = jit(agent.init)(task, jax.random.key(0)).online
+    noisier = dataclasses.replace(agent, noise_scale=5.0)
+    loud = jit(noisier.init)(task, jax.random.key(0)).online
     row = Experience.like(jnp.ones(3), jnp.array(0))
-    batch = jax.tree.map(lambda x: jnp.ones((4, *x.shape), x.dtype), row)
-    batch = batch._replace(terminal=jnp.zeros(4, bool))
+    batch = jax.tree.map(lambda x: np.ones((4, *x.shape), x.dtype), row)
+    batch = jax.tree.map(jnp.asarray, batch._replace(terminal=np.zeros(4, bool)))
 
     def spread(online, target):
         each = lambda key: agent._losses(online, target, batch, 0.9, key).each  # noqa: E731
-        return np.ptp(jax.vmap(each)(jax.random.split(jax.random.key(1), 5)), axis=0)
+        return np.ptp(jit(jax.vmap(each))(jax.random.split(jax.random.key(1), 5)), axis=0)
 
     np.testing.assert_array_equal(spread(quiet, loud), 0)
     assert (spread(loud, quiet) > 1e-3).all()
@@ -501,25 +516,26 @@ def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):
         replay_capacity=16,
         learning_starts=8,
     )
-    before = agent.init(task, jax.random.key(0))
+    before = jit(agent.init)(task, jax.random.key(0))
     for i in range(2):
-        before = agent.observe(before, rollout(agent, observation=float(i), reward=i - 0.5))
+        before = jit(agent.observe)(before, rollout(agent, observation=float(i), reward=i - 0.5))
     step = rollout(agent, observation=3.0)
-    after, metrics = agent.learn(task, before, step, jax.random.key(1))
-    replay = agent.observe(before, step).replay
-    index = replay.draw(jax.random.key(1), 6)
-    batch = replay.at(index)
-    losses = agent._losses(before.online, before.target, batch, 0.99, jax.random.key(0))
+    after, metrics = jit(agent.learn)(task, before, step, jax.random.key(1))
+    replay = jit(agent.observe)(before, step).replay
+    losses_of = jit(lambda *args: agent._losses(*args, 0.99, jax.random.key(0)))
+    draw = jit(lambda replay, key: (replay.draw(key, 6), replay.at(replay.draw(key, 6))))
+    index, batch = draw(replay, jax.random.key(1))
+    losses = losses_of(before.online, before.target, batch)
     np.testing.assert_allclose(metrics["loss"], losses.each.mean(), rtol=1e-5)  # all alike so far
     expected = np.ones(16)
     expected[12:] = 0
     expected[np.asarray(index)] = (np.asarray(losses.off) + 1e-6) ** 0.6
     assert after.replay.priorities is not None
     np.testing.assert_allclose(after.replay.priorities.of(jnp.arange(16)), expected, rtol=1e-4)
-    _, metrics = agent.learn(task, after, step, jax.random.key(2))
-    replay = agent.observe(after, step).replay
-    index = replay.draw(jax.random.key(2), 6)
-    losses = agent._losses(after.online, after.target, replay.at(index), 0.99, jax.random.key(0))
+    _, metrics = jit(agent.learn)(task, after, step, jax.random.key(2))
+    replay = jit(agent.observe)(after, step).replay
+    index, batch = draw(replay, jax.random.key(2))
+    losses = losses_of(after.online, after.target, batch)
     beta = 0.4 + 0.6 / 10
     assert replay.priorities is not None
     weight = replay.priorities.importance(index, beta)
@@ -556,17 +572,18 @@ def test_every_option_fits_a_market(network):
         replay_capacity=64, double=True, dueling=True, n_steps=2, prioritized=True, noisy=True,
         values="quantile", atoms=3, huber_delta=1.0,
     )  # fmt: skip
-    state = agent.init(market, jax.random.key(0))
+    state = jit(agent.init)(market, jax.random.key(0))
     assert structure(learned_abstractly(agent, market, state)) == structure(state)
-    view = jax.vmap(market.observe)(jax.vmap(market.reset)(jax.random.split(jax.random.key(0), 5)))
-    values = agent.action_values(state.online, view)
+    seen = jit(jax.vmap(lambda key: market.observe(market.reset(key))))
+    view = seen(jax.random.split(jax.random.key(0), 5))
+    values = jit(agent.action_values)(state.online, view)
     assert values is not None
     assert isinstance(market.actions, MenuActions)
     assert values.shape == (5, market.actions.n)
     if network == "mlp":
-        mirrored = jax.tree.map(lambda x: x[:, ::-1], view)
+        mirrored = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[:, ::-1]), view)
         pooled, each = market.actions.pooled, market.actions.each
-        other = agent.action_values(state.online, mirrored)
+        other = jit(agent.action_values)(state.online, mirrored)
         assert other is not None
         np.testing.assert_allclose(other[:, :pooled], values[:, :pooled], atol=1e-5)
         blocks, mirror = (v[:, pooled:].reshape(5, each, 3) for v in (values, other))
@@ -580,14 +597,14 @@ def test_all_actions_can_duel():
         hidden=(8, 8), num_envs=4, batch_size=8, learning_starts=16, replay_capacity=64,
         dueling=True, double=True, all_actions=True, market_baseline=True,
     )  # fmt: skip
-    state = agent.init(market, jax.random.key(0))
+    state = jit(agent.init)(market, jax.random.key(0))
     assert structure(learned_abstractly(agent, market, state)) == structure(state)
 
 
 def test_priorities_are_part_of_what_is_saved(task, agent, tmp_path):
     agent = dataclasses.replace(agent, prioritized=True)
-    fresh = agent.init(task, jax.random.key(0))
-    state = jax.tree.map(np.asarray, agent.observe(fresh, rollout(agent)))
+    fresh = jit(agent.init)(task, jax.random.key(0))
+    state = jax.tree.map(np.asarray, jit(agent.observe)(fresh, rollout(agent)))
     write_tree(tmp_path / "state", state)
     again = read_tree(tmp_path / "state", fresh)
     assert again.replay.priorities.levels[-1].sum() == agent.num_envs
