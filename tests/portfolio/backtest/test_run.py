@@ -306,7 +306,7 @@ def test_backtests_that_cannot_be(settings, message, tmp_path):
         ("config.json", "{}", "in another format"),
         ("config.json", '{"kind": "backtest", "format": 1}', "in another format"),
         ("config.json", '{"kind": "comparison", "format": 2}', "is a comparison, not a backtest"),
-        ("prices.safetensors", "", "prices.safetensors is no safetensors file or is damaged"),
+        ("prices.safetensors", "", "prices.safetensors is damaged or not a safetensors file"),
         ("config.json", None, "config.json is damaged"),
     ],
 )
