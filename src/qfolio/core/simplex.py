@@ -14,7 +14,7 @@ def project(
     """The weights nearest to ``scores``: between 0 and ``cap``, summing to 1.
 
     They are clip(scores − τ, 0, cap) for the one τ that makes the sum 1 (Duchi et al. 2008; with a
-    cap: Wang & Lu 2015). Scores on the simplex are returned unchanged, and small ones become exactly
+    cap: Wang & Lu 2015). Scores on the simplex are returned as they are; small ones become exactly
     zero. The sum falls piecewise linearly in τ, and its kinks are at the scores and at the scores
     less their caps; between the two kinks around τ it is known which entries lie strictly between
     their bounds, and the value and its gradient follow from these. The caps must add up to 1 or
