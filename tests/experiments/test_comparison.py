@@ -162,7 +162,7 @@ def test_few_seeds_tell_nothing_apart():
     assert [fewest_seeds(pairs) for pairs in (1, 3, 45)] == [4, 5, 7]
     said = conclusion(rank({"a": result(GOOD[:3]), "b": result(BAD[:3])}))
     assert said[1] == (
-        "With 3 seeds each two agents cannot be told apart, whatever they reach; it takes 4 seeds "
+        "With 3 seeds each two agents cannot be told apart, whatever their results; this needs 4 seeds "
         "or more."
     )
     said = conclusion(rank({name: result(GOOD[:4]) for name in "abc"}))
@@ -270,7 +270,7 @@ def test_an_agent_that_diverges_does_not_stop_the_others(tmp_path):
     assert re.match(r"wild could not be trained. The loss of seed", content["notes"][0])
     alone = Comparison.create(tiny(wild=1e29, wilder=1e30), seeds=3, out=tmp_path / "alone")
     alone.run()
-    with pytest.raises(QfolioError, match=r"not two agents to compare\. wild: The loss"):
+    with pytest.raises(QfolioError, match=r"fewer than two agents to compare\. wild: The loss"):
         alone.finish()
 
 
@@ -314,7 +314,7 @@ def test_agents_that_do_not_fit_are_refused_before_anything_is_trained(tmp_path)
     with pytest.raises(QfolioError, match=r"^odd: dqn chooses among numbered actions"):
         Comparison.create(entrants, seeds=3, out=tmp_path / "run")
     entrants["odd"] = dataclasses.replace(entrants["slow"], task=Kelly(menu="grid:2"))
-    with pytest.raises(QfolioError, match="has one task, and here are pendulum, market/kelly"):
+    with pytest.raises(QfolioError, match="has one task, but these are pendulum, market/kelly"):
         Comparison.create(entrants, seeds=3, out=tmp_path / "run")
     with pytest.raises(QfolioError, match="seeds is 0"):
         Comparison.create(tiny(), seeds=0, out=tmp_path / "run")
