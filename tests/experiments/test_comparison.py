@@ -162,8 +162,8 @@ def test_few_seeds_tell_nothing_apart():
     assert [fewest_seeds(pairs) for pairs in (1, 3, 45)] == [4, 5, 7]
     said = conclusion(rank({"a": result(GOOD[:3]), "b": result(BAD[:3])}))
     assert said[1] == (
-        "With 3 seeds each two agents cannot be told apart, whatever their results; this needs 4 seeds "
-        "or more."
+        "With 3 seeds each two agents cannot be told apart, whatever their results; this needs 4 "
+        "seeds or more."
     )
     said = conclusion(rank({name: result(GOOD[:4]) for name in "abc"}))
     assert said[1].startswith("With 4 seeds each no two of 3 agents can be told apart, whatever")

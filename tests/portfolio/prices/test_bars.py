@@ -139,7 +139,7 @@ def test_columns_of_bars(tmp_path: Path, header: str, assets: dict[str, int], no
 
 def test_a_column_that_may_be_a_feature_beside_bars(tmp_path: Path):
     path = columns("Date,Open,High,Low,Close,rsi", tmp_path)
-    with pytest.raises(QfolioError, match="but beside them stands 'rsi'"):
+    with pytest.raises(QfolioError, match="but there is also 'rsi'"):
         load(path)
     assert load(path, features=("rsi",)).assets == ("Close",)
 

@@ -270,7 +270,7 @@ def test_rows_of_a_data_frame_are_counted_from_zero():
         (wide(A2="1,2"), "row 2: there are 4 fields, but 3 column names"),
         (wide().split("\n", 1)[1], "row 1: the first line holds values instead of column names"),
         (wide(A1="open", B1="high").replace("\n", ",1,1,1\n").replace("1,1,1", "low,close,v", 1),
-         "'open', 'high', 'low', 'close' are columns of one asset, but beside them stands 'v'"),
+         "'open', 'high', 'low', 'close' are columns of one asset, but there is also 'v'"),
         ("ticker,px\nA,1\nA,2\nA,3\n", "there is no column of dates"),
         ("day,ticker,px\n2020-01-02,A,1\n2020-01-03,A,2\n2020-01-06,A,3\n",
          "column 'ticker': holds names of assets, but no column is called price or close"),
@@ -293,7 +293,7 @@ def test_sources_that_are_no_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     sources: list[tuple[Any, str]] = [
         (csv(tmp_path, pickle.dumps(Bomb()), "p.pkl"), "export it as CSV"),
         (csv(tmp_path, pickle.dumps(Bomb()), "p.csv"), "is not UTF-8 text"),
-        (csv(tmp_path, pickle.dumps(Bomb()), "p.parquet"), "is no Parquet file or is damaged"),
+        (csv(tmp_path, pickle.dumps(Bomb()), "p.parquet"), "is damaged or not a Parquet file"),
         (csv(tmp_path, "", "p.xlsx"), "export it as CSV"),
         (tmp_path, "Is a directory"),
         (tmp_path / "none.csv", "No such file or directory"),
