@@ -137,8 +137,7 @@ def test_ranking_by_return_where_no_optimum_is_known():
     assert ranking["pairs"][0]["probability_interval"] is None
     assert second == "With 4 seeds each it can be told apart from worse (115.0)."
     assert (
-        last
-        == "Only best comes to stay within 10 % of the best return: after 500 steps and 1 s a seed."
+        last == "Only best settles within 10 % of the best return, after 500 steps and 1 s a seed."
     )
 
 
@@ -360,12 +359,12 @@ def test_the_command(presets, monkeypatch, capsys, tmp_path):
     content = json.loads((folder / "comparison.json").read_text())
     assert content["results"]["dqn"]["episodes"] == 4
     assert content["agents"]["dqn"]["preset"] == "fast"
-    assert content["notes"][0].startswith("How long to train was set by hand")
+    assert content["notes"][0].startswith("The length of training was set by hand")
     assert qfolio(monkeypatch, "evaluate", folder / "agents" / "dqn-bold", "--json") == 0
     graded = json.loads(capsys.readouterr().out)
     assert graded["return_per_seed"] == pytest.approx(content["results"]["dqn:bold"]["returns"])
     assert qfolio(monkeypatch, *arguments) == 2
-    assert f"go on with --resume {folder}" in capsys.readouterr().err
+    assert f"continue with --resume {folder}" in capsys.readouterr().err
     before = (folder / "comparison.json").read_text()
     assert qfolio(monkeypatch, "compare", "--resume", folder) == 0
     assert (folder / "comparison.json").read_text() == before
@@ -376,7 +375,7 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
     arguments = ["compare", "--agents", "dqn,dqn:bold", "--out", tmp_path / "run"]
     assert qfolio(monkeypatch, *arguments) == 130
     printed = capsys.readouterr().out.replace("\n", "")
-    assert printed.endswith(f"Go on with: qfolio compare --resume {tmp_path / 'run'}")
+    assert printed.endswith(f"Resume with: qfolio compare --resume {tmp_path / 'run'}")
 
 
 @pytest.mark.parametrize(
@@ -391,7 +390,7 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
         (["--agents", "dqn,dqn:bold", "--episodes", 4, "--steps", 9], "give one of them"),
         (["--agents", "dqn,dqn:bold", "--episodes", 0], "episodes is 0"),
         (["--resume", "nowhere"], "no comparison"),
-        (["--resume", ".", "--seeds", 3], "add nothing"),
+        (["--resume", ".", "--seeds", 3], "add only --trust"),
     ],
 )  # fmt: skip
 def test_comparisons_that_are_refused(presets, monkeypatch, capsys, tmp_path, options, message):

@@ -63,7 +63,7 @@ class Losses(NamedTuple):
 
 
 class DQN(Agent):
-    """A deep Q-network; the defaults are those of the original report."""
+    """A deep Q-network; the defaults are those of the report that qfolio grew out of."""
 
     network: str = static("flat")  # over everything observed; or one of networks.KINDS
     hidden: tuple[int, ...] = sizes(256, 256)

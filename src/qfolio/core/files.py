@@ -52,7 +52,7 @@ def require_new(folder: Path) -> None:
     """Raises QfolioError if ``folder`` is not empty."""
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise QfolioError(
-            f"{folder} is not empty; name a new folder, or go on with --resume {folder}."
+            f"{folder} is not empty; name a new folder, or continue with --resume {folder}."
         )
 
 

@@ -90,12 +90,12 @@ def _quickest(ranking: dict[str, Any]) -> str:
         if entry["threshold"] == HEADLINE and entry["steps"] is not None
     }
     if not arrived:
-        return f"No agent comes to stay {near}."
+        return f"No agent settles {near}."
     frugal = min(arrived, key=lambda name: arrived[name]["steps"])
     quick = min(arrived, key=lambda name: arrived[name]["seconds"])
     steps = f"{arrived[frugal]['steps']:,.0f}"
     seconds = f"{span(arrived[quick]['seconds'])} a seed"
     if len(arrived) == 1:
-        return f"Only {frugal} comes to stay {near}: after {steps} steps and {seconds}."
+        return f"Only {frugal} settles {near}, after {steps} steps and {seconds}."
     least = f"{quick} the least time" if quick != frugal else "the least time"
-    return f"To stay {near}, {frugal} needs the fewest steps ({steps}) and {least} ({seconds})."
+    return f"To settle {near}, {frugal} needs the fewest steps ({steps}) and {least} ({seconds})."

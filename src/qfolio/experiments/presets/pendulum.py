@@ -182,7 +182,7 @@ PRESETS: Presets = {
         "best": Preset("dqn", _BEST, episodes=24_032, seeds=8),
         "categorical": Preset("dqn", _CATEGORICAL, episodes=8608, seeds=8),
         "rainbow": Preset("dqn", _RAINBOW, episodes=8608, seeds=8),
-        # The hyperparameters of the original report; they are DQN's defaults.
+        # The hyperparameters of the report that qfolio grew out of; they are DQN's defaults.
         "report": Preset("dqn", {}, episodes=600, seeds=1),
     },
     ("pendulum/hidden", "dqn"): {
