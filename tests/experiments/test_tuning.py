@@ -182,7 +182,7 @@ def test_wrong_ranges(ranges, says):
     ("ranges", "says"),
     [
         (["discount=0.5..1.5"], "discount is 1.5"),
-        (["learning_starts=20|500"], "learning_starts is 500"),
+        (["learning_starts=20|500"], "learning_starts \\(500\\)"),
         (["hidden=1|2|3|4|5|6|7|8|9", "batch_size=1|2|3|4|5|6|7|8"], "72 programs"),
     ],
 )

@@ -218,7 +218,7 @@ def test_progress_and_settings():
     assert seen == [1.0]
     assert short.task.window == WINDOW
     for options, said in (
-        ({"episodes": None}, "how many episodes"),
+        ({"episodes": None}, "needs episodes"),
         ({"episodes": 0}, "episodes is 0"),
         ({"seeds": 0}, "seeds is 0"),
         ({"seed": -1}, "seed is -1"),

@@ -229,8 +229,8 @@ class Comparison:
         if coarse:
             notes.append(
                 f"The learning curves of {listed(coarse)} have fewer than {COARSE} points, because "
-                "evaluations are far apart: they need fewer steps to come near the goal than "
-                "stated."
+                "evaluations are far apart: these agents need fewer steps to come near the goal "
+                "than stated."
             )
         return notes
 
