@@ -53,13 +53,13 @@ def read_config(path: Path, kind: type[C]) -> C:
     if found != kind.kind or content.pop("format", None) != kind.format:
         raise QfolioError(
             f"{path.parent} was written by qfolio {content.get('version', '(unknown version)')} in "
-            f"another format; this is {__version__}: use that version, or start anew."
+            f"another format; this is {__version__}: use that version, or start over."
         )
     try:
         return msgspec.convert(content, kind)
     except (msgspec.ValidationError, QfolioError) as error:
         reason = _readable(str(error)).rstrip(".")
-        raise QfolioError(f"{path} is damaged ({reason}); restore it, or start anew.") from None
+        raise QfolioError(f"{path} is damaged ({reason}); restore it, or start over.") from None
 
 
 def _readable(message: str) -> str:

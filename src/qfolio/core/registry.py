@@ -214,7 +214,7 @@ def _unknown(kind: Kind, name: str) -> QfolioError:
         hint = f"a module {first} is neither installed nor in this folder."
     else:
         gym = ", any environment of Gymnasium, such as gym:CartPole-v1," if kind == "task" else ""
-        hint = f"there is {', '.join(table)}{gym} and your own as module:Name."
+        hint = f"choose from {', '.join(table)}{gym} or your own as module:Name."
     return QfolioError(f"there is no {kind} {name!r}; {hint}")
 
 

@@ -59,7 +59,7 @@ def parse(assignments: Iterable[str]) -> dict[str, str]:
         name, equals, value = assignment.partition("=")
         if not (name.strip() and equals and value.strip()):
             raise QfolioError(
-                f"--set takes name=value, for example discount=0.99; {assignment!r} is not."
+                f"--set takes name=value, for example discount=0.99; not {assignment!r}."
             )
         pairs[name.strip().replace("-", "_")] = value.strip()
     return pairs

@@ -59,7 +59,7 @@ def read_holdings(
             known = f"the backtest does not know {quote(name)}{hint(name, assets)}"
             raise QfolioError(f"{where}: {known if name else 'the asset has no name'}.")
         if name in held:
-            raise QfolioError(f"{where}: {quote(name)} comes twice; add the two up.")
+            raise QfolioError(f"{where}: {quote(name)} appears twice; add the two up.")
         if is_missing(cells[i]):
             raise QfolioError(f"{where}: there is no number of shares of {quote(name)}.")
         if wrong[i] or (name != CASH and CURRENCIES & set(str(cells[i]))):

@@ -283,7 +283,7 @@ def test_a_baseline_of_a_users_own_is_found_by_its_module(
 
 
 def test_errors_say_what_and_where() -> None:
-    with pytest.raises(QfolioError, match="no baseline 'best'; there is equal-weight"):
+    with pytest.raises(QfolioError, match="no baseline 'best'; choose from equal-weight"):
         baseline("best")
     with pytest.raises(QfolioError, match="no fold"):
         decisions("equal-weight", [], prices())

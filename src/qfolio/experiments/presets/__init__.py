@@ -39,6 +39,6 @@ def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
     """The preset of that name; raises QfolioError if there is none."""
     presets = presets_of(task, agent)
     if name not in presets:
-        there = f"there is {', '.join(presets)}" if presets else "there are none"
+        there = f"choose from {', '.join(presets)}" if presets else "there are none"
         raise QfolioError(f"there is no preset {name!r} for {agent} on {task}; {there}.")
     return presets[name]

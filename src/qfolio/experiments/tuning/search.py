@@ -141,7 +141,7 @@ def parse(assignments: Iterable[str], kind: type["Agent"]) -> list[Dimension]:
         if not (name and equals and text.strip()):
             raise QfolioError(
                 "--search takes name=low..high or name=a|b|c, for example "
-                f"learning_rate=1e-4..1e-2; {assignment!r} is not."
+                f"learning_rate=1e-4..1e-2; not {assignment!r}."
             )
         if name in space:
             raise QfolioError(f"--search names {name} twice.")

@@ -320,7 +320,7 @@ class Backtest:
         name = next(iter(self.agents)) if agent is None else agent
         if name not in self.agents:
             raise QfolioError(
-                f"The backtest has no agent {name!r}; there is {', '.join(self.agents)}."
+                f"The backtest has no agent {name!r}; choose from {', '.join(self.agents)}."
             )
         return name
 

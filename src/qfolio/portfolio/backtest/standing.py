@@ -37,7 +37,7 @@ class Standing:
             agents = [name for name, entry in strategies.items() if entry["kind"] == "agent"]
             if agent not in agents:
                 raise QfolioError(
-                    f"The backtest has no agent {agent!r}; there is {', '.join(agents)}."
+                    f"The backtest has no agent {agent!r}; choose from {', '.join(agents)}."
                 )
             name = f"{agent}{TOGETHER}" if f"{agent}{TOGETHER}" in strategies else agent
             worse = strategies[name]["to_reference"]["finding"] == "worse"

@@ -71,7 +71,7 @@ def pick_prices(
             taken = [table.names[j] for j in chosen if j not in others]
             findings.note(f"prices are those of {listing(taken)}; left out: {listing(left)}")
         else:
-            findings.note(f"left out, because there are no prices in it: {listing(left)}")
+            findings.note(f"left out, because they hold no prices: {listing(left)}")
     return tuple(assets[j] for j in chosen), tuple(chosen)
 
 

@@ -136,7 +136,7 @@ def _in_order(
         before = first.setdefault(moments[line], line)
         if before != line:
             row = table.first_row + before
-            repeated[line] = f"the date {day(moments[line])} stands in row {row} already"
+            repeated[line] = f"the date {day(moments[line])} is already in row {row}"
     for line in known[1:][steps < 0].tolist():
         if line not in repeated:
             unsorted[line] = f"the date {day(moments[line])} comes after a later one"
@@ -168,7 +168,7 @@ def _long(
     size = len(days) * len(assets)
     if size > MOST_CELLS and len(lines) < SPARSEST * size:
         findings.error(
-            f"{len(assets):,} assets on {len(days):,} dates have {len(lines):,} prices only, "
+            f"{len(assets):,} assets on {len(days):,} dates have only {len(lines):,} prices, "
             "so that nearly all are missing",
             advice="Check the columns of dates and assets, or keep the assets that matter.",
         )
@@ -176,8 +176,8 @@ def _long(
     place = i * len(assets) + j
     _, first, back = np.unique(place, return_index=True, return_inverse=True)
     repeated = {
-        int(lines[k]): f"{quote(assets[j[k]])} on {day(days[i[k]])} stands in row "
-        f"{table.first_row + int(lines[first[back[k]]])} already"
+        int(lines[k]): f"{quote(assets[j[k]])} on {day(days[i[k]])} is already in row "
+        f"{table.first_row + int(lines[first[back[k]]])}"
         for k in np.flatnonzero(first[back] != np.arange(len(place))).tolist()
     }
     advice = "Remove one of the two rows."

@@ -121,15 +121,15 @@ def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:
         )
         return
     if len(dates) < FEW_ROWS:
-        findings.warn(f"the table has {amount(len(dates), 'row')} only, too few to learn from")
+        findings.warn(f"the table has only {amount(len(dates), 'row')}, too few to learn from")
     if len(rest.assets) == 1:
-        findings.warn(f"there is one asset only, {quote(grid.assets[rest.assets[0]])}")
+        findings.warn(f"there is only one asset, {quote(grid.assets[rest.assets[0]])}")
     steps, usual = spacing(dates)
     closed = 0.0 if every_day(dates) else 7.0  # markets with weekends have holidays, too
     long = np.flatnonzero(steps > 3 * usual + closed)
     for k in long[:LISTED].tolist():
         findings.warn(
-            f"the row before is that of {day(dates[k])}, {steps[k]:.4g} days earlier "
+            f"the previous row is {day(dates[k])}, {steps[k]:.4g} days earlier "
             f"(usual: {usual:.4g})",
             row=None if grid.long else grid.spot(grid.prices, rest.head + int(k) + 1, 0)["row"],
             date=day(dates[k + 1]),

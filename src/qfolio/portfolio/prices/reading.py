@@ -173,7 +173,7 @@ def _from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set
     header = parse_header(records)
     if len(header.names) < 2:
         raise QfolioError(
-            f"{quote(name)} has one column only, {quote(header.names[0])}; a table needs several, "
+            f"{quote(name)} has only one column, {quote(header.names[0])}; a table needs several, "
             "separated by commas, semicolons or tabs."
         )
     plain = texts(header.names)
