@@ -121,8 +121,8 @@ def _treat_late_starts(
     if late == "error":
         _report_assets(
             grid, behind,
-            lambda j: f"the first price is on {day(grid.dates[span.start[j]])}, the table starts on "
-            f"{day(grid.dates[span.head])}",
+            lambda j: f"the first price is on {day(grid.dates[span.start[j]])}, the table starts "
+            f"on {day(grid.dates[span.head])}",
             "with a late start",
             "Choose how to treat late starts: late='drop-asset', 'trim' or 'join' (--late).",
             findings,
