@@ -313,7 +313,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self._steps = 0
         self._seed = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
         self._state, observation = _stepping().reset(self._there, self._seed)
-        return self._told(observation), {}
+        return self._as_numpy(observation), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._steps >= self.task.horizon:
@@ -330,9 +330,9 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         truncated = self._steps >= self.task.horizon and not terminated
         if terminated:
             self._steps = self.task.horizon
-        return self._told(observation), float(after.reward), terminated, truncated, {}
+        return self._as_numpy(observation), float(after.reward), terminated, truncated, {}
 
-    def _told(self, observation: Any) -> Any:
+    def _as_numpy(self, observation: Any) -> Any:
         if self._named:
             return {name: np.array(x) for name, x in observation._asdict().items()}
         if isinstance(self.observation_space, spaces.Discrete):

@@ -173,7 +173,7 @@ class PortfolioPolicy(BaseOptimization):
             episodes=self.episodes,
             **task,
         )
-        self.weights_ = self._tomorrow()
+        self.weights_ = self._next_weights()
         return self
 
     def partial_fit(self, X: Any, y: Any = None) -> "PortfolioPolicy":
@@ -197,7 +197,7 @@ class PortfolioPolicy(BaseOptimization):
         self.returns_ = np.concatenate([self.returns_, returns])[-len(self.returns_) :]
         self.n_samples_seen_ += len(returns)
         self.policy_ = self.policy_.update(self._learned(), self.update_episodes)
-        self.weights_ = self._tomorrow()
+        self.weights_ = self._next_weights()
         return self
 
     def predict(self, X: Any) -> Any:
@@ -262,7 +262,7 @@ class PortfolioPolicy(BaseOptimization):
         held = np.append(max(0.0, 1 - weights.sum()), weights)
         return np.asarray(held / held.sum())
 
-    def _tomorrow(self) -> np.ndarray:
+    def _next_weights(self) -> np.ndarray:
         window = self.policy_.task.window
         prices = _prices(self.returns_[-window:], self._assets())
         targets, _ = self.policy_.decide(prices, window, self._held(), 1)

@@ -116,7 +116,7 @@ class OnPolicy(Agent):
             return networks.build(self._networks, task, observation, outputs, key)
 
         weights = PolicyAndValue(
-            actor=_quiet(build(outputs_of(task.actions), actor_key)),
+            actor=_zero_output(build(outputs_of(task.actions), actor_key)),
             log_std=jnp.full(_coordinates(task.actions), jnp.log(self.initial_std)),
             critic=build(Outputs(1), critic_key),
             actions=task.actions,
@@ -210,7 +210,7 @@ def _coordinates(actions: Actions) -> int:
     return actions.n if isinstance(actions, Box) else int(isinstance(actions, Simplex))
 
 
-def _quiet(network: Network) -> Network:
+def _zero_output(network: Network) -> Network:
     """The network with an output layer of zeros: the first policy is the same everywhere."""
 
     def last(network: Network) -> tuple[Array, Array]:

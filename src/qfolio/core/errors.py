@@ -11,7 +11,7 @@ class QfolioError(Exception):
     """
 
 
-def told(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     """An exception of a user's code on one line: its type, message and location."""
     message = " ".join(str(error).split()).rstrip(".")
     frames = traceback.extract_tb(error.__traceback__)

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from qfolio.core.errors import QfolioError, told
+from qfolio.core.errors import QfolioError, one_line
 from qfolio.core.evaluation import Greedy
 from qfolio.core.mdp import Agent, Task, Transition
 from qfolio.core.population import Population, programs_of
@@ -155,7 +155,7 @@ class Environments:
         if isinstance(reason, QfolioError):
             reason = str(reason)
         elif isinstance(reason, Exception):
-            reason = told(reason)
+            reason = one_line(reason)
         step = int(self._steps[index])
         where = f"at step {step} of an episode" if step else "at the start of an episode"
         return QfolioError(f"{self._name} failed {where}: {reason}.")
@@ -254,7 +254,7 @@ class HostPopulation(Population):
                 seen = environments.observation
                 if time < length:
                     actions = self._start("act", act, carry, own, seen, np.int32(time))
-            before, action, *outcomes = map(_in_time, zip(*rollout, strict=True))
+            before, action, *outcomes = map(_stack_rows, zip(*rollout, strict=True))
             reward, after, terminated, truncated = outcomes
             transition = Transition((), before, action, reward, (), after, terminated, truncated)
             inputs = transition, seen, np.int32(row)
@@ -317,7 +317,7 @@ def _stack(members: Sequence[PyTree]) -> PyTree:
     return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *members)
 
 
-def _in_time(rows: Sequence[np.ndarray]) -> Any:
+def _stack_rows(rows: Sequence[np.ndarray]) -> Any:
     """Stacks the arrays of steps along a leading time axis."""
     return np.stack(rows) if len(rows) > 1 else rows[0][None]
 

@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
 from qfolio.core import settings
-from qfolio.core.errors import QfolioError, told
+from qfolio.core.errors import QfolioError, one_line
 
 TASKS = {
     "pendulum": "qfolio.tasks.pendulum:Pendulum",
@@ -186,7 +186,7 @@ def import_own(module: str) -> ModuleType:
     try:
         return import_module(module)
     except Exception as error:
-        raise QfolioError(f"{module} cannot be imported: {told(error)}.") from error
+        raise QfolioError(f"{module} cannot be imported: {one_line(error)}.") from error
 
 
 def _where(kind: Kind, name: str) -> str | None:

@@ -67,7 +67,7 @@ class Journal:
         path = folder / "journal.log"
         lock = JournalFileOpenLock(str(path))
         try:
-            _mend(path, lock)
+            _drop_cut_line(path, lock)
             self._study = optuna.create_study(
                 storage=JournalStorage(JournalFileBackend(str(path), lock)),
                 study_name="qfolio",
@@ -112,7 +112,7 @@ class Journal:
         preset: a configuration to propose first, if it lies within the space.
         """
         with FileLock(self.folder / "asking.lock"):
-            self._give_up_the_dead()
+            self._fail_dead_trials()
             self._enqueue(preset)
             states = [trial.state for trial in self._study.get_trials(deepcopy=False)]
             held = sum(state in _HELD for state in states)
@@ -166,7 +166,7 @@ class Journal:
             stored = {dim.key: dim.stored(preset[dim.name]) for dim in self.space}
             self._study.enqueue_trial(stored, user_attrs={"preset": True})
 
-    def _give_up_the_dead(self) -> None:
+    def _fail_dead_trials(self) -> None:
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             process = trial.user_attrs.get("process")
             place = self.folder / "processes" / str(process)
@@ -185,7 +185,7 @@ def best_of(trials: Sequence[Trial]) -> Trial | None:
     return max(finite, key=lambda trial: trial.value, default=None)
 
 
-def _mend(journal: Path, lock: JournalFileOpenLock) -> None:
+def _drop_cut_line(journal: Path, lock: JournalFileOpenLock) -> None:
     """Removes a last line that a crash has cut short; Optuna could not read past it."""
     if not journal.exists():
         return
