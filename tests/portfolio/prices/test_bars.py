@@ -120,7 +120,7 @@ def columns(text: str, folder: Path) -> Path:
         ("Date,AAPL_Close,AAPL_Volume,MSFT_Close", {"AAPL": 1, "MSFT": 3}, "'AAPL_Volume'"),
         ("Date,Close_A,Volume_A,Close_B,Volume_B", {"A": 1, "B": 3}, "'Volume_A', 'Volume_B'"),
         ("Date,A.Open,A.High,A.Low,A.Close,A.Volume,A.Adjusted", {"A": 6}, "'A.Close'"),
-        ("Date,AAPL,MSFT,Volume", {"AAPL": 1, "MSFT": 2}, "no prices in it: 'Volume'"),
+        ("Date,AAPL,MSFT,Volume", {"AAPL": 1, "MSFT": 2}, "hold no prices: 'Volume'"),
         # These are assets, whatever their names:
         ("Date,LOW,OPEN,AAPL", {"LOW": 1, "OPEN": 2, "AAPL": 3}, None),
         ("Date,A_Close,B_Close", {"A_Close": 1, "B_Close": 2}, None),
