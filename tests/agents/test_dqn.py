@@ -279,7 +279,7 @@ def test_continuous_actions_are_refused_by_the_tasks_name(task, words):
                 {"noisy": True}, {"persistence": 0.5}, {"value_rescaling": True}],
 )  # fmt: skip
 def test_all_actions_refuses_what_moves_do_not_give(changes):
-    with pytest.raises(QfolioError, match=f"take {next(iter(changes))}="):
+    with pytest.raises(QfolioError, match=f"set {next(iter(changes))}="):
         DQN(all_actions=True, **changes)
 
 
