@@ -167,7 +167,7 @@ def test_nothing_is_learned_twice(policy):
         policy.update(table().between(0, 60))
     updated = policy.update(table().between(0, 61))
     assert updated.learned == np.datetime64("2020-03-01")
-    with pytest.raises(QfolioError, match="2020-03-01 already"):
+    with pytest.raises(QfolioError, match="2020-03-01; give newer"):
         updated.update(table().between(0, 61))
 
 
