@@ -1,4 +1,4 @@
-"""The entry point; what is slow to import is imported by the commands that need it."""
+"""The entry point; slow imports are left to the commands that need them."""
 
 import os
 import sys
@@ -12,13 +12,13 @@ OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size
 
 
 def main() -> NoReturn:
-    """The program: Ctrl-C ends it at once, or after the current chunk of a training."""
+    """Runs the program; Ctrl-C ends it at once, or after the current chunk of a training."""
     exit_on_ctrl_c()
     run()
 
 
 def run() -> NoReturn:
-    """Runs what was typed; errors meant for people become one sentence and exit code 2."""
+    """Runs the command line; a QfolioError becomes one sentence and exit code 2."""
     import tyro
 
     from qfolio.commands.comparison import compare
@@ -46,7 +46,7 @@ def run() -> NoReturn:
     except QfolioError as error:
         _refuse(str(error))
     except BrokenPipeError:  # such as: qfolio prices table.csv | head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads the rest
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discards the rest
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _refuse(f"{where}{error.strerror or error}.")

@@ -279,13 +279,13 @@ def test_refuses_what_makes_no_sense(settings):
 @pytest.mark.parametrize(
     ("task", "words"),
     [
-        (Pendulum(torques=0), "those of Pendulum are continuous; take sac or ppo"),
-        (Merton(), "those of Merton are continuous; give it a menu of .* or take sac or ppo"),
-        (GymnasiumTask("Pendulum-v1"), "those of Pendulum-v1 are continuous; take sac or ppo"),
+        (Pendulum(torques=0), "those of Pendulum are continuous; use sac or ppo"),
+        (Merton(), "those of Merton are continuous; give it a menu of .* or use sac or ppo"),
+        (GymnasiumTask("Pendulum-v1"), "those of Pendulum-v1 are continuous; use sac or ppo"),
     ],
 )
 def test_continuous_actions_are_refused_by_the_tasks_name(task, words):
-    with pytest.raises(QfolioError, match=f"dqn chooses among numbered actions, and {words}"):
+    with pytest.raises(QfolioError, match=f"dqn chooses among numbered actions, but {words}"):
         DQN().init(task, jax.random.key(0))
 
 
@@ -294,7 +294,7 @@ def test_continuous_actions_are_refused_by_the_tasks_name(task, words):
                 {"noisy": True}, {"persistence": 0.5}, {"value_rescaling": True}],
 )  # fmt: skip
 def test_all_actions_refuses_what_moves_do_not_give(changes):
-    with pytest.raises(QfolioError, match=f"take {next(iter(changes))}="):
+    with pytest.raises(QfolioError, match=f"set {next(iter(changes))}="):
         DQN(all_actions=True, **changes)
 
 

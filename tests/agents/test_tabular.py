@@ -305,7 +305,7 @@ def test_double_q_learning_against_the_bias_of_a_maximum():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_tasks_without_numbers_are_refused(kind):
-    with pytest.raises(QfolioError, match="Pendulum has none; take a task that has, such as pend"):
+    with pytest.raises(QfolioError, match="Pendulum has none; use a task that has, such as pend"):
         kind().init(Pendulum(), jax.random.key(0))
 
 

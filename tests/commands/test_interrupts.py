@@ -30,7 +30,7 @@ def test_the_first_ctrl_c_stops_after_the_chunk(tmp_path):
     begun = time.perf_counter()
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
-    assert out.splitlines()[-1] == f"Stopped. Go on with: qfolio train --resume {tmp_path / 'run'}"
+    assert out.splitlines()[-1] == f"Stopped. Resume with: qfolio train --resume {tmp_path / 'run'}"
     assert err == ""
     assert time.perf_counter() - begun < 10  # two seconds where nobody else computes
     assert (tmp_path / "run" / "checkpoint.safetensors").exists()

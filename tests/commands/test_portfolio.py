@@ -147,7 +147,7 @@ def test_a_policy_that_was_found_worse_is_traded_on_demand_only(copy, monkeypatc
     assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 2
     assert capsys.readouterr().err == (
         "qfolio: In its own backtest, pathwise-together falls short of equal-weight; to trade "
-        "it all the same, add --agent pathwise or --anyway.\n"
+        "it nevertheless, add --agent pathwise or --anyway.\n"
     )
     for consent in (["--agent", "pathwise"], ["--anyway"]):
         plan = allocation(copy, monkeypatch, capsys, "--capital", 1, *consent)

@@ -140,8 +140,7 @@ def test_ranking_by_return_where_no_optimum_is_known():
     assert ranking["pairs"][0]["probability_interval"] is None
     assert second == "With 4 seeds each it can be told apart from worse (115.0)."
     assert (
-        last
-        == "Only best comes to stay within 10 % of the best return: after 500 steps and 1 s a seed."
+        last == "Only best settles within 10 % of the best return, after 500 steps and 1 s a seed."
     )
 
 
@@ -165,8 +164,8 @@ def test_few_seeds_tell_nothing_apart():
     assert [fewest_seeds(pairs) for pairs in (1, 3, 45)] == [4, 5, 7]
     said = conclusion(rank({"a": result(GOOD[:3]), "b": result(BAD[:3])}))
     assert said[1] == (
-        "With 3 seeds each two agents cannot be told apart, whatever they reach; it takes 4 seeds "
-        "or more."
+        "With 3 seeds each two agents cannot be told apart, whatever their results; this needs 4 "
+        "seeds or more."
     )
     said = conclusion(rank({name: result(GOOD[:4]) for name in "abc"}))
     assert said[1].startswith("With 4 seeds each no two of 3 agents can be told apart, whatever")
@@ -278,7 +277,7 @@ def test_an_agent_that_diverges_does_not_stop_the_others(tmp_path):
     assert re.match(r"wild could not be trained. The loss of seed", content["notes"][0])
     alone = Comparison.create(tiny(wild=1e29, wilder=1e30), seeds=3, out=tmp_path / "alone")
     alone.run()
-    with pytest.raises(QfolioError, match=r"not two agents to compare\. wild: The loss"):
+    with pytest.raises(QfolioError, match=r"fewer than two agents to compare\. wild: The loss"):
         alone.finish()
 
 
@@ -322,7 +321,7 @@ def test_agents_that_do_not_fit_are_refused_before_anything_is_trained(tmp_path)
     with pytest.raises(QfolioError, match=r"^odd: dqn chooses among numbered actions"):
         Comparison.create(entrants, seeds=3, out=tmp_path / "run")
     entrants["odd"] = dataclasses.replace(entrants["slow"], task=Kelly(menu="grid:2"))
-    with pytest.raises(QfolioError, match="has one task, and here are pendulum, market/kelly"):
+    with pytest.raises(QfolioError, match="has one task, but these are pendulum, market/kelly"):
         Comparison.create(entrants, seeds=3, out=tmp_path / "run")
     with pytest.raises(QfolioError, match="seeds is 0"):
         Comparison.create(tiny(), seeds=0, out=tmp_path / "run")
@@ -368,12 +367,12 @@ def test_the_command(presets, monkeypatch, capsys, tmp_path):
     content = json.loads((folder / "comparison.json").read_text())
     assert content["results"]["dqn"]["episodes"] == 4
     assert content["agents"]["dqn"]["preset"] == "fast"
-    assert content["notes"][0].startswith("How long to train was set by hand")
+    assert content["notes"][0].startswith("The length of training was set by hand")
     assert qfolio(monkeypatch, "evaluate", folder / "agents" / "dqn-bold", "--json") == 0
     graded = json.loads(capsys.readouterr().out)
     assert graded["return_per_seed"] == pytest.approx(content["results"]["dqn:bold"]["returns"])
     assert qfolio(monkeypatch, *arguments) == 2
-    assert f"go on with --resume {folder}" in capsys.readouterr().err
+    assert f"continue with --resume {folder}" in capsys.readouterr().err
     before = (folder / "comparison.json").read_text()
     assert qfolio(monkeypatch, "compare", "--resume", folder) == 0
     assert (folder / "comparison.json").read_text() == before
@@ -384,7 +383,7 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
     arguments = ["compare", "--agents", "dqn,dqn:bold", "--out", tmp_path / "run"]
     assert qfolio(monkeypatch, *arguments) == 130
     printed = capsys.readouterr().out.replace("\n", "")
-    assert printed.endswith(f"Go on with: qfolio compare --resume {tmp_path / 'run'}")
+    assert printed.endswith(f"Resume with: qfolio compare --resume {tmp_path / 'run'}")
 
 
 @pytest.mark.parametrize(
@@ -399,7 +398,7 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
         (["--agents", "dqn,dqn:bold", "--episodes", 4, "--steps", 9], "give one of them"),
         (["--agents", "dqn,dqn:bold", "--episodes", 0], "episodes is 0"),
         (["--resume", "nowhere"], "no comparison"),
-        (["--resume", ".", "--seeds", 3], "add nothing"),
+        (["--resume", ".", "--seeds", 3], "add only --trust"),
     ],
 )  # fmt: skip
 def test_comparisons_that_are_refused(presets, monkeypatch, capsys, tmp_path, options, message):

@@ -167,7 +167,7 @@ def test_the_report_says_what_happened(content):
     assert "mass from 1 to 1.5" in page
     for way in continual.WAYS:
         assert way in page
-    assert "does not come to stay" in verdict(content)
+    assert "does not settle" in verdict(content)
 
 
 def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
@@ -176,10 +176,10 @@ def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
     with monkeypatch.context() as stopping:
         stopping.setattr(BarProgress, "on_chunk", Interrupt().on_chunk)
         assert qfolio(monkeypatch, *words, "--out", folder, *TINY) == 130
-    said = f"Go on with: qfolio continual --resume {folder}"
+    said = f"Resume with: qfolio continual --resume {folder}"
     assert capsys.readouterr().out.splitlines()[-1].endswith(said)
     assert qfolio(monkeypatch, *words, "--out", folder, *TINY) == 2
-    assert f"go on with --resume {folder}" in capsys.readouterr().err
+    assert f"continue with --resume {folder}" in capsys.readouterr().err
     assert qfolio(monkeypatch, "continual", "--resume", folder) == 0
     assert {path.name for path in folder.iterdir()} == {
         "continual.json", "report.html", "recovery.png",
@@ -194,8 +194,8 @@ def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
     ("options", "message"),
     [
         (["--resume", "nowhere"], "no continual"),
-        (["--resume", ".", "--change", "mass=2"], "add nothing"),
-        (["--resume", ".", "--rate", 0.5], "add nothing"),
+        (["--resume", ".", "--change", "mass=2"], "add only --trust"),
+        (["--resume", ".", "--rate", 0.5], "add only --trust"),
     ],
 )
 def test_resume_refuses_what_it_would_ignore(monkeypatch, capsys, options, message):

@@ -183,7 +183,7 @@ def test_wrong_ranges(ranges, says):
     ("ranges", "says"),
     [
         (["discount=0.5..1.5"], "discount is 1.5"),
-        (["learning_starts=20|500"], "learning_starts is 500"),
+        (["learning_starts=20|500"], "learning_starts \\(500\\)"),
         (["hidden=1|2|3|4|5|6|7|8|9", "batch_size=1|2|3|4|5|6|7|8"], "72 programs"),
     ],
 )
@@ -513,7 +513,7 @@ def test_the_page_of_few_trials(tmp_path):
         ([-110.0, -111.0, -110.0, -111.0, -110.5], [-102.0] * 5, "worse"),
         ([-110.0, -111.0], [-102.0, -102.0], "2 seeds, −9.0 to −8.0): too few seeds for a verdict"),
         ([-110.0, None], [-102.0, -102.8], "diverged for the best"),
-        ([-110.0], [-102.0], "a single seed tells no more"),
+        ([-110.0], [-102.0], "a single seed allows no further conclusion"),
     ],
 )
 def test_the_comparison_is_honest(best, preset, says):

@@ -58,6 +58,6 @@ def test_targets_that_are_not_numbers_are_no_silent_holding(policy, prices):
     task = on_table(policy.task, prices)
     agent = Diverged(rollout_length=10, num_envs=2, hidden=(4, 4))
     with pytest.raises(
-        QfolioError, match=r"Diverged names target weights at row 30 .* off 1 by nan"
+        QfolioError, match=r"Diverged gives target weights at row 30 .* off 1 by nan"
     ):
         follow(task, agent, policy.members, 30, np.eye(4)[:2], 2)

@@ -153,7 +153,7 @@ def test_it_goes_on_from_where_it_was(policy):
 
 def test_no_update_without_learning_state(policy):
     bare = Policy(policy.task, policy.agent, policy.members, policy.assets, policy.features)
-    with pytest.raises(QfolioError, match="cannot go on learning"):
+    with pytest.raises(QfolioError, match="cannot be updated"):
         bare.update(table())
     with pytest.raises(QfolioError, match="features"):
         policy.update(table(features=2))
@@ -164,11 +164,11 @@ def test_no_update_without_learning_state(policy):
 
 
 def test_nothing_is_learned_twice(policy):
-    with pytest.raises(QfolioError, match="up to 2020-02-29 already: there is nothing new"):
+    with pytest.raises(QfolioError, match="up to 2020-02-29; give newer prices"):
         policy.update(table().between(0, 60))
     updated = policy.update(table().between(0, 61))
     assert updated.learned == np.datetime64("2020-03-01")
-    with pytest.raises(QfolioError, match="2020-03-01 already"):
+    with pytest.raises(QfolioError, match="2020-03-01; give newer"):
         updated.update(table().between(0, 61))
 
 
@@ -219,7 +219,7 @@ def test_progress_and_settings():
     assert seen == [1.0]
     assert short.task.window == WINDOW
     for options, said in (
-        ({"episodes": None}, "how many episodes"),
+        ({"episodes": None}, "needs episodes"),
         ({"episodes": 0}, "episodes is 0"),
         ({"seeds": 0}, "seeds is 0"),
         ({"seed": -1}, "seed is -1"),

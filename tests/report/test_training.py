@@ -323,7 +323,7 @@ def test_arrow_shows_the_torque() -> None:
 
 
 def test_episode_of_wrong_shape() -> None:
-    with pytest.raises(ValueError, match="make no episode"):
+    with pytest.raises(ValueError, match="do not fit an episode"):
         pendulum_frames(np.zeros((3, 2)), np.zeros(3), np.zeros(3))
 
 

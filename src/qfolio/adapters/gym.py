@@ -28,7 +28,7 @@ except ImportError:
 ID = "qfolio/Portfolio-v0"
 
 IDS = {name: f"qfolio/{where.partition(':')[2]}-v0" for name, where in TASKS.items()}
-"""Of the tasks by name, such as qfolio/Pendulum-v0."""
+"""Environment IDs by task name, such as qfolio/Pendulum-v0."""
 
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -42,28 +42,27 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
     features) up to today, of shape (assets, window, channels); and "holding", the weights of the
     assets held now (the rest is cash).
 
-    **Action**: N + 1 numbers, cash first, of which the nearest point of the simplex is taken as
-    target weights (Euclidean projection, no asset above ``max_weight``); so weights stand for
-    themselves.
+    **Action**: N + 1 numbers, cash first. Target weights are the nearest point of the simplex
+    (Euclidean projection, no asset above ``max_weight``), so valid weights are used unchanged.
     With ``menu`` ("grid:10", "tilts:0.1"), the number of an allocation instead.
 
     **Step**: a decision at row t is executed at the close of row t + lag, and its reward is that of
-    the return of row t + lag + 1, net of the exact cost. Wealth is kept in double precision, by the
-    same replay as the backtest's. Episodes are truncated after ``horizon`` steps and never
-    terminate.
+    the return of row t + lag + 1, net of the exact cost. Wealth is simulated in double precision,
+    as in the backtest. Episodes are truncated after ``horizon`` steps and never terminate.
 
     ``info`` holds "wealth" (1 at the start), "cost" (share of wealth paid for this step's trade),
     "turnover", "target" (weights decided, cash first), "date" (of the row observed) and
-    "return_date" (of the row that earned the last return). It knows more than an agent may.
+    "return_date" (of the row that earned the last return). It includes later rows, which agents
+    must not use.
 
     Args:
-        prices: Anything that ``qfolio.load_prices`` reads; None for skfolio's 20 stocks.
-        scaled_by: The table that the scale of observations comes from, if not ``prices``: to test
-            on later prices, give those that were trained on.
+        prices: Anything that ``qfolio.load_prices`` reads (default: skfolio's 20 stocks).
+        scaled_by: The table that sets the scale of observations (default: ``prices``); to test on
+            later prices, pass the training prices.
         render_mode: "ansi" for a line of text, or None.
         task: Settings of the portfolio task, such as window, lag, cost, max_weight, menu, reward.
 
-    ``reset`` draws the first row, unless told ``options={"start": row}``.
+    ``reset`` draws the first row, unless given ``options={"start": row}``.
     """
 
     metadata = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012
@@ -152,7 +151,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         return self._observe(), float(reward), False, over, self._info()
 
     def render(self) -> str | None:
-        """Date, wealth and what is held, in a line."""
+        """Date, wealth and holdings on one line."""
         if self.render_mode is None or self._row < 0:
             return None
         named = zip(("cash", *self.prices.assets), self._held, strict=True)
@@ -198,9 +197,9 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
 
 
 class _Programs:
-    """The task's own rules, compiled once for all environments; jax is imported at first use.
+    """The task's functions, compiled once for all environments; jax is imported at first use.
 
-    They run in double precision where their inputs are.
+    They run in double precision if their inputs do.
     """
 
     def __init__(self) -> None:
@@ -243,7 +242,7 @@ class _Programs:
             return self._doubled(task.reward_function.init())
 
     def reward(self, task: Any, memory: Any, traded: Simulation) -> tuple[float, Any]:
-        """Of a single day's replay, and the reward's state after it."""
+        """The reward of a one-day simulation, and the reward's state after it."""
         outcome = 1 + traded.returns[0], traded.cost[0], traded.weights[0]
         with self._double():
             reward, memory = self._reward(task, memory, *outcome)
@@ -259,16 +258,16 @@ _programs = cache(_Programs)
 class TaskEnv(gymnasium.Env[Any, Any]):
     """A task of ``qfolio train`` by its name, compiled, one step at a time.
 
-    Observations are those of qfolio's agents: numbers (Box), one of a few numbers (Discrete) or in
-    markets a Dict of each asset's "features" and the "holding". Actions are numbered (Discrete),
-    or numbers (Box); where they are weights of a market, the nearest point of the simplex is taken.
-    Episodes are truncated after the task's ``horizon``. Raises QfolioError for settings and actions
-    that do not fit.
+    Observations are those of qfolio's agents: numbers (Box), a state's number (Discrete) or, in
+    markets, a Dict of each asset's "features" and the "holding". Actions are numbered (Discrete)
+    or numbers (Box); weights of a market are projected onto the nearest point of the simplex.
+    Episodes are truncated after the task's ``horizon``. Raises QfolioError for invalid settings and
+    actions.
 
     Args:
-        name: Of the task, such as "pendulum".
-        render_mode: None; there is nothing to be seen.
-        settings: Of the task, such as torques=0.
+        name: The task, such as "pendulum".
+        render_mode: Must be None.
+        chosen: Settings of the task, such as torques=0.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
@@ -285,7 +284,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         devices.configure()
         task: Any = settings.build(find("task", name), chosen)
         self.task, self._steps = task, task.horizon  # over
-        self._there = jax.device_put(task)  # its arrays need not travel at each step
+        self._there = jax.device_put(task)  # copies its arrays once, not at each step
         seen = jax.eval_shape(lambda key: task.observe(task.reset(key)), jax.random.key(0))
         number = lambda x: spaces.Box(-_LARGEST, _LARGEST, x.shape, np.float32)  # noqa: E731
         self._named = isinstance(seen, View)
@@ -309,12 +308,12 @@ class TaskEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """A start state, drawn anew."""
+        """Draws a start state."""
         super().reset(seed=seed)
         self._steps = 0
         self._seed = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
         self._state, observation = _stepping().reset(self._there, self._seed)
-        return self._told(observation), {}
+        return self._as_numpy(observation), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._steps >= self.task.horizon:
@@ -331,9 +330,9 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         truncated = self._steps >= self.task.horizon and not terminated
         if terminated:
             self._steps = self.task.horizon
-        return self._told(observation), float(after.reward), terminated, truncated, {}
+        return self._as_numpy(observation), float(after.reward), terminated, truncated, {}
 
-    def _told(self, observation: Any) -> Any:
+    def _as_numpy(self, observation: Any) -> Any:
         if self._named:
             return {name: np.array(x) for name, x in observation._asdict().items()}
         if isinstance(self.observation_space, spaces.Discrete):
@@ -342,7 +341,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
 
 
 class _Stepping:
-    """How a task is reset and stepped, compiled once for all environments of a kind."""
+    """A task's reset and step, compiled once for all environments of a kind."""
 
     def __init__(self) -> None:
         import jax

@@ -1,4 +1,4 @@
-"""Policies as estimators of scikit-learn, for the model selection and the reports of skfolio.
+"""Policies as scikit-learn estimators, for skfolio's model selection and reports.
 
 >>> from qfolio.adapters.sklearn import PortfolioPolicy
 >>> from skfolio.model_selection import WalkForward, cross_val_predict
@@ -28,17 +28,16 @@ OWN = ("cost", "lag", "max_weight", "window")
 class PortfolioPolicy(BaseOptimization):
     """A learned policy that trades every day, as an estimator.
 
-    ``X`` holds simple returns, of shape (observations, assets), as in skfolio; a row of it is
-    earned by the decision that was made ``lag`` + 1 rows before. So predictions begin with
-    decisions made at the last rows of the training data, whose returns the fitted estimator keeps
-    for this and for the window that the policy looks at; and ``fit`` learns from all of its rows
-    but the last ``lag``, which lie behind the first of those decisions. Nothing that is decided at
-    a row depends on a later one.
+    ``X`` holds simple returns, of shape (observations, assets), as in skfolio; each row is earned
+    by the decision made ``lag`` + 1 rows before. Predictions therefore begin with decisions at the
+    last rows of the training data, whose returns the fitted estimator keeps, as it does for the
+    policy's window; and ``fit`` learns from all rows but the last ``lag``, which come after the
+    first of those decisions. No decision depends on a later row.
 
-    ``predict`` takes the rows of ``X`` to follow those that were learned from. Where both have
-    dates, it looks up which rows came before, and if these are too few for a window (as on the
-    training data themselves), what is held stays as it is until there are enough. Rows that a
-    splitter purges in between are not seen; the market then stands still for the policy.
+    ``predict`` assumes that the rows of ``X`` follow the training rows. If both have dates, it
+    looks up which rows came before, and if these are too few for a window (as on the training data
+    themselves), it holds the portfolio without trading until there are enough. The policy does not
+    see rows that a splitter purges in between; it observes a market that does not move there.
 
     Parameters
     ----------
@@ -49,23 +48,23 @@ class PortfolioPolicy(BaseOptimization):
         Name of the hyperparameters to start from.
 
     episodes : int, default=None
-        Training episodes of each seed in ``fit``; those of the preset if None.
+        Training episodes of each seed in ``fit``; the preset's if None.
 
     update_episodes : int, default=None
-        The same for each ``partial_fit`` but the first; one for each of the agent's environments
-        if None.
+        Training episodes of each later ``partial_fit``; one for each of the agent's environments if
+        None.
 
     seeds : int, default=None
-        Agents that are trained, whose mean decision is followed; those of the preset if None.
+        Number of agents trained, whose mean decision is followed; the preset's if None.
 
     seed : int, default=0
         The first agent's seed; the others have the next ones.
 
     window : int, default=None
-        Rows of returns that the policy sees; that of the preset if None.
+        Rows of returns that the policy observes; the preset's if None.
 
     cost : float, default=0.001
-        Of trading one way, as a fraction of what is traded; both learning and predicted returns
+        One-way trading cost, as a fraction of the value traded; learning and predicted returns both
         pay it exactly.
 
     lag : int, default=1
@@ -75,7 +74,7 @@ class PortfolioPolicy(BaseOptimization):
         Largest weight of one asset.
 
     settings : dict, default=None
-        Settings of the agent or of the portfolio task in place of the preset's, by name.
+        Settings of the agent or of the portfolio task that replace the preset's, by name.
 
     portfolio_params : dict, default=None
         Parameters of the predicted portfolio, such as ``name`` or ``annualization_factor``.
@@ -84,27 +83,26 @@ class PortfolioPolicy(BaseOptimization):
         What happens when fitting fails, as in skfolio's other models.
 
     previous_weights : float, dict or array-like of shape (n_assets,), default=None
-        Weights of the assets held at the close before the first row that is predicted (the rest is
-        cash); nothing but cash if None. skfolio's walk-forward functions pass on what the last
-        fold held.
+        Weights of the assets held at the close before the first predicted row (the rest is cash);
+        all cash if None. skfolio's walk-forward functions pass on the last fold's weights.
 
     Attributes
     ----------
     policy_ : qfolio.portfolio.policy.Policy
-        What was learned.
+        The learned policy.
 
     weights_ : ndarray of shape (n_assets,)
-        Target weights after the last row that was learned from, for who holds
-        ``previous_weights``. The sum is less than 1 where the policy wants cash.
+        Target weights after the last training row, for a holder of ``previous_weights``. They sum
+        to less than 1 if the policy wants cash.
 
     returns_ : ndarray of shape (n_observations, n_assets)
-        The last returns that were seen.
+        The last returns seen.
 
     observations_ : pandas.Index or None
         Their dates.
 
     n_samples_seen_ : int
-        Number of all returns that were seen, also of those that are no longer kept.
+        Number of all rows seen, including those no longer kept.
 
     n_features_in_, feature_names_in_ :
         Number and names of the assets.
@@ -153,7 +151,7 @@ class PortfolioPolicy(BaseOptimization):
 
     @property
     def needs_previous_weights(self) -> bool:
-        """Always: a fold starts with what the last one held, and pays for what it changes."""
+        """Always: a fold starts with the last one's weights, and pays for its trades."""
         return True
 
     def fit(self, X: Any, y: Any = None) -> "PortfolioPolicy":
@@ -164,7 +162,7 @@ class PortfolioPolicy(BaseOptimization):
         devices.configure()
         returns = validate_data(self, X, dtype=np.float64)
         chosen, task = self._chosen()
-        self._held()  # odd holdings are refused before time is spent on training
+        self._held()  # rejects invalid holdings before training
         self.returns_, self.observations_ = returns, _dates(X)
         self.n_samples_seen_ = len(returns)
         self.policy_ = train(
@@ -175,13 +173,13 @@ class PortfolioPolicy(BaseOptimization):
             episodes=self.episodes,
             **task,
         )
-        self.weights_ = self._tomorrow()
+        self.weights_ = self._next_weights()
         return self
 
     def partial_fit(self, X: Any, y: Any = None) -> "PortfolioPolicy":
-        """Goes on learning from returns of the same assets that follow those seen before.
+        """Continues learning from returns of the same assets that follow those seen before.
 
-        The first call is a ``fit``; each later one looks at as many of the last rows as that.
+        The first call is a ``fit``; later ones learn from as many of the last rows as it had.
         """
         self._validate_partial_fit_fallback()
         if not hasattr(self, "policy_"):
@@ -192,14 +190,14 @@ class PortfolioPolicy(BaseOptimization):
         else:
             if not dates[0] > self.observations_[-1]:
                 raise ValueError(
-                    f"X begins at {dates[0]}, but rows up to {self.observations_[-1]} were learned "
-                    "from already; partial_fit takes new rows only."
+                    f"X begins at {dates[0]}, but rows up to {self.observations_[-1]} have already "
+                    "been learned from; partial_fit takes new rows only."
                 )
             self.observations_ = self.observations_.append(dates)[-len(self.returns_) :]
         self.returns_ = np.concatenate([self.returns_, returns])[-len(self.returns_) :]
         self.n_samples_seen_ += len(returns)
         self.policy_ = self.policy_.update(self._learned(), self.update_episodes)
-        self.weights_ = self._tomorrow()
+        self.weights_ = self._next_weights()
         return self
 
     def predict(self, X: Any) -> Any:
@@ -232,7 +230,7 @@ class PortfolioPolicy(BaseOptimization):
         chosen = presets.preset(self.preset, "portfolio", self.agent)
         changes = dict(self.settings or {})
         for name in changes.keys() & set(OWN):
-            raise QfolioError(f"{name} is a parameter of its own; leave it out of settings.")
+            raise QfolioError(f"{name} is a parameter of the estimator; leave it out of settings.")
         mine = names(find("agent", chosen.agent))
         of_agent = {name: value for name, value in changes.items() if name in mine}
         of_task = {name: value for name, value in changes.items() if name not in mine}
@@ -242,7 +240,7 @@ class PortfolioPolicy(BaseOptimization):
         return chosen._replace(settings={**chosen.settings, **of_agent}), task
 
     def _learned(self) -> Prices:
-        """The rows up to the first decision that a prediction begins with."""
+        """The rows up to the first decision of a prediction."""
         learned = self.returns_[: len(self.returns_) - self.lag]
         dropped = self.n_samples_seen_ - len(self.returns_)
         return _prices(learned, self._assets(), first=dropped)
@@ -264,14 +262,14 @@ class PortfolioPolicy(BaseOptimization):
         held = np.append(max(0.0, 1 - weights.sum()), weights)
         return np.asarray(held / held.sum())
 
-    def _tomorrow(self) -> np.ndarray:
+    def _next_weights(self) -> np.ndarray:
         window = self.policy_.task.window
         prices = _prices(self.returns_[-window:], self._assets())
         targets, _ = self.policy_.decide(prices, window, self._held(), 1)
         return np.asarray(targets[0, 1:])
 
     def _before(self, X: Any) -> np.ndarray:
-        """The returns that are known before the first row of ``X``."""
+        """The returns known before the first row of ``X``."""
         dates = _dates(X)
         if dates is None or self.observations_ is None:
             return self.returns_
@@ -284,7 +282,7 @@ class PortfolioPolicy(BaseOptimization):
         task, days = self.policy_.task, len(returns)
         window, lag = task.window, task.lag
         before = before[max(0, len(before) - window - lag) :]
-        # Rows that are missing before the first decision's window; nothing moves in them.
+        # Rows missing before the first decision's window; their returns are zero.
         missing = window + lag - len(before)
         still = np.zeros((missing, returns.shape[1]))
         prices = _prices(np.concatenate([still, before, returns]), self._assets())
@@ -302,11 +300,10 @@ class PortfolioPolicy(BaseOptimization):
 
 
 class PolicyPortfolio(Portfolio):
-    """A portfolio whose weights a policy changes every day; costs are in its returns.
+    """A portfolio whose weights a policy changes every day; its returns are net of costs.
 
     ``weights`` are means over the days, ``weights_per_observation`` those of each day, and
-    ``turnover`` is the sum of what was traded. simulation: the replay, with cash, turnover and cost
-    of each day.
+    ``turnover`` is the sum of all trades. simulation: cash, turnover and cost of each day.
     """
 
     __slots__ = {"simulation"}
@@ -340,7 +337,7 @@ class PolicyPortfolio(Portfolio):
         raise NotImplementedError("Contributions are not defined for weights that change daily.")
 
     def _get_init_params(self) -> dict[str, Any]:
-        """What it can be made from again, by name."""
+        """The arguments that rebuild it, by name."""
         kept = set(inspect.signature(Portfolio.__init__).parameters)
         kept -= {"self", "kwargs", "weights", "weight_drift", "sample_weight"}
         params = {name: getattr(self, name) for name in sorted(kept)}
@@ -348,7 +345,7 @@ class PolicyPortfolio(Portfolio):
 
 
 def _dates(X: Any) -> Any:
-    """The labels of the rows, where they can tell which came before which."""
+    """The row labels if they define an order; else None."""
     index: Any = getattr(X, "index", None)
     if not hasattr(index, "is_monotonic_increasing"):
         return None
@@ -357,7 +354,7 @@ def _dates(X: Any) -> Any:
 
 
 def _prices(returns: np.ndarray, assets: tuple[str, ...], first: int = 0) -> Prices:
-    """Prices that begin with 1 and have these simple returns; days are counted from ``first``."""
+    """Prices that start at 1 and have these simple returns; days are counted from ``first``."""
     if not (returns > -1).all():
         row, asset = np.argwhere(~(returns > -1))[0]
         raise ValueError(

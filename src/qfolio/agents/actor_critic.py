@@ -1,9 +1,9 @@
 """What DDPG, TD3 and SAC share: a policy and action values, learned from a replay buffer.
 
 The critics regress Q(s, a) towards a Bellman target at the action that the policy takes next; the
-actor climbs the critics' gradient in the action. Each algorithm's file says how it does the one and
-the other; here stand the networks, the buffer and the settings of all three. docs/actor_critic.md
-holds every formula and its place.
+actor ascends the critics' gradient in the action. Each algorithm's file defines these two steps;
+this file holds the networks, the buffer and the settings that all three share.
+docs/actor_critic.md lists every formula and its place.
 """
 
 import abc
@@ -29,11 +29,11 @@ from qfolio.learning.targets import Scalar, Scale, huber_loss, possible_values, 
 class Critics(eqx.Module):
     """Networks side by side, each with its own estimate of Q(s, a).
 
-    They read an observation and an action, or an observation alone where actions are numbered.
+    They read an observation and an action, or an observation alone if actions are numbered.
     """
 
     networks: Callable[[PyTree], Array]  # with a leading critic axis
-    scale: Scale = eqx.field(static=True)  # of what the networks give
+    scale: Scale = eqx.field(static=True)  # of the networks' outputs
 
     def __init__(
         self, make: Callable[[PRNGKeyArray], Network], n: int, scale: Scale, key: PRNGKeyArray
@@ -48,7 +48,7 @@ class Critics(eqx.Module):
         return self._values(lambda network: network((observation, action))[:, 0])
 
     def every(self, observation: PyTree) -> Float[Array, "critic batch action"]:
-        """Q(s, ·) of each critic, where actions are numbered."""
+        """Q(s, ·) of each critic, for numbered actions."""
         return self._values(lambda network: network(observation))
 
     def _values(self, read: Callable[[Any], Array]) -> Array:
@@ -57,7 +57,7 @@ class Critics(eqx.Module):
     def errors(
         self, q: Float[Array, "critic batch"], target: Float[Array, " batch"]
     ) -> Float[Array, "critic batch"]:
-        """How far off the networks' outputs were, when they said ``q``."""
+        """Errors of the networks' outputs for ``q``, in their scale."""
         return self.scale.outputs(q) - self.scale.outputs(target)
 
 
@@ -67,22 +67,22 @@ def critic_loss(
     target: Float[Array, " batch"],
     huber_delta: Scalar,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Mean Huber loss of the errors to one target, summed over the critics; and what to report."""
+    """Mean Huber loss of the errors to one target, summed over the critics; and metrics."""
     q = critics(batch.observation, batch.action)
     loss = huber_loss(critics.errors(q, target), huber_delta).mean(1).sum()
     return loss, {"loss": loss, "q": q.mean()}
 
 
 class Batch(NamedTuple):
-    """What a gradient step learns from."""
+    """The batch of a gradient step."""
 
     steps: Experience
-    discount: Discount  # of what follows them
-    rewards: Float[Array, "2"]  # the lowest and the highest that there ever were
+    discount: Discount  # of the value that follows them
+    rewards: Float[Array, "2"]  # the lowest and the highest so far
 
 
 class Actor(eqx.Module):
-    """A policy: a network, and the actions that its outputs stand for."""
+    """A policy: a network, and the kind of actions that its outputs define."""
 
     network: Callable[[PyTree], Array]
     actions: Actions
@@ -102,12 +102,12 @@ L = TypeVar("L", bound=Learned)
 
 
 class ActorCriticState(eqx.Module, Generic[L]):
-    """All that an agent learns and remembers."""
+    """The state of an agent."""
 
     learned: L
     replay: Replay
     steps: Int[Array, ""]  # of each environment
-    rewards: Float[Array, "2"]  # the lowest and the highest that there ever were
+    rewards: Float[Array, "2"]  # the lowest and the highest so far
 
 
 State = TypeVar("State", bound=ActorCriticState)
@@ -122,20 +122,22 @@ class ActorCritic(Agent, Generic[L]):
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     batch_size: int = static(256)
     gradient_steps: int = static(1)  # gradient steps per step of all environments
-    n_steps: int = static(1)  # whose rewards a target adds up
+    n_steps: int = static(1)  # of a target's return
     replay_capacity: int = static(100_000)  # transitions
     learning_starts: int = static(1000)  # transitions by random actions before learning
-    tau: float = number(0.005)  # how far targets go towards the online networks each time
+    tau: float = number(0.005)  # step of the targets towards the online networks
     discount: float = number(0.99)
     learning_rate: float = number(1e-3)
-    learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
+    learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
     actor_learning_rate_ratio: float = number(0.3)  # the actor's, as a share of the critics'
     reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
-    input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
+    input_gain: float = number(
+        0.0
+    )  # of the first layer, for observations scaled to ±1; 0: unscaled
     huber_delta: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
     value_rescaling: bool = static(False)  # critics learn roots of values: small ones weigh more
-    clip_bootstrap: bool = static(True)  # to the values that the rewards so far allow
+    clip_bootstrap: bool = static(True)  # to the range of values possible with the rewards so far
 
     def __check_init__(self) -> None:
         self._replay.check()
@@ -166,7 +168,7 @@ class ActorCritic(Agent, Generic[L]):
 
     @abc.abstractmethod
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> L:
-        """What gradient steps will change; ``observation`` is an example."""
+        """The networks and optimisers before training; ``observation`` is an example."""
 
     @abc.abstractmethod
     def explore(self, learned: L, observation: PyTree, key: PRNGKeyArray) -> Array:
@@ -205,7 +207,7 @@ class ActorCritic(Agent, Generic[L]):
         )
 
     def row(self, state: ActorCriticState[L], step: Experience) -> PyTree:
-        """What the buffer keeps of a step of all environments, made in ``state``."""
+        """The rows to store for a step of all environments, made in ``state``."""
         return step
 
     def learn(
@@ -241,9 +243,9 @@ class ActorCritic(Agent, Generic[L]):
         following: Float[Array, " batch"],
         bonus: tuple[Scalar, Scalar] = (0.0, 0.0),
     ) -> Float[Array, " batch"]:
-        """Bellman target; with ``clip_bootstrap`` what follows is as the rewards so far allow.
+        """Bellman target; ``clip_bootstrap`` clips the next value to what past rewards allow.
 
-        bonus: the least and the most that a later step may be worth besides its reward.
+        bonus: the least and the most that a later step may add to its reward.
         """
         if self.clip_bootstrap:
             each = self.reward_scale * batch.rewards + jnp.stack([jnp.asarray(x) for x in bonus])
@@ -262,7 +264,7 @@ class ActorCritic(Agent, Generic[L]):
     def build_critics(
         self, task: Task, observation: PyTree, count: int, key: PRNGKeyArray
     ) -> Critics:
-        """Critics over everything that is observed and an action."""
+        """Critics over the whole observation and an action."""
         assert not isinstance(task.actions, Discrete)
         action = uniform(task.actions, key, 1)[0]
         seen = sum(jnp.size(leaf) for leaf in jax.tree.leaves(observation))

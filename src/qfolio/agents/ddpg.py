@@ -1,7 +1,7 @@
 """Deep deterministic policy gradient (Lillicrap et al. 2016).
 
-The critic regresses Q(s, a) towards r + γ Q'(s', π'(s')), where Q' and π' are targets that follow
-slowly. The actor π climbs Q(s, π(s)) by the critic's gradient in the action (Silver et al. 2014,
+The critic regresses Q(s, a) towards r + γ Q'(s', π'(s')), where Q' and π' are slowly updated
+targets. The actor π ascends Q(s, π(s)) by the critic's gradient in the action (Silver et al. 2014,
 eq. 9). Exploration adds noise to the actor's action. docs/actor_critic.md lists formulas and
 deviations.
 """
@@ -30,9 +30,9 @@ REACH = 4.0
 
 
 class Actor(actor_critic.Actor):
-    """A deterministic policy: a network whose outputs are brought among the actions.
+    """A deterministic policy: a network whose outputs are mapped to actions.
 
-    By tanh between the bounds of a box, by softmax onto the simplex of weights.
+    Tanh maps them to a box's bounds, softmax to the simplex of weights.
     """
 
     actions: Box | Simplex
@@ -41,7 +41,7 @@ class Actor(actor_critic.Actor):
         return self.among(self.network(observation))
 
     def among(self, output: Float[Array, "batch entry"]) -> Float[Array, "batch entry"]:
-        """The actions that the network's outputs stand for."""
+        """The actions of the network's outputs."""
         if isinstance(self.actions, Simplex):
             return jax.nn.softmax(output)
         if math.isinf(self.actions.bound):
@@ -59,7 +59,7 @@ class Actor(actor_critic.Actor):
 
 
 class Learned(actor_critic.Learned):
-    """What gradient steps change: the actor has a target, too."""
+    """What gradient steps change, with a target of the actor."""
 
     actor: Actor
     target_actor: Actor
@@ -70,7 +70,7 @@ def actor_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """Minus the mean of Q(s, π(s)), by the smallest of the critics.
 
-    saturation_penalty: what a unit of ``saturation`` costs.
+    saturation_penalty: cost of a unit of ``saturation``.
     """
     output = actor.network(observation)
     value = critics(observation, actor.among(output)).min(0).mean()
@@ -92,8 +92,8 @@ class DDPG(ActorCritic[Learned]):
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
         if isinstance(task.actions, Discrete):
             raise QfolioError(
-                f"{type(self).__name__.lower()} needs continuous actions, and those of "
-                f"{task.name} are numbered; take dqn or sac, or make them continuous: "
+                f"{type(self).__name__.lower()} needs continuous actions, but those of "
+                f"{task.name} are numbered; use dqn or sac, or make them continuous: "
                 "torques=0 of the pendulum, no menu in a market."
             )
         actor_key, critic_key = jax.random.split(key)
@@ -139,11 +139,11 @@ class DDPG(ActorCritic[Learned]):
     def following(
         self, learned: Learned, observation: PyTree, key: PRNGKeyArray
     ) -> Float[Array, " batch"]:
-        """What the next observation is worth: Q'(s', π'(s'))."""
+        """The value of the next observation: Q'(s', π'(s'))."""
         return learned.target_critics(observation, learned.target_actor(observation))[0]
 
     def improve(self, learned: Learned, batch: Experience) -> Learned:
-        """A step of the actor up the critics; then the targets follow."""
+        """A step of the actor up the critics; then an update of the targets."""
         rate = self.actor_learning_rate_ratio * self._schedule(learned.critic_adam.count)
         actor, adam, _ = optimizer.minimize(
             actor_loss,
@@ -161,5 +161,5 @@ class DDPG(ActorCritic[Learned]):
         )
 
     def climbed(self, critics: Critics) -> Critics:
-        """The critics of whose values the actor climbs the smallest."""
+        """The critics whose smallest value the actor ascends."""
         return critics

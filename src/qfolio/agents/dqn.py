@@ -1,16 +1,16 @@
-"""Deep Q-network (Mnih et al. 2015), and what was built on it, as options.
+"""Deep Q-network (Mnih et al. 2015), with its extensions as options.
 
 A Q-network estimates the discounted return of each action. Collecting: actions are ε-greedy on it,
 and transitions go into a replay buffer. Training: it regresses, on batches from the buffer, towards
-r + γ max_a Q'(s', a), where Q' is a target network that follows it slowly.
+r + γ max_a Q'(s', a), where Q' is a slowly updated target network.
 
 Options, which together are Rainbow (Hessel et al. 2018): double Q-learning (van Hasselt et
 al. 2016), dueling networks (Wang et al. 2016), returns over n steps, prioritized replay (Schaul et
 al. 2016), noisy networks (Fortunato et al. 2018), and distributions of returns in place of their
-means (Bellemare et al. 2017; Dabney et al. 2018). Besides, a network may learn roots of values
-(after Pohlen et al. 2018), and in an exogenous task ``all_actions`` learns from one move of the
-market what every action would have led to. docs/dqn.md holds every formula, the place where it
-stands here, and each deviation from the papers.
+means (Bellemare et al. 2017; Dabney et al. 2018). In addition, a network may learn roots of values
+(after Pohlen et al. 2018), and in an exogenous task ``all_actions`` learns every action's outcome
+from one move of the market. docs/dqn.md lists every formula, its place in this file, and each
+deviation from the papers.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_ta
 
 
 class DQNState(eqx.Module):
-    """All that a DQN agent learns and remembers."""
+    """The state of a DQN agent."""
 
     online: Network
     target: Network
@@ -55,10 +55,10 @@ Learned = tuple[Network, optimizer.Optimizer, Priorities | None]
 
 
 class Losses(NamedTuple):
-    """Of a batch."""
+    """Losses of a batch."""
 
     each: Float[Array, "batch *action"]
-    off: Float[Array, " batch"] | None  # how far off the values were; priorities follow it
+    off: Float[Array, " batch"] | None  # absolute errors of the values, for priorities
     max_q: Float[Array, ""]  # mean of max_a Q(s, a), in units of reward
 
 
@@ -75,25 +75,25 @@ class DQN(Agent):
     learning_starts: int = static(64)  # transitions stored before learning
     double: bool = static(False)
     dueling: bool = static(False)  # a stream for the state's value and one for advantages
-    n_steps: int = static(1)  # whose rewards a target adds up
-    prioritized: bool = static(False)  # transitions are drawn by how far off their values were
+    n_steps: int = static(1)  # of a target's return
+    prioritized: bool = static(False)  # transitions are drawn in proportion to their errors
     priority_exponent: float = number(0.6)  # α
     importance_exponent: float = number(0.4)  # β at the start
     importance_steps: float = number(1e5)  # gradient steps until β is 1
-    values: str = static("expected")  # what is learned of a return: expected, categorical, quantile
-    atoms: int = static(51)  # numbers for each action, where values are a distribution
+    values: str = static("expected")  # of returns: expected, categorical or quantile
+    atoms: int = static(51)  # numbers for each action, if values are a distribution
     v_min: float = number(-10.0)  # ends of categorical's support, in units of scaled reward
     v_max: float = number(10.0)
-    noisy: bool = static(False)  # explore by learned noise on weights, besides ε
+    noisy: bool = static(False)  # explore by learned noise on weights, in addition to ε
     noise_scale: float = number(0.5)  # σ₀
-    all_actions: bool = static(False)  # learn every action at once, from re-drawn holdings
-    market_baseline: bool = static(False)  # with all_actions: rewards above those of other holdings
+    all_actions: bool = static(False)  # learn all actions at once, from random holdings
+    market_baseline: bool = static(False)  # with all_actions: rewards relative to other holdings'
     time_limit_terminal: bool = static(False)  # wrong, but often done
     target_update_interval: int = static(200)  # steps between target updates
-    tau: float = number(1.0)  # how far each goes towards the online network; 1 copies it
+    tau: float = number(1.0)  # step towards the online network; 1 copies it
     discount: float = number(0.99)
     learning_rate: float = number(1e-3)
-    learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
+    learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
     epsilon_start: float = number(1.0)
     epsilon_end: float = number(0.01)
@@ -101,7 +101,9 @@ class DQN(Agent):
     persistence: float = constant(0.0)  # share of exploring steps that repeat the last action
     huber_delta: float = number(math.inf)  # |TD error| beyond which the loss is linear
     reward_scale: float = number(1.0)  # the network learns values of scaled rewards
-    input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
+    input_gain: float = number(
+        0.0
+    )  # of the first layer, for observations scaled to ±1; 0: unscaled
     value_rescaling: bool = static(False)  # learn roots of values: small ones weigh more
 
     def __check_init__(self) -> None:
@@ -122,7 +124,7 @@ class DQN(Agent):
             hindsight.require_plain({name: getattr(self, name) for name in hindsight.PLAIN})
         if self.market_baseline and self.batch_size < 2:
             raise QfolioError(
-                "market_baseline compares holders; it needs a batch_size of 2 or more."
+                "market_baseline compares holdings; it needs a batch_size of 2 or more."
             )
 
     @property
@@ -163,15 +165,15 @@ class DQN(Agent):
 
     @property
     def _values(self) -> Values:
-        """What the network's numbers mean."""
+        """The kind of values that the network's outputs represent."""
         return self._value_config.build()
 
     def init(self, task: Task, key: PRNGKeyArray) -> DQNState:
         if not isinstance(task.actions, Discrete):
             menu = "give it a menu of allocations (menu=grid:10), or "
             raise QfolioError(
-                f"dqn chooses among numbered actions, and those of {task.name} are continuous; "
-                f"{menu if isinstance(task, ExogenousTask) else ''}take sac or ppo."
+                f"dqn chooses among numbered actions, but those of {task.name} are continuous; "
+                f"{menu if isinstance(task, ExogenousTask) else ''}use sac or ppo."
             )
         state = task.reset(key)
         observation = task.observe(state)
@@ -206,7 +208,7 @@ class DQN(Agent):
     def action_values(
         self, weights: Network, observation: PyTree
     ) -> Float[Array, "batch action"] | None:
-        """Q(s, ·) in units of the task's reward; none where they are above a baseline."""
+        """Q(s, ·) in units of the task's reward; None if they are relative to a baseline."""
         return None if self.market_baseline else self._q(weights, observation) / self.reward_scale
 
     def policy(self, weights: Network, observation: PyTree) -> Int[Array, " batch"]:
@@ -225,7 +227,7 @@ class DQN(Agent):
         return self._values.mean(self._read(network, observation))
 
     def _read(self, network: Network, observation: PyTree) -> Float[Array, "batch action atom"]:
-        """What the network says of each action; ``_values`` knows what it means."""
+        """The network's outputs for each action; ``_values`` interprets them."""
         return heads.read(self._head, network, observation)
 
     def observe(self, state: DQNState, rollout: Transition) -> DQNState:
@@ -289,7 +291,7 @@ class DQN(Agent):
         discount: Discount,
         key: PRNGKeyArray,
     ) -> Losses:
-        """discount: of what follows the batch's rewards. key: of the noise."""
+        """discount: of the values that follow the batch's rewards. key: for the noise."""
         noisy = heads.draw_noise(online, key) if self.noisy else online
         values = self._values
         z = self._read(noisy, batch.observation)

@@ -1,9 +1,9 @@
-"""Dyna-Q (Sutton 1990): Q-learning that also learns a model, and from what the model imagines.
+"""Dyna-Q (Sutton 1990): Q-learning from real steps and from steps of a learned model.
 
-Each real step is learned from as by Q-learning, and counted: how often action a of state s led to
-s', and with what reward on average. Then ``planning`` imagined steps follow: a state and action
-that was seen before, any of them alike, with an outcome drawn by its count. They are learned from
-in the same way. Every real step is so used many times, which saves real steps and costs time.
+Q-learning learns from each real step, and the model counts it: how often action a in state s led to
+s', and with what mean reward. Then ``planning_steps`` imagined steps follow, which are learned from
+in the same way: a state and action seen before, drawn uniformly, with an outcome drawn in
+proportion to its count. This uses each real step many times, at the price of computing time.
 """
 
 import equinox as eqx
@@ -18,9 +18,9 @@ from qfolio.core.mdp import Metrics, Task, Transition
 
 
 class Counts(eqx.Module):
-    """The model: of each entry (state · actions + action), the outcomes that were seen.
+    """The model: the outcomes seen of each entry (state · actions + action).
 
-    An outcome is the next state's number, or the number of states where the task ended.
+    An outcome is the next state's number, or the number of states if the task ended.
     """
 
     # Outcome (−1: none), how often it was seen, and its rewards summed; one array, because XLA
@@ -40,9 +40,9 @@ class Counts(eqx.Module):
         outcome: Int[Array, " batch"],
         reward: Float[Array, " batch"],
     ) -> "Counts":
-        """With one more step of each entry; of several steps of one entry, the last counts.
+        """Adds a step of each entry; of several steps of one entry, only the last is counted.
 
-        Where there is no room for an outcome, it replaces the rarest.
+        If there is no room for an outcome, it replaces the rarest.
         """
         if len(entry) == 1:  # XLA scatters two in place, but not one
             entry, outcome, reward = (jnp.tile(x, 2) for x in (entry, outcome, reward))
@@ -89,7 +89,7 @@ class Counts(eqx.Module):
 
 
 class DynaState(TableState):
-    """What Dyna-Q remembers beside its table."""
+    """A table and the model."""
 
     model: Counts
 
@@ -102,7 +102,10 @@ class DynaQ(Tabular):
 
     def __check_init__(self) -> None:
         require(
-            self, "planning_steps", lambda x: 1 <= x <= 4096, "from 1 to 4096; without, q-learning"
+            self,
+            "planning_steps",
+            lambda x: 1 <= x <= 4096,
+            "from 1 to 4096; without planning, use q-learning",
         )
         require(self, "outcomes", lambda x: 1 <= x <= 4096, "from 1 to 4096")
 
@@ -110,7 +113,7 @@ class DynaQ(Tabular):
         state = super().init(task, key)
         _, states, actions = state.tables.shape
         if states >= 2**24:
-            raise QfolioError(f"dyna-q counts fewer than 2²⁴ states; here are {states}.")
+            raise QfolioError(f"dyna-q needs fewer than 2²⁴ states; this task has {states}.")
         outcomes = min(self.outcomes, states + 1)  # every state, and the end
         model = Counts.empty(states * actions, outcomes)
         return DynaState(state.cells, state.episodes, model)

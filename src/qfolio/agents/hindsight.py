@@ -1,8 +1,8 @@
-"""Every action's value at once, where prices do not answer to our trades.
+"""Values of all actions at once, in markets whose prices do not depend on our trades.
 
-One move of the market tells what each action would have led to from any holding (hindsight learning
-for exogenous inputs, Sinclair et al. 2023): the buffer keeps moves instead of transitions, holdings
-are drawn anew at each update, and all actions regress together.
+One move of the market gives the outcome of every action from any holding (hindsight learning for
+exogenous inputs, Sinclair et al. 2023): the buffer stores moves instead of transitions, holdings
+are drawn at each update, and all actions regress together.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,14 +23,14 @@ Q = Callable[[PyTree], Float[Array, "batch action"]]
 
 
 class Move(NamedTuple):
-    """What the buffer keeps: how the market moved."""
+    """A move of the market, as the buffer stores it."""
 
     market: PyTree
     next_market: PyTree
 
     @staticmethod
     def of(rollout: Transition) -> "Move":
-        """A rollout's moves in one row, by time and then environment."""
+        """A rollout's moves as rows, ordered by time and then environment."""
         moves = Move(rollout.state.market, rollout.next_state.market)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), moves)
 
@@ -39,46 +39,46 @@ PLAIN: dict[str, str | bool | int | float] = {
     "values": "expected", "n_steps": 1, "prioritized": False, "noisy": False, "persistence": 0.0,
     "value_rescaling": False,
 }  # fmt: skip
-"""The settings of an agent that moves, and holdings drawn anew, allow for."""
+"""The values of an agent's settings that ``all_actions`` requires."""
 
 
 def require_plain(settings: Mapping[str, str | bool | int | float]) -> None:
-    """Raises QfolioError where one of an agent's settings is not as in ``PLAIN``."""
+    """Raises QfolioError if one of an agent's settings differs from ``PLAIN``."""
     for name, value in PLAIN.items():
         if settings[name] != value:
             raise QfolioError(
-                "all_actions learns expected values from single moves, all drawn alike, and needs "
-                f"no exploration; take {name}={str(value).lower()}, or all_actions=false."
+                "all_actions learns expected values from single moves, drawn uniformly, without "
+                f"exploration; set {name}={str(value).lower()}, or all_actions=false."
             )
 
 
 def require_exogenous(task: Task) -> None:
-    """Raises QfolioError where a move does not tell what every action leads to."""
+    """Raises QfolioError unless a move gives the outcome of every action."""
     if not isinstance(task, ExogenousTask):
         raise QfolioError(
-            "all_actions needs a market, whose prices do not answer to actions; "
-            f"{task.name} is none."
+            "all_actions needs a market, whose prices do not depend on actions; "
+            f"{task.name} is not a market."
         )
     if task.path_dependent:
         raise QfolioError(
-            "all_actions draws holdings without a past, and this reward (such as "
-            "differential-sharpe) depends on it; take reward=crra, or all_actions=false."
+            "all_actions draws holdings without a history, on which this reward (such as "
+            "differential-sharpe) depends; set reward=crra, or all_actions=false."
         )
 
 
 class Rule(NamedTuple):
-    """How targets are made; the names are those of the agent's settings."""
+    """How to compute targets; the names are those of the agent's settings."""
 
     discount: Scalar
     reward_scale: Scalar
     double: bool
-    market_baseline: bool  # rewards count from what the same move pays another holder on average
+    market_baseline: bool  # rewards are relative to another holding's mean over actions
 
 
 def errors(
     rule: Rule, task: ExogenousTask, moves: Move, key: PRNGKeyArray, online: Q, target: Q
 ) -> tuple[Float[Array, "batch action"], Float[Array, "batch action"]]:
-    """Target less value for every action from a holding drawn for each move, and the values."""
+    """Target minus value of every action, from a random holding for each move; and the values."""
     count = len(jax.tree.leaves(moves)[0])
     holdings = jax.vmap(task.draw_holding)(jax.random.split(key, count))
     q = online(jax.vmap(task.observe)(Position(moves.market, holdings)))
@@ -90,9 +90,9 @@ def errors(
     actions = jnp.arange(q.shape[-1])
     reward, next_holdings = jax.vmap(partial(after, holdings))(actions)  # (action, batch)
     if rule.market_baseline:
-        # It depends on the market alone: taking it off leaves the best policy as it is, and takes
-        # off what all actions have in common of the market's noise (input-dependent baselines, Mao
-        # et al. 2019).
+        # It depends on the market alone: subtracting it does not change the best policy, and
+        # removes the market noise that all actions share (input-dependent baselines, Mao et al.
+        # 2019).
         others = jax.tree.map(lambda x: jnp.roll(x, 1, 0), holdings)
         reward = reward - jax.vmap(partial(after, others))(actions)[0].mean(0)
     never = jnp.zeros(reward.shape[1:], bool)

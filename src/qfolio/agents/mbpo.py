@@ -1,10 +1,10 @@
 """Model-based policy optimization (Janner et al. 2019, algorithm 2): SAC on imagined steps.
 
-An ensemble of networks learns from all real transitions how an action changes the observation, what
-it pays, and whether anything follows. From real observations the policy then goes on in imagination
-for a few steps, each predicted by a member drawn at random, and soft actor-critic learns from these
-steps. Members differ by where they began and by their data: each counts a real transition 0, 1, 2,
-… times (on-line bootstrap, Oza & Russell 2001). docs/model_based.md lists formulas and deviations.
+An ensemble of networks learns from all real transitions how an action changes the observation, its
+reward, and whether the episode ends. From real observations the model then imagines a few steps of
+the policy, each predicted by a random member, and soft actor-critic learns from these steps.
+Members differ in their initial weights and data: each counts a real transition 0, 1, 2, … times
+(on-line bootstrap, Oza & Russell 2001). docs/model_based.md lists formulas and deviations.
 """
 
 from collections.abc import Callable
@@ -28,15 +28,15 @@ from qfolio.learning.replay import Experience, Replay
 from qfolio.learning.targets import squash, unsquash
 
 GAIN = 3.0
-"""Of the model's first layer: its inputs, which go to ±1, are to reach where SiLU bends."""
+"""Gain of the model's first layer: inputs within ±1 should reach the bend of SiLU."""
 
 
 class Model(eqx.Module):
     """An ensemble of networks; their weights have a leading axis.
 
-    They see observations and actions taken to ±1, and predict the change of the observation in
-    units of its range, the reward's root, and whether nothing follows (as a number, 0 or 1).
-    Small rewards decide where large ones are avoided, and a root is finer near zero.
+    Their inputs are observations and actions scaled to ±1; they predict the change of the
+    observation in units of its range, the reward's root, and whether the episode ends (as a number,
+    0 or 1). Small rewards matter once large ones are avoided, and a root resolves them better.
     """
 
     members: Callable[[Array], Array]
@@ -55,14 +55,14 @@ class Model(eqx.Module):
         return jax.vmap(lambda member: member(inputs))(self.members)
 
     def truth(self, step: Experience) -> Float[Array, "batch seen+2"]:
-        """What would have been right to predict."""
+        """The true values of a prediction."""
         change = (step.next_observation - step.observation) / self.scale
         return jnp.column_stack([change, squash(step.reward), step.terminal])
 
     def imagine(
         self, observation: Float[Array, "batch seen"], action: Array, key: PRNGKeyArray
     ) -> Experience:
-        """A step of each row, as a member drawn at random expects it."""
+        """A step of each row, as a random member predicts it."""
         expected = self(observation, action)
         member = jax.random.randint(key, expected.shape[1:2], 0, len(expected))
         drawn = expected[member, jnp.arange(len(member))]
@@ -74,7 +74,7 @@ class Model(eqx.Module):
 def model_loss(
     model: Model, step: Experience, counts: Float[Array, "batch member"]
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Squared errors relative to the batch's variance, each step counted as often as it is."""
+    """Squared errors relative to the batch's variance, weighted by each member's counts."""
     truth = model.truth(step)
     unit = jnp.maximum(truth.std(0), 1e-2).at[-1].set(1.0)
     errors = ((model(step.observation, step.action) - truth) / unit) ** 2
@@ -90,16 +90,16 @@ class Remembered(NamedTuple):
 
 
 class MBPOState(ActorCriticState[Learned]):
-    """That of SAC, whose buffer holds real steps, with a model and its imagination."""
+    """SAC's state, whose buffer holds real steps, with a model and its imagined steps."""
 
     model: Model
     model_adam: optimizer.Optimizer
     imagined: Replay
-    bootstrap_key: UInt32[Array, "2"]  # of the counts; each step folds its number in
+    bootstrap_key: UInt32[Array, "2"]  # for the counts; each step folds its number in
 
 
 class MBPO(SAC):
-    """Soft actor-critic that learns from a learned model's steps alone."""
+    """Soft actor-critic that learns only from steps of a learned model."""
 
     ensemble_size: int = static(5)  # networks in the ensemble
     model_hidden: tuple[int, ...] = sizes(128, 128)
@@ -114,7 +114,7 @@ class MBPO(SAC):
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "model_replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         require(self, "model_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "n_steps", lambda x: x == 1, "1: imagined steps stand alone")
+        require(self, "n_steps", lambda x: x == 1, "1: imagined steps are single")
         require_sizes(self, "model_hidden")
 
     def init(self, task: Task, key: PRNGKeyArray) -> MBPOState:
@@ -123,7 +123,7 @@ class MBPO(SAC):
         if getattr(observation, "ndim", 0) != 1 or task.states is not None:
             raise QfolioError(
                 "mbpo predicts observations that are one row of numbers; those of "
-                f"{task.name} are not. Take sac or dqn."
+                f"{task.name} are not; use sac or dqn."
             )
         actions = task.actions
         entries = actions.n if isinstance(actions, Discrete) else uniform(actions, key, 1).shape[1]
@@ -192,7 +192,7 @@ class MBPO(SAC):
         return model, adam, metrics
 
     def _imagine(self, model: Model, state: MBPOState, key: PRNGKeyArray) -> Replay:
-        """The buffer of imagined steps, with those of the present policy and model."""
+        """The buffer of imagined steps, with new ones of the current policy and model."""
         start_key, key = jax.random.split(key)
         starts = state.replay.sample(start_key, self.model_rollout_batch).step.observation
 

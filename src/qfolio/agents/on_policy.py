@@ -1,9 +1,9 @@
-"""What policy-gradient agents share: a stochastic policy beside an estimate of what it earns.
+"""What policy-gradient agents share: a stochastic policy and an estimate of its return.
 
-They act by drawing from the policy, and learn from a rollout that this very policy has made: each
-action is compared with what the estimate had expected (an advantage), the policy moves towards
-actions that did better, and the estimate towards what came. ``reinforce.py``, ``a2c.py`` and
-``ppo.py`` differ in how. docs/policy_gradients.md has the formulas.
+They act by drawing from the policy, and learn from rollouts of the current policy: each action's
+return is compared with the estimate (the advantage), the policy moves towards actions that did
+better, and the estimate towards the returns. ``reinforce.py``, ``a2c.py`` and ``ppo.py`` differ in
+how. docs/policy_gradients.md has the formulas.
 """
 
 from functools import partial
@@ -23,11 +23,11 @@ from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.targets import Scalar, advantages
 
 REACH = 2.0
-"""Mean, in bounds, beyond which nearly all draws count as cut to the bound."""
+"""Mean, in units of the bound, beyond which nearly all draws are clipped."""
 
 
 class PolicyAndValue(eqx.Module):
-    """A policy (the actor) and the discounted return that it is expected to earn (the critic)."""
+    """A policy (the actor) and an estimate of its discounted return (the critic)."""
 
     actor: Network
     log_std: Float[Array, " coordinate"]  # the same in all states; one for all assets of a market
@@ -48,7 +48,7 @@ class OnPolicyState(eqx.Module):
 
 
 class Batch(NamedTuple):
-    """Steps of a rollout in one row, by time and then environment, with what came of them."""
+    """Steps of a rollout as rows, by time and then environment, with advantages and targets."""
 
     observation: PyTree
     action: Array
@@ -59,7 +59,7 @@ class Batch(NamedTuple):
 
 
 class OnPolicy(Agent):
-    """Acting, the networks and the step of the optimiser; how to learn is left open."""
+    """Acting, the networks and the optimiser's step; subclasses define ``learn``."""
 
     network: str = static("flat")  # over everything observed; or mlp, cnn, rnn, shared by assets
     hidden: tuple[int, ...] = sizes(64, 64)  # of the actor, and of the critic
@@ -68,17 +68,19 @@ class OnPolicy(Agent):
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     discount: float = number(0.99)
     learning_rate: float = number(3e-4)
-    learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
+    learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
-    max_grad_norm: float = number(0.5)  # longer gradients are cut to it
+    max_grad_norm: float = number(0.5)  # longer gradients are rescaled to it
     value_coef: float = number(0.5)  # of the critic's mean squared error in the loss
     entropy_coef: float = number(0.0)  # of the policy's entropy, which the loss rewards
     initial_std: float = number(1.0)  # in units of the bound, or of the logits of weights
     normalize_advantages: bool = static(True)  # to mean 0 and deviation 1 over a batch
-    time_limit_terminal: bool = static(False)  # nothing follows where the clock cuts an episode
+    time_limit_terminal: bool = static(False)  # treats truncations as terminal
     saturation_penalty: float = number(0.1)  # on means far beyond the bounds; 0: none
     reward_scale: float = number(1.0)  # the critic learns values of scaled rewards
-    input_gain: float = number(0.0)  # of the first layer, observations taken to ±1; 0: as it is
+    input_gain: float = number(
+        0.0
+    )  # of the first layer, for observations scaled to ±1; 0: unscaled
 
     def __check_init__(self) -> None:
         require(self, "num_envs rollout_length", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
@@ -114,7 +116,7 @@ class OnPolicy(Agent):
             return networks.build(self._networks, task, observation, outputs, key)
 
         weights = PolicyAndValue(
-            actor=_quiet(build(outputs_of(task.actions), actor_key)),
+            actor=_zero_output(build(outputs_of(task.actions), actor_key)),
             log_std=jnp.full(_coordinates(task.actions), jnp.log(self.initial_std)),
             critic=build(Outputs(1), critic_key),
             actions=task.actions,
@@ -137,7 +139,7 @@ class OnPolicy(Agent):
         return state
 
     def judge(self, weights: PolicyAndValue, rollout: Transition, gae_lambda: Scalar) -> Batch:
-        """Compares a rollout that these weights made with what they expect.
+        """A rollout of these weights with its advantages and targets.
 
         gae_lambda: λ of the advantages, from 0 (trust the critic) to 1 (trust the rewards).
         """
@@ -165,17 +167,17 @@ class OnPolicy(Agent):
         )
 
     def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
-        """What the policy raises, by the log density that it gives to the batch's actions."""
+        """The policy's objective, given its log density of the batch's actions."""
         return log_prob * self.weighed(batch)
 
     def weighed(self, batch: Batch) -> Float[Array, " batch"]:
-        """The advantages as the objective takes them."""
+        """The advantages in the objective, normalised if so set."""
         if not self.normalize_advantages:
             return batch.advantage
         return normalized(batch.advantage, batch.counted)
 
     def loss(self, weights: PolicyAndValue, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
-        """Minus the objective and the policy's entropy, with the critic's error."""
+        """Minus the objective and the weighted entropy, plus the weighted critic's error."""
         output = weights.actor(batch.observation)
         policy = policy_of(weights.actions, output, weights.log_std)
         mean = partial(jnp.mean, where=batch.counted)
@@ -204,11 +206,11 @@ def normalized(
 
 
 def _coordinates(actions: Actions) -> int:
-    """How many standard deviations a policy has; a choice has none."""
+    """The number of a policy's standard deviations; discrete policies have none."""
     return actions.n if isinstance(actions, Box) else int(isinstance(actions, Simplex))
 
 
-def _quiet(network: Network) -> Network:
+def _zero_output(network: Network) -> Network:
     """The network with an output layer of zeros: the first policy is the same everywhere."""
 
     def last(network: Network) -> tuple[Array, Array]:

@@ -1,10 +1,10 @@
 """Pathwise policy gradient: net growth, differentiated through the episode.
 
-Where prices do not answer to our trades, the reward of a whole episode is a differentiable function
-of the policy: each action earns what the market then did, pays what it costs to get there from the
-last holding, and leaves the next one. The gradient of that sum is exact for the paths seen; nothing
-is estimated by perturbing actions (Moody & Saffell 1998; Jiang et al. 2017, eq. 21–22, whose
-memory of previous weights is the holding here). docs/pathwise.md lists formulas and deviations.
+If prices do not depend on our trades, the reward of a whole episode is a differentiable function of
+the policy: each action earns the market's next return, pays the cost of trading from the last
+holding, and leaves the next one. The gradient of the sum is exact for the paths seen; no action is
+perturbed to estimate it (Moody & Saffell 1998; Jiang et al. 2017, eq. 21–22, whose memory of
+previous weights is the holding here). docs/pathwise.md lists formulas and deviations.
 """
 
 import math
@@ -37,15 +37,15 @@ from qfolio.learning.optimizer import CosineSchedule
 
 
 class Band(eqx.Module):
-    """From a view of the market to target weights, or to positions where they are unbounded.
+    """Maps a view of the market to target weights, or to positions if they are unbounded.
 
-    The network names two edges for each asset, and a holding outside them wants to go to the nearer
-    one. With proportional costs the best policy of one asset has this form (Davis & Norman 1990; as
-    a network: Imaki et al. 2021, "No-transaction band network"); two edges that meet say where to
-    go from anywhere. Where all that is wanted sums to more than 1, the projection takes some of it
-    away, also from assets inside their edges.
-    They start close together, so that both are traded to and have gradients, around equal weights
-    or around no position.
+    The network outputs two edges for each asset; a holding outside them moves to the nearer one.
+    With proportional costs the best policy of one asset has this form (Davis & Norman 1990; as a
+    network: Imaki et al. 2021, "No-transaction band network"); two edges that meet are a target
+    from anywhere. If the wanted weights sum to more than 1, the projection reduces them, also those
+    of assets inside their edges.
+    The edges start close together, so that both are traded to and have gradients, around equal
+    weights or no position.
     """
 
     network: Shared
@@ -55,7 +55,7 @@ class Band(eqx.Module):
         return self.allowed(self.wanted(self.network.read(view.features), view.holding))
 
     def allowed(self, wanted: Float[Array, "batch entry"]) -> Float[Array, "batch entry"]:
-        """What is wanted, brought to the nearest point of the simplex."""
+        """The point of the simplex nearest to ``wanted``."""
         if isinstance(self.actions, Box):
             return wanted
         return simplex.project(wanted, jnp.asarray(self.actions.caps))
@@ -63,8 +63,8 @@ class Band(eqx.Module):
     def wanted(
         self, reading: Reading, holding: Float[Array, "batch asset"]
     ) -> Float[Array, "batch entry"]:
-        """The holding, brought between the edges; cash is what is left of 1."""
-        # Among many assets weights are small, and so is what an output of one should mean.
+        """The holding, clipped to the edges; cash is the rest."""
+        # Among many assets weights are small, and the outputs are scaled to match.
         start, unit, scale = 0.0, 1.0, 1.0
         if isinstance(self.actions, Simplex):
             start = unit = 1 / (1 + self.actions.assets)
@@ -93,15 +93,15 @@ class Pathwise(Agent):
     hidden: tuple[int, ...] = sizes(32, 32)
     num_envs: int = static(64)  # paths in a batch
     rollout_length: int = static(50)  # steps of each path that a gradient goes through
-    tail: int = static(0)  # of these, the last ones only show what followed
+    tail: int = static(0)  # of these, last steps without a gradient of their own
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     gradient_steps: int = static(1)  # gradient steps per rollout
     learning_rate: float = number(1e-3)
-    learning_rate_final: float = number(1.0)  # share left at the end of the cosine
+    learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e4)  # gradient steps of the cosine
-    max_grad_norm: float = number(math.inf)  # longer gradients are cut to it
+    max_grad_norm: float = number(math.inf)  # longer gradients are rescaled to it
     reward_scale: float = number(1.0)
-    simplex_penalty: float = number(0.01)  # on what is off the simplex: its own gradient is zero
+    simplex_penalty: float = number(0.01)  # on weights off the simplex, where the gradient is zero
 
     def __check_init__(self) -> None:
         if self.network not in SHARED:
@@ -137,7 +137,7 @@ class Pathwise(Agent):
         if not isinstance(task, ExogenousTask) or isinstance(task.actions, Discrete):
             raise QfolioError(
                 "pathwise needs a market whose actions are weights or positions; "
-                f"{task.name} is none (in a market, leave menu empty)."
+                f"{task.name} is not one (in a market, leave menu empty)."
             )
         episode = min(self.episode_steps or task.horizon, task.horizon)
         if episode % self.rollout_length:
@@ -147,7 +147,7 @@ class Pathwise(Agent):
             )
         view = task.observe(task.reset(key))
         network = Shared(self.network, view, self.hidden, pooled=0, each=2, key=key)
-        # An output layer of zeros: the first policy is the band that it starts from.
+        # With an output layer of zeros, the first policy is the initial band.
         last = lambda n: (n.head.weights[-1], n.head.biases[-1])  # noqa: E731
         network = eqx.tree_at(last, network, replace_fn=jnp.zeros_like)
         policy = Band(network, task.actions)
@@ -191,7 +191,7 @@ class Pathwise(Agent):
         return PathwiseState(policy, adam, state.steps + 1), {"loss": losses.mean()}
 
     def _loss(self, policy: Band, task: ExogenousTask, rollout: Transition) -> Float[Array, ""]:
-        """Minus the mean reward a step of following ``policy`` along the rollout's market."""
+        """Minus the mean reward per step of ``policy`` along the rollout's market."""
 
         def follow(policy: Band, holding: PyTree, steps: slice) -> Any:
             def step(holding: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
@@ -205,7 +205,7 @@ class Pathwise(Agent):
 
             moves = (rollout.state.market, rollout.next_state.market, rollout.observation)
             market, next_market, seen = jax.tree.map(lambda x: x[steps], moves)
-            # Windows are read before the holdings go through time, all at once.
+            # All windows are read at once, before the scan over holdings.
             return lax.scan(
                 step, holding, (market, next_market, policy.network.read(seen.features))
             )
@@ -215,7 +215,7 @@ class Pathwise(Agent):
         holding, (rewards, off) = follow(policy, start, slice(None, cut))
         total = rewards.sum()
         if self.tail:
-            # A trade near the end would be paid for without earning what it was made for.
+            # Without a tail, a trade near the end would pay its cost without earning its return.
             _, (later, _) = follow(lax.stop_gradient(policy), holding, slice(cut, None))
             total += later.sum()
         return self.simplex_penalty * off.mean() - self.reward_scale * total / rewards.size

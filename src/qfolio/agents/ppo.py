@@ -1,8 +1,8 @@
 """Proximal policy optimisation (Schulman et al. 2017).
 
-A rollout is used for several epochs of gradient steps on minibatches. What keeps the policy near
-the one that made the rollout is the objective: it rewards no change of an action's probability
-beyond 1 ± ``clip_range``. Advantages are generalised (Schulman et al. 2016).
+A rollout is used for several epochs of gradient steps on minibatches. The clipped objective keeps
+the policy near the one that made the rollout: it does not reward a probability ratio beyond
+1 ± ``clip_range``. Advantages are generalised (Schulman et al. 2016).
 docs/policy_gradients.md has the formulas and the deviations from the paper.
 """
 
@@ -26,7 +26,7 @@ class PPO(OnPolicy):
     epochs: int = static(10)
     batch_size: int = static(64)
     gae_lambda: float = number(0.95)  # λ of the advantages: 0 trusts the critic, 1 the rewards
-    clip_range: float = number(0.2)  # how far the objective follows a change of probability
+    clip_range: float = number(0.2)  # ε: largest rewarded change of a probability ratio
 
     def __check_init__(self) -> None:
         require(self, "epochs batch_size", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
@@ -63,8 +63,8 @@ def minibatches(key: PRNGKeyArray, batch: Batch, size: int) -> Batch:
 def shuffled(key: PRNGKeyArray, n: int) -> Int[Array, " n"]:
     """The numbers from 0 to ``n`` − 1 in random order.
 
-    Up to 2¹⁶ they are sorted with random bits in front of them: ten times as fast on a CPU as
-    sorting pairs, which had taken a fifth of PPO's time. Where bits tie, the order stays.
+    Up to 2¹⁶ they are sorted with random high bits, ten times as fast on a CPU as sorting pairs,
+    which had taken a fifth of PPO's time. Ties keep their order.
     """
     if n > 2**16:
         return jax.random.permutation(key, n)
@@ -78,6 +78,6 @@ def clipped(
 ) -> Float[Array, " batch"]:
     """min(rA, clip(r, 1 − ε, 1 + ε)A) (Schulman et al. 2017, eq. 7).
 
-    ratio: the probability of an action over that when it was drawn.
+    ratio: an action's probability over its probability when drawn.
     """
     return jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)

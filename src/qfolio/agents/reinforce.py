@@ -1,10 +1,11 @@
 """REINFORCE with a learned baseline (Williams 1992).
 
 Whole episodes are played; then the policy takes one step along the gradient of its actions' log
-probabilities, each times the return that followed it less the baseline. No reward is replaced by an
-estimate: the steps of an episode that is unfinished at the end of a rollout are left out. The one
-exception can be switched off (``time_limit_terminal``): the baseline stands in for what a time
-limit cuts off. docs/policy_gradients.md has the formulas and the deviations from the paper.
+probabilities, each times the return that followed minus the baseline. No reward is replaced by an
+estimate: steps of an episode that is unfinished at the end of a rollout are left out. There is one
+exception: the baseline replaces the rewards that a time limit cuts off, unless
+``time_limit_terminal``. docs/policy_gradients.md has the formulas and the deviations from the
+paper.
 """
 
 from jax import lax

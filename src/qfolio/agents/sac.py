@@ -1,11 +1,10 @@
 """Soft actor-critic (Haarnoja et al. 2018, "Soft actor-critic algorithms and applications").
 
-The agent maximises reward plus α times the policy's entropy, so that it stays as random as the task
-lets it be. Two critics regress Q(s, a) towards r + γ V'(s') with the soft value
-V(s) = E[min Q(s, a) − α log π(a|s)]; the actor climbs V; the temperature α is tuned so that the
-entropy meets a target. Actions are squashed normal numbers, weights on a simplex, or numbered,
-where expectations are sums (Christodoulou 2019). docs/actor_critic.md lists formulas and
-deviations.
+The agent maximises reward plus α times the policy's entropy. Two critics regress Q(s, a) towards
+r + γ V'(s') with the soft value V(s) = E[min Q(s, a) − α log π(a|s)]; the actor ascends V; the
+temperature α is tuned so that the entropy meets a target. Actions are squashed normal numbers,
+weights on a simplex, or numbered (then expectations are sums, Christodoulou 2019).
+docs/actor_critic.md lists formulas and deviations.
 """
 
 import math
@@ -32,7 +31,7 @@ from qfolio.learning.networks import Outputs, outputs_of
 from qfolio.learning.targets import Scalar, Scale, follow
 
 LOG_STD = (-10.0, 2.0)
-"""Where a normal number's log standard deviation is kept."""
+"""Bounds of a normal number's log standard deviation."""
 
 
 class Actor(actor_critic.Actor):
@@ -52,7 +51,7 @@ class Actor(actor_critic.Actor):
 
 
 class Learned(actor_critic.Learned):
-    """What gradient steps change: the temperature, too."""
+    """What gradient steps change, with the temperature."""
 
     actor: Actor
     log_temperature: Float[Array, ""]
@@ -60,10 +59,10 @@ class Learned(actor_critic.Learned):
 
 
 def target_entropy(actions: Actions, spread: Scalar) -> Float[Array, ""]:
-    """The entropy of a choice that is uniform over a share of each coordinate's range.
+    """The entropy of a uniform distribution over a share of each coordinate's range.
 
     A coordinate without bounds counts as one from −1 to 1, weights have the simplex's volume, and
-    of n numbered actions 1 + ``spread`` (n − 1) are left.
+    of n numbered actions 1 + ``spread`` (n − 1) remain.
     """
     if isinstance(actions, Discrete):
         return jnp.log1p(spread * (actions.n - 1))
@@ -106,12 +105,12 @@ def actor_loss(
 def temperature_loss(
     log_temperature: Float[Array, ""], excess: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Falls with the temperature where there is more entropy than wanted, and else rises."""
+    """Lowers the temperature if the entropy exceeds its target, and else raises it."""
     return log_temperature * excess, {"temperature": jnp.exp(log_temperature)}
 
 
 class Policy(NamedTuple):
-    """What acting needs, and the values of numbered actions."""
+    """The actor, and the critics of numbered actions."""
 
     actor: Actor
     critics: Critics | None
@@ -120,8 +119,8 @@ class Policy(NamedTuple):
 class SAC(ActorCritic[Learned]):
     """A stochastic actor, two critics with targets, and a temperature."""
 
-    spread: float = number(0.184)  # target entropy, as share of the actions; Haarnoja's is e⁻¹/2
-    initial_temperature: float = number(1.0)  # at the start
+    spread: float = number(0.184)  # target entropy, as a share of the actions; Haarnoja: e⁻¹/2
+    initial_temperature: float = number(1.0)
 
     def __check_init__(self) -> None:
         require(
@@ -156,7 +155,7 @@ class SAC(ActorCritic[Learned]):
     def action_values(
         self, weights: Policy, observation: PyTree
     ) -> Float[Array, "batch action"] | None:
-        """Q(s, ·) in units of reward, where actions are numbered; it counts later entropy, too."""
+        """Q(s, ·) in units of reward, if actions are numbered; includes later entropy."""
         if weights.critics is None:
             return None
         return weights.critics.every(observation).min(0) / self.reward_scale
@@ -205,9 +204,9 @@ class SAC(ActorCritic[Learned]):
         entropy: Float[Array, " batch"],
         temperature: Float[Array, ""],
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The least and the most that a later step's entropy is worth.
+        """The least and the most value of a later step's entropy.
 
-        The policy may stay as random as it is now, or come to the entropy that is ``wanted``.
+        The policy may keep its current entropy, or reach the one that is ``wanted``.
         """
         most = jnp.maximum(wanted, entropy.mean())
         return temperature * jnp.minimum(wanted, 0.0), temperature * jnp.maximum(most, 0.0)

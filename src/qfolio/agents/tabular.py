@@ -1,16 +1,16 @@
-"""Learning action values in a table, for tasks that show a number: Q-learning and its relatives.
+"""Action values in a table, for tasks whose observation is a number: Q-learning and its relatives.
 
 A step (s, a, r, s') moves one entry of the table towards a target, Q(s, a) ← Q(s, a) + α (r + γ
-v(s') − Q(s, a)); nothing follows where the task ended, and a time limit is no end. The agents
-differ in v(s'), what they think follows:
+v(s') − Q(s, a)), with v(s') = 0 if the task terminated, but not at a time limit. The agents differ
+in v(s'), the estimate of the next state's value:
 
 - Q-learning (Watkins 1989): max_a Q(s', a).
-- SARSA (Rummery & Niranjan 1994): Q(s', a') of the action that is really taken next.
-- Expected SARSA (van Seijen et al. 2009): its mean over the ε-greedy policy.
+- SARSA (Rummery & Niranjan 1994): Q(s', a') of the next action.
+- Expected SARSA (van Seijen et al. 2009): the mean of Q(s', ·) over the ε-greedy policy.
 - Double Q-learning (van Hasselt 2010): two tables; one selects the best action, the other values
-  it, and a coin says which of them learns.
+  it, and a fair coin decides which of them learns.
 
-docs/tabular.md holds every formula and each deviation from the papers.
+docs/tabular.md lists every formula and each deviation from the papers.
 """
 
 from typing import NamedTuple, TypeVar
@@ -30,11 +30,11 @@ Values = Float[Array, "state action"]
 
 
 Tables = Float[Array, "table state action"]
-"""One table, or two for double Q-learning, whose mean acts."""
+"""One table, or two for double Q-learning, which acts on their mean."""
 
 
 class Move(NamedTuple):
-    """A step that is learned from, of each environment; states by number."""
+    """A step of each environment; states are numbers."""
 
     state: Int[Array, " batch"]
     action: Int[Array, " batch"]
@@ -51,10 +51,10 @@ class Move(NamedTuple):
 
 
 class TableState(eqx.Module):
-    """All that a tabular agent learns and remembers."""
+    """The state of a tabular agent."""
 
-    # Value, and number of updates, which the step size follows. They are one array, and learning
-    # reports no errors, because XLA would else copy the tables at every step.
+    # Value and number of updates, which sets the step size. They are one array, and learning
+    # reports no errors, because XLA would otherwise copy the tables at every step.
     cells: Float[Array, "table state action 2"]
     episodes: Int[Array, ""]  # finished; ε follows it
 
@@ -67,14 +67,14 @@ State = TypeVar("State", bound=TableState)
 
 
 class Tabular(Agent):
-    """A table of action values and ε-greedy actions; the agents below say how it learns."""
+    """A table of action values and ε-greedy actions; subclasses define ``learn``."""
 
     num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     discount: float = number(0.99)
     learning_rate: float = number(0.1)  # α
     learning_rate_decay: float = number(0.0)  # d: after n updates of an entry, α/(1 + d n)
-    initial_value: float = number(0.0)  # of every entry; above what can be true: optimism
+    initial_value: float = number(0.0)  # of every entry; above the largest return: optimism
     epsilon_start: float = number(1.0)
     epsilon_end: float = number(0.01)
     epsilon_decay: float = number(0.995)  # factor per finished episode
@@ -97,8 +97,8 @@ class Tabular(Agent):
         if task.states is None or not isinstance(task.actions, Discrete):
             missing = "numbered states" if task.states is None else "numbered actions"
             raise QfolioError(
-                f"A table needs {missing}, and {task.name} has none; take a task that "
-                "has, such as pendulum/grid, or another agent, such as dqn."
+                f"A table needs {missing}, but {task.name} has none; use a task that has, "
+                "such as pendulum/grid, or another agent, such as dqn."
             )
         shape = (self.count, task.states, task.actions.n)
         full = jnp.full(shape, jnp.asarray(self.initial_value, jnp.float32))
@@ -138,7 +138,7 @@ class Tabular(Agent):
         following: Float[Array, " batch"],
         table: Int[Array, " batch"] | int = 0,
     ) -> State:
-        """Takes each move's entry of a table towards r + γ v(s'), with v(s') as ``following``."""
+        """Moves each entry towards r + γ v(s'), with v(s') as ``following``."""
         _, states, actions, _ = state.cells.shape
         entry = (table * states + move.state) * actions + move.action
         cells = state.cells.reshape(-1, 2)
@@ -146,17 +146,17 @@ class Tabular(Agent):
         error = td_target(move.reward, move.terminated, following, self.discount) - value
         rate = self.learning_rate / (1 + self.learning_rate_decay * visits)
         step = jnp.stack([step_share(entry, rate) * error, jnp.ones_like(error)], 1)
-        if len(entry) == 1:  # one more that goes nowhere: XLA scatters two in place, but not one
+        if len(entry) == 1:  # a dummy row: XLA scatters two in place, but not one
             entry, step = jnp.append(entry, len(cells)), jnp.concatenate([step, step])
         cells = cells.at[entry].add(step).reshape(state.cells.shape)
         return eqx.tree_at(lambda s: s.cells, state, cells)
 
 
 def step_share(entry: Int[Array, " batch"], rate: Float[Array, " batch"]) -> Float[Array, " batch"]:
-    """The part of each error that is added to its entry: α, where no other move has that entry.
+    """The share of each error that is added to its entry: α, if no other move has that entry.
 
-    n moves of one entry together go as far as n steps of α towards one target: 1 − (1 − α)ⁿ towards
-    the mean of theirs.
+    n moves of one entry together have the effect of n steps of α towards their mean target:
+    1 − (1 − α)ⁿ.
     """
     if len(entry) == 1:
         return rate
@@ -165,7 +165,7 @@ def step_share(entry: Int[Array, " batch"], rate: Float[Array, " batch"]) -> Flo
 
 
 class QLearning(Tabular):
-    """Q-learning: towards the best action's value, whichever is taken."""
+    """Q-learning: towards the best action's value, whichever action is taken."""
 
     def learn(
         self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
@@ -206,23 +206,23 @@ class DoubleQ(Tabular):
 
 
 class SarsaState(TableState):
-    """What SARSA remembers beside its table."""
+    """A table and the last step."""
 
     last: Move  # it waits for the next action
 
 
 class Sarsa(Tabular):
-    """SARSA: towards the value of the action that is taken next.
+    """SARSA: towards the value of the next action.
 
-    A step is learned from when the next one shows that action. After a truncation none is taken,
-    and one is drawn from the policy.
+    Learning from a step waits until the next one shows that action. After a truncation there is
+    none, and one is drawn from the policy.
     """
 
     def init(self, task: Task, key: PRNGKeyArray) -> SarsaState:
         state = super().init(task, key)
         zeros = jnp.zeros(self.num_envs, jnp.int32)
         never = zeros.astype(bool)
-        # At first none waits: what is learned of a state that does not exist goes nowhere.
+        # No step waits at first: updates of a state that does not exist are dropped.
         nowhere = jnp.full_like(zeros, state.tables.shape[1])
         last = Move(nowhere, zeros, zeros.astype(jnp.float32), zeros, never, never)
         return SarsaState(state.cells, state.episodes, last)

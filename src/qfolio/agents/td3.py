@@ -1,8 +1,8 @@
 """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, algorithm 1).
 
-DDPG with three changes against values that are too high: the Bellman target takes the smaller of
-two critics' estimates; noise on its action smooths the value over similar actions; and the actor
-and all targets wait for several steps of the critics. docs/actor_critic.md lists formulas and
+DDPG with three changes against overestimation: the Bellman target takes the smaller of two critics'
+estimates; noise on its action smooths the value over similar actions; and the actor and all targets
+are updated only once for several steps of the critics. docs/actor_critic.md lists formulas and
 deviations.
 """
 
@@ -25,7 +25,7 @@ class TD3(DDPG):
     target_noise: float = number(0.2)  # of the target's action, in units of the bound
     target_noise_clip: float = number(0.5)  # the largest such noise
     policy_delay: int = static(2)  # critics' steps for one of the actor and the targets
-    pessimistic_actor: bool = static(True)  # climbs the smaller value; false: the first critic's
+    pessimistic_actor: bool = static(True)  # ascends the smaller value; false: the first critic's
 
     critics: ClassVar[int] = 2
 

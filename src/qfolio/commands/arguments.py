@@ -1,4 +1,4 @@
-"""Arguments that several commands take, and how they look in --help."""
+"""Arguments shared by several commands, with their form in --help."""
 
 from pathlib import Path
 from typing import Annotated
@@ -21,16 +21,18 @@ Assignments = Annotated[
 
 
 def budget_of(episodes: int | None, steps: int | None) -> Budget | None:
-    """What ``--episodes`` or ``--steps`` asks for; None where neither is given."""
+    """The budget of ``--episodes`` or ``--steps``; None if neither is given."""
     if episodes is not None and steps is not None:
-        raise QfolioError("--episodes and --steps both say how far to train; give one of them.")
+        raise QfolioError(
+            "--episodes and --steps both set the length of training; give one of them."
+        )
     return None if episodes is None and steps is None else Budget(episodes, steps)
 
 
 def again(command: str, folder: Path, *parts: object) -> str:
-    """The command line that goes on with a folder.
+    """The command line that resumes the work in a folder.
 
-    parts: its tasks and agents; the modules of a user's own must be trusted anew.
+    parts: its tasks and agents; a user's own modules must be trusted again.
     """
     modules = own_modules(*parts)
     return " ".join([command, str(folder), *(["--trust", *modules] if modules else [])])

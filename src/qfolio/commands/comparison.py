@@ -35,21 +35,21 @@ def compare(
 
     Args:
         task: Task to learn (default: pendulum).
-        agents: Agents, separated by commas, each with a preset behind a colon if it is not
-            --preset: dqn,pathwise or dqn:fast,dqn:report. Your own are module:Name or
-            module:Name:PRESET.
-        preset: Preset of agents that name none (default: fast if there is one, else the first).
+        agents: Agents, separated by commas, each with an optional preset after a colon:
+            dqn,pathwise or dqn:fast,dqn:report. Your own are module:Name or module:Name:PRESET.
+        preset: Preset of agents without one of their own (default: fast if there is one, else the
+            first).
         episodes: Training episodes of each seed (default: the presets' numbers).
         steps: Environment steps of each seed, instead of episodes.
         seeds: Number of seeds of each agent (default: 10).
         seed: First seed; the others follow it (default: 0).
         out: New folder for the comparison (default: one in runs/).
-        resume: Folder of a comparison to go on with.
+        resume: Folder of a comparison to resume.
         trust: Modules of your own code that the folder may name (default: none).
     """
     given = (task, agents, preset, episodes, steps, seeds, seed, out)
     if resume is not None and any(option is not None for option in given):
-        raise QfolioError("--resume keeps what the comparison was started with; add nothing.")
+        raise QfolioError("--resume keeps the comparison's settings; add only --trust.")
     budget = budget_of(episodes, steps)
     from qfolio.core import devices
 
@@ -70,8 +70,8 @@ def compare(
             command=shlex.join(["qfolio", *sys.argv[1:]]),
             note=""
             if budget is None
-            else "How long to train was set by hand; learning rates that fall with time, and the "
-            "like, were tuned for the presets' own lengths.",
+            else "The length of training was set by hand; learning-rate schedules and the like "
+            "were tuned for the presets' own lengths.",
             out=out or Path("runs") / name,
         )
     else:
@@ -91,7 +91,7 @@ def compare(
 def _entrants(
     task: str, agents: str, preset: str | None, budget: "Budget | None"
 ) -> "dict[str, Entrant]":
-    """The agents that ``--agents`` names, by what it calls them."""
+    """The agents of ``--agents``, by their names there."""
     from qfolio.core import settings
     from qfolio.experiments import presets
     from qfolio.experiments.comparison.run import Entrant
@@ -121,14 +121,14 @@ def _entrants(
 
 
 def _parts(entry: str) -> tuple[str, str]:
-    """An agent and its preset, "" where it names none: dqn:fast, module:Name:fast."""
+    """An agent and its preset, "" if there is none: dqn:fast, module:Name:fast."""
     parts = entry.split(":")
     count = 1 if registry.is_known("agent", parts[0]) else 2
     return ":".join(parts[:count]), ":".join(parts[count:])
 
 
 def _train(run: "Comparison") -> None:
-    """Trains with a bar, and a line for each agent that is finished."""
+    """Trains with a bar, and a line for each agent that starts."""
     from qfolio.commands import console
     from qfolio.commands.progress import BarProgress
 

@@ -1,4 +1,4 @@
-"""What the commands print: live progress and tables."""
+"""Output of the commands: live progress and tables."""
 
 import contextlib
 import math
@@ -29,15 +29,15 @@ console = Console(highlight=False)
 
 
 def say(text: str) -> None:
-    """Prints lines; characters that the terminal would obey are escaped."""
+    """Prints lines; control characters are escaped."""
     print("\n".join(map(printable, text.split("\n"))), flush=True)
 
 
 @contextlib.contextmanager
 def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., None]]:
-    """A bar with text beside it, on terminals only and gone at the end.
+    """A bar with text beside it, on terminals only, removed at the end.
 
-    Yields what moves it: ``update(completed=…)``, with ``description=…`` where the text changes.
+    Yields the function that moves it: ``update(completed=…)``, with ``description=…`` for new text.
     """
     columns = (
         rich.progress.BarColumn(bar_width=24),
@@ -50,7 +50,7 @@ def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., 
 
 
 def describe_run(run: "Run", budget: "Budget") -> str:
-    """What is trained on what, and how far where that is more than was asked for."""
+    """Agent, task and seeds of a run, and its budget if rounding makes it larger."""
     config, planned = run.config, budget.planned(run.population)
     seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
     return (
@@ -86,13 +86,13 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
         say(f"95 % interval of the mean return over seeds: {number(low)} to {number(high)}")
     else:
         say(
-            f"An interval over seeds takes {FEWEST_SEEDS} seeds or more (--seeds); "
+            f"An interval over seeds needs {FEWEST_SEEDS} seeds or more (--seeds); "
             f"{len(returns)} {'is' if len(returns) == 1 else 'are'} too few."
         )
 
 
 def number(value: float | None) -> str:
-    """One decimal, or four digits that matter where that says too little."""
+    """One decimal, or four significant digits for small numbers."""
     if value is None or math.isnan(value):
         return "–"
     return f"{value:,.1f}" if abs(value) >= 10 or not value else f"{value:#.4g}"
@@ -104,7 +104,7 @@ def _cells(optimum: str, value: float, regret: float, over: float | None) -> tup
 
 
 def print_rule(rule: dict[str, Any]) -> None:
-    """What the learned policies do, beside what is best, from ``Run.grade``."""
+    """The numbers of the learned policies beside the exact ones, from ``Run.grade``."""
     from qfolio.report.rule import rows
 
     table = Table(box=None, header_style="bold", pad_edge=False)
@@ -117,7 +117,7 @@ def print_rule(rule: dict[str, Any]) -> None:
 
 
 def print_findings(findings: "list[Finding]") -> None:
-    """What is wrong with a price table, errors first, then warnings and notes."""
+    """The findings on a price table, errors first, then warnings and notes."""
     severities = ("error", "warning", "note")
     for finding in sorted(findings, key=lambda finding: severities.index(finding.severity)):
         say(f"{finding.severity}: {finding}. {finding.advice}".rstrip())
@@ -128,7 +128,7 @@ def print_findings(findings: "list[Finding]") -> None:
 
 
 def print_prices(facts: dict[str, Any]) -> None:
-    """What a price table holds, from ``prices.describe``."""
+    """The content of a price table, from ``prices.describe``."""
     say(
         f"{printable(facts['source'])}: {facts['rows']:,} rows of {facts['assets']:,} assets, "
         f"{facts['first']} to {facts['last']}, about {facts['periods_per_year']:g} a year."
@@ -151,7 +151,7 @@ def describe_search(work: "Tuning") -> str:
 
 
 def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
-    """The best configuration beside the preset and the optimum, and what the search found."""
+    """The best configuration beside the preset and the optimum, and the search's verdicts."""
     say("")
     for name, row in (("best", "return_per_seed"), ("preset", "preset_return_per_seed")):
         returns = [math.nan if x is None else x for x in summary[row]]
@@ -174,7 +174,7 @@ def describe_backtest(backtest: "Backtest") -> str:
 
 
 def print_assessment(assessment: "Assessment") -> None:
-    """A row for each strategy, and what follows from it in words."""
+    """A row for each strategy, and the verdicts."""
     from qfolio.portfolio.backtest.verdict import verdicts
 
     table = Table(box=None, header_style="bold", pad_edge=False)
@@ -201,7 +201,7 @@ def print_assessment(assessment: "Assessment") -> None:
 
 
 def print_allocation(allocation: "Allocation", standing: "Standing", trained: str) -> None:
-    """Whose trades these are, the trades, and what they cost.
+    """The agent, its trades, and their cost.
 
     trained: the date of the last row that the policy has learned from.
     """
@@ -240,7 +240,7 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
 
 
 def print_ranking(content: dict[str, Any]) -> None:
-    """A row for each agent, best first, and what follows from it in words."""
+    """A row for each agent, best first, and the conclusion."""
     from qfolio.core.statistics import FEWEST_SEEDS
     from qfolio.experiments.comparison.conclusion import amount, share, span
     from qfolio.experiments.comparison.ranking import HEADLINE

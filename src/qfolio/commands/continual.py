@@ -37,7 +37,7 @@ def continual(
     resume: Folder = None,
     trust: Modules = (),
 ) -> None:
-    """Change a task after training and compare ways to go on: how soon each recovers, at what cost.
+    """Change a task after training and compare how soon each way to go on recovers, at what cost.
 
     Args:
         task: Task to learn (default: pendulum).
@@ -47,19 +47,19 @@ def continual(
         episodes: Training episodes before the change, and after it (default: the preset's number).
         seeds: Number of seeds trained side by side (default: the preset's number).
         seed: First seed; the others follow it (default: 0).
-        rate: Share of the first learning rate that an agent goes on with (default: 0.3).
-        renewal: Share of the first training that a renewed agent learns for (default: 0.5).
-        epsilon: Exploration that a renewed agent begins with (default: 0.3).
+        rate: Learning rate after the change, as a share of the initial one (default: 0.3).
+        renewal: Training of a renewed agent, as a share of the first training (default: 0.5).
+        epsilon: Initial exploration of a renewed agent (default: 0.3).
         assignments: Settings of the agent, and of the task before the change.
         out: New folder for the report (default: one in runs/).
-        resume: Folder to go on with; only what was under way when it was stopped is done again.
+        resume: Folder to resume; only the training that was stopped is done again.
         trust: Modules of your own code that the folder may name (default: none).
     """
     given = (task, agent, preset, episodes, seeds, seed, rate, renewal, epsilon, out)
     if resume is not None and (
         change or assignments or any(option is not None for option in given)
     ):
-        raise QfolioError("--resume keeps what was started; add nothing.")
+        raise QfolioError("--resume keeps the experiment's settings; add only --trust.")
     from qfolio.core import devices
 
     devices.configure()
@@ -108,7 +108,9 @@ def _plan(
     registry.find("agent", agent_name)
     preset = presets.preset(preset_name, task_name, agent_name)
     if not change:
-        raise QfolioError("--change says what becomes of the task, for example --change mass=2.")
+        raise QfolioError(
+            "--change is missing: name the task's new numbers, for example --change mass=2."
+        )
     chosen = settings.parse(assignments)
     before = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
     before = {**preset.task, **before}

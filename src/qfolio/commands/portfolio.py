@@ -41,7 +41,7 @@ def prices(
     features: Names = (),
     date: Name = None,
 ) -> None:
-    """Check a price table and report what is wrong with it, by row and column.
+    """Check a price table and report errors, warnings and notes by row and column.
 
     Args:
         file: CSV or Parquet file, wide (a column per asset), long (date, asset, price) or as
@@ -99,25 +99,25 @@ def backtest(
         cost_bps: Cost of buying or selling, in basis points of the value traded.
         lag: Rows between the close that a decision sees and the close at which it trades.
         train: Length of the first training window: 5y, 6m, 8w or 500d (d counts rows).
-        test: Length of a fold, after which agents are trained anew.
-        rolling: Train on a window of fixed length, instead of all rows so far.
+        test: Length of a fold, after which agents are retrained.
+        rolling: Train on a window of fixed length instead of all rows so far.
         cap: Largest weight of one asset, from 0 to 1.
         cost_model: Cost of trading and holding: proportional, or your own as module:Name.
         baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight
             is always among them (default: all of qfolio's).
         seeds: Agents of each kind (default: the preset's number).
-        seed: Seed of the first agent; the others' follow it.
+        seed: First seed; the others follow it.
         episodes: Training episodes of each agent in a fold (default: the preset's number).
-        trials: Earlier trials on these prices, for the deflated Sharpe ratio to count; those made
-            on the default table are counted already.
+        trials: Earlier trials on these prices, for the deflated Sharpe ratio; known trials on the
+            default table are added to them.
         assignments: Hyperparameters of all agents that have them (learning_rate=1e-3) or of one
             (dqn.discount=0.9), or of the task (window=20 reward=crra).
         out: New folder for the backtest (default: one in runs/).
-        resume: Folder of a backtest to go on with.
+        resume: Folder of a backtest to resume.
         trust: Modules of your own code that the folder may name (default: none).
         missing: How to treat missing prices.
-        late: How to treat assets that start later than others.
-        features: Columns that hold features for agents to see, not prices.
+        late: How to treat assets that start later than the table.
+        features: Columns that hold features for agents instead of prices.
         date: Column of dates (default: found by its name).
     """
     options = dict(locals())
@@ -160,7 +160,7 @@ def backtest(
         defaults = inspect.signature(backtest).parameters
         kept = defaults.keys() - {"resume", "trust"}
         if any(options[name] != defaults[name].default for name in kept):
-            raise QfolioError("--resume keeps what the backtest was started with; add nothing.")
+            raise QfolioError("--resume keeps the backtest's settings; add only --trust.")
         run, folder = Backtest.open(resume), resume
     console.say(console.describe_backtest(run))
     with console.bar("compiling") as update:
@@ -187,24 +187,24 @@ def allocate(
     date: Name = None,
     as_json: Annotated[bool, arg(name="json")] = False,
 ) -> None:
-    """Compute tomorrow's target weights, and the trades that lead there.
+    """Compute tomorrow's target weights, and the trades to reach them.
 
-    The verdict of the backtest on the agent is printed, too. Where the first agent did worse than
+    The verdict of the backtest on the agent is printed, too. If the first agent did worse than
     equal weights, nothing is allocated without --agent or --anyway.
 
     Args:
-        folder: Folder of a backtest; its policies were trained on the latest rows, too.
+        folder: Folder of a backtest; its policies are also trained on the latest rows.
         prices: Latest prices, CSV or Parquet, of the assets of the backtest (default: the prices
             of the backtest).
         holdings: Table with a column of assets (asset, symbol, ticker) and one of shares (shares,
             quantity, qty); a row "cash" holds money (default: all is cash).
-        capital: Money in cash, unless the holdings say it.
+        capital: Cash, unless the holdings include it.
         agent: Agent to follow (default: the first of the backtest).
         anyway: Allocate even if the backtest is not finished, or found the agent worse than equal
             weights.
         whole_shares: Trade whole shares only.
-        as_of: Day for which weights are wanted; prices may be up to a week older (default: today).
-        update: Go on learning from the new rows first, and keep what was learned.
+        as_of: Day of the allocation; prices may be up to a week older (default: today).
+        update: Update the policy on the new rows first, and store the updated policy.
         trust: Modules of your own code that the folder may name (default: none).
         missing: How to treat missing prices.
         features: Columns that hold features (default: those of the backtest).
@@ -253,7 +253,7 @@ def allocate(
 
 
 def _split(text: str) -> dict[str, str]:
-    """What an option names with commas between, by what the backtest calls it."""
+    """The names in a comma-separated option, by their short names in the backtest."""
     agents = [name.strip() for name in text.split(",") if name.strip()]
     names = {registry.short(agent): agent for agent in agents}
     if len(names) < len(agents):
@@ -262,7 +262,7 @@ def _split(text: str) -> dict[str, str]:
 
 
 def _known(kind: registry.Kind, name: str) -> str:
-    """The name of a part that a person has typed, whose module may now be imported."""
+    """The name of a part that a user has typed; imports its module."""
     registry.find(kind, name)
     return name
 
@@ -276,8 +276,8 @@ def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
 
 
 def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
-    """Presets with settings changed: of one agent (dqn.discount), of all that have it, or the
-    task's."""
+    """Presets with changed settings: of one agent (dqn.discount), of all that have it, or of the
+    task."""
     from qfolio.portfolio.task import Portfolio
 
     used = set()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class RunProgress(Listener):
     """A line for each point of a run's learning curve, and a bar between them.
 
-    optimum: on the curve's start states, None where it is not known. show: called with the run at
+    optimum: on the curve's start states, None if it is unknown. show: called with the run at
     each point of the curve.
     """
 
@@ -66,7 +66,7 @@ class RunProgress(Listener):
 
 
 class BarProgress(Listener):
-    """Moves a bar that ``console.bar`` has made; name: of what is under way."""
+    """Moves a bar of ``console.bar``; name: of the training."""
 
     def __init__(self, update: Callable[..., None], name: str) -> None:
         self.update, self.name = update, name
@@ -81,20 +81,20 @@ class BarProgress(Listener):
 
 
 class BacktestProgress:
-    """A bar over all jobs of a backtest, or a line for each tenth where there is no terminal.
+    """A bar over all jobs of a backtest, or a line for each tenth without a terminal.
 
-    Called before each job, it makes the listener to that job's training.
+    Called before each job, it returns the listener of that job's training.
     """
 
     def __init__(self, update: Callable[..., None]) -> None:
         self.update, self.begun, self.said = update, perf_counter(), ""
 
     def __call__(self, job: "Job", done: float, share: float) -> list[Listener]:
-        """done, share: of all jobs, those that are done, and one of them."""
+        """done, share: the finished share of all jobs, and the share of this job."""
         return [_JobProgress(self, job.name.partition("/")[0], done, share)]
 
     def note(self, agent: str, done: float, known: bool) -> None:
-        """known: whether the agent learns by now, so that its speed says when it will be done."""
+        """known: whether learning has begun, so that its speed predicts the time left."""
         spent = perf_counter() - self.begun
         left = time_left(spent * (1 / done - 1) if known and done else math.nan)
         description = f"{agent}  {left} left"
@@ -141,11 +141,11 @@ class SearchProgress:
 
 
 def time_left(seconds: float) -> str:
-    """As hours, minutes and seconds; a dash where it is not known."""
+    """The time as hours, minutes and seconds; a dash if it is unknown."""
     return "–" if math.isnan(seconds) else str(datetime.timedelta(seconds=round(seconds)))
 
 
 def stop(command: str) -> NoReturn:
-    """Says how to go on after Ctrl-C, and exits with the code that a shell expects."""
-    say(f"Stopped. Go on with: {command}")
+    """Prints how to resume after Ctrl-C, and exits with the conventional code."""
+    say(f"Stopped. Resume with: {command}")
     raise SystemExit(EXIT_CODE)

@@ -65,7 +65,7 @@ def train(
         out: New folder for the run (default: one in runs/).
         assignments: Settings of agent and task, for example --set discount=0.98 hidden=256,256; a
             report and docs/dqn.md list them.
-        resume: Folder of a run to go on with, up to --episodes or --steps if given.
+        resume: Folder of a run to resume, up to --episodes or --steps if given.
         trust: Modules of your own code that the folder may name (default: none).
         compare: Train two more agents with one thing changed, for the report (DQN: double DQN; in
             markets: one action at a time instead of all at once).
@@ -93,9 +93,7 @@ def train(
             chosen = settings.parse(assignments)
             run = _new_run(task, agent, preset, budget, seeds, seed or 0, folder, chosen)
         elif assignments or any(x is not None for x in (task, agent, preset, seeds, seed, out)):
-            raise QfolioError(
-                "--resume keeps what the run was started with; add only --episodes or --steps."
-            )
+            raise QfolioError("--resume keeps the run's settings; add only --episodes or --steps.")
         else:
             run, folder = Run.open(resume), resume
         budget = budget or run.budget
@@ -123,7 +121,7 @@ def evaluate(
     Args:
         folder: Folder of a run.
         episodes: Number of start states, the same for every run and agent (default: 1,024, or 100
-            where Gymnasium steps the environment).
+            for environments of Gymnasium).
         trust: Modules of your own code that the folder may name (default: none).
         as_json: Print JSON instead of a table.
     """
@@ -150,7 +148,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
     """Show a run's first agent in a window; without a display, write episode.gif.
 
     Args:
-        folder: A run folder.
+        folder: Folder of a run.
         episodes: Episodes to show in the window.
         trust: Modules of your own code that the folder may name (default: none).
     """
@@ -170,7 +168,9 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
 
     run = Run.open(folder)
     if not isinstance(run.task, Pendulum):
-        raise QfolioError(f"{folder} is a run on {run.config.task}; only a pendulum can be seen.")
+        raise QfolioError(
+            f"{folder} is a run on {run.config.task}; only the pendulum can be shown."
+        )
     if has_display():
         window = Window(f"qfolio: {folder}")
         for number in range(episodes):
@@ -214,21 +214,21 @@ def _new_run(
 
 
 def _train(run: "Run", budget: "Budget", show: Callable[["Run"], None] | None = None) -> None:
-    """Trains with live progress, beside the optimum."""
+    """Trains with live progress and the optimum."""
     from qfolio.commands import console
     from qfolio.commands.progress import RunProgress
     from qfolio.core.evaluation import start_keys
 
     solution, optimum = run.task.optimum(), None
     if solution is not None:
-        with console.console.status("Solving for the exact optimum (once; then it is on disk)"):
+        with console.console.status("Solving for the exact optimum (once; then it is cached)"):
             on_curve = solution.returns(start_keys())[: run.population.curve_starts]
             optimum = float(on_curve.mean())
     run.train(budget, [RunProgress(run, optimum, show)])
 
 
 def _contrast(run: "Run", folder: Path) -> "Run | None":
-    """The same training with the one thing changed that the report contrasts; resumable too."""
+    """The training of the report's variant, with one setting changed; resumable, too."""
     from qfolio.commands.console import say
     from qfolio.experiments.run import Run
     from qfolio.report.contrast import contrast_of
@@ -282,7 +282,7 @@ def _resume(run: "Run", folder: Path | None) -> str:
 
 
 def _command(run: "Run") -> str:
-    """The command line that repeats a run, and the one that goes on with it."""
+    """The command line that repeats a run, and the one that resumes it."""
     from qfolio.experiments.presets import preset, presets_of
 
     config = run.config
@@ -308,7 +308,7 @@ def _command(run: "Run") -> str:
 
 @contextlib.contextmanager
 def _window(live: bool) -> Iterator[Callable[["Run"], None] | None]:
-    """What ``--live`` shows: the first agent's episode in a window, at each point of the curve."""
+    """The window of ``--live``, with the first agent's episode at each point of the curve."""
     from qfolio.commands.window import Window, has_display
 
     if not live:

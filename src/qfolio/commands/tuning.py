@@ -40,7 +40,7 @@ def tune(
     Args:
         task: Task to learn, any that qfolio train knows (default: pendulum).
         agent: Algorithm, or your own as module:Name (default: the first with presets for the task).
-        preset: Preset that the search starts from; it also sets what is not searched
+        preset: Preset to start from; it also sets the settings that are not searched
             (default: fast).
         trials: Configurations to try in all (default: 64).
         seeds: Seeds to train each configuration with (default: 2).

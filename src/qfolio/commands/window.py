@@ -12,16 +12,16 @@ from qfolio.core.errors import QfolioError
 def has_display() -> bool:
     """Whether a window can be opened here."""
     if os.environ.get("SDL_VIDEODRIVER") == "dummy":
-        return True  # a window that nobody sees, asked for by name
+        return True  # an invisible window, requested explicitly
     if sys.platform in ("win32", "darwin"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 class Window:
-    """Shows pendulum episodes in real time; closing it ends nothing but the show.
+    """Shows pendulum episodes in real time; closing it does not stop the training.
 
-    Raises QfolioError where Gymnasium or pygame is not installed or no window can be opened.
+    Raises QfolioError if Gymnasium or pygame is not installed or no window can be opened.
     """
 
     def __init__(self, caption: str = "qfolio") -> None:
@@ -42,7 +42,7 @@ class Window:
             raise QfolioError(f"No window can be opened here ({error}).") from None
         driver = pygame.display.get_driver()
         if driver in ("dummy", "offscreen") and os.environ.get("SDL_VIDEODRIVER") != driver:
-            # SDL falls back to these where the display does not answer.
+            # SDL falls back to these if the display does not answer.
             display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
             raise QfolioError(f"No window can be opened on display {display}; unset it for a GIF.")
         self.caption(caption)
@@ -52,13 +52,13 @@ class Window:
             self._pygame.display.set_caption(text)
 
     def show(self, states: np.ndarray, torques: np.ndarray) -> bool:
-        """One episode: states (time + 1, 2), torques (time,); False once the window was closed."""
+        """Shows an episode: states (time + 1, 2), torques (time,); False once it is closed."""
         pendulum = self._env.unwrapped
         for state, torque in zip(states[1:], torques, strict=True):
             if not self._open:
                 return False
             pendulum.state, pendulum.last_u = np.asarray(state, float), float(torque)
-            pendulum.render()  # keeps to the task's 20 frames a second
+            pendulum.render()  # limited to the task's 20 frames a second
             self._open = not self._pygame.event.peek(self._pygame.QUIT)
         return self._open
 

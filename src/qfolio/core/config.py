@@ -1,4 +1,4 @@
-"""The settings in a folder, as types: written as JSON, and checked when they are read."""
+"""Typed configuration of a folder: written as JSON and validated when read."""
 
 import re
 from pathlib import Path
@@ -12,20 +12,21 @@ from qfolio.core.version import __version__
 
 
 class Config(msgspec.Struct, kw_only=True, frozen=True):
-    """What a folder is configured with; each kind of folder has a subclass.
+    """The configuration of a folder; each kind of folder has a subclass.
 
-    Annotated fields say what a file must hold: ``seeds: Annotated[int, msgspec.Meta(ge=1)]``. What
-    types cannot say is checked in ``__post_init__``, which raises ValueError or QfolioError.
+    Annotated fields constrain values: ``seeds: Annotated[int, msgspec.Meta(ge=1)]``. Constraints
+    that types cannot express are checked in ``__post_init__``, which raises ValueError or
+    QfolioError.
     """
 
     kind: ClassVar[str]
-    """What the folder is, as messages call it: "backtest"."""
+    """Name of this kind of folder in messages, such as "backtest"."""
 
     format: ClassVar[int]
     """Raised whenever an older folder can no longer be read."""
 
     version: str = __version__
-    """Of the qfolio that wrote it."""
+    """Version of qfolio that wrote the file."""
 
 
 C = TypeVar("C", bound=Config)
@@ -40,8 +41,8 @@ def write_config(path: Path, config: Config) -> None:
 def read_config(path: Path, kind: type[C]) -> C:
     """The settings in a file.
 
-    Raises QfolioError where the file is missing, belongs to a folder of another kind, was written
-    in another format, or holds values that do not fit.
+    Raises QfolioError if the file is missing, belongs to a folder of another kind, was written in
+    another format, or holds invalid values.
     """
     if not path.is_file():
         raise QfolioError(f"{path.parent} is no {kind.kind}: it has no {path.name}.")
@@ -52,13 +53,13 @@ def read_config(path: Path, kind: type[C]) -> C:
     if found != kind.kind or content.pop("format", None) != kind.format:
         raise QfolioError(
             f"{path.parent} was written by qfolio {content.get('version', '(unknown version)')} in "
-            f"another format; this is {__version__}: use that version, or start anew."
+            f"another format; this is {__version__}: use that version, or start over."
         )
     try:
         return msgspec.convert(content, kind)
     except (msgspec.ValidationError, QfolioError) as error:
         reason = _readable(str(error)).rstrip(".")
-        raise QfolioError(f"{path} is damaged ({reason}); restore it, or start anew.") from None
+        raise QfolioError(f"{path} is damaged ({reason}); restore it, or start over.") from None
 
 
 def _readable(message: str) -> str:

@@ -1,10 +1,10 @@
-"""How jax is set up, and how the members of a population share the processor.
+"""JAX setup, and the placement of a population's members on devices.
 
 A population is a pytree whose leaves have a leading member axis: one member for each seed (or
-configuration). Devices share the members. On a GPU a device steps its members in lockstep (vmap).
-On a CPU each core is a device of its own, and takes its members one after the other: one agent's
-weights then stay in its cache, its matrix products keep their shape, and a member's arithmetic does
-not depend on how many others there are, to the last bit.
+configuration), spread over the devices. A GPU steps its members in lockstep (vmap). On a CPU each
+core is a separate device and runs its members one after another: an agent's weights stay in cache,
+its matrix products keep their shape, and its arithmetic does not depend on the number of members,
+to the last bit.
 """
 
 import datetime
@@ -32,7 +32,7 @@ LOCKSTEP = {"gpu", "tpu"}
 def configure() -> None:
     """Makes each CPU core a device and keeps compiled programs on disk.
 
-    Takes effect if called before jax first computes; whatever the user has set himself stays.
+    Takes effect if called before jax first computes; settings made by the user are kept.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     wanted = {
@@ -54,9 +54,9 @@ def describe() -> str:
 
 
 def circumstances(*programs: str) -> dict[str, Any]:
-    """When and on what something begins, as its file on disk tells.
+    """Device, versions and start time of a run, for its record on disk.
 
-    programs: Python, or libraries, whose versions it tells, too.
+    programs: libraries, or "python", whose versions are included.
     """
     versions = {name: python_version() if name == "python" else version(name) for name in programs}
     return {
@@ -67,7 +67,7 @@ def circumstances(*programs: str) -> dict[str, Any]:
 
 
 def require_memory(tree: Any, count: int) -> None:
-    """Raises QfolioError where ``count`` members shaped like ``tree`` cannot fit, before trying."""
+    """Raises QfolioError if ``count`` members shaped like ``tree`` exceed the memory."""
     needed = count * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
     stats = jax.devices()[0].memory_stats()
     if stats:
@@ -78,7 +78,7 @@ def require_memory(tree: Any, count: int) -> None:
         return
     if needed > there:
         raise QfolioError(
-            f"These settings need {needed / 2**30:,.1f} GiB of memory and there are "
+            f"These settings need {needed / 2**30:,.1f} GiB of memory, but there are only "
             f"{there / 2**30:,.1f}; lower hidden, replay_capacity or the number of seeds."
         )
 
@@ -86,17 +86,17 @@ def require_memory(tree: Any, count: int) -> None:
 class Members:
     """``count`` members spread over the devices, each in a slot of its device.
 
-    one_by_one: whether members of a device take turns; else they advance in lockstep.
+    one_by_one: whether a device runs its members in turn instead of in lockstep.
 
-    Outside, leaves have a leading axis of ``count``; on the devices, one of slots. ``place`` and
-    ``fetch`` go from the one to the other.
+    Outside, leaves have a leading axis of length ``count``; on the devices, an axis of slots.
+    ``place`` and ``fetch`` convert between the two.
     """
 
     def __init__(self, count: int) -> None:
         devices = jax.devices()[: min(len(jax.devices()), count)]
         self.one_by_one = devices[0].platform not in LOCKSTEP
-        # Two slots or more where members take turns: XLA drops an axis of one and then rounds
-        # differently. There, a slot without a member costs memory, but no time.
+        # At least two slots if members take turns: XLA drops an axis of length one and then rounds
+        # differently. An empty slot costs memory, but no time.
         slots = max(2 if self.one_by_one else 1, -(-count // len(devices)))
         shares = np.array_split(np.arange(count), len(devices))
         self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
@@ -119,10 +119,10 @@ class Members:
     def compile(
         self, function: Callable[..., Any], *example: Any, split: int = 1, donate: bool = False
     ) -> Any:
-        """``function(*members, *shared)`` as a program over all members' slots.
+        """Compiles ``function(*members, *shared)`` for all members.
 
-        example: arguments shaped like those to come; the first ``split`` of them have an axis of
-        slots, the others go to each member as they are. donate: the first one's memory is reused.
+        example: arguments of the shapes to compile for; the first ``split`` of them have an axis of
+        slots, the others are the same for all members. donate: reuse the first one's memory.
         """
 
         def on_device(taken: Array, *args: Any) -> Any:

@@ -1,4 +1,4 @@
-"""How good a policy is: greedy returns from fixed starts, and how far its values overestimate."""
+"""Evaluation: greedy returns from fixed start states, and the overestimation of action values."""
 
 import math
 from typing import NamedTuple
@@ -11,14 +11,14 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 from qfolio.core.mdp import Agent, Policy, Task
 
 STARTS = 1024
-"""Start states that results are graded on; those along the learning curve are the first of them."""
+"""Start states of a final evaluation; those of the learning curve are the first of them."""
 
 CURVE_STARTS = 64
 """Start states of the evaluations along the learning curve."""
 
 
 def start_keys(n: int = STARTS) -> Key[Array, " start"]:
-    """Keys of the fixed start states; the first of many are the same as few."""
+    """Keys of the fixed start states; a smaller set is a prefix of a larger one."""
     return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(20151), i))(jnp.arange(n))
 
 
@@ -26,7 +26,7 @@ class Greedy(NamedTuple):
     """Greedy episodes from some starts."""
 
     returns: Float[Array, " start"]  # undiscounted, over the task's horizon
-    overestimation: Float[Array, ""]  # NaN without action values, or where what follows is unknown
+    overestimation: Float[Array, ""]  # NaN without action values, or if the tail is unknown
 
 
 def tail_steps(discount: float | None) -> int:
@@ -41,10 +41,10 @@ def evaluate(
 ) -> Greedy:
     """Follows the greedy policy from each key's start state over the horizon and ``tail`` steps.
 
-    The return counts the horizon. The overestimation is the mean over the states visited in it of
-    max_a Q(s, a) less the discounted return that really followed (van Hasselt et al. 2016,
-    section 3); the tail is there so that what follows is not cut off. Starts after which the task
-    itself ends within the tail, such as the last rows of a price table, do not count for it.
+    The return covers the horizon. The overestimation is the mean, over the states visited within
+    it, of max_a Q(s, a) minus the realised discounted return (van Hasselt et al. 2016, section 3);
+    the tail keeps that return from being cut off. Starts from which the task itself ends within
+    the tail, such as the last rows of a price table, are left out of it.
     """
     starts = jax.vmap(task.reset)(keys)
     known = jax.vmap(task.steps_left)(starts) >= task.horizon + tail
@@ -78,7 +78,7 @@ def evaluate(
 
 
 def greedy(task: Task, agent: Agent, weights: PyTree) -> Policy:
-    """What an agent's greedy policy intends in a state."""
+    """An agent's greedy policy: from a state to the intended action."""
 
     def policy(state: PyTree) -> Array:
         view = jax.tree.map(lambda x: x[None], task.observe(state))

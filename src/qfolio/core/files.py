@@ -21,7 +21,7 @@ from safetensors.numpy import load, save
 from qfolio.core.errors import QfolioError
 
 UNFINISHED = ".part"
-"""Ending of files that a killed process may have left."""
+"""Suffix of temporary files; a killed process may leave some."""
 
 
 def cache_directory() -> Path:
@@ -49,16 +49,16 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def require_new(folder: Path) -> None:
-    """Raises QfolioError where ``folder`` already holds something."""
+    """Raises QfolioError if ``folder`` is not empty."""
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise QfolioError(
-            f"{folder} is not empty; name a new folder, or go on with --resume {folder}."
+            f"{folder} is not empty; name a new folder, or continue with --resume {folder}."
         )
 
 
 @contextlib.contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """Another name to fill the folder under; at the end it is renamed, so it is whole or absent."""
+    """A temporary folder that is renamed to ``folder`` at the end: it is complete or absent."""
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -66,7 +66,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
         yield temporary
         mask = os.umask(0)
         os.umask(mask)
-        temporary.chmod(0o777 & ~mask)  # as the user's new folders are
+        temporary.chmod(0o777 & ~mask)  # mkdtemp ignores the user's umask
         if folder.exists():
             folder.rmdir()
         temporary.rename(folder)
@@ -79,9 +79,9 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keeps every other process out of a folder, until the block ends or this process does.
+    """Locks a folder against other processes until the block or this process ends.
 
-    Raises QfolioError where another process holds the folder, and says which.
+    Raises QfolioError, which names the other process, if the folder is already locked.
     """
     holder = folder / ".holder"
     lock = FileLock(folder / ".lock", timeout=0)
@@ -97,7 +97,7 @@ def locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         holder.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # Windows keeps open files
+        with contextlib.suppress(OSError):  # Windows cannot delete open files
             (folder / ".lock").unlink(missing_ok=True)
         lock.release()
 
@@ -106,7 +106,7 @@ def _holder(path: Path) -> str:
     try:
         held = read_json(path)
         return f"process {held['pid']} on {held['host']} since {held['since']}"
-    except (QfolioError, KeyError):  # between taking the lock and signing it
+    except (QfolioError, KeyError):  # locked, but not signed yet
         return "another process"
 
 
@@ -115,29 +115,29 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Raises QfolioError where the file is missing or holds no JSON object."""
+    """Raises QfolioError if the file is missing or holds no JSON object."""
     try:
         content = json.loads(path.read_text())
     except OSError as error:
         raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
     except (ValueError, RecursionError) as error:
-        raise QfolioError(f"{path} is damaged, it holds no valid JSON ({error}).") from None
+        raise QfolioError(f"{path} is damaged: it holds no valid JSON ({error}).") from None
     if not isinstance(content, dict):
-        raise QfolioError(f"{path} is damaged, it holds no JSON object.")
+        raise QfolioError(f"{path} is damaged: it holds no JSON object.")
     return content
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Named arrays as safetensors, which hold numbers only and cannot carry code.
+    """Writes named arrays as safetensors, which cannot carry code.
 
-    A digest goes with them, so that flipped bits are noticed when they are read.
+    A digest is stored with them, so that reading detects flipped bits.
     """
     ordered = {name: np.asarray(a, order="C") for name, a in arrays.items()}
     write_bytes(path, save(ordered, metadata={"sha256": _digest(ordered)}))
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Raises QfolioError where the file is missing, truncated, changed or not safetensors."""
+    """Raises QfolioError if the file is missing, truncated, changed or not safetensors."""
     try:
         content = path.read_bytes()
         arrays = load(content)
@@ -147,17 +147,17 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
     except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise QfolioError(
-            f"{path} is no safetensors file or is damaged ({error}); restore it or train anew."
+            f"{path} is damaged or not a safetensors file ({error}); restore it or train again."
         ) from None
     if digest != _digest(arrays):
         raise QfolioError(
-            f"{path} is damaged: its numbers do not match its digest; restore it or train anew."
+            f"{path} is damaged: its numbers do not match its digest; restore it or train again."
         )
     return arrays
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    """Of names, types, shapes and every bit of arrays."""
+    """SHA-256 of the arrays' names, types, shapes and bytes."""
     sha = hashlib.sha256()
     for name in sorted(arrays):
         array = arrays[name]
@@ -167,12 +167,12 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def write_tree(path: Path, tree: Any) -> None:
-    """The arrays of a pytree, by the names of their places in it."""
+    """Writes the arrays of a pytree, named by their paths in it."""
     write_arrays(path, _named(tree))
 
 
 def read_tree(path: Path, template: Any) -> Any:
-    """``template`` with its arrays from a file, which must fit it name by name."""
+    """``template`` with its arrays from a file; QfolioError if names, shapes or types differ."""
     import jax
 
     arrays, wanted = read_arrays(path), _named(template)
@@ -183,7 +183,7 @@ def read_tree(path: Path, template: Any) -> Any:
     if not fits:
         raise QfolioError(
             f"{path} does not belong to the settings beside it; "
-            "restore the two together, or train anew."
+            "restore the two together, or train again."
         )
     return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])
 

@@ -1,9 +1,8 @@
-"""The training loop for environments that cannot be compiled: the twin of ``training.py``.
+"""The training loop for environments that cannot be compiled: the counterpart of ``training.py``.
 
-The agents are the same, and so is what is compiled of them: one program takes the rollout that has
-just come to its end, learns from it and answers with the next actions. Python steps the
-environments of Gymnasium in between. Members take turns: while their programs compute, on as many
-cores as there are, the environments of another are stepped.
+The agents are the same. One compiled program takes the finished rollout, learns from it and returns
+the next actions; Python steps the environments of Gymnasium in between. Members take turns: while
+their programs run on all cores, the environments of another member are stepped.
 """
 
 import abc
@@ -17,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from qfolio.core.errors import QfolioError, told
+from qfolio.core.errors import QfolioError, one_line
 from qfolio.core.evaluation import Greedy
 from qfolio.core.mdp import Agent, Task, Transition
 from qfolio.core.population import Population, programs_of
@@ -35,10 +34,10 @@ from qfolio.core.training import (
 T = TypeVar("T")
 
 CHUNK = 200
-"""Steps between two returns to the caller, at least (whole rollouts)."""
+"""Least number of steps in a chunk (rounded up to whole rollouts)."""
 
 LANES = 10
-"""Environments that are stepped side by side when a member is graded."""
+"""Environments that are stepped side by side when a member is evaluated."""
 
 
 @runtime_checkable
@@ -46,11 +45,11 @@ class Facts(Protocol):
     """How observations and actions are translated between an environment and agents."""
 
     def given(self, actions: np.ndarray) -> list[Any]:
-        """A batch of agents' actions, each as the environment takes it."""
+        """A batch of agents' actions in the environment's format."""
         ...
 
     def seen(self, observation: Any) -> Any:
-        """An environment's observation as agents get it."""
+        """An environment's observation in the agents' format."""
         ...
 
 
@@ -73,7 +72,7 @@ class HostTask(Task):
 
 
 class Outcome(NamedTuple):
-    """What a step of some environments led to; ``observation`` is from before any reset."""
+    """The result of stepping environments; ``observation`` is from before any reset."""
 
     reward: Float[np.ndarray, " environment"]
     observation: np.ndarray  # (environment, ...)
@@ -82,11 +81,11 @@ class Outcome(NamedTuple):
 
 
 class Environments:
-    """Environments of one task in a row, stepped one after the other.
+    """Environments of one task, stepped one after another.
 
-    limit: steps after which their episodes are truncated. observation: what is seen now. Raises
-    QfolioError, which names environment and step, where an environment fails or does not keep to
-    its observation space.
+    limit: steps after which their episodes are truncated. observation: the current ones. Raises
+    QfolioError, which names environment and step, if an environment fails or violates its
+    observation space.
     """
 
     def __init__(self, task: HostTask, limit: int, count: int) -> None:
@@ -98,7 +97,7 @@ class Environments:
         self._steps = np.zeros(count, np.int32)
 
     def reset(self, index: int, seed: int | None = None) -> None:
-        """Starts an episode in one place."""
+        """Starts an episode in one environment."""
         self._steps[index] = 0
         try:
             observation, _ = self._environments[index].reset(seed=seed)
@@ -109,7 +108,7 @@ class Environments:
             raise self._failure(index, "its observation is not finite")
 
     def step(self, actions: np.ndarray, which: Iterable[int] | None = None) -> Outcome:
-        """One step of all, or only of those in some places; resets none."""
+        """Steps all environments, or those in ``which``; resets none."""
         count = len(self._steppers)
         reward = np.zeros(count, np.float32)
         terminated, truncated = np.zeros(count, bool), np.zeros(count, bool)
@@ -128,14 +127,14 @@ class Environments:
         return Outcome(reward, after, terminated, truncated)
 
     def restart(self, finished: Bool[np.ndarray, " environment"]) -> None:
-        """Starts an episode where one is over; what was observed before stays as it is."""
+        """Resets the finished environments; arrays returned before stay unchanged."""
         if finished.any():
             self.observation = self.observation.copy()
             for i in np.flatnonzero(finished).tolist():
                 self.reset(i)
 
     def _seen(self, observation: Any) -> Any:
-        """An observation as agents get it; numpy alone would stretch one of another shape."""
+        """The agents' observation; numpy would broadcast a wrong shape without this check."""
         seen, wanted = self._facts.seen(observation), self.observation.shape[1:]
         if np.shape(seen) != wanted:
             raise QfolioError(
@@ -144,7 +143,7 @@ class Environments:
         return seen
 
     def _require_finite(self, after: np.ndarray, reward: np.ndarray) -> None:
-        """Raises QfolioError where an environment made a number that is not finite."""
+        """Raises QfolioError if an environment returned a number that is not finite."""
         if np.isfinite(after).all() and np.isfinite(reward).all():
             return
         for i in range(len(reward)):
@@ -156,7 +155,7 @@ class Environments:
         if isinstance(reason, QfolioError):
             reason = str(reason)
         elif isinstance(reason, Exception):
-            reason = told(reason)
+            reason = one_line(reason)
         step = int(self._steps[index])
         where = f"at step {step} of an episode" if step else "at the start of an episode"
         return QfolioError(f"{self._name} failed {where}: {reason}.")
@@ -165,7 +164,7 @@ class Environments:
 class HostPopulation(Population):
     """A population whose task is stepped from Python.
 
-    Restored, it goes on with what its agents know, in environments that start new episodes.
+    After ``restore`` agents keep what they learned, but environments start new episodes.
     """
 
     starts, curve_starts = 100, 10
@@ -201,9 +200,9 @@ class HostPopulation(Population):
         return records
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
-        """Greedy returns (member, start) from environments that the keys seed.
+        """Greedy returns (member, start) from environments seeded by the keys.
 
-        The overestimation is not told: what would have followed a time limit cannot be seen.
+        The overestimation is NaN: rewards after a time limit are not observed.
         """
         if not self._judges:
             limit = self.task.horizon
@@ -223,11 +222,11 @@ class HostPopulation(Population):
         return environments
 
     def _play(self, member: int, steps: int, learning: bool) -> Generator[None, None, Episodes]:
-        """Some steps of a member; yields whenever it has something to compute."""
+        """Plays some steps of a member; yields while its programs compute."""
         length, name = self.agent.rollout_steps, "learn" if learning else "collect"
         environments, own = self._environments[member], self._own[member]
         state = self._states[member]
-        # At each step jax takes apart what it gets: a list of arrays is quicker than modules.
+        # jax flattens its arguments at each call: a list of arrays is faster than modules.
         carry, form = jax.tree.flatten((state, self._blank(state)))
 
         def act(task: Task, agent: Agent, carry: PyTree, seen: Array, time: Array) -> Array:
@@ -255,7 +254,7 @@ class HostPopulation(Population):
                 seen = environments.observation
                 if time < length:
                     actions = self._start("act", act, carry, own, seen, np.int32(time))
-            before, action, *outcomes = map(_in_time, zip(*rollout, strict=True))
+            before, action, *outcomes = map(_stack_rows, zip(*rollout, strict=True))
             reward, after, terminated, truncated = outcomes
             transition = Transition((), before, action, reward, (), after, terminated, truncated)
             inputs = transition, seen, np.int32(row)
@@ -293,7 +292,7 @@ class HostPopulation(Population):
         return returns
 
     def _blank(self, state: TrainingState) -> Episodes:
-        """Records of a chunk in which no episode has ended yet."""
+        """Empty records of a chunk."""
         shape = (self._rows, self.agent.num_envs)
         monitored = jax.eval_shape(self.agent.monitor, state.agent)
         zeros: Any = np.zeros(shape, np.float32)
@@ -309,7 +308,7 @@ class HostPopulation(Population):
 
 
 def population_of(task: Task, agents: Agent | Sequence[Agent], seeds: Sequence[int]) -> Population:
-    """Members of a task, compiled or stepped from Python as the task needs it."""
+    """A population on a task, compiled or stepped from Python as the task requires."""
     kind = HostPopulation if isinstance(task, HostTask) else Population
     return kind(task, agents, seeds)
 
@@ -318,13 +317,13 @@ def _stack(members: Sequence[PyTree]) -> PyTree:
     return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *members)
 
 
-def _in_time(rows: Sequence[np.ndarray]) -> Any:
-    """What came step by step, with a leading axis of time."""
+def _stack_rows(rows: Sequence[np.ndarray]) -> Any:
+    """Stacks the arrays of steps along a leading time axis."""
     return np.stack(rows) if len(rows) > 1 else rows[0][None]
 
 
 def _take_turns(players: Sequence[Generator[None, None, T]]) -> list[T]:
-    """Lets each go on until it yields, in turn, until all have returned."""
+    """Resumes the players in turn until all have returned."""
     results: dict[int, T] = {}
     while len(results) < len(players):
         for i, player in enumerate(players):

@@ -1,4 +1,4 @@
-"""The vocabulary of markets: what an agent may see of one, and how it numbers its choices."""
+"""Types for markets: an agent's observation, and the numbering of its discrete actions."""
 
 from typing import NamedTuple
 
@@ -9,16 +9,16 @@ from qfolio.core.mdp import Discrete
 
 
 class View(NamedTuple):
-    """What an agent may see of a market: what is known of each asset, and what it holds."""
+    """An observation of a market: the features of each asset and the weights held."""
 
     features: Float[Array, "*batch asset time channel"]
     holding: Float[Array, "*batch asset"]  # weights, without cash
 
 
 class MenuActions(Discrete):
-    """Numbered choices, of which the first ``pooled`` concern the whole market.
+    """Numbered actions; the first ``pooled`` concern the whole market.
 
-    The others come in ``each`` blocks of one choice per asset.
+    The others come in ``each`` blocks of one action per asset.
     """
 
     pooled: int = eqx.field(static=True, kw_only=True)

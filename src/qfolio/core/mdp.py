@@ -1,7 +1,7 @@
-"""The vocabulary: what a task is, what an agent is, and what passes between them.
+"""The interfaces of tasks and agents, and the data that passes between them.
 
 Everything here is a pytree, and every method a pure function of pytrees, so that ``jit``, ``vmap``
-and ``scan`` apply without ceremony. Agents never import tasks and tasks never import agents: both
+and ``scan`` apply directly. Agents never import tasks and tasks never import agents: both
 know only this file.
 """
 
@@ -24,7 +24,7 @@ class Discrete(eqx.Module):
 
 
 class Simplex(eqx.Module):
-    """Weights of cash (first) and ``assets`` assets: none negative, their sum 1.
+    """Weights of cash (first) and ``assets`` assets: non-negative, summing to 1.
 
     cap: the largest weight of one asset; cash has none.
     """
@@ -32,7 +32,7 @@ class Simplex(eqx.Module):
     assets: int = eqx.field(static=True)
     cap: float = eqx.field(static=True, default=1.0)
 
-    unit = 1.0  # what noise and critics measure an action by
+    unit = 1.0  # the scale of actions for noise and critics
 
     @property
     def caps(self) -> np.ndarray:
@@ -41,14 +41,14 @@ class Simplex(eqx.Module):
 
 
 class Box(eqx.Module):
-    """``n`` numbers from −``bound`` to ``bound``; a task takes what lies beyond for the bound."""
+    """``n`` numbers from −``bound`` to ``bound``; tasks clip actions to this range."""
 
     n: int = eqx.field(static=True)
     bound: float = eqx.field(static=True, default=math.inf)
 
     @property
     def unit(self) -> float:
-        """What noise and critics measure an action by: its bound, or 1."""
+        """The scale of actions for noise and critics: the bound, or 1 if there is none."""
         return self.bound if math.isfinite(self.bound) else 1.0
 
 
@@ -56,7 +56,7 @@ Actions = Discrete | Simplex | Box
 
 
 class Step(NamedTuple):
-    """What one action leads to: ``terminated`` is true where the task itself ended."""
+    """The result of one action; ``terminated`` is true if the task itself ended."""
 
     state: PyTree
     reward: Float[Array, ""]
@@ -64,12 +64,12 @@ class Step(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """One step as an agent remembers it; a rollout has leading axes (time, environment).
+    """One step as agents store it; a rollout has leading axes (time, environment).
 
     ``next_observation`` is the true one, from before any reset. ``terminated`` (nothing follows)
     and ``truncated`` (the clock ran out) stay apart, because the value of what follows a truncation
-    is not zero (Pardo et al. 2018, "Time limits in reinforcement learning"). The task's own states
-    are there for agents that know the task; the others look at observations only.
+    is not zero (Pardo et al. 2018, "Time limits in reinforcement learning"). The task's states are
+    for agents that know the task; the others use observations only.
     """
 
     state: PyTree
@@ -84,21 +84,21 @@ class Transition(NamedTuple):
 
 @runtime_checkable
 class Optimum(Protocol):
-    """The exact answer of a task, computed without learning."""
+    """The exact solution of a task, computed without learning."""
 
     def returns(self, keys: Key[Array, " start"]) -> np.ndarray:
-        """Undiscounted returns of the optimal policy, one for each start that a key draws."""
+        """Undiscounted returns of the optimal policy, one for each key's start state."""
         ...
 
 
 Policy = Callable[[PyTree], Array]
-"""From a state of a task to what its policy intends."""
+"""From a task's state to the intended action."""
 
 
 class Task(eqx.Module):
     """A Markov decision process with a time limit; no method resets the task by itself."""
 
-    if TYPE_CHECKING:  # a setting or a property of each task; to a checker, no argument of Task
+    if TYPE_CHECKING:  # each task has them; for type checkers, Task takes no arguments
 
         @property
         def horizon(self) -> int: ...
@@ -111,7 +111,7 @@ class Task(eqx.Module):
 
     @property
     def name(self) -> str:
-        """What messages call the task."""
+        """The name of the task in messages."""
         return type(self).__name__
 
     @abc.abstractmethod
@@ -120,11 +120,11 @@ class Task(eqx.Module):
 
     @abc.abstractmethod
     def observe(self, state: PyTree) -> PyTree:
-        """What the agent may see of a state; nothing later than now."""
+        """The agent's observation of a state, without knowledge of the future."""
 
     @property
     def states(self) -> int | None:
-        """How many observations there are where they are numbers from 0 on; else None."""
+        """The number of observations if they are integers from 0; else None."""
         return None
 
     @property
@@ -141,52 +141,52 @@ class Task(eqx.Module):
         return None
 
     def steps_left(self, state: PyTree) -> Int[Array, ""]:
-        """How many steps can follow a state, which may be more than a time limit leaves."""
+        """How many steps can follow a state, regardless of the time limit."""
         return jnp.array(jnp.iinfo(jnp.int32).max)
 
     def intent(self, state: PyTree, action: Array) -> Array:
-        """What an action asks for, where it is a number from a menu; else the action itself."""
+        """The meaning of a numbered menu action; other actions are returned unchanged."""
         return action
 
     def rule(self, policy: Policy) -> Mapping[str, float | None]:
-        """The few numbers that say what a policy does, in tasks where there are such.
+        """The few numbers that describe a policy, in tasks that define some.
 
-        None where a policy has no such number, such as an edge that it never trades to.
+        None if a policy has no such number, such as an edge that it never trades to.
         """
         return {}
 
 
 class Position(NamedTuple):
-    """The state of an exogenous task: the part that actions leave alone, and the part they make."""
+    """The state of an exogenous task: actions affect the holding, but not the market."""
 
     market: PyTree
     holding: PyTree
 
 
 class ExogenousTask(Task):
-    """A task whose randomness does not answer to actions, such as prices that we only take.
+    """A task whose randomness does not depend on actions, such as prices for a price taker.
 
-    One observed move of the market then tells the outcome of every action from every holding, by
+    One observed move of the market then gives the outcome of every action from every holding, by
     ``settle`` (hindsight learning for exogenous inputs, Sinclair et al. 2023). Agents may use it on
-    moves that they have seen; ``reset_market`` and ``next_market`` are the loop's alone.
+    moves that they have seen; only the training loop calls ``reset_market`` and ``next_market``.
     """
 
     @property
     def path_dependent(self) -> bool:
-        """Whether a reward depends on earlier ones, so that a holding needs a past."""
+        """Whether a reward depends on earlier ones, so that a holding includes a history."""
         return False
 
     @abc.abstractmethod
     def reset_market(self, key: PRNGKeyArray) -> PyTree:
-        """A market to start from."""
+        """A start state of the market."""
 
     @abc.abstractmethod
     def next_market(self, market: PyTree, key: PRNGKeyArray) -> PyTree:
-        """Where the market goes, whatever we do."""
+        """The next state of the market."""
 
     @abc.abstractmethod
     def draw_holding(self, key: PRNGKeyArray) -> PyTree:
-        """A random holding; learning from many shows an agent what to do from any."""
+        """A random holding, so that an agent learns to act from any."""
 
     @abc.abstractmethod
     def settle(
@@ -211,7 +211,7 @@ Metrics = dict[str, Array]
 class Agent(eqx.Module):
     """An algorithm: hyperparameters are its fields, everything it learns lives in its state."""
 
-    if TYPE_CHECKING:  # a setting or a property of each agent; to a checker, no argument of Agent
+    if TYPE_CHECKING:  # each agent has them; for type checkers, Agent takes no arguments
 
         @property
         def num_envs(self) -> int:
@@ -223,7 +223,7 @@ class Agent(eqx.Module):
 
         @property
         def discount(self) -> float | None:
-            """Of the action values; None where the agent estimates none."""
+            """Discount of the action values; None if the agent estimates none."""
     else:
         num_envs: eqx.AbstractVar[int]
         episode_steps: eqx.AbstractVar[int]
@@ -254,10 +254,10 @@ class Agent(eqx.Module):
     def learn(
         self, task: Task, state: Any, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[Any, Metrics]:
-        """Stores experience and learns from it; only exogenous tasks may be asked what would be."""
+        """Stores experience and learns from it; only exogenous tasks may be queried."""
 
     def monitor(self, state: Any) -> Metrics:
-        """Named scalars that describe the state at any time, before learning too."""
+        """Named scalars that describe the state at any time, also before learning."""
         return {}
 
     @abc.abstractmethod
@@ -265,9 +265,9 @@ class Agent(eqx.Module):
         """The part of the state that the learned policy needs."""
 
     def carry_over(self, state: Any, fresh: Any) -> Any:
-        """The state to go on learning with on other data: what was learned, not what was stored.
+        """The state to continue learning on other data: learned weights, but no stored experience.
 
-        fresh: a state before any experience, of the same settings.
+        fresh: a state before any experience, with the same settings.
         """
         return state
 

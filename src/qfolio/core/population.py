@@ -20,9 +20,9 @@ from qfolio.core.training import Episodes, TrainingState, advance, begin, chunk_
 class Population:
     """Members trained side by side, and the programs that do it.
 
-    tasks, agents: one for all members, or one for each, which may differ in numbers and arrays.
+    tasks, agents: one for all members, or one for each, differing in numbers and arrays only.
     state: the members' TrainingState, with a leading member axis.
-    starts, curve_starts: on how many starts policies are graded, and along the learning curve.
+    starts, curve_starts: how many starts a final evaluation and the learning curve use.
     """
 
     starts, curve_starts = STARTS, CURVE_STARTS
@@ -36,9 +36,9 @@ class Population:
         if len({jax.tree.structure(agent) for agent in agents}) > 1:
             raise QfolioError(
                 "members of one population must share all settings that shape the program; train "
-                "agents that differ in them in populations of their own."
+                "agents that differ in them in separate populations."
             )
-        # What is asked of the first holds for all: it does not depend on numbers.
+        # Only properties that all members share are read from the first.
         self.task, self.agent = task, agent = tasks[0], agents[0]
         self._tail = max(tail_steps(agent.discount) for agent in agents)
         self.seconds_compile = 0.0
@@ -48,10 +48,10 @@ class Population:
         self._begin(own, form)
 
     def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
-        """Members before their first step; ``own`` and ``form`` are those of ``_split``."""
+        """Sets up the members before their first step; ``own`` and ``form`` are from ``_split``."""
         self._members = Members(len(self.seeds))
         self._own = self._members.place(own)
-        # Nothing else may change what is compiled under a name.
+        # The key holds everything that a compiled program depends on.
         rows = chunk_steps(self.task, self.agent)
         self._programs = programs_of((form, len(self.seeds), self._members.one_by_one, rows))
         seeds = self._members.place(np.array(self.seeds, np.uint32))
@@ -80,9 +80,9 @@ class Population:
         return self._fetch(lambda state: state.healthy).tolist()
 
     def steps_left(self, episodes: int | None = None, *, steps: int | None = None) -> int:
-        """Steps of each environment until each member has done what is given; 0 if done.
+        """Steps of each environment until each member has used its budget; 0 if it has.
 
-        episodes: finished by each member, if none ends early. steps: of all its environments.
+        episodes: per member, if none ends early. steps: per member, over all its environments.
         """
         if steps is not None:
             return max(0, -(-steps // self.agent.num_envs) - self.steps)
@@ -94,10 +94,10 @@ class Population:
         return max(1, rounds * episode_steps(self.task, self.agent) - under_way)
 
     def advance(self, steps: int, *, strict: bool = True) -> Episodes:
-        """At most one chunk; returns the records as numpy arrays (member, time, environment).
+        """Advances at most one chunk; returns records as numpy arrays (member, time, environment).
 
         Raises QfolioError, and leaves ``state`` undefined, if a loss is not finite; unless
-        ``strict``, the others go on, and ``healthy`` tells.
+        ``strict``, the others continue, and ``healthy`` shows which failed.
         """
         steps, learning = self._plan(steps, chunk_steps(self.task, self.agent))
 
@@ -114,11 +114,11 @@ class Population:
 
     @property
     def learning(self) -> bool:
-        """Whether the next steps learn; the first ones only fill the memory."""
+        """Whether the next steps learn; the warm-up only stores experience."""
         return self._plan(1, 1)[1]
 
     def _plan(self, steps: int, most: int) -> tuple[int, bool]:
-        """How many steps to go now, in whole rollouts, and whether they learn."""
+        """How many steps to take now, in whole rollouts, and whether they learn."""
         length = self.agent.rollout_steps
         warm_up = -(-self.agent.warm_up() // length) * length - self.steps
         steps = min(steps, most, warm_up if warm_up > 0 else most)
@@ -135,9 +135,9 @@ class Population:
             )
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
-        """Greedy returns (member, start) and overestimation (member,) of the policies so far.
+        """Greedy returns (member, start) and overestimation (member,) of the current policies.
 
-        tail: steps beyond the horizon that the overestimation counts; those that matter if None.
+        tail: steps beyond the horizon for the overestimation (default: ``tail_steps``).
         """
         tail = self._tail if tail is None else tail
 
@@ -157,7 +157,7 @@ class Population:
         return self._fetch(lambda state: state)
 
     def restore(self, state: TrainingState) -> None:
-        """Goes on from what ``fetch`` gave."""
+        """Restores the states that ``fetch`` returned."""
         self.state = self._members.place(state)
 
     def _fetch(self, where: Callable[[TrainingState], PyTree]) -> PyTree:
@@ -185,7 +185,7 @@ class Population:
         *args: Any,
         donate: bool = False,
     ) -> Any:
-        """The same without waiting for the result; compiled at the first use of the name.
+        """``_run`` without waiting for the result; compiles at the first use of the name.
 
         own: the numbers of the member's agent and task.
         """
@@ -201,24 +201,24 @@ class Population:
         return self._programs[name](*args)
 
     def _compile(self, one: Callable[..., Any], *args: Any, donate: bool) -> Any:
-        """A program from arguments shaped like these; the first one's memory may be reused."""
+        """Compiles for arguments shaped like these; ``donate`` reuses the first one's memory."""
         return self._members.compile(one, *args, split=2, donate=donate)
 
 
 @lru_cache(maxsize=8)
 def programs_of(form: Hashable) -> dict[str, Any]:
-    """Compiled programs by name, for all populations of one form: compiling takes long."""
+    """Compiled programs by name, shared by all populations of one form."""
     return {}
 
 
 def _split(
     members: Sequence[PyTree],
 ) -> tuple[list[np.ndarray], list[Array], Callable[[Any, Any], PyTree], Hashable]:
-    """Parts the members' numbers and arrays into each one's own and those that all share.
+    """Splits the members' numbers and arrays into own and shared ones.
 
-    Numbers are each one's own, so that one program serves them all; an array is shared if it is
-    the same object in all. Returns the own with a leading member axis, the shared, a function that
-    puts one member together again, and what a program for them depends on.
+    Numbers are own, so that one program serves all members; an array is shared if it is the same
+    object in all. Returns the own ones with a leading member axis, the shared ones, a function that
+    rebuilds one member, and a key of everything that a program for them depends on.
     """
     columns = list(zip(*(jax.tree.leaves(member) for member in members), strict=True))
     structure = jax.tree.structure(members[0])

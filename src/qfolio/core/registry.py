@@ -1,10 +1,10 @@
-"""What qfolio knows by name: its own classes, those of installed packages, and a user's own.
+"""Classes by name: qfolio's own, those of installed packages, and a user's own.
 
 A user's own class is named ``module:Name``; the module may lie in the current directory. An
 installed package offers its classes as entry points in the groups ``qfolio.tasks``,
-``qfolio.agents``, ``qfolio.baselines``, ``qfolio.rewards`` and ``qfolio.costs``. What a person
-types is imported (``find``). A folder keeps the names, too, but a file may come from a stranger:
-only modules that have been imported already count there (``imported``, ``build``).
+``qfolio.agents``, ``qfolio.baselines``, ``qfolio.rewards`` and ``qfolio.costs``. Names that a user
+types are imported (``find``). Names in a folder may come from someone else: they must be in modules
+that have already been imported (``imported``, ``build``).
 """
 
 import difflib
@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
 from qfolio.core import settings
-from qfolio.core.errors import QfolioError, told
+from qfolio.core.errors import QfolioError, one_line
 
 TASKS = {
     "pendulum": "qfolio.tasks.pendulum:Pendulum",
@@ -92,7 +92,7 @@ ENTRIES: dict[Kind, Entries] = {
 }
 
 GYM = "gym:"
-"""What begins the name of a task that is an environment of Gymnasium; its ID follows."""
+"""Prefix of tasks that are environments of Gymnasium; the environment's ID follows."""
 
 _GYMNASIUM = "qfolio.tasks.gymnasium:GymnasiumTask"
 
@@ -103,9 +103,9 @@ def is_known(kind: Kind, name: str) -> bool:
 
 
 def find(kind: Kind, name: str) -> type[Any]:
-    """The class that a person names; imports its module, from the current directory, too.
+    """The class that a user names; imports its module, also from the current directory.
 
-    Raises QfolioError where there is none, or where it is not of that kind.
+    Raises QfolioError if there is none, or if it is not of that kind.
     """
     where = _where(kind, name)
     module, _, attribute = (where or name).partition(":")
@@ -129,7 +129,7 @@ def find(kind: Kind, name: str) -> type[Any]:
 def imported(kind: Kind, name: str) -> type[Any]:
     """The class that a folder or a setting names.
 
-    Raises QfolioError where finding it would run code that nobody but a file has named.
+    Raises QfolioError if importing it would run code that only a file has named.
     """
     if _where(kind, name) is None:
         _require_imported(kind, name, name.rpartition(":")[0])
@@ -137,7 +137,7 @@ def imported(kind: Kind, name: str) -> type[Any]:
 
 
 def build(kind: Kind, name: str, chosen: Mapping[str, Any]) -> Any:
-    """The object that a folder names, with its settings; ``imported`` says which are refused."""
+    """The object that a folder names, with its settings; refuses what ``imported`` refuses."""
     found = imported(kind, name)
     if _where(kind, name) == _GYMNASIUM:
         _require_imported(kind, name, str(chosen.get("id", "")).rpartition(":")[0])
@@ -160,12 +160,12 @@ def name_of(instance: object) -> str:
 
 
 def short(name: str) -> str:
-    """What to call it in a table or a folder's name: ``Name`` of ``module:Name``."""
+    """A short name for tables and folders: ``Name`` of ``module:Name``."""
     return name if name.startswith(GYM) else name.rpartition(":")[2]
 
 
 def own_modules(*instances: object) -> list[str]:
-    """The modules that ``build`` needs somebody to trust, to make these again."""
+    """The modules that must be trusted for ``build`` to make these again."""
     names = [name_of(instance).removeprefix(GYM) for instance in instances]
     modules = [name.rpartition(":")[0] for name in names]
     return sorted({name for name in modules if name and not name.startswith("qfolio.")})
@@ -178,7 +178,7 @@ def trust(modules: Iterable[str]) -> None:
 
 
 def import_own(module: str) -> ModuleType:
-    """Imports a module that a person has named, from the current directory, too."""
+    """Imports a module that a user has named, also from the current directory."""
     if not _exists(module):
         raise QfolioError(
             f"{module} cannot be imported: it is neither installed nor in this folder."
@@ -186,11 +186,11 @@ def import_own(module: str) -> ModuleType:
     try:
         return import_module(module)
     except Exception as error:
-        raise QfolioError(f"{module} cannot be imported: {told(error)}.") from error
+        raise QfolioError(f"{module} cannot be imported: {one_line(error)}.") from error
 
 
 def _where(kind: Kind, name: str) -> str | None:
-    """Where a name is defined that qfolio or an installed package has."""
+    """Where qfolio or an installed package defines a name; None if neither does."""
     if kind == "task" and name.startswith(GYM):
         return _GYMNASIUM
     entries = ENTRIES[kind]
@@ -214,7 +214,7 @@ def _unknown(kind: Kind, name: str) -> QfolioError:
         hint = f"a module {first} is neither installed nor in this folder."
     else:
         gym = ", any environment of Gymnasium, such as gym:CartPole-v1," if kind == "task" else ""
-        hint = f"there is {', '.join(table)}{gym} and your own as module:Name."
+        hint = f"choose from {', '.join(table)}{gym} or your own as module:Name."
     return QfolioError(f"there is no {kind} {name!r}; {hint}")
 
 
@@ -222,10 +222,10 @@ def _exists(module: str) -> bool:
     """Whether there is such a module, installed or in the current directory."""
     here = os.getcwd()
     if here not in sys.path and "" not in sys.path:
-        sys.path.append(here)  # last, so that a file here stands in for no library
+        sys.path.append(here)  # last, so that a file here cannot shadow a library
     try:
         return module in sys.modules or find_spec(module) is not None
     except ModuleNotFoundError:
         return False
-    except Exception:  # of a package around it, which importing will show
+    except Exception:  # raised by a parent package; importing will report it
         return True

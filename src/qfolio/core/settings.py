@@ -26,7 +26,7 @@ def names(kind: type) -> set[str]:
 
 
 def _types(kind: type) -> dict[str, Any]:
-    """Types of the settings; fields that hold arrays are none."""
+    """Types of the settings; fields that hold arrays are not settings."""
     hints = typing.get_type_hints(kind)
     kinds = (bool, int, float, str, tuple[int, ...])
     return {f.name: hints[f.name] for f in dataclasses.fields(kind) if hints[f.name] in kinds}
@@ -59,7 +59,7 @@ def parse(assignments: Iterable[str]) -> dict[str, str]:
         name, equals, value = assignment.partition("=")
         if not (name.strip() and equals and value.strip()):
             raise QfolioError(
-                f"--set takes name=value, for example discount=0.99; {assignment!r} is not."
+                f"--set takes name=value, for example discount=0.99; not {assignment!r}."
             )
         pairs[name.strip().replace("-", "_")] = value.strip()
     return pairs
@@ -88,7 +88,7 @@ def _convert(name: str, kind: Any, value: Any) -> Any:
         return tuple(_convert(name, int, item) for item in value)
     except (ValueError, TypeError, KeyError, OverflowError, QfolioError):
         examples = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-        wanted = examples.get(kind, "whole numbers with commas between, for example 256,256")
+        wanted = examples.get(kind, "whole numbers separated by commas, for example 256,256")
         raise QfolioError(
             f"{name} is {json.dumps(value, default=str)}; it must be {wanted}."
         ) from None

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 def project(
     scores: Float[Array, "*batch entry"], cap: Float[Array, " entry"] | float = 1.0
 ) -> Float[Array, "*batch entry"]:
-    """The nearest weights to ``scores``: none negative or above ``cap``, their sum 1.
+    """The weights nearest to ``scores``: between 0 and ``cap``, summing to 1.
 
     They are clip(scores − τ, 0, cap) for the one τ that makes the sum 1 (Duchi et al. 2008; with a
-    cap: Wang & Lu 2015). Scores on the simplex come back as they are, and small ones become exactly
+    cap: Wang & Lu 2015). Scores on the simplex are returned as they are; small ones become exactly
     zero. The sum falls piecewise linearly in τ, and its kinks are at the scores and at the scores
     less their caps; between the two kinks around τ it is known which entries lie strictly between
     their bounds, and the value and its gradient follow from these. The caps must add up to 1 or
@@ -24,7 +24,7 @@ def project(
     cap = jnp.broadcast_to(jnp.asarray(cap, scores.dtype), scores.shape)
     fixed = lax.stop_gradient(scores)
     kinks = jnp.concatenate([fixed, fixed - cap], -1)
-    # All pairs in one pass: a loop over halvings or a sort takes longer for so few entries.
+    # All pairs at once: bisection or sorting takes longer for so few entries.
     above = fixed[..., None, :] - kinks[..., :, None]
     sums = jnp.clip(above, 0, cap[..., None, :]).sum(-1)
     low = jnp.where(sums >= 1, kinks, -jnp.inf).max(-1, keepdims=True)
@@ -39,7 +39,7 @@ def project(
 
 
 def grid(entries: int, parts: int) -> np.ndarray:
-    """All weights that are multiples of 1/parts, shape (points, entries), the last rising fastest.
+    """All weights that are multiples of 1/parts, shape (points, entries), the last varying fastest.
 
     With two entries, cash and one asset, the asset's weights are 0, 1/parts, …, 1.
     """

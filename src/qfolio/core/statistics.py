@@ -3,9 +3,8 @@
 They follow R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
 Precipice" (2021): the interquartile mean ignores the best and the worst quarter of the runs,
 resampling whole runs shows how much a result depends on which seeds happened to be drawn, and the
-probability of improvement says how often a run of one agent beats a run of another. Whether two
-agents can be told apart at all is left to an exact rank test, as a bootstrap of few runs claims
-more than it knows.
+probability of improvement is how often a run of one agent beats a run of another. An exact rank
+test decides whether two agents differ, because bootstrap intervals of few runs are too narrow.
 """
 
 import math
@@ -88,9 +87,10 @@ def bootstrap_interval(
 
 
 def band(values: ArrayLike) -> tuple[Floats, Floats]:
-    """Return what is drawn around the interquartile mean over seeds, as lower and upper ends.
+    """Return the lower and upper ends of the band around the interquartile mean over seeds.
 
-    It is the 95 % bootstrap interval, or with fewer than FEWEST_SEEDS seeds their range.
+    The band is the 95 % bootstrap interval, or the seeds' range if there are fewer than
+    FEWEST_SEEDS.
 
     Args:
         values: Numbers of shape (..., n), one column per seed.
@@ -124,7 +124,7 @@ def stratified_interval(
     resamples: int = 2000,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """Return a percentile bootstrap interval of a statistic of groups, each drawn again by itself.
+    """Return a percentile bootstrap interval of a statistic of groups, each resampled separately.
 
     It is too narrow with few values: of three normal ones, a 95 % interval of the interquartile
     mean holds the truth in about 75 % of all cases, of five in 90 % and of ten in 93 %.
@@ -173,11 +173,11 @@ def probability_of_improvement(first: ArrayLike, second: ArrayLike) -> Floats:
 
 
 def rank_test(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the two-sided p-value of the test of Wilcoxon, Mann and Whitney, exact with ties.
+    """Return the two-sided p-value of the Wilcoxon-Mann-Whitney test, exact with ties.
 
-    If both groups come from one distribution, each choice of n of all n + m values is as likely to
-    be the first group; the p-value is the share of the choices whose ranks have a sum as far from
-    the middle as that observed. Beyond 100 values the sum is taken as normal.
+    If both groups come from one distribution, each choice of n of all n + m values is equally
+    likely to be the first group; the p-value is the share of choices whose rank sum is at least as
+    far from the middle as the observed one. Above 100 values the rank sum is taken as normal.
 
     Args:
         first: Numbers of shape (n,).
@@ -203,7 +203,7 @@ def rank_test(first: ArrayLike, second: ArrayLike) -> float:
 
 
 def holm(p_values: ArrayLike) -> Floats:
-    """Return the p-values of tests made together, so that none errs more often than one would.
+    """Return p-values adjusted for multiple tests; they control the family-wise error rate.
 
     Source: S. Holm, "A Simple Sequentially Rejective Multiple Test Procedure" (1979).
     """

@@ -5,8 +5,8 @@ import unicodedata
 from typing import Any
 
 UNSAFE = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
-"""Unicode categories that a terminal may obey instead of showing: control, format (which turns the
-direction of text), unassigned, private, surrogates, line and paragraph separators."""
+"""Unicode categories that a terminal may obey instead of showing: control, format (which may
+reverse text), unassigned, private, surrogates, line and paragraph separators."""
 
 _FORMULA = re.compile(r"(^|[;\t\r\n])([^\S\t\r\n]*[=+\-@＝＋－＠])")
 

@@ -19,11 +19,11 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 from qfolio.core.mdp import Agent, Metrics, Task, Transition
 
 CHUNK = 400
-"""Steps between two returns to Python, at least (whole episodes)."""
+"""Least number of steps in a chunk (rounded up to whole episodes)."""
 
 
 class Tally(NamedTuple):
-    """What has been counted since each environment's episode began."""
+    """Running totals of each environment's current episode."""
 
     steps: Int[Array, " environment"]
     learned: Int[Array, " environment"]  # of these, the steps that learned
@@ -32,7 +32,7 @@ class Tally(NamedTuple):
 
 
 class TrainingState(eqx.Module):
-    """One member's whole training: saved and loaded, it goes on bit for bit."""
+    """One member's complete training state: saved and loaded, training continues bit for bit."""
 
     agent: PyTree
     task: PyTree  # (environment, ...)
@@ -44,7 +44,7 @@ class TrainingState(eqx.Module):
 
 
 class Episodes(NamedTuple):
-    """A record for each step and environment; the values count where ``finished``."""
+    """A record for each step and environment; the values are valid where ``finished``."""
 
     finished: Bool[Array, "time environment"]
     returns: Float[Array, "time environment"]
@@ -70,7 +70,7 @@ def begin(task: Task, agent: Agent, seed: UInt32[Array, ""]) -> TrainingState:
     )
 
     def learned(state: TrainingState) -> Metrics:
-        """The metrics of a rollout of blanks, of which only the names count."""
+        """The metrics of a blank rollout; only their names are used."""
         observation = jax.vmap(task.observe)(state.task)
         action = agent.act(state.agent, observation, task_key)
         no = jnp.zeros(environments, bool)
@@ -113,7 +113,7 @@ def healthy(agent: Agent, state: TrainingState) -> Bool[Array, ""]:
 
 
 def chunk_steps(task: Task, agent: Agent) -> int:
-    """Steps in a chunk: whole rollouts, and whole episodes of those that do not end early."""
+    """Steps in a chunk: whole rollouts and whole episodes of full length."""
     length = math.lcm(episode_steps(task, agent), agent.rollout_steps)
     return length * -(-CHUNK // length)
 
@@ -170,7 +170,7 @@ def step_keys(key: UInt32[Array, "2"], time: Array) -> Key[Array, "4"]:
 def absorb(
     task: Task, agent: Agent, state: TrainingState, rollout: Transition, *, learning: bool
 ) -> tuple[TrainingState, Episodes, Metrics]:
-    """Learns from a rollout, or only stores it, and counts it."""
+    """Learns from a rollout, or only stores it, and updates the counts."""
     if learning:
         last = state.steps + agent.rollout_steps - 1
         learner, metrics = agent.learn(task, state.agent, rollout, step_keys(state.key, last)[3])
@@ -204,7 +204,7 @@ def absorb(
 
 
 def _scan(function: Callable[..., Any], carry: Any, xs: Any) -> tuple[Any, Any]:
-    """``lax.scan``; a single step stands in line, without a loop."""
+    """``lax.scan``, without a loop for a single step."""
     if jax.tree.leaves(xs)[0].shape[0] > 1:
         return lax.scan(function, carry, xs)
     carry, y = function(carry, jax.tree.map(lambda x: x[0], xs))

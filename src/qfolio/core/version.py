@@ -1,3 +1,3 @@
-"""The version, below everything that records it."""
+"""The version of qfolio."""
 
 __version__ = "0.1.0"

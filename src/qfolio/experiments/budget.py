@@ -1,4 +1,4 @@
-"""How far agents are trained, and from which seeds."""
+"""Training budgets and seeds."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Budget:
-    """How far each member is trained: a number of episodes, or of steps of all its environments.
+    """The training of each member: a number of episodes, or of steps of all its environments.
 
     Raises QfolioError unless exactly one of the two is given, from 1 to 2³¹ − 1.
     """
@@ -21,19 +21,17 @@ class Budget:
 
     def __post_init__(self) -> None:
         if (self.episodes is None) == (self.steps is None):
-            raise QfolioError(
-                "give either episodes or steps, to say how far each agent is trained."
-            )
+            raise QfolioError("give either episodes or steps, the length of each agent's training.")
         _require(self.unit, self.amount, 1, 2**31 - 1)
 
     @property
     def unit(self) -> str:
-        """What is counted: "episodes" or "steps"."""
+        """The unit: "episodes" or "steps"."""
         return "episodes" if self.steps is None else "steps"
 
     @property
     def amount(self) -> int:
-        """How many of them."""
+        """The number of units."""
         amount = self.episodes if self.steps is None else self.steps
         assert amount is not None
         return amount
@@ -43,18 +41,18 @@ class Budget:
         return {self.unit: self.amount}
 
     def planned(self, population: "Population") -> int:
-        """Steps of all environments of a member in the end: whole rollouts, so perhaps more."""
+        """Final steps of all environments of a member, rounded up to whole rollouts."""
         length = population.agent.rollout_steps
         left = -(-self.left(population) // length) * length
         return (population.steps + left) * population.agent.num_envs
 
     def left(self, population: "Population") -> int:
-        """Steps of each environment until every member of a population has done its budget."""
+        """Steps of each environment until every member of a population has used its budget."""
         return population.steps_left(self.episodes, steps=self.steps)
 
 
 def seed_range(seeds: int, seed: int) -> range:
-    """``seeds`` seeds from ``seed`` on; raises QfolioError where they do not fit in 32 bits."""
+    """``seeds`` seeds from ``seed``; raises QfolioError if they do not fit in 32 bits."""
     _require("seeds", seeds, 1, 2**20)
     _require("seed", seed, 0, 2**32 - seeds)
     return range(seed, seed + seeds)

@@ -1,13 +1,13 @@
-"""Continual learning: the world changes after training, and what an agent can do about it.
+"""Continual learning: adaptation to a world that changes after training.
 
-A task's numbers (the mass of a pendulum) change when training is over. Four ways to go on are
-compared in the changed world, against its own exact optimum: the policy as it is; learning on from
-the same memory; renewed learning, which keeps what was learned, forgets what was stored and starts
-its schedules again; and a fresh agent. What each has forgotten is measured in the old world.
+A task's numbers (such as the mass of a pendulum) change when training is over. Four ways to go on
+are compared in the changed world, against its own exact optimum: the policy as it is; continued
+learning with the same replay buffer; renewed learning, which keeps the weights, empties the buffer
+and restarts the schedules; and a fresh agent. Forgetting is measured in the old world.
 
 The folder holds continual.json (settings, written at the start; the first training and each way,
-added as soon as it is finished), learned.safetensors (what the first training left, until every way
-has gone on from it) and, at the end, the report.
+added when finished), learned.safetensors (the state after the first training, until every way is
+finished) and, at the end, the report.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ from qfolio.learning.optimizer import Optimizer
 FILE, LEARNED = "continual.json", "learned.safetensors"
 
 POINTS = 24
-"""Of a learning curve after the change, about; renewed learning has as many on its shorter way."""
+"""Approximate number of points on a learning curve after the change, also of the renewed agent."""
 
 WITHIN = 0.1
 """A seed has recovered when its regret in the changed world stays below."""
@@ -47,11 +47,11 @@ WITHIN = 0.1
 
 @dataclass(frozen=True)
 class Plan:
-    """What happens: ``agent`` learns ``task`` for some episodes, which then becomes ``changed``.
+    """The experiment: ``agent`` learns ``task``, which then becomes ``changed``.
 
-    rate: share of its initial learning rate that an agent goes on with. renewal: share of its first
-    training that a renewed agent learns for. epsilon: how much that one explores at first, where it
-    does so by chance.
+    rate: share of the initial learning rate with which an agent goes on. renewal: length of a
+    renewed agent's training, as a share of the first. epsilon: the renewed agent's initial
+    exploration, if it explores ε-greedily.
     """
 
     task: Task
@@ -68,18 +68,20 @@ class Plan:
         _ = Budget(self.episodes), seed_range(self.seeds, self.seed)
         for name in ("rate", "renewal", "epsilon"):
             if not 0 < getattr(self, name) <= 1:
-                raise QfolioError(f"{name} is {getattr(self, name)}; it must be from 0 to 1.")
+                raise QfolioError(
+                    f"{name} is {getattr(self, name)}; it must be above 0 and at most 1."
+                )
         if jax.tree.structure(self.task) != jax.tree.structure(self.changed):  # type: ignore[operator]
             raise QfolioError(
-                "only numbers of a task may change while it is learned, as its program stays; "
-                f"of {type(self.task).__name__} these are {', '.join(_numbers(self.task))}."
+                "only numbers of a task may change, because its compiled program stays the same; "
+                f"those of {type(self.task).__name__} are {', '.join(_numbers(self.task))}."
             )
         if not self.changes:
             raise QfolioError("nothing changes; name one of the task's numbers, as in mass=2.")
         if any(task.optimum() is None for task in (self.task, self.changed)):
             raise QfolioError(
-                f"recovery is measured against an exact optimum, and {type(self.task).__name__} "
-                "has none; take the pendulum."
+                f"recovery is measured against an exact optimum, but {type(self.task).__name__} "
+                "has none; use the pendulum."
             )
 
     @property
@@ -90,12 +92,12 @@ class Plan:
 
     @property
     def going_on(self) -> Agent:
-        """The agent, whose learning rate does not fall below ``rate``."""
+        """The agent, with a learning rate that does not fall below ``rate``."""
         return self._set(learning_rate_final=max(self.rate, _setting(self.agent, "final")))
 
     @property
     def renewed(self) -> Agent:
-        """The agent, whose schedules take a part of their time, and that explores less."""
+        """The agent, with shorter schedules and less exploration."""
         steps = self.renewal * _setting(self.agent, "steps")
         agent = self._set(learning_rate_steps=steps)
         if isinstance(epsilon := getattr(agent, "epsilon_start", None), float):
@@ -111,8 +113,8 @@ def _setting(agent: Agent, name: str) -> float:
     value = getattr(agent, f"learning_rate_{name}", None)
     if not isinstance(value, float):
         raise QfolioError(
-            f"{type(agent).__name__} has no learning rate that falls with time, which is what "
-            "going on is about; take an agent with a network, such as dqn."
+            f"{type(agent).__name__} has no learning-rate schedule, which going on requires; use "
+            "an agent with a network, such as dqn."
         )
     return value
 
@@ -122,11 +124,11 @@ def _numbers(task: Task) -> list[str]:
 
 
 class Course(msgspec.Struct):
-    """How the seeds fared in one way to go on.
+    """The results of the seeds in one way to go on.
 
     steps: since the change, of all environments of a seed. curve: regrets (point, seed) on the
-    first start states. final: regrets (seed,) on all of them; other: the same in the other world,
-    which is the old one after the change. seconds: of learning, all seeds.
+    first start states. final: regrets (seed,) on all of them; other: the same in the other world
+    (after the change, the old one). seconds: of learning, all seeds.
     """
 
     steps: list[int]
@@ -147,7 +149,7 @@ WAYS = {
 
 
 class ContinualConfig(Config, frozen=True):
-    """The whole of continual.json: what happens, and what has come out so far."""
+    """The content of continual.json: the plan, and the results so far."""
 
     kind: ClassVar[str] = "continual"
     format: ClassVar[int] = 2
@@ -176,7 +178,7 @@ class ContinualConfig(Config, frozen=True):
 
     @classmethod
     def of(cls, plan: Plan, command: str) -> "ContinualConfig":
-        """What is planned, before anything has come out."""
+        """The configuration of a plan, before any result."""
         return cls(
             **describe(plan.task, plan.agent),
             changes=plan.changes,
@@ -194,7 +196,7 @@ class ContinualConfig(Config, frozen=True):
         )
 
     def plan(self) -> Plan:
-        """The plan that was made."""
+        """The plan that it describes."""
         after = {name: new for name, (_, new) in self.changes.items()}
         return Plan(
             task_of(self.task, self.task_settings),
@@ -212,7 +214,7 @@ class ContinualConfig(Config, frozen=True):
 def create(plan: Plan, folder: Path, command: str = "") -> None:
     """Makes the new or empty folder that ``compare`` works in.
 
-    command: what was typed to start it, for the report.
+    command: the command that started it, for the report.
     """
     config = ContinualConfig.of(plan, command)
     with new_folder(folder) as place:
@@ -220,15 +222,15 @@ def create(plan: Plan, folder: Path, command: str = "") -> None:
 
 
 def compare(folder: Path, listen: Callable[[str], Listener] | None = None) -> dict[str, Any] | None:
-    """Trains, changes the world and goes on in every way; all that a report shows, as JSON values.
+    """Trains, changes the world and goes on in every way; returns the report's data as JSON values.
 
-    What the folder already holds is not done again. None where Ctrl-C stopped it. Raises
-    QfolioError where a loss is not finite.
+    Results that the folder already holds are not computed again. None if Ctrl-C stopped it. Raises
+    QfolioError if a loss is not finite.
 
-    listen: called with what is under way; makes the listener to that training.
+    listen: called with the name of each training; returns its listener.
     """
     if not (folder / FILE).is_file():
-        read_config(folder / FILE, ContinualConfig)  # says that this is no such folder
+        read_config(folder / FILE, ContinualConfig)  # raises: this is not such a folder
     with locked(folder):
         return _compare(folder, listen)
 
@@ -283,17 +285,17 @@ def _compare(folder: Path, listen: Callable[[str], Listener] | None) -> dict[str
 def recovery(course: Course) -> dict[str, Any]:
     """Environment steps from the change until a seed's regret stays within ``WITHIN``.
 
-    middle: the interquartile mean, None where a quarter of the seeds or more never do.
+    middle: the interquartile mean; None if more than a quarter of the seeds never do.
     """
     steps = steps_within(course.steps, np.array(course.curve), WITHIN)
     return {"per_seed": steps, "middle": middle_steps(steps)}
 
 
 def renew(agent: Agent, learned: TrainingState, fresh: TrainingState) -> TrainingState:
-    """Members before their first step who know what ``learned`` does.
+    """Members before their first step with the weights of ``learned``.
 
-    What was stored is forgotten, and the optimiser and all counters, which schedules follow, are
-    those of ``fresh``.
+    Stored experience is dropped; the optimiser and all counters, which set the schedules, are those
+    of ``fresh``.
     """
 
     def is_optimizer(x: Any) -> bool:
@@ -309,7 +311,7 @@ def renew(agent: Agent, learned: TrainingState, fresh: TrainingState) -> Trainin
 
 
 class Grades:
-    """The exact optimum of one world, and how far policies are from it."""
+    """The exact optimum of one world, and the regrets of policies in it."""
 
     def __init__(self, task: Task) -> None:
         solution = task.optimum()
@@ -321,7 +323,7 @@ class Grades:
         return float(self._best.mean())
 
     def regrets(self, population: Population, starts: int) -> list[float]:
-        """Of the members' policies in this world, on the first start states."""
+        """Regrets of the members' policies in this world, on the first start states."""
         if population.task is not self.task:
             learned = population.fetch()
             population = Population(self.task, population.agent, population.seeds)
@@ -353,7 +355,7 @@ def _learn(
     worlds: tuple[Grades, Grades],
     listeners: list[Listener],
 ) -> Course | None:
-    """Learns ``episodes`` more, graded now and then; None where Ctrl-C stopped it.
+    """Learns ``episodes`` more, with regular grading; None if Ctrl-C stopped it.
 
     worlds: this one and the other one.
     """

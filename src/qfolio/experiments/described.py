@@ -1,4 +1,4 @@
-"""Tasks and agents as configurations describe them: by name and settings."""
+"""Tasks and agents in configurations: by name and settings."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from qfolio.core.registry import build, name_of
 
 
 def describe(task: Task, agent: Agent) -> dict[str, Any]:
-    """Both by name and settings, under the names that configurations give them."""
+    """A task and an agent by name and settings, with the configurations' keys."""
     return {
         "task": name_of(task),
         "task_settings": settings.describe(task),
@@ -18,7 +18,7 @@ def describe(task: Task, agent: Agent) -> dict[str, Any]:
 
 
 def task_of(name: str, described: dict[str, Any]) -> Task:
-    """The task of a configuration; it imports no module that a stranger may have named there."""
+    """The task of a configuration; imports no module that only the configuration names."""
     task: Task = build("task", name, described)
     return task
 

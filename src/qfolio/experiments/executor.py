@@ -1,4 +1,4 @@
-"""Where jobs run: here, one after the other."""
+"""Executors of jobs: in this process, one after another."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol, TypeVar, runtime_checkable
@@ -12,34 +12,34 @@ R = TypeVar("R")
 
 @runtime_checkable
 class Job(Protocol[R_co]):
-    """Work as a value: it holds all that it needs, and its result depends on nothing else.
+    """Work as a value: its result depends only on its fields.
 
     A job may therefore run twice, anywhere, and in any order.
     """
 
     @property
     def name(self) -> str:
-        """What it is called; unique among the jobs of one experiment."""
+        """Its name, unique among the jobs of one experiment."""
         ...
 
     def run(self, listeners: Sequence[Listener]) -> R_co | None:
-        """The result; None where Ctrl-C stopped it."""
+        """The result; None if Ctrl-C stopped it."""
         ...
 
 
 @runtime_checkable
 class Executor(Protocol):
-    """Runs jobs and gives their results as they come; it ends early where Ctrl-C stopped one."""
+    """Runs jobs and yields their results as they finish; ends early if Ctrl-C stopped one."""
 
     def map(
         self, jobs: Sequence[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
     ) -> Iterator[tuple[Job[R], R]]:
-        """Each finished job with its result; ``listen`` makes the listeners to a job's training."""
+        """Each finished job with its result; ``listen`` returns the listeners of a job."""
         ...
 
 
 class Here:
-    """Runs jobs in this process, one after the other."""
+    """Runs jobs in this process, one after another."""
 
     def map(
         self, jobs: Sequence[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]

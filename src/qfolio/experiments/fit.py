@@ -1,7 +1,7 @@
-"""The one driver of training: chunks, records, listeners and Ctrl-C.
+"""The driver of all training: chunks, records, listeners and Ctrl-C.
 
-Every command that learns trains a population with ``fit``. Whatever else happens between two chunks
-(files, learning curves, progress, checkpoints) is done by a listener.
+Every command that learns trains a population with ``fit``. Listeners do everything else between two
+chunks: files, learning curves, progress, checkpoints.
 """
 
 import math
@@ -23,14 +23,14 @@ Row = dict[str, float]
 
 @dataclass
 class Training:
-    """A training under way, as its listeners see it.
+    """A training in progress, as its listeners see it.
 
     Attributes:
-        population: What is trained.
-        budget: How far.
-        config: What the training is, for those who record it.
+        population: The population that is trained.
+        budget: The budget of each member.
+        config: The configuration, for listeners that record it.
         begun: Steps of each environment before this training.
-        left: Steps of each environment that are left.
+        left: Remaining steps of each environment.
         seconds: Time spent on training, without compiling.
         members: The member of each row of the last chunk.
         interrupted: Whether Ctrl-C asked it to stop.
@@ -44,7 +44,7 @@ class Training:
     seconds: float = 0.0
     members: Sequence[int] = ()
     interrupted: bool = False
-    _learned: int = 0  # steps that learned, of each environment, and the time that they took
+    _learned: int = 0  # steps of each environment that learned, and their time
     _learning_seconds: float = 0.0
 
     @property
@@ -54,19 +54,19 @@ class Training:
 
     @property
     def share(self) -> float:
-        """How much of this training is done, in steps."""
+        """The share of this training that is done, in steps."""
         done = self.population.steps - self.begun
         return done / max(done + self.left, 1)
 
     @property
     def steps_per_second(self) -> float:
-        """Environment steps of all members; those that learn, as soon as there are such."""
+        """Environment steps of all members; once learning has begun, of steps that learn."""
         per_step = self.population.agent.num_envs * len(self.population.seeds)
         return self._rate * per_step
 
     @property
     def seconds_left(self) -> float:
-        """NaN before learning has begun: what comes before says nothing about its speed."""
+        """NaN before learning has begun, because the warm-up has another speed."""
         return self.left / self._rate if self._learned or self.finished else math.nan
 
     @property
@@ -98,16 +98,16 @@ class Training:
 
 
 class Listener:
-    """What is told of a training; a listener overrides what it needs."""
+    """Hooks into a training; a listener overrides those that it needs."""
 
     def on_start(self, training: Training) -> None:
         """Before the first chunk."""
 
     def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        """After each chunk, with every episode that it finished, in the order of time."""
+        """After each chunk, with its finished episodes in order of time."""
 
     def on_end(self, training: Training) -> None:
-        """After the last chunk, or the one after which Ctrl-C stopped; not after an error."""
+        """After the last chunk, also if Ctrl-C stopped the training; not after an error."""
 
 
 def fit(
@@ -119,18 +119,18 @@ def fit(
     chunk: int = 2**31,
     strict: bool = True,
 ) -> Training:
-    """Trains a population until each member has done its budget.
+    """Trains a population until each member has used its budget.
 
     A first Ctrl-C stops after the current chunk and sets ``interrupted``.
 
     Args:
-        population: What is trained; it goes on from where it is.
-        budget: How far, counted from the very beginning.
-        listeners: Told of every chunk, in their order.
-        config: What the training is, for listeners that record it.
+        population: The population to train, from its current state.
+        budget: The budget of each member, including earlier training.
+        listeners: Called after every chunk, in their order.
+        config: The configuration, for listeners that record it.
         chunk: Most steps of a chunk, if fewer than the population's own.
-        strict: Whether a loss that is not finite raises QfolioError; without, the other members
-            go on.
+        strict: Whether a loss that is not finite raises QfolioError; otherwise the other members
+            continue.
     """
     training = Training(population, budget, config or {}, population.steps, budget.left(population))
     if training.finished:
@@ -153,8 +153,8 @@ def fit(
 def _rows(
     seeds: Sequence[int], before: Sequence[int], episodes: Episodes
 ) -> tuple[list[Row], list[int]]:
-    """A row for each finished episode and its member, in the order in which they finished."""
-    # By time first, so that the order does not depend on where chunks begin and end.
+    """A row for each finished episode and its member, in order of time."""
+    # By time first, so that the order does not depend on the chunks.
     places = np.argwhere(episodes.finished.swapaxes(0, 1))
     time, member, environment = places.T
     columns = {"return": episodes.returns, **episodes.metrics}

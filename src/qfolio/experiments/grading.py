@@ -41,7 +41,7 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
 
 
 def _rule(population: Population, solution: Optimum | None) -> dict[str, Any] | None:
-    """What the members' policies do beside what is best, in tasks where few numbers say it."""
+    """The members' policies and the best one as few numbers, in tasks that define them."""
     if not isinstance(solution, FollowedOptimum):
         return None
     task, agent, members = population.task, population.agent, population.weights()

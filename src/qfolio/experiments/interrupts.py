@@ -2,8 +2,8 @@
 
 jax computes in the main thread, sometimes for seconds, and Python cannot interrupt it there: an
 exception would come too late, end inside one of jax's callbacks, or crash the process at its exit.
-The command line therefore listens in a thread of its own (``exit_on_ctrl_c``). Whatever is on disk
-at that moment is whole, since files are written under another name and renamed.
+The command line therefore listens in a separate thread (``exit_on_ctrl_c``). Files on disk are
+complete at any moment, because they are written under another name and renamed.
 """
 
 import contextlib
@@ -16,10 +16,10 @@ from collections.abc import Iterator
 from typing import Any
 
 EXIT_CODE = 130
-"""What a shell expects of a program that Ctrl-C ended."""
+"""The conventional exit code of a program that Ctrl-C ended."""
 
 _trainings: list[threading.Event] = []
-"""The request to stop the training under way in the main thread, if there is one."""
+"""The stop request of the training in the main thread, if there is one."""
 
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -28,7 +28,7 @@ _SHOW_CURSOR = "\x1b[?25h"
 def interruptible() -> Iterator[threading.Event]:
     """Yields an event that the first Ctrl-C sets; a second one interrupts at once.
 
-    Within another such block it is that one's event: both stop.
+    A nested block shares the outer block's event: both stop.
     """
     if threading.current_thread() is not threading.main_thread():
         yield threading.Event()
@@ -60,8 +60,8 @@ def exit_on_ctrl_c() -> None:
 def _leave() -> None:
     """Ends the process with ``EXIT_CODE``, without waiting for jax's threads.
 
-    Nothing is flushed: what is printed is flushed at once, and a main thread that waits for the
-    reader of a pipe would hold its lock.
+    Nothing is flushed: output is flushed when printed, and a main thread that waits for the reader
+    of a pipe would hold the lock.
     """
     cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
     with contextlib.suppress(OSError):
@@ -74,14 +74,14 @@ def _ignore(number: int, frame: Any) -> None:
 
 
 def _first(stop: threading.Event) -> bool:
-    """Asks a training to stop; false where it has been asked already."""
+    """Asks a training to stop; false if it has been asked already."""
     asked = stop.is_set()
     stop.set()
     return not asked
 
 
 def _listen(receiver: socket.socket, sender: socket.socket) -> None:
-    """Acts on the numbers of signals; the sender is kept open as long as the thread lives."""
+    """Acts on signal numbers; holds a reference to the sender to keep it open."""
     while numbers := receiver.recv(64):
         for number in numbers:
             if number == signal.SIGINT and not (_trainings and _first(_trainings[0])):

@@ -1,4 +1,4 @@
-"""A run: seeds of one agent in training on one task, and what they have reported so far."""
+"""A run: the training of one agent's seeds on one task, and its records."""
 
 import contextlib
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from qfolio.experiments.grading import grade
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder
 
 EVALUATIONS = 20
-"""Points on the learning curve, about."""
+"""Approximate number of points on the learning curve."""
 
 CHECKPOINT_SECONDS = 10.0
 
@@ -62,11 +62,11 @@ class Run:
         """A run before its first step.
 
         Args:
-            task, agent: What learns what.
-            budget: How far each seed is trained; or as a number:
+            task, agent: The task, and the agent that learns it.
+            budget: The budget of each seed; or as a number:
             episodes, steps: One of the two. Steps are those of all environments of a seed.
-            seeds, seed: How many agents, and the first one's seed; the others' follow it.
-            preset: Which settings these are, for people to read.
+            seeds, seed: How many agents, and the first one's seed; the others have the next ones.
+            preset: The name of the settings, for readers.
             out: A new or empty folder; without it nothing is written.
         """
         budget = budget or Budget(episodes, steps)
@@ -96,7 +96,7 @@ class Run:
     ) -> "Run":
         """A run as its last checkpoint left it.
 
-        task, agent: needed only where the folder alone cannot make them: they hold arrays, or are a
+        task, agent: needed only if the folder alone cannot make them: they hold arrays, or are a
         user's own and their module has not been imported.
         """
         files = RunFolder(Path(folder))
@@ -119,17 +119,17 @@ class Run:
 
     @property
     def folder(self) -> Path | None:
-        """Where the run is kept."""
+        """The folder of the run, if it has one."""
         return None if self._folder is None else self._folder.path
 
     @property
     def episodes(self) -> int:
-        """Finished by the seed that has finished fewest."""
+        """Finished episodes of the seed that has finished fewest."""
         return self.population.episodes
 
     @property
     def budget(self) -> Budget:
-        """How far each seed is trained."""
+        """The budget of each seed."""
         return self.config.budget
 
     def done(self, unit: str) -> int:
@@ -139,11 +139,11 @@ class Run:
         return self.episodes
 
     def train(self, budget: Budget | None = None, listeners: Sequence[Listener] = ()) -> None:
-        """Trains until each seed has done its budget (default: what was configured).
+        """Trains until each seed has used its budget (default: the configured one).
 
         A first Ctrl-C stops after the current chunk, sets ``interrupted`` and leaves a checkpoint.
-        Raises QfolioError where a loss is not finite (the last good checkpoint stays) or where
-        another process trains in the folder.
+        Raises QfolioError if a loss is not finite (the last good checkpoint stays) or if another
+        process trains in the folder.
         """
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
             self._train(budget or self.budget, listeners)
@@ -151,14 +151,14 @@ class Run:
     def _train(self, budget: Budget, listeners: Sequence[Listener]) -> None:
         self.interrupted = False
         if not self.evaluations and self.population.steps:
-            self.evaluate()  # of a run whose table was lost
+            self.evaluate()  # the run's table was lost
         if not budget.left(self.population):
             return
         self.config = msgspec.structs.replace(
             self.config, episodes=budget.episodes, steps=budget.steps
         )
         if not self.population.steps:
-            self.evaluations = []  # of a process that was killed before its first checkpoint
+            self.evaluations = []  # left by a process that was killed before its first checkpoint
         if self._folder is not None:
             self._folder.write_config(self.config)
             self._folder.tidy({METRICS: self.metrics, EVALUATION: self.evaluations})
@@ -175,7 +175,7 @@ class Run:
         return grade(self.population, starts)
 
     def summary(self) -> dict[str, Any]:
-        """Greedy returns on the fixed start states, the optimum on the same, and what it cost."""
+        """Greedy returns on the fixed start states, their optimum, and the cost of training."""
         steps, config = self.done("steps"), self.config
         summary = {
             "task": config.task,
@@ -238,7 +238,7 @@ class Run:
 
 
 class _Metrics(Listener):
-    """Keeps the row of every finished episode, and the time that training took."""
+    """Records the row of every finished episode, and the training time."""
 
     def __init__(self, run: Run) -> None:
         self.run, self.before = run, run.seconds_train
@@ -249,13 +249,13 @@ class _Metrics(Listener):
 
 
 class _Curve(Listener):
-    """Grades the policies at the start, at the end, and about ``EVALUATIONS`` times between."""
+    """Evaluates the policies at the start, at the end, and about ``EVALUATIONS`` times between."""
 
     def __init__(self, run: Run) -> None:
         self.run = run
 
     def on_start(self, training: Training) -> None:
-        # In steps since the very beginning, so that a resumed run has the same curve.
+        # In steps since the run's start, so that a resumed run has the same curve.
         self.every = (training.begun + training.left) / EVALUATIONS
         self.points = training.begun // self.every
         if not training.begun:
@@ -269,7 +269,7 @@ class _Curve(Listener):
 
 
 class _Checkpoints(Listener):
-    """Writes a checkpoint now and then, and at the end."""
+    """Writes a checkpoint every ``CHECKPOINT_SECONDS``, and at the end."""
 
     def __init__(self, run: Run) -> None:
         self.run, self.saved = run, perf_counter()
@@ -296,8 +296,8 @@ def train(
 ) -> Run:
     """Trains ``seeds`` agents side by side, from seeds ``seed``, ``seed + 1``, …
 
-    episodes, steps: how far, each of them; one of the two. out: a new folder for the run; without
-    it nothing is written. ``run.summary()`` grades it.
+    episodes, steps: the budget of each; one of the two. out: a new folder for the run; without it
+    nothing is written. ``run.summary()`` grades it.
     """
     devices.configure()
     run = Run.create(task, agent, episodes=episodes, steps=steps, seeds=seeds, seed=seed, out=out)

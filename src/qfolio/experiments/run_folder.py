@@ -1,9 +1,9 @@
 """The folder of a run.
 
 It holds config.json (settings), metrics.csv and evaluation.csv (appended), checkpoint.safetensors
-(the whole training state, replaced as one), policy.safetensors (weights) and, at the end,
-summary.json. The checkpoint is the truth: rows that are ahead of it are dropped when a run is
-resumed, and then come again, the same to the last digit.
+(the whole training state, replaced atomically), policy.safetensors (weights) and, at the end,
+summary.json. The checkpoint is authoritative: rows ahead of it are dropped when a run is resumed,
+and then recomputed, identical to the last digit.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ CHECKPOINT, POLICY, SUMMARY = "checkpoint.safetensors", "policy.safetensors", "s
 
 
 class RunConfig(Config, frozen=True):
-    """What a run is: one agent, one task, some seeds, and how far they are trained."""
+    """The configuration of a run: one agent, one task, its seeds, and their budget."""
 
     kind: ClassVar[str] = "run"
     format: ClassVar[int] = 4
@@ -47,7 +47,7 @@ class RunConfig(Config, frozen=True):
 
     @property
     def budget(self) -> Budget:
-        """How far each seed is trained."""
+        """The budget of each seed."""
         return Budget(self.episodes, self.steps)
 
     @property
@@ -57,7 +57,7 @@ class RunConfig(Config, frozen=True):
 
 
 class RunFolder:
-    """Reads and writes a run's files; a run without a folder has none."""
+    """Reads and writes a run's files."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -66,14 +66,14 @@ class RunFolder:
         write_config(self.path / CONFIG, config)
 
     def read_config(self) -> RunConfig:
-        """Raises QfolioError where the folder holds no run of this version."""
+        """Raises QfolioError if the folder holds no run of this version."""
         return read_config(self.path / CONFIG, RunConfig)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         write_json(self.path / SUMMARY, summary)
 
     def write_checkpoint(self, state: Any, weights: Any) -> None:
-        """The policy first: the checkpoint says how far the run is."""
+        """Writes the policy first: the checkpoint marks the run's progress."""
         write_tree(self.path / POLICY, weights)
         write_tree(self.path / CHECKPOINT, state)
 
@@ -82,13 +82,13 @@ class RunFolder:
         return read_tree(self.path / CHECKPOINT, template)
 
     def append(self, name: str, rows: Sequence[Row]) -> None:
-        """Adds rows to a table, with a header where it is new."""
+        """Appends rows to a table, with a header if it is new."""
         if rows:
             with (self.path / name).open("a", newline="") as file:
                 file.write(_csv(rows, header=file.tell() == 0))
 
     def rows(self, name: str, episodes: dict[int, int], steps: int) -> list[Row]:
-        """The rows of a table up to a checkpoint; one cut short by a crash does not count.
+        """The rows of a table up to a checkpoint, without one that a crash cut short.
 
         episodes: of each seed, at the checkpoint. steps: of each seed's environments.
         """
@@ -110,7 +110,7 @@ class RunFolder:
         return rows
 
     def tidy(self, tables: dict[str, list[Row]]) -> None:
-        """Brings the tables back to these rows, and removes what a killed process left."""
+        """Resets the tables to these rows, and removes temporary files of a killed process."""
         for name, rows in tables.items():
             if rows:
                 write_bytes(self.path / name, _csv(rows, header=True).encode())

@@ -1,9 +1,9 @@
-"""Action values as one number or as a distribution of returns: how each is read and learned.
+"""Action values as an expectation or as a distribution of returns: how each is read and learned.
 
-A network gives ``atoms`` numbers z for each action. Each kind of value says what they mean: their
-``mean`` is the action value, ``outcomes`` are the returns that may follow, each of which makes a
-target, and ``loss`` is the distance of z from the targets, with how far off the value was, to set
-priorities by. Numbers that stand for returns may be roots of them (``Scale``).
+A network outputs ``atoms`` numbers z for each action. Each kind of value interprets them: ``mean``
+is the action value, ``outcomes`` are the possible returns, each of which makes a target, and
+``loss`` is the distance of z from the targets, with the value's absolute error, which sets
+priorities. Outputs that represent returns may be their roots (``Scale``).
 """
 
 import math
@@ -46,7 +46,7 @@ class Expected(NamedTuple):
 
 
 class Categorical(NamedTuple):
-    """Probabilities, as logits, of returns, or roots, equally spaced (Bellemare et al. 2017)."""
+    """Logits of equally spaced returns, or of their roots (Bellemare et al. 2017)."""
 
     scale: Scale
     atoms: int
@@ -70,7 +70,7 @@ class Categorical(NamedTuple):
         target: Float[Array, "batch atom"],
         following: Float[Array, "batch atom"],
     ) -> Losses:
-        """Cross-entropy; its distance from the least possible is the divergence of the two."""
+        """Cross-entropy, and the KL divergence, its distance from the minimum."""
         wanted = project(target, jax.nn.softmax(following), self.support)
         loss = -(wanted * jax.nn.log_softmax(z)).sum(-1)
         return loss, jnp.maximum(loss - jax.scipy.special.entr(wanted).sum(-1), 0.0)
@@ -105,17 +105,17 @@ KINDS = ("expected", "categorical", "quantile")
 
 
 class ValueConfig(NamedTuple):
-    """What an agent's settings say of its action values; the names are those of the settings."""
+    """An agent's settings of its action values; the names are those of the settings."""
 
     values: str  # one of KINDS
-    atoms: int  # numbers for each action, where values are a distribution
+    atoms: int  # numbers for each action, if values are a distribution
     v_min: Scalar  # ends of the categorical support
     v_max: Scalar
     huber_delta: Scalar  # |error| beyond which the loss is linear
-    value_rescaling: bool  # whether numbers that stand for returns are roots of them
+    value_rescaling: bool  # whether outputs are roots of returns
 
     def check(self) -> None:
-        """Raises QfolioError where the settings make no sense."""
+        """Raises QfolioError if the settings are invalid."""
         require(self, "values", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
         require(self, "atoms", lambda x: 2 <= x <= 1001, "from 2 to 1001")
         require(self, "v_min v_max", lambda x: -1e30 <= x <= 1e30, "from -1e30 to 1e30")
@@ -126,7 +126,7 @@ class ValueConfig(NamedTuple):
             require(self, "huber_delta", math.isfinite, "finite for quantiles, such as 1")
 
     def build(self) -> Values:
-        """The kind of values that the settings ask for."""
+        """The kind of values that the settings choose."""
         scale = Scale(self.value_rescaling)
         if self.values == "categorical":
             return Categorical(scale, self.atoms, self.v_min, self.v_max)
@@ -140,14 +140,14 @@ def project(
     probabilities: Float[Array, "batch outcome"],
     support: Float[Array, " atom"],
 ) -> Float[Array, "batch atom"]:
-    """Probabilities of outcomes, brought to an increasing support (Bellemare et al. 2017, eq. 7).
+    """Probabilities of outcomes, projected onto an increasing support (Bellemare 2017, eq. 7).
 
-    Each outcome's probability goes to its two neighbours, the nearer the more, so that the mean
-    stays; what lies beyond the support goes to its ends.
+    Each outcome's probability is split linearly between its two neighbours, which preserves the
+    mean; outcomes beyond the support go to its ends.
     """
     gaps = jnp.diff(support)[:, None]
     passed = jnp.clip((outcomes[:, None, :] - support[:-1, None]) / gaps, 0.0, 1.0)
-    above = jnp.einsum("bgo,bo->bg", passed, probabilities)  # what goes beyond each gap's lower end
+    above = jnp.einsum("bgo,bo->bg", passed, probabilities)  # mass beyond each gap's lower end
     total = probabilities.sum(-1, keepdims=True)
     reached = jnp.concatenate([total, above, jnp.zeros_like(total)], axis=1)
     return jnp.maximum(reached[:, :-1] - reached[:, 1:], 0.0)
@@ -160,7 +160,7 @@ def quantile_huber_loss(
 ) -> Float[Array, " batch"]:
     """Sum over quantiles of the mean over outcomes (Dabney et al. 2018, eq. 10 and algorithm 1).
 
-    Errors below a quantile's level count by 1 − level, those above by the level.
+    Negative errors are weighted by 1 − level, positive ones by the quantile's level.
     """
     n = quantiles.shape[-1]
     error = outcomes[:, None, :] - quantiles[:, :, None]

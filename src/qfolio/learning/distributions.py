@@ -1,7 +1,7 @@
-"""What a stochastic policy draws its actions from, one for each kind of actions.
+"""Distributions of a stochastic policy's actions, one for each kind of action.
 
-All have leading batch axes. ``sample`` draws, ``log_prob`` is the density of an action that was
-drawn, ``mode`` is what the policy does when it does not explore.
+All have leading batch axes. ``sample`` draws an action, ``log_prob`` is the log density of a drawn
+action, ``mode`` is the action without exploration.
 """
 
 import math
@@ -35,7 +35,7 @@ class Categorical(eqx.Module):
 
 
 class Gaussian(eqx.Module):
-    """Independent normal numbers; a task takes those beyond its bounds for the bounds."""
+    """Independent normal numbers; tasks clip them to their bounds."""
 
     mean: Float[Array, "*batch n"]
     log_std: Float[Array, "*#batch n"]
@@ -57,7 +57,7 @@ class Gaussian(eqx.Module):
 
 
 class Squashed(eqx.Module):
-    """Normal numbers brought into ±``bound`` by tanh (Haarnoja et al. 2018, appendix C)."""
+    """Normal numbers squashed into ±``bound`` by tanh (Haarnoja et al. 2018, appendix C)."""
 
     normal: Gaussian
     bound: float = eqx.field(static=True)
@@ -70,7 +70,7 @@ class Squashed(eqx.Module):
     ) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch"]]:
         """A draw and its log density; gradients flow through both."""
         x = self.normal.sample(key)
-        # log(1 − tanh² x) without cancellation, where tanh x is close to ±1.
+        # log(1 − tanh² x) without cancellation when tanh x is close to ±1.
         slope = 2 * (math.log(2) - x - jax.nn.softplus(-2 * x)) + math.log(self.bound)
         return self.bound * jnp.tanh(x), self.normal.log_prob(x) - slope.sum(-1)
 
@@ -98,7 +98,7 @@ class LogisticNormal(eqx.Module):
         return self._density(logs[..., 1:] - logs[..., :1])
 
     def entropy(self) -> Float[Array, "*batch"]:
-        """That of y, which differs from that of the weights by what y's mean determines."""
+        """The entropy of y; that of the weights differs by a term that depends on y's mean."""
         return self.normal.entropy()
 
     def mode(self) -> Float[Array, "*batch entry"]:
@@ -121,9 +121,9 @@ def policy_of(
     output: Float[Array, "*batch output"],
     log_std: Float[Array, " coordinate"],
 ) -> Distribution:
-    """The policy that a network's output stands for.
+    """The policy that a network's output defines.
 
-    output: as many numbers as ``networks.outputs_of(actions)``, in units of the bound where actions
+    output: as many numbers as ``networks.outputs_of(actions)``, in units of the bound if actions
     have one. log_std: of each coordinate, or one for all, in the same units.
     """
     if isinstance(actions, Discrete):

@@ -19,7 +19,7 @@ Gain = Float[Array, "*inputs"] | float
 """Factors of an encoder's first weights, one for each channel or for all."""
 
 ACTIVATIONS = {"relu": jax.nn.relu, "silu": jax.nn.silu}
-"""What a layer's units give, by name: functions of jax cannot be pickled."""
+"""Activations by name: jax's functions cannot be pickled."""
 
 
 class MLP(eqx.Module):
@@ -58,12 +58,12 @@ class MLP(eqx.Module):
 
 
 class CNN(eqx.Module):
-    """A convolution along time or over an image, then one layer over all that it found.
+    """A convolution along time or over an image, then one layer over all its outputs.
 
-    The filters see three rows of a window (time, channel), or 3 × 3 pixels of an image (height,
-    width, channel), and there is one for eight numbers of ``width`` (16 for 128, as in MinAtar,
-    Young & Tian 2019). Small convolutions are faster on a CPU as one product of matrices over
-    copied neighbourhoods than as XLA's own (docs/networks.md).
+    Filters cover three rows of a window (time, channel), or 3 × 3 pixels of an image (height,
+    width, channel); there are ``width`` / 8 (16 for 128, as in MinAtar, Young & Tian 2019). On a
+    CPU, small convolutions are faster as one matrix product over copied neighbourhoods than XLA's
+    own (docs/networks.md).
     """
 
     first: MLP
@@ -78,10 +78,10 @@ class CNN(eqx.Module):
         *space, channels = shape
         if min(space) < self.SIZE:
             raise QfolioError(
-                f"A CNN needs windows of {self.SIZE} rows or more; here: {space[0]}."
+                f"A CNN needs windows of {self.SIZE} rows or more; this one has {space[0]}."
                 if len(space) == 1
                 else f"A CNN needs images of {self.SIZE} × {self.SIZE} pixels or more; "
-                f"here: {' × '.join(map(str, space))}."
+                f"these have {' × '.join(map(str, space))}."
             )
         self.dimensions = len(space)
         first, second = jax.random.split(key)
@@ -129,7 +129,7 @@ class RNN(eqx.Module):
 class LSTM(eqx.Module):
     """Long short-term memory along time (Hochreiter & Schmidhuber 1997); its last output.
 
-    With a forget gate (Gers et al. 2000), which starts open by a bias of one.
+    With a forget gate (Gers et al. 2000) that starts open, with a bias of one.
     """
 
     inputs: MLP

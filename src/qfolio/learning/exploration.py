@@ -1,4 +1,4 @@
-"""How agents explore: ε-greedily, or by actions drawn uniformly."""
+"""Exploration: ε-greedy, or by uniformly drawn actions."""
 
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from qfolio.learning.targets import Scalar
 
 
 class EpsilonSchedule(NamedTuple):
-    """ε, which each finished episode multiplies by a factor, down to a lower bound."""
+    """ε, which decays by a factor per finished episode, down to a lower bound."""
 
     epsilon_start: Scalar
     epsilon_end: Scalar
     epsilon_decay: Scalar
 
     def __call__(self, episodes: Int[Array, ""]) -> Float[Array, ""]:
-        """ε after so many finished episodes."""
+        """ε after this many finished episodes."""
         return jnp.maximum(self.epsilon_end, self.epsilon_start * self.epsilon_decay**episodes)
 
 
@@ -29,10 +29,10 @@ def epsilon_greedy(
     last: Int[Array, " batch"] | None = None,
     persistence: float = 0.0,
 ) -> Int[Array, " batch"]:
-    """The best action, or with probability ε any.
+    """The best action, or with probability ε a random one.
 
-    Where the ``last`` actions are given, they come again with probability ε · persistence, before
-    anything is chosen: what explores goes on with it for a while (after Dabney et al. 2021,
+    If ``last`` is given, its actions are repeated with probability ε · persistence before anything
+    is chosen, so that exploration persists for several steps (after Dabney et al. 2021,
     "Temporally-extended ε-greedy exploration").
     """
     if last is not None:
@@ -41,14 +41,14 @@ def epsilon_greedy(
         again = jax.random.uniform(again_key, last.shape) < epsilon * persistence
         return jnp.where(again, last, drawn)
     n, greedy = values.shape[-1], values.argmax(-1)
-    # One number decides both: below ε explore, and where below ε it fell picks the action.
+    # One draw decides both whether to explore (below ε) and which action (its place below ε).
     drawn = jax.random.uniform(key, greedy.shape)
     explored = jnp.minimum(drawn / jnp.maximum(epsilon, 1e-30) * n, n - 1).astype(jnp.int32)
     return jnp.where(drawn < epsilon, explored, greedy)
 
 
 def uniform(actions: Actions, key: PRNGKeyArray, n: int) -> Array:
-    """``n`` actions drawn uniformly; from [−1, 1] where they have no bounds."""
+    """``n`` actions drawn uniformly; from [−1, 1] if they have no bounds."""
     if isinstance(actions, Discrete):
         return jax.random.randint(key, (n,), 0, actions.n, jnp.int32)
     if isinstance(actions, Simplex):

@@ -1,4 +1,4 @@
-"""The last layers of a network where plain ones will not do: streams, and noise on the weights."""
+"""Special last layers of a network: dueling streams, and noisy weights."""
 
 import math
 from typing import NamedTuple
@@ -15,10 +15,10 @@ from qfolio.learning.targets import Scalar
 
 
 class NoisyMLP(MLP):
-    """Layers whose weights carry noise of a learned size (Fortunato et al. 2018, section 3).
+    """Layers whose weights have noise of a learned scale (Fortunato et al. 2018, section 3).
 
-    The noise of a weight is the product of one number for its input and one for its output. As it
-    is, the network has the mean weights; ``draw`` gives it with noise.
+    The noise is factorised: a weight's noise is the product of one number for its input and one for
+    its output. The module itself uses the mean weights; ``draw`` returns it with noise.
     """
 
     weight_scales: list[Float[Array, "inputs outputs"]]
@@ -45,7 +45,7 @@ class NoisyMLP(MLP):
 
 
 class Streams(eqx.Module):
-    """Layers that begin together and part into streams; the streams' outputs stand in one row.
+    """Shared layers that split into streams; the streams' outputs are concatenated.
 
     Dueling networks have one stream for a state's value and one for its actions' advantages (Wang
     et al. 2016, figure 1).
@@ -55,10 +55,10 @@ class Streams(eqx.Module):
     streams: list[MLP]
 
     def __init__(self, mlp: MLP, first: int, noise: Scalar | None, key: PRNGKeyArray) -> None:
-        """Parts the last two layers of ``mlp``, or its last one where there are not three.
+        """Splits the last two layers of ``mlp``, or only its last if it has fewer than three.
 
-        first: outputs of the first stream; 0 for a single stream of all. noise: the size that the
-        noise of the streams' weights starts with, or None.
+        first: outputs of the first stream; 0 for a single stream. noise: the initial scale of the
+        noise on the streams' weights, or None.
         """
         shared = max(len(mlp.weights) - 2, min(len(mlp.weights) - 1, 1))
         layers = lambda m: (m.weights, m.biases)  # noqa: E731
@@ -80,11 +80,11 @@ class Streams(eqx.Module):
 
 
 class HeadConfig(NamedTuple):
-    """What the last layers of a network of action values are."""
+    """The last layers of a network of action values."""
 
     atoms: int  # numbers for each action
     dueling: bool  # a stream for the state's value and one for advantages
-    noise: Scalar | None  # the size that the noise of their weights starts with; None: no noise
+    noise: Scalar | None  # initial scale of the noise on their weights; None: no noise
 
 
 def build(
@@ -94,9 +94,9 @@ def build(
     observation: PyTree,
     key: PRNGKeyArray,
 ) -> networks.Network:
-    """A network of action values: ``atoms`` numbers for each action in a row.
+    """A network of action values: ``atoms`` numbers for each action.
 
-    Where it is dueling, those of the state's value stand before them.
+    If it is dueling, the numbers of the state's value come first.
     """
     atoms, dueling, noise = head
     pooled, each, _ = networks.outputs_of(task.actions)
@@ -113,7 +113,7 @@ def build(
 def read(
     head: HeadConfig, network: networks.Network, observation: PyTree
 ) -> Float[Array, "batch action atom"]:
-    """What a network from ``build`` says of each action."""
+    """The outputs of a network from ``build`` for each action."""
     outputs = network(observation)
     z = outputs.reshape(outputs.shape[0], -1, head.atoms)
     return duel(z) if head.dueling else z
@@ -131,9 +131,9 @@ def draw_noise(network: PyTree, key: PRNGKeyArray) -> PyTree:
 
 
 def duel(z: Float[Array, "batch outputs atom"]) -> Float[Array, "batch action atom"]:
-    """Action values from a state's value, which stands first, and its actions' advantages.
+    """Action values from a state's value, which comes first, and its actions' advantages.
 
-    Advantages count from their mean over the actions (Wang et al. 2016, eq. 9).
+    Advantages are centred on their mean over the actions (Wang et al. 2016, eq. 9).
     """
     value, advantage = z[:, :1], z[:, 1:]
     return value + advantage - advantage.mean(1, keepdims=True)

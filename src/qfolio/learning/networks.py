@@ -17,10 +17,10 @@ from qfolio.learning.targets import Scalar
 
 
 class Flat(eqx.Module):
-    """An MLP over everything that is observed, in one row of numbers.
+    """An MLP over the whole observation, flattened.
 
-    An observation that is one of ``states`` numbers becomes a row with a one at its place; windows
-    and images can be read by an ``encoder`` first.
+    An observation that is one of ``states`` numbers is one-hot encoded; an ``encoder`` can read
+    windows and images first.
     """
 
     mlp: MLP
@@ -53,7 +53,7 @@ def _rows(
 
 
 class Reading(NamedTuple):
-    """What a shared network makes of the windows alone."""
+    """A shared network's intermediate results from the windows alone."""
 
     joined: Float[Array, "*batch asset width"]
     direct: Float[Array, "*batch asset outputs"]
@@ -62,11 +62,11 @@ class Reading(NamedTuple):
 class Shared(eqx.Module):
     """One network for all assets of a market, so that the order of the columns does not matter.
 
-    An encoder reads each asset's own window. What it found is joined with the mean over all assets
-    and with the holding, and goes through the remaining layers, asset by asset (ensemble of
+    An encoder reads each asset's own window. Its output is joined with the mean over all assets
+    and with the holding, and passes through the remaining layers, asset by asset (ensemble of
     identical independent evaluators, Jiang et al. 2017, section 5; the mean over assets: Zaheer et
-    al. 2017, "Deep Sets"). A linear path from window and holding to the outputs lies beside it.
-    Outputs of the whole market are means over the assets.
+    al. 2017, "Deep Sets"). A linear path from window and holding to the outputs is added. Outputs
+    of the whole market are means over the assets.
     """
 
     encoder: Window | CNN | RNN | LSTM
@@ -102,7 +102,7 @@ class Shared(eqx.Module):
         return self.answer(self.read(view.features), view.holding)
 
     def read(self, features: Float[Array, "*batch asset time channel"]) -> Reading:
-        """All that does not depend on the holding, once for many holdings."""
+        """Everything that does not depend on the holding, computed once for many holdings."""
         found = jax.nn.relu(self.encoder(features))
         width = found.shape[-1]
         of_window, of_market = self.join[:width], self.join[width : 2 * width]
@@ -123,8 +123,7 @@ class Shared(eqx.Module):
 class PerAsset(eqx.Module):
     """A ``Shared`` network's outputs in one row: the market's, then every asset's first, ….
 
-    Of an action's values and of a policy's weights alike; where an action has several numbers,
-    these stand together.
+    If an action has several numbers (``atoms``), these are adjacent.
     """
 
     network: Shared
@@ -145,27 +144,27 @@ SHARED = tuple(_ENCODERS)
 KINDS = ("flat", *SHARED)
 
 _READS = {"cnn": (2, 3), "rnn": (2,), "lstm": (2,)}
-"""Dimensions of what an encoder reads: (time, channel), or (height, width, channel)."""
+"""Dimensions of an encoder's input: (time, channel), or (height, width, channel)."""
 
 Network = Flat | PerAsset
 
 
 class NetworkConfig(NamedTuple):
-    """What an agent's settings say of its networks; the names are those of the settings."""
+    """An agent's settings of its networks; the names are those of the settings."""
 
-    network: str  # ``flat``, an encoder of windows or images, or for markets one that assets share
+    network: str  # flat, an encoder of windows or images, or in markets one that assets share
     hidden: tuple[int, ...]  # units of each hidden layer
-    input_gain: Scalar = 0.0  # of the first layer, observations taken to ±1; 0: as it is
+    input_gain: Scalar = 0.0  # of the first layer, for observations scaled to ±1; 0: unscaled
 
     def check(self) -> None:
-        """Raises QfolioError where the settings make no sense."""
+        """Raises QfolioError if the settings are invalid."""
         require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
         require_sizes(self)
         require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
 
 
 class Outputs(NamedTuple):
-    """How many numbers a network gives: of the whole, and of each asset in a market."""
+    """How many numbers a network outputs: for the whole, and for each asset of a market."""
 
     pooled: int
     each: int = 0
@@ -184,9 +183,9 @@ def outputs_of(actions: Actions) -> Outputs:
 def saturation(
     actions: Actions, output: Float[Array, "batch output"], reach: float
 ) -> Float[Array, " batch"]:
-    """How far an actor's outputs are beyond ±``reach``, squared; 0 where actions have no bound.
+    """Squared distance of an actor's outputs beyond ±``reach``; 0 if actions have no bound.
 
-    Outputs beyond it all come to the same action, and no gradient leads back from there.
+    All outputs beyond it give the same action, and their gradient vanishes.
     """
     if not isinstance(actions, Box) or math.isinf(actions.bound):
         return jnp.zeros(len(output))
@@ -202,9 +201,9 @@ def build(
 ) -> Network:
     """A network from batches of the task's observations to rows of numbers.
 
-    An encoder has ``hidden[0]`` outputs, and the remaining layers come behind it. The gain has no
-    effect on a network that assets share. observation: an example. Raises QfolioError where the
-    kind of network does not fit what is observed.
+    An encoder has ``hidden[0]`` outputs, and the remaining layers follow it. The gain has no
+    effect on a network that assets share. observation: an example. Raises QfolioError if the kind
+    of network does not fit the observation.
     """
     kind, hidden, input_gain = config
     # Small weights on a bounded observation make a function too smooth for some tasks.
@@ -226,7 +225,7 @@ def build(
     if isinstance(task.actions, Discrete) and not isinstance(task.actions, MenuActions):
         raise QfolioError(
             f"network={kind} is shared by assets and needs a menu with choices for each, such as "
-            "menu=tilts:0.1; otherwise take network=flat."
+            "menu=tilts:0.1; or use network=flat."
         )
     shared = Shared(kind, observation, hidden, outputs.pooled, outputs.each, key)
     return PerAsset(shared, outputs.atoms)
@@ -236,11 +235,11 @@ def _does_not_fit(kind: str, task: Task, shape: tuple[int, ...]) -> str:
     name = task.name
     if kind not in _READS:
         return (
-            f"network={kind} is shared by the assets of a market, and {name} is none; take "
+            f"network={kind} is shared by the assets of a market, but {name} is not a market; use "
             "network=flat."
         )
     images = " or images (height, width, channel)" if 3 in _READS[kind] else ""
     return (
-        f"network={kind} reads windows (time, channel){images}; an observation of {name} is none, "
-        f"its shape is {shape}; take network=flat."
+        f"network={kind} reads windows (time, channel){images}, but observations of {name} have "
+        f"the shape {shape}; use network=flat."
     )

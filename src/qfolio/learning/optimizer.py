@@ -22,7 +22,7 @@ class CosineSchedule(NamedTuple):
     """A learning rate that falls along a cosine; the names are those of the agents' settings."""
 
     learning_rate: Scalar  # at the start
-    learning_rate_final: Scalar  # share of it that is left at the end
+    learning_rate_final: Scalar  # share of it that remains at the end
     learning_rate_steps: Scalar  # gradient steps until then
 
     def __call__(self, update: Int[Array, ""]) -> Float[Array, ""]:
@@ -33,7 +33,7 @@ class CosineSchedule(NamedTuple):
         return self.learning_rate * (final + weight * (1 - final))
 
     def check(self) -> None:
-        """Raises QfolioError where a setting is out of range."""
+        """Raises QfolioError if a setting is out of range."""
         scales = "learning_rate learning_rate_steps"
         require(self, scales, lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "learning_rate_final", lambda x: 0 <= x <= 1, "between 0 and 1")
@@ -70,7 +70,7 @@ def repeat(
     times: int,
     key: PRNGKeyArray,
 ) -> tuple[Weights, Metrics]:
-    """``times`` gradient steps one after the other, and the means of their metrics."""
+    """``times`` gradient steps in sequence, and the means of their metrics."""
     if times == 1:
         return update(weights, key)
     weights, metrics = lax.scan(update, weights, jax.random.split(key, times))
@@ -78,5 +78,5 @@ def repeat(
 
 
 def clip(gradient: Weights, norm: Scalar) -> Weights:
-    """The gradient, or where it is longer than ``norm``, its direction at that length."""
+    """The gradient, rescaled to ``norm`` if it is longer."""
     return optax.clip_by_global_norm(norm).update(gradient, optax.EmptyState())[0]

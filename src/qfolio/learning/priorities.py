@@ -14,19 +14,19 @@ FAN = 16
 
 
 class Priorities(eqx.Module):
-    """A number for each row, drawn in proportion to it; setting and drawing cost O(log rows).
+    """Rows' priorities; rows are drawn in proportion to them. Updates and draws cost O(log rows).
 
-    The last level holds the rows' numbers, FAN to a node, and each level above the sums of the
-    nodes below it. A wide tree is shallow: few dependent steps, each over many numbers at once.
-    Sums are taken anew from their children, so that rounding does not pile up.
+    The last level holds the rows' priorities, FAN to a node, and each level above holds the sums of
+    the nodes below it. A wide tree is shallow: few dependent steps, each over many numbers at once.
+    Sums are recomputed from their children, so that rounding errors do not accumulate.
     """
 
     levels: list[Float[Array, "_ 16"]]  # from the root's children to the rows
-    highest: Float[Array, ""]  # that any row has had; new rows get it
+    highest: Float[Array, ""]  # of all rows so far; new rows get it
 
     @staticmethod
     def empty(capacity: int) -> "Priorities":
-        """No row can be drawn yet."""
+        """All zero: no row can be drawn yet."""
         levels: list[Array] = []
         nodes = capacity
         while not levels or nodes > 1:
@@ -42,7 +42,7 @@ class Priorities(eqx.Module):
         return self.levels[-1][index // FAN, index % FAN]
 
     def set(self, index: Int[Array, " n"], values: Float[Array, " n"]) -> "Priorities":
-        """Rows set to ``values``; one that comes twice has to come with the same."""
+        """Rows set to ``values``; a row that occurs twice must have equal values."""
         highest = jnp.maximum(self.highest, values.max())
         levels = []
         for level in reversed(self.levels):
@@ -63,7 +63,7 @@ class Priorities(eqx.Module):
         for level in self.levels:
             children = level[node]
             sums = children.cumsum(-1)
-            # Whatever rounding does, a child of zero is never taken.
+            # A child with zero sum is never taken, whatever the rounding.
             reached = jnp.where(children > 0, sums, -1.0)
             bound = jnp.minimum(mass, 0.9999999 * reached.max(-1))[:, None]
             child = jnp.argmax(reached > bound, axis=-1).astype(jnp.int32)
@@ -75,22 +75,22 @@ class Priorities(eqx.Module):
     def update(
         self, index: Int[Array, " n"], off: Float[Array, " n"], exponent: Scalar
     ) -> "Priorities":
-        """Rows set to how far ``off`` their values were, to the power of ``exponent`` (α)."""
-        return self.set(index, (off + 1e-6) ** exponent)  # a little more: any is drawn again
+        """Rows set to their values' errors ``off``, to the power of ``exponent`` (α)."""
+        return self.set(index, (off + 1e-6) ** exponent)  # above 0, so that any is drawn again
 
     def importance(self, index: Int[Array, " n"], exponent: Scalar) -> Float[Array, " n"]:
-        """Weights (N P(i))^−exponent of rows drawn, the largest of them 1 (section 3.4)."""
+        """Weights (N P(i))^−exponent of drawn rows, scaled to a maximum of 1 (section 3.4)."""
         drawn = self.of(index)
         return (drawn.min() / drawn) ** exponent
 
 
 class ImportanceSchedule(NamedTuple):
-    """β, the exponent of importance weights, which rises to 1 in a line."""
+    """β, the exponent of importance weights, which rises linearly to 1."""
 
     importance_exponent: Scalar  # at the start
     importance_steps: Scalar  # gradient steps until it is 1
 
     def __call__(self, updates: Int[Array, ""]) -> Float[Array, ""]:
-        """β after so many gradient steps."""
+        """β after this many gradient steps."""
         done = jnp.minimum(updates / self.importance_steps, 1.0)
         return self.importance_exponent + (1 - self.importance_exponent) * done

@@ -17,11 +17,11 @@ from qfolio.learning.priorities import Priorities
 from qfolio.learning.targets import Scalar, n_step
 
 Discount = Float[Array, "*#batch"] | float
-"""Of what follows a batch of experience."""
+"""Discount of the values that follow a batch of experience."""
 
 
 class Experience(NamedTuple):
-    """What the buffer keeps of a transition; nothing is bootstrapped behind ``terminal``."""
+    """A transition as the buffer stores it; nothing is bootstrapped after ``terminal``."""
 
     observation: PyTree
     action: Array
@@ -41,7 +41,7 @@ class Experience(NamedTuple):
     def of(
         rollout: Transition, *, time_limit_terminal: bool = False, with_last: bool = False
     ) -> "Experience":
-        """A rollout's experiences in one row, by time and then environment."""
+        """A rollout flattened into rows, ordered by time and then environment."""
         step = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout)
         terminal, last = step.terminated, step.terminated | step.truncated
         if time_limit_terminal:
@@ -53,17 +53,17 @@ class Experience(NamedTuple):
 
 
 class ReplayConfig(NamedTuple):
-    """What an agent's settings say of its buffer; the names are those of the settings."""
+    """An agent's settings of its buffer; the names are those of the settings."""
 
-    num_envs: int  # rows that are written at a time
+    num_envs: int  # rows written at a time
     batch_size: int
-    n_steps: int  # whose rewards a target adds up
+    n_steps: int  # of a target's return
     replay_capacity: int  # rows
     learning_starts: int  # rows that are stored before learning
     prioritized: bool = False
 
     def check(self) -> None:
-        """Raises QfolioError where the settings make no sense."""
+        """Raises QfolioError if the settings are invalid."""
         counts = "num_envs batch_size n_steps"
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
@@ -71,9 +71,9 @@ class ReplayConfig(NamedTuple):
         joined = self.n_steps * self.num_envs
         if max(self.learning_starts, joined) > self.replay_capacity:
             raise QfolioError(
-                f"learning_starts is {self.learning_starts} and n_steps × environments is "
-                f"{joined}, and replay_capacity ({self.replay_capacity}) can hold fewer; lower the "
-                "ones or raise the other."
+                f"replay_capacity is {self.replay_capacity}, less than learning_starts "
+                f"({self.learning_starts}) or n_steps × environments ({joined}); raise the one, or "
+                "lower the others."
             )
 
     @property
@@ -100,7 +100,7 @@ class Replay(eqx.Module):
     rows: Float[Array, "capacity numbers"]
     position: Int[Array, ""]  # of the next write
     size: Int[Array, ""]  # rows that hold something
-    priorities: Priorities | None  # by which rows are drawn; None: all alike
+    priorities: Priorities | None  # of the rows drawn; None: uniform
     like: PyTree = eqx.field(static=True)  # shape and type of a row's leaves
     width: int = eqx.field(static=True)
     steps: int = eqx.field(static=True)
@@ -111,7 +111,7 @@ class Replay(eqx.Module):
     ) -> "Replay":
         """Room for ``capacity`` rows shaped like ``row``, written ``width`` at a time.
 
-        steps: writes, its own included, that must be there before a row can be drawn.
+        steps: writes, its own included, that must exist before a row can be drawn.
         """
         capacity = -(-capacity // width) * width
         like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), row)
@@ -137,14 +137,14 @@ class Replay(eqx.Module):
         )
 
     def _admit(self, size: Int[Array, ""]) -> Priorities | None:
-        """Priorities once rows are written: the highest for those that can be drawn from now on."""
+        """Priorities after a write: the highest for rows that can now be drawn."""
         if self.priorities is None:
             return None
         row = jnp.arange(self.width)
         ready = (self.position - (self.steps - 1) * self.width) % self.rows.shape[0] + row
         value = jnp.where(size >= self.steps * self.width, self.priorities.highest, 0.0)
         values = jnp.broadcast_to(value, ready.shape)
-        if self.steps > 1:  # what is written has to wait
+        if self.steps > 1:  # the rows just written cannot be drawn yet
             ready = jnp.concatenate([ready, self.position + row])
             values = jnp.concatenate([values, jnp.zeros(self.width)])
         return self.priorities.set(ready, values)
@@ -154,14 +154,14 @@ class Replay(eqx.Module):
         return self.at(self.draw(key, n))
 
     def draw(self, key: PRNGKeyArray, n: int) -> Int[Array, " n"]:
-        """Where ``n`` rows stand, drawn by priority or else uniformly."""
+        """Indices of ``n`` rows, drawn by priority or else uniformly."""
         if self.priorities is not None:
             return self.priorities.draw(key, n)
         # One draw of uniforms instead of randint's two; float32 splits [0, 1) into 2²³ parts.
         uniform = jax.random.uniform(key, (n,))
         if self.steps == 1:
             return (uniform * self.size).astype(jnp.int32)
-        ready = self.size - (self.steps - 1) * self.width  # the oldest so many
+        ready = self.size - (self.steps - 1) * self.width  # how many, the oldest
         drawn = (uniform * ready).astype(jnp.int32)
         return (self.position - self.size + drawn) % self.rows.shape[0]
 
@@ -169,12 +169,12 @@ class Replay(eqx.Module):
         return self.unpack(self.rows[index])
 
     def latest(self) -> PyTree:
-        """The ``width`` rows that were written last; zeros before the first."""
+        """The ``width`` rows written last; zeros before the first write."""
         start = (self.position - self.width) % self.rows.shape[0]
         return self.unpack(lax.dynamic_slice_in_dim(self.rows, start, self.width))
 
     def ahead(self, index: Int[Array, " n"]) -> PyTree:
-        """Rows and those of the next writes at the same place; leading axes (``steps``, n)."""
+        """Rows and their successors in the next writes; leading axes (``steps``, n)."""
         offset = self.width * jnp.arange(self.steps)[:, None]
         rows = self.at(((index + offset) % self.rows.shape[0]).reshape(-1))
         return jax.tree.map(lambda x: x.reshape(self.steps, -1, *x.shape[1:]), rows)
@@ -197,7 +197,7 @@ def join(replay: Replay, index: Int[Array, " n"], discount: Scalar) -> tuple[Exp
     """Rows of experience over the buffer's ``steps``, and the discount of what follows them.
 
     They end with the last of these steps or with the episode, and lead to the true next observation
-    of the step that they end with.
+    of their final step.
     """
     if replay.steps == 1:
         return replay.at(index), discount

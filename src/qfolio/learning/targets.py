@@ -1,4 +1,4 @@
-"""What values and policies are learned towards: pure functions of a few numbers."""
+"""Targets and losses of values and policies, as pure functions."""
 
 from typing import NamedTuple, TypeVar
 
@@ -16,7 +16,7 @@ Scalar = Float[Array, ""] | float
 def chosen(
     values: Float[Array, "batch action *atom"], action: Int[Array, " batch"]
 ) -> Float[Array, "batch *atom"]:
-    """What ``values`` says of one action of each row."""
+    """``values`` of one action of each row."""
     index = action.reshape(-1, *[1] * (values.ndim - 1))
     return jnp.take_along_axis(values, index, axis=1)[:, 0]
 
@@ -24,7 +24,7 @@ def chosen(
 def bootstrap(
     q_next: Float[Array, "batch action *atom"], selector: Float[Array, "batch action"]
 ) -> Float[Array, "batch *atom"]:
-    """The next state's value: ``q_next`` at the action that ``selector`` finds best.
+    """The next state's value: ``q_next`` at the best action of ``selector``.
 
     Double Q-learning (van Hasselt et al. 2016, eq. 4) lets the online network select and the target
     network evaluate; with ``selector = q_next`` this is max_a Q'(s', a) (Mnih et al. 2015).
@@ -38,12 +38,12 @@ def td_target(
     following: Float[Array, "*batch"],
     discount: Float[Array, "*#batch"] | float,
 ) -> Float[Array, "*batch"]:
-    """Bellman target r + γ V(s'), where nothing follows a terminal transition."""
+    """Bellman target r + γ V(s'), or r if the transition is terminal."""
     return reward + jnp.where(terminal, 0.0, discount * following)
 
 
 def possible_values(rewards: Float[Array, "2"], discount: Scalar) -> Float[Array, "2"]:
-    """The lowest and the highest return over one step or more, of rewards between two numbers."""
+    """The lowest and highest possible return over one step or more, given the range of rewards."""
     forever = rewards / jnp.maximum(1 - discount, 1e-9)
     lowest, highest = jnp.stack([rewards, forever], axis=1)
     return jnp.stack([lowest.min(), highest.max()])
@@ -64,20 +64,20 @@ def unsquash(root: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 class Scale(NamedTuple):
-    """Whether networks give values, or roots of them, among which small values weigh more.
+    """Whether networks output values or their roots, which give small values more weight.
 
-    Where there is chance, the mean of the targets' roots is not the root of their mean: a value
-    learned so is nearer to zero than the mean.
+    If returns are random, the mean of the targets' roots is not the root of their mean: a value
+    learned this way is biased towards zero.
     """
 
     roots: bool
 
     def values(self, outputs: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """What a network's outputs say."""
+        """The values of a network's outputs."""
         return unsquash(outputs) if self.roots else outputs
 
     def outputs(self, values: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """What a network should give for values."""
+        """The outputs that stand for values."""
         return squash(values) if self.roots else values
 
 
@@ -86,9 +86,9 @@ def n_step(
     last: Bool[Array, "step batch"],
     discount: Scalar,
 ) -> tuple[Float[Array, " batch"], Int[Array, " batch"]]:
-    """Σ γᵏ rₖ up to the first step that is its episode's last, and the number of that step.
+    """Σ γᵏ rₖ up to the episode's last step, and the number of that step.
 
-    Without such a step, up to the last one given (Sutton & Barto 2018, eq. 7.1, its sum alone).
+    If the episode continues, up to the last step given (Sutton & Barto 2018, eq. 7.1, the sum).
     """
     before = jnp.concatenate([jnp.zeros_like(last[:1]), last[:-1]])
     counts = jnp.cumprod(1.0 - before, axis=0)
@@ -97,7 +97,7 @@ def n_step(
 
 
 def huber_loss(error: Float[Array, "*batch"], delta: Scalar) -> Float[Array, "*batch"]:
-    """½e² up to |e| = δ and δ(|e| − ½δ) beyond (Huber 1964); δ = ∞ squares everything."""
+    """½e² up to |e| = δ and δ(|e| − ½δ) beyond (Huber 1964); δ = ∞ gives the squared error."""
     clipped = jnp.clip(error, -delta, delta)
     return clipped * (error - clipped / 2)
 
@@ -113,8 +113,8 @@ def advantages(
 ) -> Float[Array, "time environment"]:
     """Generalised advantage estimates (Schulman et al. 2016, eq. 16; ``gae_lambda`` is λ).
 
-    ``next_value`` is that of the true next observation, so that a truncation is bootstrapped
-    through while the sum of what follows stops there.
+    ``next_value`` is that of the true next observation: a truncation bootstraps from it, while the
+    sum of later errors stops there.
     """
     error = td_target(reward, terminated, next_value, discount) - value
 
@@ -128,5 +128,5 @@ def advantages(
 
 
 def follow(target: Weights, online: Weights, rate: Scalar) -> Weights:
-    """A target network, moved towards the online one by ``rate``; exact for rates of 0 and 1."""
+    """The target network after a step of ``rate`` towards the online one; exact for 0 and 1."""
     return jax.tree.map(lambda t, w: (1 - rate) * t + rate * w, target, online)

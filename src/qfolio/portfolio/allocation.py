@@ -14,15 +14,15 @@ from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
 
 MAX_AGE = datetime.timedelta(days=7)
-"""Prices that are older are stale."""
+"""Older prices are stale."""
 
 NOISE = 1e-6
-"""Targets within this weight of what is held are no orders, since policies decide in float32."""
+"""Smaller changes of a weight are not ordered, since policies decide in float32."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Allocation:
-    """What to hold after the close of ``date``, and what to trade for it; arrays by asset."""
+    """Target weights after the close of ``date``, and the trades to reach them; arrays by asset."""
 
     date: str  # of the last prices
     assets: tuple[str, ...]
@@ -43,18 +43,18 @@ class Allocation:
         *,
         whole_shares: bool = False,
     ) -> "Allocation":
-        """The policy's target after the table's last row, and the trades from what is held now.
+        """The policy's target after the table's last row, and the trades from the current holding.
 
-        The targets are scaled to what is left after costs (the transaction remainder factor), so
-        that the trades never need more money than there is. Whole shares are rounded toward zero;
-        where less is sold by this than is spent, fewer of the cheapest assets are bought.
+        The targets are scaled to the wealth after costs (the transaction remainder factor), so that
+        the trades never need more money than there is. Whole shares are rounded toward zero; if the
+        sales then do not cover the purchases, fewer of the cheapest assets are bought.
 
         Args:
-            policy: Decides on the target weights.
-            prices: Ends with the row after which to trade.
-            shares: Held now, of shape (assets,).
-            cash: In money.
-            whole_shares: Trade no fractions of shares.
+            policy: The policy to follow.
+            prices: Prices up to the row after which to trade.
+            shares: Shares held now, of shape (assets,).
+            cash: Cash held now, in money.
+            whole_shares: Whether to trade whole shares only.
 
         Raises:
             QfolioError: There is nothing to allocate.
@@ -91,7 +91,7 @@ class Allocation:
             weights=weights,
             trades=trades,
             cost=float(cost),
-            cash_after=float(max(cash_after, 0.0)),  # of rounding
+            cash_after=float(max(cash_after, 0.0)),  # rounding may leave it below 0
         )
 
     @property
@@ -126,7 +126,7 @@ class Allocation:
 
 
 def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """The targets without rounding noise, cash first; exactly ``held`` where nothing is ordered."""
+    """The targets without rounding noise, cash first; exactly ``held`` if nothing is ordered."""
     orders = np.abs(targets - held) > NOISE
     if not orders[1:].any():
         return held
@@ -136,11 +136,11 @@ def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
 
 
 def _whole(trades: np.ndarray, prices: np.ndarray, cash: float, rate: float) -> np.ndarray:
-    """Trades rounded toward zero, with fewer of the cheapest bought where money runs short."""
+    """Trades rounded toward zero, with fewer of the cheapest bought if money runs short."""
     trades = np.trunc(trades + np.copysign(1e-9, trades)) + 0.0  # no -0
     spent, received = np.maximum(trades, 0) @ prices, np.maximum(-trades, 0) @ prices
     budget = (cash + received * (1 - rate)) * (1 - rate)
-    short = spent - budget * (1 + 1e-12)  # of rounding
+    short = spent - budget * (1 + 1e-12)  # tolerates rounding
     for i in np.argsort(prices):
         if short > 0 and trades[i] > 0:
             fewer = min(trades[i], np.ceil(short / prices[i]))
@@ -165,5 +165,5 @@ def require_fresh(prices: Prices, as_of: str | None) -> None:
     if today - last > MAX_AGE:
         raise QfolioError(
             f"The prices are stale: they end on {last}, {(today - last).days} days before {today}; "
-            f"bring the latest with --prices, or set --as-of {last}."
+            f"give the latest with --prices, or set --as-of {last}."
         )

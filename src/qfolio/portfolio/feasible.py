@@ -16,9 +16,9 @@ class Feasible(eqx.Module):
     def project(
         self, wanted: Float[Array, " entry"], held: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
-        """Weights of the set for who wants ``wanted`` (on the simplex) and holds ``held``.
+        """Weights of the set for the wanted weights (on the simplex) and the weights held.
 
-        Weights of the set stay as they are; differentiable almost everywhere.
+        Weights of the set are returned unchanged; differentiable almost everywhere.
         """
 
     @abc.abstractmethod
@@ -27,27 +27,27 @@ class Feasible(eqx.Module):
 
     @abc.abstractmethod
     def violations(self, weights: Any) -> dict[str, Any]:
-        """By how much weights of shape (..., entry) lie outside the set, of shape (...), by name.
+        """How far weights of shape (..., entry) lie outside the set, of shape (...), by condition.
 
-        Takes numpy and jax arrays. 0 or less where a condition holds, NaN where a weight is NaN.
+        Takes numpy and jax arrays. 0 or less if a condition holds, NaN if a weight is NaN.
         """
 
 
 class CappedSimplex(Feasible):
-    """Long-only weights of sum 1, each asset's at most its limit; cash has none."""
+    """Long-only weights of sum 1, each asset's at most its limit; cash has no limit."""
 
     limits: Float[Array, " asset"]  # 0 where an asset cannot be traded
 
     def project(
         self, wanted: Float[Array, " entry"], held: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
-        """What is wanted above an asset's limit stays in cash."""
+        """The excess over an asset's limit stays in cash."""
         allowed = jnp.minimum(wanted[1:], self.limits)
         cash = wanted[:1] + (wanted[1:] - allowed).sum(keepdims=True)
         return jnp.concatenate([cash, allowed])
 
     def draw(self, key: PRNGKeyArray) -> Float[Array, " entry"]:
-        """From nearly equal weights to nearly all in one."""
+        """Random concentration, from nearly equal weights to nearly all in one."""
         spread_key, key = jax.random.split(key)
         spread = jax.random.uniform(spread_key, maxval=4.0)
         weights = jax.nn.softmax(spread * jax.random.gumbel(key, (self.limits.shape[0] + 1,)))

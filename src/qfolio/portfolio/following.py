@@ -17,11 +17,11 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
 TOLERANCE = 1e-4
-"""How far targets may be off what may be ordered; they are computed in float32."""
+"""How far targets may be outside the feasible set; they are computed in float32."""
 
 
 def on_table(task: Portfolio, prices: Prices) -> Portfolio:
-    """The same task, scaled by what it was trained on, over all rows of another table."""
+    """The same task over all rows of another table, with the scale of its training data."""
     other = Portfolio.arrays(prices)
     rows = jnp.array(len(prices) - 1, jnp.int32)
     where = lambda t: (t.log_relatives, t.extra, t.first_decision, t.last_decision)  # noqa: E731
@@ -40,20 +40,20 @@ def follow(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Greedy decisions from row ``first`` on: of each member by itself, or of all together.
 
-    Together, they hold one portfolio and follow the mean of their targets. Behind the table's last
-    row nothing moves.
+    Together, they hold one portfolio and follow the mean of their targets. After the table's last
+    row prices do not move.
 
     Args:
-        members: What each agent learned, with a leading seed axis.
+        members: The agents' weights, with a leading seed axis.
         held: Weights at row ``first``, shape (seed, entry), or (1, entry) if together.
         count: Number of decisions.
 
     Returns:
-        Target weights, and what is held one row after each decision, both of shape
+        Target weights, and the weights held one row after each decision, both of shape
         (seed or 1, count, entry).
 
     Raises:
-        QfolioError: Targets are not numbers, or may not be ordered.
+        QfolioError: Targets are not numbers, or not feasible.
     """
     portfolios = jax.tree.map(lambda x: x[None] if together else x[:, None], members)
     start = jnp.array(first, jnp.int32), jnp.asarray(held, jnp.float32)
@@ -86,13 +86,13 @@ def _follow(
 
 
 def _require_feasible(task: Portfolio, agent: Agent, targets: np.ndarray, first: int) -> None:
-    """A replay would take weights that are not numbers for no order, without a word."""
+    """Raises QfolioError for infeasible targets; a replay would read NaN as no order."""
     for said, amount in task.feasible.violations(targets).items():
         wrong = ~(amount <= TOLERANCE)
         if wrong.any():
             seed, day = np.argwhere(wrong)[0]
             raise QfolioError(
-                f"{type(agent).__name__} names target weights at row {first + day} of the prices "
-                f"that may not be ordered: {said} {amount[seed, day]:.3g}; train it anew, with a "
+                f"{type(agent).__name__} gives target weights at row {first + day} of the prices "
+                f"that are not allowed: {said} {amount[seed, day]:.3g}; train it again, with a "
                 "lower learning_rate if they are not numbers."
             )

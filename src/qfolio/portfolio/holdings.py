@@ -1,4 +1,4 @@
-"""Reads what is held now: shares and cash, as brokers export them."""
+"""Reads current holdings: shares and cash, as brokers export them."""
 
 import math
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ def read_holdings(
 
     Args:
         path: A table with a column of assets (asset, symbol, ticker, …) and one of shares (shares,
-            quantity, qty, …), in which a row "cash" holds money; other columns are left alone.
+            quantity, qty, …), in which a row "cash" holds money; other columns are ignored.
             Without it, all is cash.
-        assets: Those that may be held.
-        capital: Money in cash, where the table does not say.
+        assets: The assets that may be held.
+        capital: Cash, if the table does not give it.
 
     Raises:
         QfolioError: The file is not such a table, names an unknown asset or one asset twice, a
@@ -59,7 +59,7 @@ def read_holdings(
             known = f"the backtest does not know {quote(name)}{hint(name, assets)}"
             raise QfolioError(f"{where}: {known if name else 'the asset has no name'}.")
         if name in held:
-            raise QfolioError(f"{where}: {quote(name)} comes twice; add the two up.")
+            raise QfolioError(f"{where}: {quote(name)} appears twice; add the two up.")
         if is_missing(cells[i]):
             raise QfolioError(f"{where}: there is no number of shares of {quote(name)}.")
         if wrong[i] or (name != CASH and CURRENCIES & set(str(cells[i]))):
@@ -74,7 +74,7 @@ def read_holdings(
 
 
 def _name_columns(names: tuple[str, ...]) -> set[int]:
-    """The columns that stay text, though names may look like numbers."""
+    """The columns that stay text, because names may look like numbers."""
     return {j for j, name in enumerate(names) if plain(name) in ASSET_NAMES}
 
 

@@ -1,9 +1,9 @@
-"""What all markets share: cash and assets, weights that drift, exact costs, and what is rewarded.
+"""The base of all markets: cash and assets, drifting weights, exact costs, and rewards.
 
-Weights have an entry for cash, then one for each asset. A decision names target weights at today's
-prices: an order in shares, scaled to what the wealth affords when it is executed, and free of cost
-where it equals what is held. What a trade costs is in ``costs.py``, the same for training and
-backtest; what may be held in ``feasible.py``; what a step is worth in ``rewards.py``.
+Weights have an entry for cash, then one for each asset. A decision sets target weights at today's
+prices: an order in shares, scaled to the wealth when it is executed, and free of cost if it equals
+the holding. Costs are in ``costs.py``, the same for training and backtest; feasible weights in
+``feasible.py``; rewards in ``rewards.py``.
 """
 
 import abc
@@ -28,7 +28,7 @@ MENU_LIMIT = 2000
 
 
 class Holding(NamedTuple):
-    """The portfolio as last decided, drifted to now, and the state of the reward."""
+    """The last target weights, drifted to now, and the state of the reward."""
 
     weights: Float[Array, " entry"]
     reward: PyTree
@@ -43,9 +43,9 @@ class Relatives(NamedTuple):
 
 
 class Menu(eqx.Module):
-    """Allocations to choose from: each keeps a share of the holding and fills up with a target.
+    """A menu of allocations: each mixes a share of the holding with a target.
 
-    limits: the largest weights; assets with 0 have no part in equal weights.
+    limits: the largest weights; assets with 0 are left out of equal weights.
     text: "grid:10" for all weights in tenths; "tilts:0.1" for: no order, all cash, equal weights,
     all in one asset, and a tenth of the holding moved into one asset (each for every asset);
     "overweight:0.1" for: no order, all cash, equal weights, and equal weights with a tenth of the
@@ -70,7 +70,7 @@ class Menu(eqx.Module):
             if comb(int(value) + assets, assets) > MENU_LIMIT:
                 raise QfolioError(
                     f"menu={text} has more than {MENU_LIMIT:,} allocations of {assets} assets; "
-                    "take a coarser grid, or menu=tilts:0.1."
+                    "use a coarser grid, or menu=tilts:0.1."
                 )
             target = jnp.asarray(simplex.grid(assets + 1, int(value)), jnp.float32)
             keep, self.actions = jnp.zeros(len(target)), Discrete(len(target))
@@ -91,16 +91,16 @@ class Menu(eqx.Module):
     def weights(
         self, held: Float[Array, " entry"], choice: Int[Array, ""]
     ) -> Float[Array, " entry"]:
-        """The allocation that a choice means to a holder of ``held``."""
+        """The allocation of a choice, given the weights held."""
         return self.keep[choice] * held + (1 - self.keep[choice]) * self.target[choice]
 
 
 class Market(ExogenousTask):
-    """Cash and assets; a market says how prices move, and the rest is here.
+    """Cash and assets; subclasses define how prices move.
 
-    cost: of trading one way, as a share of what is traded. menu: text of a ``Menu`` for agents that
-    choose among allocations; without, an action is the target weights. reward, cost_model: names of
-    a ``Reward`` and of a ``CostModel``.
+    cost: one-way trading cost, as a share of the value traded. menu: text of a ``Menu`` for agents
+    that choose among allocations; without it, an action is the target weights. reward, cost_model:
+    names of a ``Reward`` and of a ``CostModel``.
     """
 
     if TYPE_CHECKING:  # as in Task
@@ -124,7 +124,7 @@ class Market(ExogenousTask):
 
     @abc.abstractmethod
     def features(self, market: PyTree) -> Float[Array, "asset time channel"]:
-        """What is known of each asset, nothing later than now."""
+        """The features of each asset, without knowledge of the future."""
 
     @abc.abstractmethod
     def relatives(self, market: PyTree, next_market: PyTree) -> Relatives:
@@ -138,7 +138,7 @@ class Market(ExogenousTask):
 
     @property
     def feasible(self) -> Feasible:
-        """The weights that may be ordered."""
+        """The set of weights that may be ordered."""
         return CappedSimplex(self.limits)
 
     @property
@@ -154,7 +154,7 @@ class Market(ExogenousTask):
         return self.reward_function.path_dependent
 
     def target(self, held: Float[Array, " entry"], action: Array) -> Float[Array, " entry"]:
-        """The target weights that an action means, brought to what may be ordered."""
+        """The target weights of an action, projected onto the feasible set."""
         weights = Menu(self.menu, self.limits).weights(held, action) if self.menu else action
         return self.feasible.project(weights, held)
 
@@ -168,7 +168,7 @@ class Market(ExogenousTask):
         return self.hold(self.feasible.draw(key))
 
     def hold(self, weights: Float[Array, " entry"]) -> Holding:
-        """A holding without a past."""
+        """A holding without a history."""
         return Holding(weights, self.reward_function.init())
 
     def settle(
@@ -187,7 +187,7 @@ class Market(ExogenousTask):
 
 
 def _part(market: Market, kind: Kind, name: str) -> Any:
-    """The part of a market that a setting names, with the settings that the two share."""
+    """The part of a market that a setting names, with the market's values of shared settings."""
     part = build(kind, name, {})
     shared = [field.name for field in dataclasses.fields(part) if hasattr(market, field.name)]
     return dataclasses.replace(part, **{name: getattr(market, name) for name in shared})

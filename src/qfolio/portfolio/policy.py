@@ -1,6 +1,6 @@
 """A learned portfolio policy: from prices and holdings to target weights.
 
-The policy is the mean over the agents of all seeds. ``policy_folder.py`` keeps it on disk.
+The policy is the mean over the agents of all seeds. ``policy_folder.py`` stores it on disk.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 
 UPDATE_RATE = 0.1
-"""Share of the learning rate with which a policy goes on learning."""
+"""Share of the learning rate with which an update learns."""
 
 UNKNOWN = np.datetime64("NaT", "s")
 
@@ -43,16 +43,16 @@ def train(
     listeners: Sequence[Listener] = (),
     **task: Any,
 ) -> "Policy":
-    """A policy that has learned from all rows of a price table, all seeds in one program.
+    """A policy trained on all rows of a price table, all seeds in one program.
 
     Args:
         prices: Anything that ``prices.load`` reads.
         agent: The name of an agent, for its fast preset; a preset; or an agent, which then needs
             ``episodes``.
-        seeds, seed: Number of agents, with the seeds ``seed``, ``seed + 1``, …; the preset's
-            number, or 5.
-        episodes: That each agent is trained for; the preset's, if not named.
-        task: Settings of the portfolio task (cost, lag, window, …) in place of the preset's.
+        seeds, seed: Number of agents (default: the preset's, or 5), with the seeds ``seed``,
+            ``seed + 1``, ….
+        episodes: Training episodes of each agent (default: the preset's).
+        task: Settings of the portfolio task (cost, lag, window, …) that replace the preset's.
 
     Raises:
         QfolioError: Table, settings and agent do not fit together, or a loss is not finite.
@@ -66,7 +66,7 @@ def train(
         seeds = agent.seeds if seeds is None else seeds
         agent = agent.build()
     if episodes is None:
-        raise QfolioError("An agent without a preset needs to be told how many episodes to train.")
+        raise QfolioError("An agent without a preset needs episodes, the length of its training.")
     count = 5 if seeds is None else seeds
     portfolio = Portfolio.of(table, **settings.convert(Portfolio, task))
     population = Population(portfolio, agent, seed_range(count, seed))
@@ -87,10 +87,10 @@ class Policy:
     """Agents of one kind and several seeds, trained on the assets of one table.
 
     task: the portfolio task, with the part of the table that they were trained on.
-    members: what each agent learned, with a leading seed axis.
-    learner: the agents' whole states, likewise; without, the policy cannot be updated.
-    updates: how often it has gone on learning.
-    learned: the date of the last row that it has learned from; NaT where that is not known.
+    members: the agents' weights, with a leading seed axis.
+    learner: the agents' whole states, likewise; without it, the policy cannot be updated.
+    updates: number of updates so far.
+    learned: the date of the last row that it has learned from; NaT if unknown.
     """
 
     def __init__(
@@ -113,9 +113,8 @@ class Policy:
 
         Args:
             prices: A price table with the assets that the policy was trained on, in any order, and
-                at least as many rows as its window has; anything that ``prices.load`` reads, with
-                its options.
-            holdings: Weights held now, by asset (what is left is cash); None for cash alone.
+                more rows than its window; anything that ``prices.load`` reads, with its options.
+            holdings: Weights held now, by asset; the rest is cash (default: all cash).
 
         Raises:
             QfolioError: The assets are not those of the policy, or prices are missing in its
@@ -133,33 +132,32 @@ class Policy:
         listeners: Sequence[Listener] = (),
         **options: Any,
     ) -> "Policy":
-        """The policy after it has gone on learning from the last rows of a newer table.
+        """The policy after further learning from the last rows of a newer table.
 
-        It looks at as many rows as it was first trained on, and keeps the scale of its
-        observations. Networks and optimiser go on from where they were, at a constant tenth of the
-        learning rate; what was stored of the old table is forgotten.
+        It learns from as many rows as in its first training, and keeps the scale of its
+        observations. Networks and optimiser continue from their states, at a constant tenth of the
+        learning rate; experience from the old table is dropped.
 
         Args:
             prices: As for ``weights``.
-            episodes: In which each agent learns; one for each of its environments, if not named.
+            episodes: Learning episodes of each agent (default: one for each of its environments).
 
         Raises:
             QfolioError: The learning state was not kept, the table does not fit, or it has no row
-                that is newer than those that were learned from.
+                newer than those already learned from.
         """
         if self.learner is None:
             raise QfolioError(
-                "This policy was kept without its learning state and cannot go on learning; train "
-                "it anew."
+                "This policy was kept without its learning state and cannot be updated; train it "
+                "again."
             )
         wanted = self.agent.num_envs if episodes is None else episodes
         _ = Budget(wanted)
         table = self.table(prices, **options)
         if table.dates[-1] <= self.learned:
             raise QfolioError(
-                f"The prices end on {day(table.dates[-1])}, and the policy has learned from those "
-                f"up to {day(self.learned)} already: there is nothing new to learn; bring newer "
-                "prices, or go without an update."
+                f"The prices end on {day(table.dates[-1])}, but the policy has already learned "
+                f"from those up to {day(self.learned)}; give newer prices, or leave out the update."
             )
         table = table.between(max(0, len(table) - self.rows), None)
         task = self._moved(table)
@@ -167,7 +165,7 @@ class Policy:
         agent: Agent = dataclasses.replace(
             of_now,
             learning_rate=of_now.learning_rate * UPDATE_RATE,
-            learning_rate_final=1.0,  # the cosine may have come to its end
+            learning_rate_final=1.0,  # the schedule may have ended
         )
         draws = [np.random.SeedSequence((i, self.updates + 1)) for i in range(self.seeds)]
         seeds = [int(draw.generate_state(1)[0]) for draw in draws]
@@ -195,7 +193,7 @@ class Policy:
 
     @property
     def rows(self) -> int:
-        """Of the part of a table that it was trained on."""
+        """Number of rows that it was trained on."""
         return (
             int(self.task.last_decision - self.task.first_decision)
             + self.task.window
@@ -226,7 +224,7 @@ class Policy:
                 f"{self.task.window + 1}."
             )
         table = table.select(self.assets)
-        # An asset that may be held needs a price all over the window, the others one at its end.
+        # An asset that may be held needs prices in the whole window, the others at its end.
         tradable, last = np.asarray(self.task.limits) > 0, len(table) - 1
         begin = last - self.task.window
         late = table.first_rows > np.where(tradable, begin, last)
@@ -234,7 +232,7 @@ class Policy:
             raise QfolioError(
                 f"The policy's window begins on {day(table.dates[begin])}, when there was no price "
                 f"of {_list([n for n, is_late in zip(self.assets, late, strict=True) if is_late])} "
-                "yet; bring earlier prices, or wait until there are enough."
+                "yet; give earlier prices, or wait until there are enough."
             )
         return table
 
@@ -259,7 +257,7 @@ class Policy:
     def decide(
         self, prices: Prices, first: int, held: np.ndarray, count: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Target weights at ``count`` rows from ``first`` on, and what is held after each.
+        """Target weights at ``count`` rows from ``first`` on, and the weights held after each.
 
         held: at row ``first``, shape (entry,). Both results are (count, entry); the second is
         drifted to the row after each decision.
@@ -270,14 +268,14 @@ class Policy:
         return tuple(x / x.sum(-1, keepdims=True) for x in (targets, after))
 
     def save(self, folder: Path | str) -> None:
-        """Writes it into a new or empty folder."""
+        """Writes the policy into a new or empty folder."""
         from qfolio.portfolio import policy_folder
 
         policy_folder.save(self, Path(folder))
 
     @classmethod
     def open(cls, folder: Path | str) -> "Policy":
-        """What ``save`` wrote. Raises QfolioError where the folder holds no policy."""
+        """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
         from qfolio.portfolio import policy_folder
 
         return policy_folder.read(Path(folder))
@@ -292,7 +290,7 @@ class Policy:
 
 
 def _learn(population: Population, episodes: int, listeners: Sequence[Listener]) -> None:
-    """Raises KeyboardInterrupt where Ctrl-C stopped it: half a training makes no policy."""
+    """Trains; raises KeyboardInterrupt if Ctrl-C stopped it before the end."""
     if not fit(population, Budget(episodes), listeners).finished:
         raise KeyboardInterrupt
 

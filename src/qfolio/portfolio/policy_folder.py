@@ -1,7 +1,7 @@
-"""A policy's folder: what it was trained with, its weights, and its learning state.
+"""A policy's folder: its settings, its weights, and its learning state.
 
-policy.json holds the settings, policy.safetensors what it decides by, and learning.safetensors the
-whole learning state, from which it can go on learning.
+policy.json holds the settings, policy.safetensors the weights and scales for decisions, and
+learning.safetensors the whole learning state, for updates.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.task import Portfolio
 
 FORMAT = 3
-"""Of a policy's folder; raised whenever an older folder can no longer be read."""
+"""Format of a policy's folder; raised whenever an older folder can no longer be read."""
 
 
 def save(policy: Policy, folder: Path) -> None:
@@ -53,7 +53,7 @@ def save(policy: Policy, folder: Path) -> None:
 
 
 def read(folder: Path) -> Policy:
-    """What ``save`` wrote. Raises QfolioError where the folder holds no policy."""
+    """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
     path = folder / "policy.json"
     config = read_json(path)
     if config.get("format") != FORMAT or config.get("kind") != "policy":
@@ -68,7 +68,7 @@ def read(folder: Path) -> Policy:
         if not all(bounds) or not all(isinstance(name, str) for name in assets + features):
             raise ValueError
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise QfolioError(f"{path} is damaged: a setting is missing or odd.") from None
+        raise QfolioError(f"{path} is damaged: a setting is missing or invalid.") from None
     task = _blank(len(assets), len(features), rows, **chosen)
     state = state_template(task, agent, seeds)
     template = _kept(task, agent.weights(state))
@@ -86,7 +86,7 @@ def state_template(task: Portfolio, agent: Agent, seeds: int) -> PyTree:
 
 
 def _kept(task: Portfolio, members: PyTree) -> dict[str, PyTree]:
-    """What a policy decides by, but for its settings."""
+    """The arrays that a policy needs to decide."""
     return {
         "members": members,
         "center": task.center,
@@ -96,7 +96,7 @@ def _kept(task: Portfolio, members: PyTree) -> dict[str, PyTree]:
 
 
 def _blank(assets: int, features: int, rows: int, **chosen: Any) -> Portfolio:
-    """A task that was trained on so many rows, of whose table nothing is left."""
+    """A task of the given number of training rows, without their prices."""
     task = Portfolio(
         log_relatives=jnp.zeros((0, assets)),
         extra=jnp.zeros((0, assets, features)),

@@ -1,9 +1,9 @@
-"""What a market pays for a step: a utility of net growth, or of the path that led to it.
+"""Rewards of a market's step: a utility of net growth, or of the path that led to it.
 
-A reward has a state of its own, for those that depend on what came before, and is a function of the
-step's outcome alone. ``reward=NAME`` of a market names one of them, or a user's own as module:Name.
-Every field has a default, and one that is called like a setting of the market (``risk_aversion``,
-``sharpe_rate``) takes its value.
+A reward is a function of its own state, which may summarise earlier steps, and of the step's
+outcome. ``reward=NAME`` of a market names one of them, or a user's own as module:Name. Every field
+has a default, and a field with the name of a market's setting (``risk_aversion``, ``sharpe_rate``)
+takes its value.
 """
 
 import abc
@@ -17,26 +17,26 @@ from jaxtyping import Array, Float, PyTree
 from qfolio.core.fields import require
 
 LEAST_VARIANCE, LEAST_SHARE = 1e-10, 1e-3
-"""What a Sharpe ratio is divided by at least: a volatility of 0.1 bp a step, and this share of the
-mean square return (a Sharpe ratio of 32 a step), below which rounding to float32 shows."""
+"""Lower bounds of the variance in a Sharpe ratio: a volatility of 0.1 bp a step, and a share of the
+mean square return (a Sharpe ratio of 32 a step), below which float32 rounding matters."""
 
 Number = Float[Array, ""] | float
 
 
 class Outcome(NamedTuple):
-    """What came of a step."""
+    """The outcome of a step."""
 
     growth: Float[Array, ""]  # wealth after the step over wealth before, net of costs
-    cost: Float[Array, ""]  # share of the wealth that its trade cost
+    cost: Float[Array, ""]  # of its trade, as a share of wealth
     weights: Float[Array, " entry"]  # right after the trade, cash first
 
 
 class Reward(eqx.Module):
-    """What a step is worth."""
+    """The reward of a step."""
 
     @abc.abstractmethod
     def init(self) -> PyTree:
-        """The state before the first step; None where no step depends on earlier ones."""
+        """The state before the first step; None if no reward depends on earlier steps."""
 
     @abc.abstractmethod
     def __call__(self, state: PyTree, outcome: Outcome) -> tuple[Float[Array, ""], PyTree]:
@@ -78,7 +78,7 @@ class CRRA(Reward):
 
 
 class MeanVariance(Reward):
-    """Return less γ/2 times its square, which is the variance for returns of mean zero."""
+    """Return minus γ/2 times its square, which is the variance for returns of mean zero."""
 
     risk_aversion: Number = 3.0  # γ
 
@@ -94,7 +94,7 @@ class MeanVariance(Reward):
 
 
 class DifferentialSharpe(Reward):
-    """How the step changes an exponentially weighted Sharpe ratio (Moody & Saffell 1998).
+    """The step's change of an exponentially weighted Sharpe ratio (Moody & Saffell 1998).
 
     With moving averages A of the returns R and B of their squares, and η the weight of the newest,
 
@@ -105,7 +105,7 @@ class DifferentialSharpe(Reward):
     1e-4 stands for a volatility of 1 % a step.
     """
 
-    sharpe_rate: Number = 0.01  # η, the reciprocal of how many steps are remembered
+    sharpe_rate: Number = 0.01  # η, the reciprocal of the memory in steps
 
     def __check_init__(self) -> None:
         require(self, "sharpe_rate", lambda x: 0 <= x <= 0.5, "from 0 to 0.5")

@@ -3,7 +3,7 @@
 State: the row of the price table, the portfolio. Observation: for each asset a window of log
 returns (and of any other features), and the current weights. Action: target weights, or a choice
 from a menu. A decision sees prices up to row t, is executed at the close of row t + lag, and earns
-the move to the row after. Nothing that is observed at t changes when a later price does.
+the move to the row after. No observation at t depends on a later price.
 """
 
 from typing import Any
@@ -25,12 +25,12 @@ Row = Int[Array, ""]
 
 
 class Portfolio(Market):
-    """Trade the assets of a price table; each episode is a stretch of ``horizon`` rows.
+    """Trade the assets of a price table; each episode covers ``horizon`` consecutive rows.
 
-    ``Portfolio.of(prices)`` makes one that may use all rows, ``part`` one that may use some.
+    ``Portfolio.of(prices)`` uses all rows, ``part`` some of them.
     """
 
-    log_relatives: Float[Array, "row asset"]  # log of price over the row before; 0 where unknown
+    log_relatives: Float[Array, "row asset"]  # log of price over the row before; 0 if unknown
     extra: Float[Array, "row asset feature"]
     limits: Float[Array, " asset"]  # largest weight of each asset; 0 where it cannot be traded
     center: Float[Array, " channel"]  # of the observed channels, from the rows of the part
@@ -39,7 +39,7 @@ class Portfolio(Market):
     last_decision: Row
     window: int = static(60)  # rows that are observed
     lag: int = static(1)  # rows from a decision to its execution
-    cost: float = constant(0.001)  # of trading one way, as a share of what is traded
+    cost: float = constant(0.001)  # one way, as a share of the value traded
     cost_model: str = static("proportional")
     max_weight: float = constant(1.0)  # of one asset
     menu: str = static("")
@@ -82,17 +82,17 @@ class Portfolio(Market):
         _ = self.costs, self.reward_function  # which check their own settings
 
     def part(self, first: int, last: int, tradable: np.ndarray | None = None) -> "Portfolio":
-        """The same task on the prices of rows ``first`` to ``last`` alone.
+        """The same task on rows ``first`` to ``last`` alone.
 
-        Windows, rewards and the scale of what is observed come from these rows only. tradable:
-        which assets may be held, shape (asset,).
+        Windows, rewards and the scale of observations come from these rows only. tradable: which
+        assets may be held, shape (asset,).
         """
         decisions = last - self.lag - 1 - (first + self.window) + 1
         if decisions < self.horizon:
             raise QfolioError(
                 f"{last - first + 1} rows are too few: a window of {self.window}, a lag of "
                 f"{self.lag} and an episode of {self.horizon} need at least "
-                f"{self.window + self.lag + self.horizon + 1}; lower window or horizon, or bring "
+                f"{self.window + self.lag + self.horizon + 1}; lower window or horizon, or give "
                 "more rows."
             )
         rows = slice(first + 1, last + 1)
@@ -126,7 +126,7 @@ class Portfolio(Market):
         return self.first_decision + drawn
 
     def next_market(self, market: Row, key: PRNGKeyArray) -> Row:
-        # One row on, the last decision's outcome is known; episodes end there at the latest.
+        # One row later the last decision's outcome is known; episodes end there at the latest.
         return jnp.minimum(market + 1, self.last_decision + 1)
 
     def steps_left(self, state: Position) -> Int[Array, ""]:
@@ -140,7 +140,7 @@ class Portfolio(Market):
         return jnp.swapaxes((channels - self.center) / self.scale, 0, 1)
 
     def relatives(self, market: Row, next_market: Row) -> Relatives:
-        # The rows up to market + lag + 1 are there: no decision is settled that lacks one.
+        # Rows up to market + lag + 1 exist for every decision that is settled.
         after = lax.dynamic_slice_in_dim(self.log_relatives, market + 1, self.lag + 1)
         return Relatives(
             waiting=jnp.exp(after[: self.lag].sum(0)),
@@ -149,7 +149,7 @@ class Portfolio(Market):
         )
 
     def coming(self, row: Row) -> Float[Array, " asset"]:
-        """Relatives from a row to the next; 1 where the table ends, as nothing is known of it."""
+        """Relatives from a row to the next; 1 after the table's last row."""
         rows = self.log_relatives.shape[0]
         following = lax.dynamic_index_in_dim(self.log_relatives, row + 1, keepdims=False)
         return jnp.where(row + 1 < rows, jnp.exp(following), 1.0)

@@ -1,4 +1,4 @@
-"""An episode of the pendulum as an animated picture that loops without a visible jump."""
+"""An episode of the pendulum as an animation that loops smoothly."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -34,7 +34,7 @@ def pendulum_gif(
 ) -> None:
     """Save an episode of T steps as a GIF in real time that repeats for ever.
 
-    The last frame stays for a moment and then fades into the first one: T + 1 + FADE_FRAMES
+    The last frame is held for a moment and then fades into the first one: T + 1 + FADE_FRAMES
     frames in all.
 
     Args:
@@ -92,7 +92,7 @@ def _checked(
     steps = len(torque)
     if state.shape != (steps + 1, 2) or torque.shape != (steps,) or reward.shape != (steps,):
         shapes = f"{state.shape}, {torque.shape} and {reward.shape}"
-        raise ValueError(f"states, torques and rewards of shapes {shapes} make no episode")
+        raise ValueError(f"states, torques and rewards of shapes {shapes} do not fit an episode")
     totals = np.concatenate([[0.0], np.cumsum(reward)])
     return state[:, 0].tolist(), [*torque.tolist(), 0.0], totals.tolist()
 
@@ -108,7 +108,7 @@ def _background() -> Image.Image:
 
 
 def _draw_trail(pen: ImageDraw.ImageDraw, angles: Sequence[float]) -> None:
-    """Draw where the bob has just been, fading away."""
+    """Draw the bob's recent path, fading away."""
     parts = list(pairwise(angles))
     for age, (a, b) in zip(range(len(parts), 0, -1), parts, strict=True):
         share = 0.6 * (1 - age / (_TRAIL + 1)) ** 1.5
@@ -116,7 +116,7 @@ def _draw_trail(pen: ImageDraw.ImageDraw, angles: Sequence[float]) -> None:
 
 
 def _draw_torque(pen: ImageDraw.ImageDraw, angle: float, torque: float) -> None:
-    """Draw an arrow that starts at the rod and bends the way the motor pushes."""
+    """Draw a curved arrow from the rod in the direction of the torque."""
     if abs(torque) < 0.02:
         return
     colour = palette.ACCENT if torque > 0 else palette.SECOND
@@ -151,7 +151,7 @@ def _draw_caption(
 
 
 def _number(pen: ImageDraw.ImageDraw, font: _Font, x: float, y: float, text: str) -> float:
-    """Draw a number with equally wide digits, so that it does not tremble; return its end."""
+    """Draw a number with digits of equal width, so that it does not jitter; return its end."""
     for letter in text:
         if letter == "-":  # The font has no minus sign, and a hyphen is too short.
             _line(pen, [(x + 0.8, y - 4.6), (x + 6.9, y - 4.6)], palette.INK, 1.3)
@@ -178,7 +178,7 @@ def _text(
 
 
 def _at(radius: float, angle: float) -> tuple[float, float]:
-    """Return the point of the picture at an angle, as Gymnasium draws it."""
+    """Return the point of the image at an angle, as Gymnasium draws it."""
     return _CENTRE[0] - radius * sin(angle), _CENTRE[1] - radius * cos(angle)
 
 
@@ -217,8 +217,8 @@ def _fade(last: Image.Image, first: Image.Image) -> list[Image.Image]:
 
 
 def _colour_table() -> Image.Image:
-    """Return an image whose palette leads from paper to each colour in even steps."""
-    # Shades too close to paper would be taken for it, and the ground must stay pure.
+    """Return an image whose palette runs from paper to each colour in even steps."""
+    # Shades too close to paper would replace it, and the background must stay pure.
     steps = {palette.INK: 20, palette.MUTED: 12, palette.HAIRLINE: 3}
     steps |= {palette.ACCENT: 20, palette.SECOND: 16}
     shades = [

@@ -1,4 +1,4 @@
-"""From a finished run or backtest to the numbers that its report shows."""
+"""Collects the data of a report from a finished run or backtest."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -30,10 +30,10 @@ from qfolio.solvers.followed import FollowedOptimum
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 
 _HELD = 201
-"""At how many weights or positions a policy is drawn."""
+"""Number of weights or positions at which a policy is drawn."""
 
 EPISODE_START = 53
-"""Which of the fixed starts the animation shows: one that hangs and has to be swung up."""
+"""The fixed start of the animation: one that hangs and must be swung up."""
 
 
 def report_data(
@@ -46,7 +46,7 @@ def report_data(
         optimum = float(solution.returns(start_keys())[: run.population.curve_starts].mean())
     pendulum = run.task if isinstance(run.task, Pendulum) else None
     known = solution if isinstance(solution, FollowedOptimum) else None
-    # In a market, training episodes have luck of their own: their returns do not compare.
+    # In a market, training episodes have other random paths: their returns do not compare.
     whole = known is None and episode_steps(run.task, run.agent) == run.task.horizon
     rows = run.metrics if whole else []
     variant = contrast_of(run.agent)
@@ -116,7 +116,7 @@ def backtest_data(
 
 
 def _training(backtest: Backtest, agent: str) -> list[FoldTraining]:
-    """How an agent's training went in each fold; nothing where a fold's records are missing."""
+    """An agent's training in each fold; empty if a fold's records are missing."""
     records = (backtest.records(agent, fold.name) for fold in backtest.folds)
     folds = [FoldTraining.of(np.array([row["return"] for row in rows])) for rows in records]
     known = [fold for fold in folds if fold is not None]
@@ -169,7 +169,7 @@ def _policy(
 
 
 def constant_weights(rule: dict[str, Any]) -> Weights:
-    """The weights that a summary's rule tells."""
+    """The constant weights in a summary's rule."""
     return Weights(
         names=tuple(name.removeprefix("weight of ") for name in rule["exact"]),
         exact=np.array(list(rule["exact"].values())),
@@ -180,15 +180,14 @@ def constant_weights(rule: dict[str, Any]) -> Weights:
 def responses(
     task: Synthetic, agent: Agent, members: PyTree, best: Policy, scene: str = "{}"
 ) -> Responses:
-    """What learned policies and the best one want in the scenes of a market, by what is held.
+    """Targets of the learned policies and the best one in a market's scenes, by the holding.
 
-    members: weights of the agents, with a leading axis. scene: with the name of a scene put into
-    it, what it is called.
+    members: weights of the agents, with a leading axis. scene: format of a scene's name.
     """
     names, markets = zip(*task.scenes(), strict=True)
     scenes = jax.tree.map(lambda *leaves: jnp.stack(leaves), *markets)
     ends = (0.0, 1.0) if isinstance(task, OneAsset) else (-2.0, 2.0)
-    # Between levels, an exact policy that knows only those would have to round.
+    # Between its levels, an exact policy would have to round.
     held = jnp.linspace(*ends, task.levels if isinstance(task, Ar1) else _HELD)
 
     def wanted(policy: Policy, market: Any, held: Array) -> Array:

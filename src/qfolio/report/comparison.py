@@ -1,6 +1,6 @@
-"""Writing the report of a comparison: one self-contained page without scripts, and its curves.
+"""The report of a comparison: one self-contained page without scripts, and its curves.
 
-Everything shown is in comparison.json, so that a report can be written anew from it.
+All data is in comparison.json, so that the report can be written again from it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FLOOR = 1e-4
-"""The smallest regret that is drawn where the scale is logarithmic."""
+"""The smallest regret drawn on a logarithmic scale."""
 
 UNLIKE = 5.0
 """Budgets that differ by more than this factor are drawn on a logarithmic scale."""
@@ -54,7 +54,7 @@ UNLIKE = 5.0
 
 @dataclass(frozen=True)
 class Look:
-    """How an agent is drawn, in every figure alike."""
+    """The line style of an agent, the same in every figure."""
 
     colour: str  # a key of palette.LIGHT and palette.DARK
     dash: str  # lengths as in SVG; '' is solid
@@ -63,7 +63,7 @@ class Look:
 
 @dataclass(frozen=True)
 class ComparisonData:
-    """What the figures show: the content of comparison.json, with the agents best first."""
+    """The data of the figures: the content of comparison.json, with the agents best first."""
 
     content: dict[str, Any]
     results: dict[str, Result]
@@ -75,7 +75,7 @@ class ComparisonData:
 
     @property
     def graded(self) -> bool:
-        """Whether there is an optimum, so that regrets are shown and not returns."""
+        """Whether there is an optimum, so that regrets are shown instead of returns."""
         return self.ranking["measure"] == "regret"
 
     @property
@@ -107,8 +107,8 @@ def write_comparison_report(folder: Path, content: dict[str, Any]) -> None:
     """Write report.html and learning_curves.png into a folder.
 
     Args:
-        folder: Where to write; made if missing.
-        content: Of comparison.json, with its ranking.
+        folder: The folder to write to; created if missing.
+        content: The content of comparison.json, with its ranking.
 
     Raises:
         OSError: A file cannot be written.
@@ -239,7 +239,7 @@ def _draw_curve(axes: Axes, data: ComparisonData, name: str, pace: float, log: b
     result, look = data.results[name], data.looks[name]
     values = curve(result, data.ranking["measure"])
     x = np.array(result.curve_steps) * pace
-    if log:  # where there is no zero
+    if log:  # which has no zero
         values, x = values[x > 0], x[x > 0]
     colour = palette.LIGHT[look.colour]
     low, high, middle = (
@@ -260,7 +260,7 @@ def _draw_curve(axes: Axes, data: ComparisonData, name: str, pace: float, log: b
 
 
 def _goal_line(axes: Axes, data: ComparisonData) -> None:
-    """Draw how near counts as near: a share of the optimum, or of the best return."""
+    """Draw the threshold that counts as near: a share of the optimum, or of the best return."""
     if _logarithmic(data):
         axes.set_yscale("log")
         axes.set_ylim(bottom=_floor(data))
@@ -273,13 +273,13 @@ def _goal_line(axes: Axes, data: ComparisonData) -> None:
 
 
 def _logarithmic(data: ComparisonData) -> bool:
-    """Whether regrets are drawn on a logarithmic scale: where they span more than a decade."""
+    """Whether regrets are drawn on a logarithmic scale: if they span more than a decade."""
     middles = _middles(data)
     return data.graded and middles.max() > 10 * max(middles.min(), FLOOR)
 
 
 def _floor(data: ComparisonData) -> float:
-    """The lower end of a logarithmic scale: below the curves, if they do not go down too far."""
+    """The lower end of a logarithmic scale: below the curves, but not below ``FLOOR``."""
     least = min(max(_middles(data).min(), FLOOR), HEADLINE / 2)
     return float(10 ** math.floor(math.log10(least)))
 
@@ -294,7 +294,7 @@ def _middles(data: ComparisonData) -> Floats:
 
 
 def tidy(text: str) -> str:
-    """A sentence with true minus signs and thin spaces, as the page writes its numbers."""
+    """A sentence with true minus signs and thin spaces, as in the page's numbers."""
     text = re.sub(r"(?<=\d),(?=\d{3})", THIN_SPACE, text.replace("'", "’"))
     text = re.sub(r"(?<![\w.])-(?=\d)", "\N{MINUS SIGN}", text)
     return re.sub(r"(?<=\d) (?=%|s\b)", THIN_SPACE, text)
@@ -333,7 +333,7 @@ def _headline(data: ComparisonData, name: str) -> dict[str, Any]:
 
 
 def _reached(data: ComparisonData, name: str) -> list[tuple[str, str]]:
-    """What an agent reached: values, each with a remark."""
+    """An agent's results: values, each with a remark."""
     agent = data.ranking["agents"][name]
     final, near = agent["final"], _headline(data, name)
     seeds = len(data.results[name].returns)
@@ -358,7 +358,7 @@ def _reached(data: ComparisonData, name: str) -> list[tuple[str, str]]:
 
 
 def _took(result: Result) -> list[str]:
-    """What an agent took."""
+    """An agent's costs."""
     operations = result.operations_per_step
     return [
         rendering.amount(result.env_steps),
@@ -372,7 +372,7 @@ def _took(result: Result) -> list[str]:
 
 
 def _scaled(value: float, units: tuple[str, ...]) -> str:
-    """A number with three digits that matter, in thousands or millions where it is large."""
+    """A number with three significant digits, in thousands or millions if it is large."""
     power = 0
     while value >= 999.5 and power < len(units) - 1:
         value, power = value / 1000, power + 1
@@ -381,7 +381,7 @@ def _scaled(value: float, units: tuple[str, ...]) -> str:
 
 
 def _within(data: ComparisonData, name: str) -> list[tuple[str, str]]:
-    """For each threshold, after how many steps it was kept, and by how many seeds."""
+    """For each threshold, the steps until it was kept, and the number of seeds."""
     seeds = len(data.results[name].returns)
     return [
         ("–" if entry["steps"] is None else rendering.amount(entry["steps"]),
@@ -391,7 +391,7 @@ def _within(data: ComparisonData, name: str) -> list[tuple[str, str]]:
 
 
 def _better(data: ComparisonData) -> list[tuple[str, list[dict[str, Any] | None]]]:
-    """Return a row for each agent: how likely one of its seeds beats one of each other agent."""
+    """Return a row for each agent: the probability that its seeds beat each other agent's."""
     cells: dict[tuple[str, str], dict[str, Any]] = {}
     for pair in data.ranking["pairs"]:
         a, b, probability = pair["first"], pair["second"], pair["probability"]
@@ -413,7 +413,7 @@ def _cell(probability: float, ends: list[float], told_apart: bool) -> dict[str, 
 
 
 def _settings(data: ComparisonData, name: str) -> tuple[str, list[Any]]:
-    """What was trained, in a line, and all its settings by group."""
+    """An agent's training in a line, and all its settings by group."""
     entry, result = data.content["agents"][name], data.results[name]
     preset = f"preset {entry['preset']}, " if entry["preset"] else ""
     line = f"{entry['agent']}, {preset}{rendering.amount(result.episodes)} episodes a seed"

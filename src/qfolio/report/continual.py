@@ -1,6 +1,6 @@
-"""Writing the report of a change in the world: one self-contained page and its figure.
+"""The report of a change in the world: one self-contained page and its figure.
 
-Everything shown is in continual.json, so that a report can be written anew from it.
+All data is in continual.json, so that the report can be written again from it.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Content = dict[str, Any]
-"""Of continual.json."""
+"""The content of continual.json."""
 
 COLOURS = dict(zip(WAYS, ("muted", "agent-3", "agent-1", "agent-2"), strict=True))
-"""Of each way, as keys of palette.LIGHT and palette.DARK."""
+"""The colour of each way, as keys of palette.LIGHT and palette.DARK."""
 
 FLOOR = 1e-3
-"""The smallest regret that is drawn, as the scale is logarithmic."""
+"""The smallest regret drawn on the logarithmic scale."""
 
 
 def write_continual_report(folder: Path, content: Content) -> None:
-    """Write report.html and recovery.png into a folder, which is made if missing."""
+    """Write report.html and recovery.png into a folder, which is created if missing."""
     folder.mkdir(parents=True, exist_ok=True)
     save_png(folder / "recovery.png", draw_recovery, content, LEAD)
     (folder / "report.html").write_text(render_page(content), encoding="utf-8")
@@ -67,7 +67,7 @@ def render_page(content: Content) -> str:
 
 
 def change(content: Content) -> str:
-    """What changes, as text."""
+    """The changes as text."""
     changes = content["changes"].items()
     return ", ".join(f"{name} from {old:g} to {new:g}" for name, (old, new) in changes)
 
@@ -76,14 +76,14 @@ def verdict(content: Content) -> str:
     """Return the result in a few plain sentences."""
     worse = percent(_middle(content, "frozen"))
     before = percent(float(interquartile_mean(content["training"]["final"])))
-    found = [f"Where it was trained, the policy has a regret of {before}; after the change, as it "
-             f"is, of {worse}."]  # fmt: skip
+    found = [f"The policy has a regret of {before} in the world it was trained in, and of {worse} "
+             "after the change, without further learning."]  # fmt: skip
     for way in ("renewed", "going on", "fresh"):
         steps = content["recovery"][way]["middle"]
         name = {"going on": "Going on", "renewed": "Renewed learning", "fresh": "A new agent"}[way]
         goal = f"within {percent(content['within'], 0)} of the new optimum"
         if steps is None:
-            found.append(f"{name} does not come to stay {goal} in {_learned(content, way)} steps.")
+            found.append(f"{name} does not settle {goal} in {_learned(content, way)} steps.")
         else:
             found.append(f"{name} stays {goal} from {amount(round(steps))} steps on.")
     return " ".join(found)
@@ -103,7 +103,7 @@ def _facts(content: Content) -> list[tuple[str, str, str]]:
 
 
 def _row(content: Content, way: str) -> list[tuple[str, str]]:
-    """What became of a way, each with a remark."""
+    """The results of a way, each with a remark."""
     course, recovery = content["courses"][way], content["recovery"][way]
     reached = sum(step is not None for step in recovery["per_seed"])
     middle = recovery["middle"]
@@ -151,7 +151,7 @@ def draw_recovery(content: Content, width: float) -> Figure:
 
 
 def _draw_course(axes: Axes, content: Content, way: str, last: int) -> None:
-    """Draw the interquartile mean over seeds and its band; what does not learn is a line."""
+    """Draw the interquartile mean over seeds and its band; a constant line without learning."""
     course = content["courses"][way]
     steps, curve = np.array(course["steps"]), np.array(course["curve"])
     if len(steps) == 1:

@@ -1,4 +1,4 @@
-"""What a report of a run sets beside its agent: the same agent with one thing changed."""
+"""The variant that a run's report compares with its agent: one setting changed."""
 
 import dataclasses
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from qfolio.core.mdp import Agent
 
 
 class Contrast(NamedTuple):
-    """A variant of an agent, and how the two are called where they stand side by side."""
+    """A variant of an agent, and the names of the two in the report."""
 
     name: str
     variant_name: str
@@ -16,7 +16,7 @@ class Contrast(NamedTuple):
 
 
 def contrast_of(agent: Agent) -> Contrast | None:
-    """The variant of an agent that its report shows, where there is one."""
+    """The variant of an agent that its report shows, if there is one."""
     if not isinstance(agent, DQN):
         return None
     if agent.all_actions:

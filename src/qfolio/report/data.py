@@ -1,4 +1,4 @@
-"""What a report is made of: plain arrays and dictionaries, independent of how they came about."""
+"""The data of a report: plain arrays and dictionaries, independent of their origin."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ Numbers = NDArray[np.floating[Any]] | NDArray[np.integer[Any]]
 
 
 def decimals(size: float, figures: int = 4, least: int = 1) -> int:
-    """Return how many decimals show that many figures of numbers of about this size."""
+    """Return the decimals that show ``figures`` significant digits of a number of this size."""
     if not math.isfinite(size) or size == 0:
         return least
     return min(max(least, figures - 1 - math.floor(math.log10(abs(size)))), 9)
@@ -26,8 +26,8 @@ class Curve:
         label: Name of the variant, for example 'double DQN'.
         episodes: Training episodes finished at each evaluation, shape (P,).
         returns: Mean greedy return on fixed starts, shape (P, S).
-        overestimation: Mean of the largest action value at the visited states less the
-            discounted return that followed, shape (P, S); NaN where no values are estimated.
+        overestimation: Mean of the largest action value at the visited states minus the
+            discounted return that followed, shape (P, S); NaN if no values are estimated.
     """
 
     label: str
@@ -43,7 +43,7 @@ class Maps:
     Attributes:
         theta: Angles in radians, 0 = upright, shape (n,).
         theta_dot: Angular speeds in rad/s, shape (m,).
-        value: Learned value, the largest action value, shape (n, m), or None where the agent
+        value: Learned value, the largest action value, shape (n, m), or None if the agent
             estimates no action values.
         policy: Torque of the learned greedy policy in N m, shape (n, m).
         exact_value: Value of the exact optimum, shape (n, m).
@@ -78,15 +78,15 @@ class Episode:
 
 @dataclass(frozen=True)
 class Responses:
-    """What each seed's policy wants, by what is held, in some scenes of a market.
+    """The targets of each seed's policy, by the holding, in some scenes of a market.
 
     Attributes:
-        scenes: What the c scenes are called.
+        scenes: Names of the c scenes.
         held: Weights or positions held, shape (h,).
-        exact: What the exact policy wants, shape (c, h).
-        learned: What each of S seeds wants, shape (S, c, h).
-        weights: Whether these are weights, from 0 to 1, and not positions without bounds.
-        region: Ends of the exact no-trade region, or None where there is no one such region.
+        exact: Targets of the exact policy, shape (c, h).
+        learned: Targets of each of S seeds, shape (S, c, h).
+        weights: Whether these are weights, from 0 to 1, or positions without bounds.
+        region: Ends of the exact no-trade region, or None if there is no single region.
     """
 
     scenes: tuple[str, ...]
@@ -99,10 +99,10 @@ class Responses:
 
 @dataclass(frozen=True)
 class Weights:
-    """What each seed's policy wants where that is always the same.
+    """The target weights of each seed's policy, if they are constant.
 
     Attributes:
-        names: What the n weights are called.
+        names: Names of the n weights.
         exact: Weights of the exact policy, shape (n,).
         learned: Weights of each of S seeds, shape (S, n).
     """
@@ -114,17 +114,17 @@ class Weights:
 
 @dataclass(frozen=True)
 class MarketData:
-    """What a report tells of a market whose best policy is known.
+    """The description of a market whose best policy is known.
 
     Attributes:
         about: Sentences on the market and its best policy.
-        measure: What a return is called: 'log growth', or 'return' where it is another sum.
-        meaning: A sentence that says what a return counts, where that needs one.
-        rule: A sentence that says what the numbers of the summary's rule are.
+        measure: The name of a return: 'log growth', or 'return' for another sum.
+        meaning: A sentence that defines a return, if needed.
+        rule: A sentence that explains the numbers of the summary's rule.
         horizon: Steps of an episode.
-        period: Name of the span that growth is given for, or '' where returns are not growth.
-        periods: Such spans in an episode.
-        policy: Learned and exact policy, or None where there is nothing to draw.
+        period: Name of the period of growth, or '' if returns are not growth.
+        periods: Number of such periods in an episode.
+        policy: Learned and exact policy, or None if there is nothing to draw.
     """
 
     about: str
@@ -147,19 +147,19 @@ class ReportData:
         summary: The results: task, agent, preset, seeds, episodes, env_steps, seconds_compile,
             seconds_train, steps_per_second, return_mean, return_ci95 (low, high;
             None for few seeds), return_per_seed, optimum, regret_per_seed (shares of the optimum),
-            overestimation_per_seed (None where no action values are estimated) and, in markets,
-            rule: a few numbers that say what a policy does, "exact" and "per_seed".
+            overestimation_per_seed (None if no action values are estimated) and, in markets,
+            rule: a few numbers that describe a policy, "exact" and "per_seed".
         config: All settings, a nested dictionary.
-        curve: The run that is reported.
+        curve: The reported run.
         comparison: The same run with one thing changed, or None.
         training_episodes: Number of each finished training episode of every seed, shape (R,).
-        training_returns: Return of those episodes, shape (R,); none where they cannot be set
-            beside the curve.
-        optimum: Mean return of the exact optimum on the evaluation starts of the curve; NaN where
-            none is known, as summary's optimum and regrets are then None.
+        training_returns: Return of those episodes, shape (R,); none if they do not compare with
+            the curve.
+        optimum: Mean return of the exact optimum on the evaluation starts of the curve; NaN if
+            unknown, when summary's optimum and regrets are None.
         maps: Solutions over the state space, or None for tasks without a 2-D state.
-        episode: A greedy episode to be shown, or None.
-        market: What there is to tell of a market, or None for other tasks.
+        episode: A greedy episode to show, or None.
+        market: The description of a market, or None for other tasks.
     """
 
     title: str

@@ -1,7 +1,7 @@
 """The colours and marks shared by figures, animation and page.
 
-Blue and orange stay apart for every common form of colour blindness. The page renames these
-colours to its own variables, which is how the figures follow its light or dark scheme.
+Blue and orange are distinct for every common form of colour blindness. The page replaces these
+colours with its own variables, so that figures follow its light or dark scheme.
 """
 
 PAPER = "#ffffff"
@@ -61,7 +61,7 @@ CSS_VARIABLES = {
 """The page's variable for each colour of a figure."""
 
 AGENTS = 6
-"""How many colours there are for agents; further agents begin again with a dashed line."""
+"""Number of colours for agents; further agents reuse them with dashed lines."""
 
 ASSETS = (
     *("#4c78a8", "#d98c3f", "#5fa37a", "#b66a8f", "#8c7bb5", "#c9b04e", "#6db0bf", "#b5695a"),
@@ -71,7 +71,7 @@ ASSETS = (
 """Calm colours for stacked areas, the same in both schemes."""
 
 MARKERS = ("o", "s", "D", "^", "v", "p")
-"""Marks of agents, in matplotlib's words."""
+"""Markers of agents, in matplotlib's notation."""
 
 MARKER_PATHS = (
     "M11,5a4,4 0 1,0 8,0a4,4 0 1,0 -8,0",
@@ -81,4 +81,4 @@ MARKER_PATHS = (
     "M15,9.5l4.5,-8h-9z",
     "M15,.5l4.6,3.4l-1.8,5.4h-5.6l-1.8,-5.4z",
 )
-"""The same as paths of SVG, 30 wide and 10 high."""
+"""The same markers as SVG paths, 30 wide and 10 high."""

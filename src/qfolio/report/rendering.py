@@ -1,4 +1,4 @@
-"""What the pages share: templates, their style, and how numbers and settings are written."""
+"""Shared by the pages: templates, their style, and the format of numbers and settings."""
 
 import json
 import math
@@ -25,7 +25,7 @@ def source(name: str) -> str:
 
 
 def render(template: str, **context: Any) -> str:
-    """Return the text of a page; everything put into it is escaped, unless it is Markup."""
+    """Return the text of a page; the context is escaped, unless it is Markup."""
     environment = Environment(
         autoescape=True,
         undefined=StrictUndefined,
@@ -60,7 +60,7 @@ def over_seeds(
     interval: Sequence[float] | None,
     write: Callable[[float], str],
 ) -> str:
-    """Return how far results vary over seeds: their 95 % interval, or the range of a few."""
+    """Return the spread of results over seeds: their 95 % interval, or the range of a few."""
     if len(values) == 1:
         return "one seed"
     if interval is None:
@@ -69,21 +69,21 @@ def over_seeds(
 
 
 def bands(seeds: int) -> str:
-    """Return what the bands of learning curves are, see ``qfolio.core.statistics.band``."""
+    """Return a description of the bands of learning curves; see ``core.statistics.band``."""
     if seeds < FEWEST_SEEDS:
         return "from the worst to the best seed"
     return f"95{THIN_SPACE}% bootstrap intervals over seeds"
 
 
 def amount(count: float) -> str:
-    """Return a large whole number with three or more digits that matter."""
+    """Return a large whole number with at least three significant digits."""
     if count >= 1e6:
         return f"{number(count / 1e6, 2)} million"
     return number(count, 0)
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a count in words that begin a sentence, for example 'Two agents'."""
+    """Return a count in words to begin a sentence, for example 'Two agents'."""
     word = _NUMBER_WORDS[count] if count < len(_NUMBER_WORDS) else str(count)
     return f"{word} {noun}{'s' if count != 1 else ''}"
 

@@ -1,19 +1,19 @@
-"""The few numbers that say what learned policies do, beside those of the exact one."""
+"""The few numbers that describe learned policies, beside those of the exact one."""
 
 from typing import Any, NamedTuple
 
 
 class Row(NamedTuple):
-    """One number; None where a policy has none."""
+    """One number; None if a policy has none."""
 
     name: str
     exact: float | None
     mean: float | None  # of the seeds that have one
-    farthest: float | None  # the seed that is farthest from exact; one without, if there is any
+    farthest: float | None  # of the seed farthest from exact; None if a seed has none
 
 
 def rows(rule: dict[str, Any] | None) -> list[Row]:
-    """What a summary's rule says."""
+    """The rows of a summary's rule."""
     if rule is None:
         return []
     found = []

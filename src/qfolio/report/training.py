@@ -1,4 +1,4 @@
-"""Writing a report: one self-contained HTML page, its figures and its animation."""
+"""The report of a run: one self-contained HTML page, its figures and its animation."""
 
 import base64
 import io
@@ -28,15 +28,15 @@ from qfolio.report.rule import rows
 
 
 def write_report(folder: Path, data: ReportData) -> None:
-    """Write report.html, learning_curve.png and what else applies into a folder.
+    """Write report.html, learning_curve.png and further figures into a folder.
 
-    That is value.png where there are maps, policy.png where there is the policy of a market, and
-    episode.gif where there is an episode; otherwise files of these names from an earlier report are
+    These are value.png if there are maps, policy.png if there is the policy of a market, and
+    episode.gif if there is an episode; otherwise files of these names from an earlier report are
     removed, so that a folder never mixes two reports. The page needs no other file and no network.
 
     Args:
-        folder: Where to write; made if missing.
-        data: What to report.
+        folder: The folder to write to; created if missing.
+        data: The data of the report.
 
     Raises:
         OSError: A file cannot be written.
@@ -110,7 +110,7 @@ def _over_seeds(summary: dict[str, Any]) -> str:
 
 
 def _distance(summary: dict[str, Any]) -> str:
-    """Return how far the result is from the optimum, where that is known."""
+    """Return the distance of the result from the optimum, if that is known."""
     if summary["optimum"] is None:
         return ""
     optimum, regret = number(summary["optimum"], _digits(summary)), _mean_regret(summary)
@@ -121,7 +121,7 @@ def _distance(summary: dict[str, Any]) -> str:
 
 
 def _digits(summary: dict[str, Any]) -> int:
-    """Return with how many decimals to write a return."""
+    """Return the decimals of a return."""
     return decimals(summary["return_mean" if summary["optimum"] is None else "optimum"])
 
 
@@ -179,7 +179,7 @@ def _agents(data: ReportData) -> list[tuple[str, list[str]]]:
 
 
 def _rule(rule: dict[str, Any] | None) -> list[tuple[str, str, str, str]]:
-    """Return what each number of a rule is called, its exact value, the mean and the farthest."""
+    """Return the name of each number of a rule, its exact value, the mean and the farthest."""
 
     def say(value: float | None) -> str:
         return "none" if value is None else number(value, 3)
@@ -201,14 +201,14 @@ def _has_policy(data: ReportData) -> bool:
 
 
 def _biases(data: ReportData) -> list[tuple[str, float]]:
-    """Return the last overestimation of each curve, where action values were estimated."""
+    """Return the last overestimation of each curve, if action values were estimated."""
     curves = [curve for curve in (data.curve, data.comparison) if curve]
     last = [(x.label, float(interquartile_mean(x.overestimation[-1]))) for x in curves]
     return last if all(np.isfinite(bias) for _, bias in last) else []
 
 
 def _bias_digits(data: ReportData) -> int:
-    """Return with how many decimals to write an overestimation."""
+    """Return the decimals of an overestimation."""
     if data.market is None:
         return 2
     return decimals(max((abs(bias) for _, bias in _biases(data)), default=1.0), 2, least=2)

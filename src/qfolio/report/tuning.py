@@ -1,4 +1,4 @@
-"""Writing the report of a hyperparameter search: one self-contained page and its figures."""
+"""The report of a hyperparameter search: one self-contained page and its figures."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _SHADES = [_mix(share) for share in _SHARES]
 
 @dataclass(frozen=True)
 class Sweep:
-    """What the page shows of a search."""
+    """The data of a search's report."""
 
     config: dict[str, Any]
     space: list[Dimension]
@@ -96,7 +96,7 @@ class Sweep:
             f"returns {number(best.mean(), digits)}, the preset {number(preset.mean(), digits)}"
         )
         if len(gains) == 1:
-            return f"{says}; a single seed tells no more."
+            return f"{says}; a single seed allows no further conclusion."
         interval = mean_interval(gains)
         gap = f"{number(gains.mean(), digits, sign=True)}"
         spread = over_seeds(gains, interval, lambda gain: number(gain, digits, sign=True))
@@ -108,7 +108,7 @@ class Sweep:
 
 
 def sweep(work: Tuning, summary: dict[str, Any], command: str) -> Sweep:
-    """What the page shows, from a search and its final comparison."""
+    """The data of the report, from a search and its final comparison."""
     trials = work.journal.trials()
     return Sweep(
         config=msgspec.to_builtins(work.config),
@@ -122,7 +122,7 @@ def sweep(work: Tuning, summary: dict[str, Any], command: str) -> Sweep:
 
 
 def write_tuning_report(folder: Path, data: Sweep) -> None:
-    """Writes report.html and, where there are enough trials, its figures as PNG files."""
+    """Writes report.html and, if there are enough trials, its figures as PNG files."""
     figures = {"sensitivity.png": (draw_sensitivity, LEAD), "pair.png": (draw_pair, WIDE)}
     for name, (draw, width) in figures.items():
         if data.found is None or (draw is draw_pair and len(data.space) < 2):
@@ -153,7 +153,7 @@ def render_page(data: Sweep) -> str:
 
 
 def draw_sensitivity(data: Sweep, width: float) -> Figure:
-    """Draw every trial over each of its settings, and what a model expects along it."""
+    """Draw every trial over each of its settings, and the model's prediction along it."""
     assert data.found is not None
     effects = data.found.effects
     most = 4 if len(effects) in (4, 7, 8) else 3
@@ -185,7 +185,7 @@ def draw_sensitivity(data: Sweep, width: float) -> Figure:
 
 
 def draw_pair(data: Sweep, width: float) -> Figure:
-    """Draw the trials over the two settings that matter most, shaded by how good they are."""
+    """Draw the trials over the two most important settings, shaded by rank."""
     assert data.found is not None
     across, up = (effect.dimension for effect in data.found.effects[:2])
     figure = new_figure(width, 0.78 * width if width > NARROW else 1.05 * width)
@@ -282,7 +282,7 @@ def _draw_special(
 
 
 def _places(data: Sweep, dim: Dimension) -> NDArray[np.float64]:
-    """The places of all trials on the scale of a setting; choices are spread a little."""
+    """The positions of all trials on the scale of a setting; choices are spread a little."""
     places = np.array([dim.position(trial.values[dim.name]) for trial in data.trials])
     if dim.choices:
         spread = np.array([trial.number * 0.618034 % 1 - 0.5 for trial in data.trials])
@@ -291,7 +291,7 @@ def _places(data: Sweep, dim: Dimension) -> NDArray[np.float64]:
 
 
 def _ticks(dim: Dimension, few: bool = False) -> tuple[list[float], list[str]]:
-    """Places and texts of round values on a setting's scale."""
+    """Positions and labels of round values on a setting's scale."""
     if dim.choices:
         return [dim.position(choice) for choice in dim.choices], list(dim.choices)
     if dim.scale == "linear":
@@ -322,7 +322,7 @@ def _height_name(data: Sweep) -> str:
 
 
 def _height_ticks(axes: Axes, found: Sensitivity) -> None:
-    """Ticks at round regrets; where the optimum is unknown, those of the returns stay."""
+    """Set ticks at round regrets; if the optimum is unknown, keep those of the returns."""
     if found.outcome.optimum is None:
         axes.locator_params(axis="y", nbins=5)
         return
@@ -346,9 +346,9 @@ def _facts(data: Sweep) -> list[tuple[str, str, str]]:
     config = data.config
     trained = [x for x in data.summary["return_per_seed"] if x is not None]
     seeds = len(data.summary["seeds"])
-    note = f"trained anew, {seeds} seeds, graded starts"
+    note = f"retrained, {seeds} seeds, graded starts"
     if data.summary["optimum"] is not None:
-        note = f"anew, {seeds} seeds; optimum {number(data.summary['optimum'], digits)}"
+        note = f"retrained, {seeds} seeds; optimum {number(data.summary['optimum'], digits)}"
     hour = 3600 / float(np.mean([trial.seconds for trial in data.trials]))
     return [
         ("Trials", number(len(data.trials), 0), f"{config['seeds']} seeds each, {failed} diverged"),
@@ -359,7 +359,7 @@ def _facts(data: Sweep) -> list[tuple[str, str, str]]:
 
 
 def _row(effect: Effect, data: Sweep) -> dict[str, Any]:
-    """Return what the table says of one setting; places are percentages of its scale."""
+    """Return a setting's row of the table; places are percentages of its scale."""
     dim = effect.dimension
     best = best_of(data.trials)
     assert best is not None
@@ -410,7 +410,7 @@ def _finals(data: Sweep) -> list[tuple[str, list[str]]]:
 
 
 def _top(data: Sweep) -> list[tuple[str, str, list[str]]]:
-    """Return the best trials, and the preset wherever it came: rank, return and settings."""
+    """Return the best trials, and the preset at any rank: rank, return and settings."""
     ranked = sorted(data.trials, key=lambda trial: -np.nan_to_num(trial.value, nan=-np.inf))
     digits = decimals(data.summary["optimum_tuned_on"] or ranked[0].value)
     rows = []
@@ -428,7 +428,7 @@ def _svgs(draw: Callable[[Sweep, float], Figure], data: Sweep, width: float) -> 
 
 
 def _shaded(svg: str) -> str:
-    """The shades follow the page's light or dark scheme, as its other colours do."""
+    """Makes the shades follow the page's light or dark scheme, as its other colours do."""
     ends: Sequence[str] = ("var(--accent)", "var(--hairline)")
     for share, shade in list(zip(_SHARES, _SHADES, strict=True))[:-1]:
         svg = svg.replace(shade, f"color-mix(in srgb, {ends[0]} {100 * share:.0f}%, {ends[1]})")

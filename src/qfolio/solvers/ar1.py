@@ -16,7 +16,7 @@ LEVELS = tuple(i / 10 for i in range(11))
 
 @dataclass(frozen=True)
 class Ar1Optimum:
-    """The solved market of ``ar1``; shapes name signal s, holding h and level a."""
+    """The solution of ``ar1``; axes are the signal s, the holding h and the level a."""
 
     signals: Float[np.ndarray, " s"]
     holdings: Float[np.ndarray, " h"]
@@ -26,11 +26,11 @@ class Ar1Optimum:
     value: Float[np.ndarray, "s h"]
     """Discounted log growth, net of costs, by signal seen and weight held."""
     after: Float[np.ndarray, "s a"]
-    """The same once the level is reached and the cost is paid."""
+    """The same after moving to the level and paying the cost."""
     actions: Int[np.ndarray, "s h"]
     """Best level, as an index."""
     growth: float
-    """Of the best policy, a year."""
+    """Log growth of the best policy, a year."""
     cost: float
     growth_of: Callable[[Int[np.ndarray, "s h"]], float]
     """Stationary growth a year of any table of actions."""
@@ -67,13 +67,13 @@ def ar1(
 
     Value iteration on (signal, weight): the expectation over x' is a sum over equally spaced
     signals within five standard deviations (exact to rounding for smooth functions), that over η
-    Gauss–Hermite quadrature; weights between the grid's are interpolated. Values are exact to
+    Gauss–Hermite quadrature; values between grid weights are interpolated. Values are exact to
     about 1e-6, growth to about 2e-5 a year at the default grids.
 
     Args:
-        rho, noise: Of the signal; |rho| < 1, noise > 0.
-        drift, slope, volatility: Of the return, per step.
-        cost: One way, at least 0 and below 1.
+        rho, noise: Parameters of the signal; |rho| < 1, noise > 0.
+        drift, slope, volatility: Parameters of the return, per step.
+        cost: Proportional and one way, at least 0 and below 1.
         levels: Ascending weights in [0, 1] to choose from.
         discount: Per step, from 0 to 0.9999.
         drifting: Whether prices move the weights.
@@ -127,7 +127,7 @@ def ar1(
         after = look_ahead(value)
         change = (trade + after[:, None, :]).max(-1) - value
         value = value + change
-        # What is left of the sum of changes lies between these multiples (MacQueen 1966).
+        # The remaining sum of changes lies between these bounds (MacQueen 1966).
         low, high = (discount / (1 - discount) * float(end) for end in (change.min(), change.max()))
         if high - low < 1e-9:
             break

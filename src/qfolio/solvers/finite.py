@@ -1,10 +1,9 @@
 """Exact solutions of finite Markov decision processes (Bellman 1957; Howard 1960), in float64.
 
-Everything is in terms of action values Q, one row for each state, and of two ways to end up at
-them: value iteration repeats Bellman's equation until it moves no value any more, and policy
-iteration solves the linear equations of one policy after another. With ``epsilon`` both find the
-best among the policies that take a random action with that probability, which is what SARSA
-learns; it is the optimum of a process whose actions fail that often.
+Both methods return action values Q, one row for each state: value iteration repeats Bellman's
+equation until the values converge, and policy iteration solves the linear equations of one policy
+after another. With ``epsilon`` both find the best of the policies that take a random action with
+that probability, which SARSA learns.
 """
 
 from typing import NamedTuple
@@ -27,8 +26,8 @@ Values = Float[np.ndarray, "state action"]
 class Model(NamedTuple):
     """A process as tables: each action of each state has some outcomes.
 
-    ``successors`` are the next states, ``transitions`` their probabilities and ``rewards`` what
-    comes with them. Terminal states lead to themselves and pay nothing.
+    ``successors`` are the next states, ``transitions`` their probabilities and ``rewards`` their
+    rewards. Terminal states lead to themselves with reward 0.
     """
 
     transitions: Float[np.ndarray, "state action outcome"]
@@ -46,8 +45,8 @@ class FiniteOptimum:
     def returns(self, keys: Key[Array, " start"]) -> np.ndarray:
         """Undiscounted returns over the task's horizon of the best policy, one for each key.
 
-        They are earned with the random numbers of an evaluation, so that whoever acts as well gets
-        as much; ``expected`` is what they are on average.
+        They use the random numbers of an evaluation, so that an optimal agent earns the same;
+        ``expected`` gives their expectations.
         """
         _, policy = finite_horizon(self.model, self.task.horizon)
         return np.asarray(_follow(self.task, jnp.asarray(policy), keys))
@@ -57,7 +56,7 @@ class FiniteOptimum:
         return finite_horizon(self.model, self.task.horizon)[0]
 
     def action_values(self, discount: float, epsilon: float = 0.0) -> Values:
-        """Q of the best policy, or of the best ε-soft one, for an endless discounted problem."""
+        """Q of the best (or the best ε-soft) policy of the discounted infinite-horizon problem."""
         return policy_iteration(self.model, discount, epsilon)
 
 
@@ -83,14 +82,14 @@ def look_ahead(model: Model, values: Float[np.ndarray, " state"], discount: floa
 
 
 def soft(values: Values, epsilon: float) -> Float[np.ndarray, " state"]:
-    """What a state is worth where with probability ε the action is any, and else the best."""
+    """State values if the action is random with probability ε, and else the best."""
     return (1 - epsilon) * values.max(-1) + epsilon * values.mean(-1)
 
 
 def value_iteration(
     model: Model, discount: float, epsilon: float = 0.0, tol: float = 1e-10
 ) -> Values:
-    """Q to within ``tol``, by sweeps over all states; each takes the error times γ."""
+    """Q to within ``tol``, by sweeps over all states; each multiplies the error by γ."""
     _require(discount, epsilon)
     values = np.zeros(model.transitions.shape[:2])
     while True:
@@ -110,7 +109,7 @@ def policy_iteration(model: Model, discount: float, epsilon: float = 0.0) -> Val
         policy = np.full((states, actions), epsilon / actions)
         policy[np.arange(states), best] += 1 - epsilon
         values = policy_evaluation(model, policy, discount)
-        # An action that is no better than rounding must not take turns with the one before.
+        # Gains within rounding error are ignored, or two equal actions would alternate for ever.
         held = np.take_along_axis(values, best[:, None], axis=1)[:, 0]
         better = values.max(-1) > held + 1e-12 * max(1.0, float(np.abs(values).max()))
         if not better.any():
@@ -146,7 +145,7 @@ def finite_horizon(
 def _require(discount: float, epsilon: float) -> None:
     if not 0 <= discount < 1:
         raise QfolioError(
-            f"The discount is {discount}; endless problems are solved for discounts from 0 to "
+            f"The discount is {discount}; with an infinite horizon it must be at least 0 and "
             "below 1."
         )
     if not 0 <= epsilon <= 1:

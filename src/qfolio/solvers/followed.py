@@ -1,4 +1,4 @@
-"""The optimum of a task whose best policy is known: graded by following it on the same paths."""
+"""The optimum of a task whose best policy is known: its returns on an evaluation's paths."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,9 +14,9 @@ from qfolio.core.mdp import ExogenousTask
 
 
 class FollowedOptimum:
-    """Returns of an exact policy from the starts, and with the random numbers, of an evaluation.
+    """Returns of an exact policy, with an evaluation's start states and random numbers.
 
-    policy: from a state of ``task`` to an action of it.
+    policy: from a state of ``task`` to an action.
     """
 
     def __init__(self, task: ExogenousTask, policy: Callable[[PyTree], Array]) -> None:

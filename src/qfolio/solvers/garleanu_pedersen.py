@@ -35,8 +35,8 @@ def garleanu_pedersen(
     maximises E Σ_t [(1 − ρ)^{t+1} (x_t B f_t − ½γΣ x_t²) − (1 − ρ)^t ½λΣ (x_t − x_{t−1})²].
 
     Source: N. Gârleanu and L. H. Pedersen, "Dynamic Trading with Predictable Returns and
-    Transaction Costs" (2013), propositions 1 to 4: the best position moves the part a/λ of the way
-    to an aim, in which factor k counts 1/(1 + φ_k a/γ) of what it would count without costs.
+    Transaction Costs" (2013), propositions 1 to 4: the best position moves by the fraction a/λ
+    towards an aim, in which factor k has 1/(1 + φ_k a/γ) times its weight without costs.
 
     Args:
         phi: Decay of each factor per step, in (0, 1]; shape (factor,), or a number for one.
@@ -45,8 +45,8 @@ def garleanu_pedersen(
         loading: B, same shape as ``phi``.
         variance: Σ > 0 of the asset's noise.
         rho: Discount rate per step, between 0 and 1, both excluded.
-        innovation: Covariance of ε, (factor, factor), or the variance of one or of each of several
-            independent ones. Only the value depends on it.
+        innovation: Covariance of ε, (factor, factor), or variances of independent factors. Only
+            the value depends on it.
 
     Raises:
         QfolioError: A parameter is out of range.

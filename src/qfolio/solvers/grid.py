@@ -2,7 +2,7 @@
 
 Backward induction gives the optimal value with k steps to go at each grid point, with bilinear
 interpolation between them. The optimal policy looks one exact step ahead and takes the action with
-the best interpolated value, so that the return it is credited with is one that really was reached.
+the best interpolated value, so that its return is one that was really attained.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from qfolio.core.mdp import Discrete, Step, Task
 class GridOptimum:
     """The optimum of a deterministic task whose state is a pair of coordinates.
 
-    axes: the grid points of both coordinates, equally spaced; a periodic axis leaves out its end.
+    axes: the grid points of both coordinates, equally spaced; a periodic axis omits its end.
     state: builds a task state from two coordinates. Solutions are cached on disk.
     """
 
@@ -46,10 +46,10 @@ class GridOptimum:
         return self._cached(name, lambda: {"returns": solve()})["returns"]
 
     def stationary(self, discount: float) -> tuple[np.ndarray, np.ndarray]:
-        """Value and best action, each (n, m), for an endless discounted problem."""
+        """Value and best action, each (n, m), for the infinite-horizon discounted problem."""
 
         def solve() -> dict[str, Array]:
-            # Backward induction until no value moves any more: at most to float32's precision.
+            # Backward induction until the values converge, at most to float32's precision.
             def improve(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
                 values, _, k = carry
                 better = self._action_values(values, discount).max(0)
@@ -126,7 +126,7 @@ class GridOptimum:
             return read_arrays(path)
         except QfolioError:  # not solved yet, or damaged
             solution = {key: np.asarray(array) for key, array in compute().items()}
-            with contextlib.suppress(OSError):  # an unwritable cache costs time, nothing else
+            with contextlib.suppress(OSError):  # an unwritable cache only costs time
                 write_arrays(path, solution)
             return solution
 

@@ -6,7 +6,7 @@ from qfolio.solvers.shared import require
 
 
 def kelly(up: float, down: float, probability: float) -> tuple[float, float]:
-    """The fraction of wealth to bet when a stake becomes ``up`` or ``down`` times itself.
+    """The fraction of wealth to bet when a stake is multiplied by ``up`` or ``down``.
 
     Source: J. L. Kelly, "A New Interpretation of Information Rate" (1956). Long only: the fraction
     is clipped to [0, 1].
@@ -20,12 +20,12 @@ def kelly(up: float, down: float, probability: float) -> tuple[float, float]:
         The fraction and the growth per bet.
 
     Raises:
-        QfolioError: A parameter is out of range, so that one side of the bet is never worse.
+        QfolioError: A parameter is out of range.
     """
     from scipy.special import xlogy
 
     require(0 <= down < 1 < up < math.inf, f"a bet needs 0 ≤ down < 1 < up; not {down} and {up}")
-    require(0 <= probability <= 1, f"a probability lies between 0 and 1; not at {probability}")
+    require(0 <= probability <= 1, f"a probability must be between 0 and 1; not {probability}")
     fraction = probability / (1 - down) - (1 - probability) / (up - 1)
     fraction = min(max(fraction, 0.0), 1.0)
     win, lose = 1 + fraction * (up - 1), 1 - fraction * (1 - down)

@@ -28,16 +28,16 @@ def growth_optimal(
     b is optimal exactly if E[x_i/(b·x)] ≤ 1 for all i, with equality where b_i > 0 (T. Cover, "An
     Algorithm for Maximizing Expected Log Investment Return", 1984, theorem 1). Cover's iteration
     starts, a primal-dual interior-point method follows, and Newton's method on the assets held
-    takes it to rounding error.
+    refines the result to rounding error.
 
     Args:
         relatives: Shape (scenario, asset), at least 0; cash, if wanted, is a column of ones.
-        probabilities: Shape (scenario,), summing to 1; equal ones by default.
+        probabilities: Shape (scenario,), summing to 1 (default: equal).
         tol: Largest violation of the conditions that is accepted.
 
     Raises:
-        QfolioError: The arguments are no scenarios, every asset is worth nothing in one of them,
-            or the tolerance is out of reach.
+        QfolioError: The arguments are not valid scenarios, every asset is worthless in one of them,
+            or the tolerance is not reached.
     """
     x = np.asarray(relatives, dtype=float)
     require(
@@ -51,7 +51,7 @@ def growth_optimal(
     )
     x, p = x[p > 0], p[p > 0]
     best = x.max(1, keepdims=True)
-    require(bool(np.all(best > 0)), "in one scenario every asset is worth nothing; add cash")
+    require(bool(np.all(best > 0)), "in one scenario every asset is worthless; add cash")
     y = x / best  # changes neither the weights nor the conditions, and keeps numbers near 1
     b = np.full(y.shape[1], 1 / y.shape[1])
     for _ in range(10):
@@ -124,7 +124,7 @@ def _newton_on_support(
     z: Float[np.ndarray, " n"],
     tol: float,
 ) -> Float[np.ndarray, " n"]:
-    """Sets what is not held to exactly 0, and the conditions on the rest to equality."""
+    """Sets assets not held to exactly 0 and solves the conditions on the rest as equalities."""
     held = b > z
     b = np.where(held, b, 0.0)
     for _ in range(50):
@@ -133,7 +133,7 @@ def _newton_on_support(
         if np.max(np.where(held, np.abs(slope), slope)) <= tol / 1000:
             break
         wanted = held | (slope > tol)
-        # Assets that repeat others leave the step open; the shortest one will do.
+        # Redundant assets leave the step undetermined; the shortest one will do.
         step = np.linalg.lstsq(_curvature(x[:, wanted], p, b[wanted]), slope[wanted], rcond=1e-13)[
             0
         ]
@@ -154,10 +154,10 @@ def merton(
         drift: Shape (asset,), a year.
         covariance: Shape (asset, asset), a year, positive definite.
         risk_aversion: γ > 0.
-        rate: Of cash, a year.
+        rate: Interest rate of cash, a year.
 
     Raises:
-        QfolioError: γ is not positive, or the shapes or the covariance are no market's.
+        QfolioError: γ is not positive, or the shapes or the covariance are invalid.
     """
     mean, sigma = drift_and_covariance(drift, covariance)
     require(0 < risk_aversion < math.inf, f"risk aversion must be positive; not {risk_aversion}")
@@ -183,7 +183,7 @@ def lognormal_scenarios(
         Relatives of shape (scenario, 1 + asset) with cash first, and probabilities.
 
     Raises:
-        QfolioError: The shapes or the covariance are no market's, or there are too many scenarios.
+        QfolioError: The shapes or the covariance are invalid, or there are too many scenarios.
     """
     mean, sigma = drift_and_covariance(drift, covariance)
     require(0 < dt < math.inf, f"dt must be positive; not {dt}")

@@ -15,13 +15,13 @@ class NoTradeRegion(NamedTuple):
     low: float
     high: float
     growth: float
-    """A year."""
+    """Log growth a year."""
 
 
 def no_trade_region(
     drift: float, volatility: float, cost: float, rate: float = 0.0, buying: float | None = None
 ) -> NoTradeRegion:
-    """The weights between which an investor with log utility does not trade; continuous time.
+    """The weights between which an investor with log utility does not trade, in continuous time.
 
     One asset follows geometric Brownian motion; selling value s yields (1 − cost)s of cash, buying
     value s takes (1 + buying)s. Outside [low, high] the agent trades to the nearer edge.
@@ -40,10 +40,10 @@ def no_trade_region(
     Args:
         drift: θ, the asset's expected return over cash, a year.
         volatility: σ, a year.
-        cost: Of selling, as a fraction of the value sold; at least 0 and below 1.
-        rate: Of cash, a year.
-        buying: Cost of buying, as a fraction of the value bought; by default ``cost``. Where
-            spending m buys (1 − c)m, as in the backtest, it is c/(1 − c).
+        cost: Cost of selling, as a fraction of the value sold; at least 0 and below 1.
+        rate: Interest rate of cash, a year.
+        buying: Cost of buying, as a fraction of the value bought (default: ``cost``). If spending
+            m buys (1 − c)m, as in the backtest, it is c/(1 − c).
 
     Raises:
         QfolioError: The Merton weight is not between 0 and 1, or so near to either that rounding
@@ -62,7 +62,7 @@ def no_trade_region(
     if wedge > 0:
 
         def excess(log_gap: float) -> float:
-            """Of the condition at the edge (α or β) that is this close to all cash or all asset."""
+            """Residual at the edge (α or β) that is exp(log_gap) from all cash or all asset."""
             gap = math.exp(log_gap)
             reach = float(logit(2 * room - gap) - logit(gap)) + wedge
             inside = math.log(gap * (1 - gap) * reach * exprel(-steep * reach)) + steep * reach
@@ -93,7 +93,7 @@ def no_trade_growth(
 ) -> Float[np.ndarray, "..."]:
     """Growth a year of keeping the weight in any region low < high, as in ``no_trade_region``.
 
-    Grades a learned region without simulation. ``low`` and ``high`` lie in (0, 1) and broadcast.
+    Evaluates a learned region without simulation. ``low`` and ``high`` lie in (0, 1) and broadcast.
     """
     from scipy.special import exprel, logit
 
@@ -110,7 +110,7 @@ def no_trade_growth(
 def no_trade_region_discrete(
     drift: float, volatility: float, cost: float, dt: float, rate: float = 0.0
 ) -> NoTradeRegion:
-    """The no-trade region of an investor who may trade every ``dt`` years only.
+    """The no-trade region of an investor who may trade only every ``dt`` years.
 
     The backtest's rule: at each step the agent sees the weight w, trades at the remainder factor
     (so that buying costs c/(1 − c) of the value bought), and then earns
@@ -118,7 +118,7 @@ def no_trade_region_discrete(
     ``no_trade_region(…, buying=cost / (1 - cost))``.
 
     Policy iteration for the average reward. Between the edges the relative value is a polynomial
-    through Chebyshev points, outside it is the value at the edge less the cost of going there; the
+    at Chebyshev points, outside it is the value at the edge less the cost of going there; the
     expectation is Gauss–Legendre quadrature between the edges and beyond them.
 
     Args:
@@ -164,7 +164,7 @@ def no_trade_region_discrete(
         coefficients = np.array([0.0, *rest])
 
         def best(paid: Callable[[float], float], bounds: tuple[float, float]) -> float:
-            """Where the value less what has been paid for going there is largest."""
+            """Where the value less the cost of going there is largest."""
 
             def loss(y: float) -> float:
                 earned, basis = ahead(np.array([y]), low, high)

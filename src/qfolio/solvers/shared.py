@@ -1,12 +1,12 @@
-"""What the solvers of markets share: quadrature, checks and the cost of a trade in logs.
+"""Shared by the solvers of markets: quadrature, checks and the log cost of a trade.
 
 In all of them, relatives are price ratios over one step and cash has relative 1; costs are
 proportional and one way (0.001 is 10 basis points); growth is the expected logarithm of the
 ratio of wealth. Everything is float64.
 
-A rebalancing of one asset and cash from weight w to weight b leaves the share (1 − c w)/(1 − c b)
-of the wealth when it sells and (1 − c + c w)/(1 − c + c b) when it buys: a price that is cut by c
-for the seller and divided by 1 − c for the buyer.
+Rebalancing one asset and cash from weight w to weight b leaves the share (1 − c w)/(1 − c b) of the
+wealth when selling and (1 − c + c w)/(1 − c + c b) when buying: the seller receives 1 − c times the
+price, the buyer pays the price divided by 1 − c.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ def log_remainder(before: np.ndarray, after: np.ndarray, cost: float) -> np.ndar
 
 
 def gauss(points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and probabilities that stand for a standard normal variable."""
+    """Gauss–Hermite nodes and probabilities of a standard normal variable."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(points)
     return nodes, weights / weights.sum()
 

@@ -1,7 +1,7 @@
-"""Catch: a ball falls through a picture, and a paddle at its bottom has to be under it.
+"""Catch: a ball falls through an image, and a paddle at the bottom must be under it.
 
-After Catch of bsuite (Osband et al. 2020), with decoys, so that there is something to see: an agent
-has to tell shapes apart wherever in the picture they are.
+After Catch of bsuite (Osband et al. 2020), with decoys, so that an agent must tell shapes apart
+anywhere in the image.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from qfolio.core.mdp import Discrete, Step, Task
 
 
 class CatchState(NamedTuple):
-    """The columns of what falls, the ball's first, the row that it is at, and the paddle."""
+    """The columns of the falling things, the ball's first, their row, and the paddle's column."""
 
     columns: Int[Array, "*batch thing"]
     row: Int[Array, "*batch"]  # from the top, of the ball and of the decoys' lower pixels
@@ -28,8 +28,8 @@ class Catch(Task):
     """Catch the ball, by actions left, stay and right.
 
     Everything falls one row a step. The ball is one pixel; each of ``decoys`` is two, one above the
-    other, in a column of its own. The episode ends when the ball is at the bottom row, where the
-    paddle is: reward 1 if it is under the ball, else −1, and 0 before. Observation: the picture,
+    other, in a column of its own. The episode ends when the ball reaches the bottom row, where the
+    paddle is: reward 1 if it is under the ball, else −1, and 0 before. Observation: the image,
     (rows, columns, 1), pixels 0 or 1. Start: the paddle in the middle, all columns random.
     """
 
@@ -47,17 +47,17 @@ class Catch(Task):
         if self.horizon < self.columns // 2:
             raise QfolioError(
                 f"rows is {self.rows}; the ball would be down in {self.horizon} steps, before the "
-                f"paddle can be at every one of {self.columns} columns: take more rows."
+                f"paddle can reach all {self.columns} columns; use more rows."
             )
 
     @property
     def horizon(self) -> int:
-        """Steps until the ball is down; no episode is cut before."""
+        """Steps until the ball is down; no episode is truncated before."""
         return self.rows - 1 - self._first_row
 
     @property
     def _first_row(self) -> int:
-        """Decoys are in the picture from the beginning."""
+        """Leaves room for the decoys' upper pixels."""
         return 1 if self.decoys else 0
 
     @property
@@ -75,7 +75,7 @@ class Catch(Task):
         return picture.at[-1, state.paddle].set(1.0)[..., None]
 
     def step(self, state: CatchState, action: Array, key: PRNGKeyArray) -> Step:
-        """Everything that follows is certain, so that ``key`` is not used."""
+        """One step; deterministic, so that ``key`` is not used."""
         paddle = jnp.clip(state.paddle + action - 1, 0, self.columns - 1)
         row = state.row + 1
         down = row == self.rows - 1

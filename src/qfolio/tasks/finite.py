@@ -1,11 +1,11 @@
-"""Finite Markov decision processes: any from your own arrays, and three well-known ones.
+"""Finite Markov decision processes: from your own arrays, and three well-known ones.
 
 >>> task = qfolio.FiniteMDP(transitions, rewards, terminal=[3])
 >>> task.optimum().action_values(0.99)
 >>> qfolio.train(task, QLearning(), episodes=1000, seeds=8).grade()
 
-States and actions are numbers from 0 on, and the observation is the state's number: tabular agents
-look it up, networks see a row with a one at its place.
+States and actions are integers from 0, and the observation is the state's number: tabular agents
+look it up, networks see it one-hot encoded.
 """
 
 from collections.abc import Sequence
@@ -28,17 +28,17 @@ class FiniteMDP(Task):
     Args:
         transitions: Probabilities, (state, action, next state); with ``successors``,
             (state, action, outcome).
-        rewards: Of each action (state, action), or of each of its outcomes, in the shape of
-            ``transitions``.
-        start: The probability of starting in each state; by default in all that are not terminal
-            alike.
-        terminal: Where an episode ends: state numbers, or true and false for each state. What the
-            tables say of these states does not count.
+        rewards: Rewards of each action, (state, action), or of each of its outcomes, in the shape
+            of ``transitions``.
+        start: The probability of starting in each state (default: uniform over states that are not
+            terminal).
+        terminal: The states that end an episode: state numbers, or true and false for each state.
+            The tables' entries for these states are ignored.
         horizon: Steps after which an episode is truncated.
-        successors: The next state of each outcome, where few of many states can follow.
+        successors: The next state of each outcome, if few of many states can follow.
 
     Raises:
-        QfolioError: An array has the wrong shape, or is no distribution.
+        QfolioError: An array has the wrong shape, or is not a distribution.
     """
 
     transitions: Float[np.ndarray, "state action outcome"]
@@ -74,7 +74,7 @@ class FiniteMDP(Task):
             if moves.shape[2] != states:
                 raise QfolioError(
                     f"transitions has {states} states and {moves.shape[2]} next states; they must "
-                    "be as many, unless successors tells which they are."
+                    "be equal, unless successors is given."
                 )
             moves, pay, after = _outcomes(moves, pay)
         else:
@@ -138,8 +138,8 @@ class Cliff(FiniteMDP):
     """Cliff walking (Sutton & Barto 2018, example 6.6): Gymnasium's ``CliffWalking``.
 
     From the lower left of 4 × 12 cells to the lower right; each step pays −1, and a step into the
-    cliff between them −100 and leads back to the start. Actions: up, right, down, left; if
-    ``slippery``, a third each goes that way and to its two sides.
+    cliff between them pays −100 and leads back to the start. Actions: up, right, down, left; if
+    ``slippery``, the step goes that way or to either side, with probability 1/3 each.
     """
 
     slippery: bool = static(False)
@@ -176,8 +176,8 @@ _LAKES = {
 class FrozenLake(FiniteMDP):
     """Gymnasium's ``FrozenLake``: over the ice to the goal, which pays 1; holes end the episode.
 
-    ``size`` 4 or 8. Actions: left, down, right, up; if ``slippery``, a third each goes that way and
-    to its two sides. horizon: as Gymnasium's, 100 and 200 steps, where 0.
+    ``size`` 4 or 8. Actions: left, down, right, up; if ``slippery``, the step goes that way or to
+    either side, with probability 1/3 each. horizon: 0 for Gymnasium's, 100 and 200 steps.
     """
 
     size: int = static(4)
@@ -205,10 +205,10 @@ class FrozenLake(FiniteMDP):
 
 
 class Garnet(FiniteMDP):
-    """A random process (Garnet; Archibald, McKinnon & Thomas 1995), always the same for a seed.
+    """A random process (Garnet; Archibald, McKinnon & Thomas 1995), fixed by its seed.
 
-    Each action leads to ``branching`` different states, with probabilities that cut the unit
-    interval at random points, and pays a standard normal number. It never ends.
+    Each action leads to ``branching`` different states, with probabilities from cutting the unit
+    interval at random points, and has a standard normal reward. It never ends.
     """
 
     n_states: int = static(50)
@@ -246,15 +246,15 @@ class Garnet(FiniteMDP):
 def _slip(
     towards: Int[np.ndarray, "state action"], slippery: bool
 ) -> Int[np.ndarray, "state action outcome"]:
-    """Where an action may lead: where it goes, or also to either side of that."""
+    """Where an action may lead: its direction, or also to either side of it."""
     sides = (1, 0, -1) if slippery else (0,)
     return np.stack([np.roll(towards, side, axis=1) for side in sides], axis=2)
 
 
 def _draw(key: PRNGKeyArray, weights: Float[Array, " n"]) -> Int[Array, ""]:
-    """An index, by its weight."""
+    """A random index, in proportion to its weight."""
     total = jnp.cumsum(weights.astype(jnp.float32))
-    # The first sum above: it rises there, so that what cannot happen is never drawn.
+    # Strictly above, so that an index of weight 0 is never drawn.
     return (total > jax.random.uniform(key) * total[-1]).argmax().astype(jnp.int32)
 
 
@@ -286,7 +286,7 @@ def _mask(terminal: ArrayLike, states: int) -> Bool[np.ndarray, " state"]:
 def _require_distribution(
     name: str, rows: Float[np.ndarray, "... outcome"], states: Sequence[int] | np.ndarray | None
 ) -> None:
-    """Raises QfolioError for the first row that holds no probabilities."""
+    """Raises QfolioError for the first row that is not a distribution."""
     bad = (rows < 0).any(-1) | (abs(rows.sum(-1) - 1) > 1e-6)
     if not bad.any():
         return
@@ -300,7 +300,7 @@ def _require_distribution(
 def _outcomes(
     moves: Float[np.ndarray, "state action next"], pay: Float[np.ndarray, "state action next"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Only what can follow, of a table over all next states."""
+    """The possible outcomes, from a table over all next states."""
     count = max(1, int((moves != 0).sum(-1).max()))
     after = np.argsort(moves == 0, axis=-1, kind="stable")[..., :count]
     return np.take_along_axis(moves, after, -1), np.take_along_axis(pay, after, -1), after

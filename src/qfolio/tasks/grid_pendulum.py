@@ -1,10 +1,10 @@
-"""The pendulum for tables: seen through a grid, and as a finite process on one.
+"""The pendulum for tables: observed on a grid, and as a finite process.
 
-``GridPendulum`` moves as the pendulum does and shows only the cell that it is in, so that a table
-can learn it. Cells hide where in them the pendulum is; what was hidden is part of what a learned
-policy loses to the exact optimum, which is that of the pendulum itself.
+``GridPendulum`` moves as the pendulum does and shows only its cell of a grid, so that a table can
+learn it. The exact optimum is that of the pendulum itself, so a learned policy's regret includes
+the information that cells hide.
 
-``interpolated`` makes a finite process of the pendulum, whose exact values can be computed.
+``interpolated`` turns the pendulum into a finite process whose exact values can be computed.
 """
 
 import jax
@@ -22,8 +22,8 @@ from qfolio.tasks.pendulum import Pendulum, PendulumState
 class GridPendulum(Pendulum):
     """The pendulum, observed as the number of its cell among ``angles`` × ``speeds``.
 
-    Cells are as large as one another, in the middle of one it stands upright and still (with odd
-    numbers), and speeds at the limit have half a cell.
+    Cells are equally large; with odd numbers, the upright pendulum at rest is at the centre of a
+    cell. Speeds at the limit have half a cell.
     """
 
     torques: int = static(3)
@@ -52,9 +52,9 @@ class GridPendulum(Pendulum):
 def interpolated(grid: GridOptimum, horizon: int = 200) -> FiniteMDP:
     """A finite process on the points of a grid, whose values are those of the grid's optimum.
 
-    An action moves a point to between four others, and the process goes to each with its weight in
-    the interpolation, as probability (Kushner & Dupuis 2001, chapter 5). Point (i, j) of the axes
-    has the number i · m + j; it starts at any.
+    An action moves a point to between four others, and the process goes to each with its
+    interpolation weight as probability (Kushner & Dupuis 2001, chapter 5). Point (i, j) of the axes
+    has the number i · m + j; starts are uniform.
     """
     n, m = len(grid.axes[0]), len(grid.axes[1])
     actions = grid.task.actions

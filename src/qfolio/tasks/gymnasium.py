@@ -1,8 +1,7 @@
-"""Any environment of Gymnasium as a task: what agents must know of it, and how it is translated.
+"""Any environment of Gymnasium as a task.
 
 ``qfolio train gym:CartPole-v1`` makes one. The environment itself cannot be compiled: ``host.py``
-steps it. This file holds the shapes that agents ask a task for, and takes observations and actions
-from one side to the other.
+steps it. This file provides the shapes that agents need and converts observations and actions.
 """
 
 import copy
@@ -23,20 +22,20 @@ from qfolio.core.mdp import Box, Discrete, Step
 from qfolio.core.registry import import_own
 
 UNLIMITED = 1000
-"""Steps after which an episode is cut where the environment itself has no time limit."""
+"""Steps after which an episode is truncated if the environment itself has no time limit."""
 
 
 class GymnasiumTask(HostTask):
     """An environment by its ID in Gymnasium's registry, such as ``CartPole-v1``.
 
     Observations are numbers (a Box, of any shape) or one of ``states`` numbers (Discrete). Actions
-    are numbered (Discrete), or coordinates from −1 to 1 that stand for the space's bounds (Box).
-    Raises QfolioError for other spaces, for an unknown ID and for what is not installed.
+    are numbered (Discrete), or coordinates from −1 to 1, scaled to the space's bounds (Box).
+    Raises QfolioError for other spaces, for an unknown ID and if a dependency is not installed.
     """
 
     id: str = static("CartPole-v1")  # with a module to import first: my_module:MyEnv-v0
-    kwargs: str = static("")  # what it is made with, as JSON: {"continuous": true}
-    horizon: int = static(0)  # episodes are truncated here; 0: at the environment's own limit
+    kwargs: str = static("")  # arguments of gymnasium.make, as JSON: {"continuous": true}
+    horizon: int = static(0)  # episodes are truncated here; 0: the environment's limit
 
     def __post_init__(self) -> None:
         if not self.horizon:
@@ -63,7 +62,7 @@ class GymnasiumTask(HostTask):
 
     @property
     def observation_scale(self) -> tuple[float, ...] | float:
-        """The bounds of an observation's numbers, and 1 where there are none."""
+        """The bounds of an observation's numbers, or 1 if there are none."""
         return self.facts.scale
 
     @property
@@ -72,7 +71,7 @@ class GymnasiumTask(HostTask):
         return self.facts.shape, np.float32 if self.states is None else np.int32
 
     def reset(self, key: PRNGKeyArray) -> Array:
-        """A state, of which nothing is known here."""
+        """A placeholder: the state is in the environment."""
         return jnp.zeros(())
 
     def observe(self, state: Array) -> Array:
@@ -83,12 +82,12 @@ class GymnasiumTask(HostTask):
         raise QfolioError(f"{self.id} cannot be compiled; qfolio.train steps it from Python.")
 
     def make(self, **options: Any) -> Any:
-        """The environment, without the time limit and the checks that ``host.py`` sees to."""
+        """The environment, without time limit and checks, which ``host.py`` does."""
         return _make(self.id, self.kwargs, **options)
 
 
 class Facts(NamedTuple):
-    """What is fixed of an environment, and how observations and actions are translated."""
+    """An environment's constants, and the conversion of observations and actions."""
 
     limit: int  # of an episode, in steps
     shape: tuple[int, ...]  # of an observation
@@ -101,15 +100,15 @@ class Facts(NamedTuple):
     high: np.ndarray
 
     def given(self, actions: np.ndarray) -> list[Any]:
-        """A batch of agents' actions, each as the environment takes it."""
+        """A batch of agents' actions in the environment's format."""
         if isinstance(self.actions, Discrete):
             return (actions.ravel() + self.first_action).tolist()
-        # An agent that has diverged is noticed by its losses; no environment should see its NaN.
+        # A diverged agent is detected by its losses; the environment should not get its NaN.
         share = (np.clip(np.nan_to_num(actions), -1.0, 1.0) + 1) / 2
         return list(self.low + share.reshape(-1, *self.low.shape) * (self.high - self.low))
 
     def seen(self, observation: Any) -> Any:
-        """An environment's observation as agents get it."""
+        """An environment's observation in the agents' format."""
         return observation if self.states is None else observation - self.first_state
 
 
@@ -144,8 +143,8 @@ def _facts(id: str, kwargs: str) -> Facts:
 
 def _refuse(id: str, what: str, space: Any, wanted: str, wrapper: str) -> NoReturn:
     raise QfolioError(
-        f"The {what} of {id} are {space}, and agents here need {wanted}; register it in a wrapper "
-        f"that makes them so, such as gymnasium.wrappers.{wrapper}."
+        f"The {what} of {id} are {space}, but agents need {wanted}; register it with a wrapper "
+        f"that converts them, such as gymnasium.wrappers.{wrapper}."
     )
 
 
@@ -165,7 +164,7 @@ def _make(id: str, kwargs: str, **options: Any) -> Any:
 
 
 def _spec(id: str) -> Any:
-    """What Gymnasium's registry holds of an ID."""
+    """Gymnasium's specification of an ID."""
     gymnasium = _gymnasium()
     module, _, name = id.rpartition(":")
     try:

@@ -1,4 +1,4 @@
-"""The inverted pendulum without its velocity: what is seen now is not all there is to know."""
+"""The inverted pendulum without its velocity: a partially observed task."""
 
 from typing import NamedTuple
 
@@ -12,18 +12,18 @@ from qfolio.tasks.pendulum import Pendulum, PendulumState
 
 
 class Seen(NamedTuple):
-    """A pendulum, and what has been seen of it: rows (cos θ, sin θ), the latest last."""
+    """A pendulum, and its last observations: rows (cos θ, sin θ), the latest last."""
 
     pendulum: PendulumState
     window: Float[Array, "*batch window 2"]
 
 
 class HiddenPendulum(Task):
-    """``Pendulum`` with the last ``window`` rows (cos θ, sin θ) for an observation.
+    """``Pendulum`` with the last ``window`` rows (cos θ, sin θ) as observation.
 
     Rows from before the start are zeros. Actions, rewards and starts are those of ``Pendulum``, and
-    so is the optimum, which knows the velocity: the first action has to be taken without, so that
-    it is a bound that cannot be reached wholly.
+    so is the optimum, which knows the velocity: since the first action must be taken without it,
+    this is an upper bound that cannot quite be reached.
     """
 
     window: int = static(4)
@@ -59,5 +59,5 @@ class HiddenPendulum(Task):
         return jnp.concatenate([window[1:], row[None]])
 
     def optimum(self) -> GridOptimum:
-        """That of the pendulum whose velocity is seen, from the same starts."""
+        """The optimum of the pendulum with observed velocity, from the same starts."""
         return self._pendulum.optimum()

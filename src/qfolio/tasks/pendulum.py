@@ -1,8 +1,8 @@
 """The inverted pendulum: Gymnasium's ``Pendulum-v1`` as a pure function, with discrete torques.
 
-A rod of length l and mass m hangs on a motor too weak to lift it in one go; it has to be swung up
-and then held. The dynamics, the limits and the cost are those of Gymnasium's ``PendulumEnv.step``,
-to which the tests hold this file step for step.
+A rod of length l and mass m hangs on a motor too weak to lift it in one go; it must be swung up and
+then held. The dynamics, the limits and the cost are those of Gymnasium's ``PendulumEnv.step``; the
+tests compare both step by step.
 """
 
 import dataclasses
@@ -61,7 +61,7 @@ class Pendulum(Task):
     def torque(
         self, action: Int[Array, "*batch"] | Float[Array, "*batch 1"]
     ) -> Float[Array, "*batch"]:
-        """The torque in N m that an action stands for."""
+        """The torque of an action in N m."""
         if not self.torques:
             return jnp.clip(action[..., 0], -self.max_torque, self.max_torque)
         return self.max_torque * (2.0 * action / (self.torques - 1) - 1.0)
@@ -91,7 +91,7 @@ class Pendulum(Task):
     def optimum(self) -> GridOptimum:
         """Dynamic programming on a grid over one turn of θ and all speeds, with equal torques.
 
-        Torques between the 11 gain less than the grid's error.
+        Torques between the 11 would gain less than the grid's error.
         """
         return GridOptimum(
             task=self if self.torques else dataclasses.replace(self, torques=11),

@@ -245,7 +245,7 @@ def test_what_is_held_drifts_with_prices() -> None:
     [
         ([0.5, 0.5], r"own at 2020-02-10 gives weights of the shape \(2,\)"),
         ([0.5, 0, 0, 0, 0], "sum to 0.5"),
-        ([0.5, 0.7, -0.2, 0, 0], "least of them -0.2"),
+        ([0.5, 0.7, -0.2, 0, 0], "minimum of -0.2"),
         ([np.nan] * 5, "sum to nan"),
         ([0, 1, 0, 0, 0], "an asset 1, more than the cap of 0.8"),
         ([0.5, 0, 0, 0, 0.5], "an asset that this fold may not hold"),
@@ -283,7 +283,7 @@ def test_a_baseline_of_a_users_own_is_found_by_its_module(
 
 
 def test_errors_say_what_and_where() -> None:
-    with pytest.raises(QfolioError, match="no baseline 'best'; there is equal-weight"):
+    with pytest.raises(QfolioError, match="no baseline 'best'; choose from equal-weight"):
         baseline("best")
     with pytest.raises(QfolioError, match="no fold"):
         decisions("equal-weight", [], prices())

@@ -97,7 +97,10 @@ def test_bootstrap_measures_are_the_measures_of_the_resampled_days(
 
 def test_percentile_interval_by_hand() -> None:
     samples = np.random.default_rng(6).permutation(np.arange(1.0, 40.0))
-    assert percentile_interval(samples).tolist() == [1, 39]  # the (39 + 1) · 2.5 % = first from either end
+    assert percentile_interval(samples).tolist() == [
+        1,
+        39,
+    ]  # the (39 + 1) · 2.5 % = first from either end
     assert percentile_interval(samples, 0.5).tolist() == [10, 30]
     samples[samples < 5] = -math.inf
     assert percentile_interval(samples).tolist() == [-math.inf, 39]

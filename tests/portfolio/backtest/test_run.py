@@ -280,7 +280,7 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
     Backtest.open(folder).keep(agent, after)
     kept = Backtest.open(folder).policy(agent)
     assert (before.learned, kept.learned) == (table().dates[-1], newer.dates[-1])
-    with pytest.raises(QfolioError, match="nothing new to learn"):
+    with pytest.raises(QfolioError, match="give newer prices"):
         kept.update(newer)
     assert (before.updates, after.updates, kept.updates) == (0, 1, 1)
     for x, y, z in zip(*(jax.tree.leaves(p.members) for p in (before, after, kept)), strict=True):
@@ -311,7 +311,7 @@ def test_backtests_that_cannot_be(settings, message, tmp_path):
         ("config.json", "{}", "in another format"),
         ("config.json", '{"kind": "backtest", "format": 1}', "in another format"),
         ("config.json", '{"kind": "comparison", "format": 2}', "is a comparison, not a backtest"),
-        ("prices.safetensors", "", "prices.safetensors is no safetensors file or is damaged"),
+        ("prices.safetensors", "", "prices.safetensors is damaged or not a safetensors file"),
         ("config.json", None, "config.json is damaged"),
     ],
 )

@@ -244,7 +244,7 @@ def test_assets_that_start_late() -> None:
     ("change", "message"),
     [
         ({"decisions": [[0.5, 0.5, 0.1]]}, "row 1 sum to 1.1"),
-        ({"decisions": [[0.5, 0.6, -0.1]]}, "least of them is -0.1"),
+        ({"decisions": [[0.5, 0.6, -0.1]]}, "minimum of -0.1"),
         ({"decisions": [[0.5, 0.5, np.nan]]}, "row 1"),
         ({"decisions": [[1.0, np.inf, 0.0]]}, "row 1"),
         ({"decisions": [[0.5, 0.5]]}, "cash first"),

@@ -120,7 +120,7 @@ def columns(text: str, folder: Path) -> Path:
         ("Date,AAPL_Close,AAPL_Volume,MSFT_Close", {"AAPL": 1, "MSFT": 3}, "'AAPL_Volume'"),
         ("Date,Close_A,Volume_A,Close_B,Volume_B", {"A": 1, "B": 3}, "'Volume_A', 'Volume_B'"),
         ("Date,A.Open,A.High,A.Low,A.Close,A.Volume,A.Adjusted", {"A": 6}, "'A.Close'"),
-        ("Date,AAPL,MSFT,Volume", {"AAPL": 1, "MSFT": 2}, "no prices in it: 'Volume'"),
+        ("Date,AAPL,MSFT,Volume", {"AAPL": 1, "MSFT": 2}, "hold no prices: 'Volume'"),
         # These are assets, whatever their names:
         ("Date,LOW,OPEN,AAPL", {"LOW": 1, "OPEN": 2, "AAPL": 3}, None),
         ("Date,A_Close,B_Close", {"A_Close": 1, "B_Close": 2}, None),
@@ -139,7 +139,7 @@ def test_columns_of_bars(tmp_path: Path, header: str, assets: dict[str, int], no
 
 def test_a_column_that_may_be_a_feature_beside_bars(tmp_path: Path):
     path = columns("Date,Open,High,Low,Close,rsi", tmp_path)
-    with pytest.raises(QfolioError, match="but beside them stands 'rsi'"):
+    with pytest.raises(QfolioError, match="but there is also 'rsi'"):
         load(path)
     assert load(path, features=("rsi",)).assets == ("Close",)
 

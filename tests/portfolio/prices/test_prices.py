@@ -210,7 +210,7 @@ def test_the_default_table_says_that_it_holds_survivors():
         ({"D5": "43837"}, 5, "Date", "'43837' is not a date that can be read"),
         ({"D5": "9999-01-01"}, 5, "Date", "'9999-01-01' lies outside the years 1678 to 2261"),
         ({"D5": "2020-01-07T16:00+01:00"}, 2, "Date", "'2020-01-02' has no time zone"),
-        ({"D5": "2020-01-03"}, 5, "Date", "the date 2020-01-03 stands in row 3 already"),
+        ({"D5": "2020-01-03"}, 5, "Date", "the date 2020-01-03 is already in row 3"),
         ({"D5": "2020-01-04"}, 5, "Date", "the date 2020-01-04 comes after a later one"),
         ({"A3": "1e9"}, 3, "A", "the price goes from 10 to 1e+09 in one row"),
     ],
@@ -242,7 +242,7 @@ def test_a_fault_in_a_long_table_is_named_by_its_own_row(tmp_path: Path):
     assert str(finding) == "row 7 (2020-01-06), column 'price': the price of 'B' is missing"
     (finding,) = errors(long("20.25", "2020-01-06,B,5\n"))
     assert (finding.row, finding.column) == (12, "asset")
-    assert finding.message == "'B' on 2020-01-06 stands in row 7 already"
+    assert finding.message == "'B' on 2020-01-06 is already in row 7"
     (finding,) = errors(long("20.25", "2020-01-09,B,19\n"))  # A has no row on this day
     assert finding.message == "'A': there are no prices after 2020-01-08"
     (finding,) = errors(long("20.25", "2020-01-08,,19\n"))
@@ -261,7 +261,7 @@ def test_rows_of_a_data_frame_are_counted_from_zero():
         ("\n\n ", "is empty"),
         (b"\x89PNG\r\n\x1a\n\0\0", "is not UTF-8 text"),
         ("Sociét\xe9,A\n".encode("latin-1"), "is not UTF-8 text"),
-        ("date\n2020-01-02\n", "one column only"),
+        ("date\n2020-01-02\n", "only one column"),
         ("date,A,B\n", "the table has 0 rows; at least 3 are needed"),
         ("date,A\n2020-01-02,1\n", "the table has 1 row; at least 3 are needed"),
         (wide(B1="A"), "column 'A': the columns 2 and 3 have the same name"),
@@ -270,13 +270,13 @@ def test_rows_of_a_data_frame_are_counted_from_zero():
         (wide(A2="1,2"), "row 2: there are 4 fields, but 3 column names"),
         (wide().split("\n", 1)[1], "row 1: the first line holds values instead of column names"),
         (wide(A1="open", B1="high").replace("\n", ",1,1,1\n").replace("1,1,1", "low,close,v", 1),
-         "'open', 'high', 'low', 'close' are columns of one asset, but beside them stands 'v'"),
+         "'open', 'high', 'low', 'close' are columns of one asset, but there is also 'v'"),
         ("ticker,px\nA,1\nA,2\nA,3\n", "there is no column of dates"),
         ("day,ticker,px\n2020-01-02,A,1\n2020-01-03,A,2\n2020-01-06,A,3\n",
          "column 'ticker': holds names of assets, but no column is called price or close"),
         (wide().replace("10", "x").replace("11", "x"), "column 'A': there are no numbers: 'x.0'"),
         ("date,A\n2020-01-03,1\n2020-01-02,2\n2020-01-02,3\n2020-01-01,3\n",
-         "row 3, column 'date': the date 2020-01-02 stands in row 4 already"),
+         "row 3, column 'date': the date 2020-01-02 is already in row 4"),
     ],
 )  # fmt: skip
 def test_tables_that_cannot_be_prices(tmp_path: Path, text: str | bytes, message: str):
@@ -293,7 +293,7 @@ def test_sources_that_are_no_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     sources: list[tuple[Any, str]] = [
         (csv(tmp_path, pickle.dumps(Bomb()), "p.pkl"), "export it as CSV"),
         (csv(tmp_path, pickle.dumps(Bomb()), "p.csv"), "is not UTF-8 text"),
-        (csv(tmp_path, pickle.dumps(Bomb()), "p.parquet"), "is no Parquet file or is damaged"),
+        (csv(tmp_path, pickle.dumps(Bomb()), "p.parquet"), "is damaged or not a Parquet file"),
         (csv(tmp_path, "", "p.xlsx"), "export it as CSV"),
         (tmp_path, "Is a directory"),
         (tmp_path / "none.csv", "No such file or directory"),
@@ -418,7 +418,7 @@ def test_no_asset_may_be_called_cash(name: str):
 def test_late_assets_need_a_choice():
     nan = np.nan
     table = frame(A=A, B=[nan, nan, *B[2:]])
-    with pytest.raises(QfolioError, match="'B': the first price is that of 2020-01-06, the table"):
+    with pytest.raises(QfolioError, match="'B': the first price is on 2020-01-06, the table"):
         load(table)
     with pytest.raises(QfolioError, match="'B': the first price"):
         load(table, missing="forward-fill")  # no fill can make it up
@@ -503,7 +503,7 @@ def test_wild_assets_have_no_splits():
     """A move of −50 % is nothing special where every move is as large."""
     values = np.where(np.arange(300) % 2, 1.0, 2.0)[:, None]
     table = pd.DataFrame(values, index=pd.bdate_range("2020-01-01", periods=300), columns=["A"])
-    assert [f.message for f in warnings(table)] == ["there is one asset only, 'A'"]
+    assert [f.message for f in warnings(table)] == ["there is only one asset, 'A'"]
 
 
 def test_holes_in_the_calendar():
@@ -513,7 +513,7 @@ def test_holes_in_the_calendar():
     assert found.row == 100
     assert "15 days earlier" in found.message
     assert [f.message for f in warnings(table[:40])] == [
-        "the table has 40 rows only, too few to learn from"
+        "the table has only 40 rows, too few to learn from"
     ]
 
 

@@ -140,7 +140,7 @@ def test_total_loss_one_seed_and_the_shortest_test() -> None:
 def test_what_does_not_fit_is_refused() -> None:
     data = usual(20)
     fewer = {name: s for name, s in data.strategies.items() if name != "third"}
-    with pytest.raises(QfolioError, match="other strategies"):
+    with pytest.raises(QfolioError, match="different strategies"):
         render_backtest(replace(data, strategies=fewer))
     with pytest.raises(QfolioError, match="do not fit 20 dates and 3 assets"):
         render_backtest(replace(data, assets=("A", "B", "C")))

@@ -1,4 +1,4 @@
-"""What may be said of a comparison, in sentences, and how its numbers are written."""
+"""The conclusions of a comparison in sentences, and the format of its numbers."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from qfolio.experiments.comparison.ranking import HEADLINE
 
 
 def conclusion(ranking: dict[str, Any]) -> list[str]:
-    """What may be said of a ranking, in sentences, and no more than that."""
+    """The conclusions that a ranking supports, in sentences."""
     first, seeds = ranking["order"][0], ranking["seeds"]
     each = f"with {seeds} seed{'s' if seeds > 1 else ''} each"
     beaten = {
@@ -32,7 +32,7 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
         count = len(ranking["order"])
         none = f"no two of {count} agents can" if count > 2 else "two agents cannot"
         sentence = (
-            f"{each.capitalize()} {none} be told apart, whatever they reach; it takes "
+            f"{each.capitalize()} {none} be told apart, whatever their results; this needs "
             f"{ranking['seeds_needed']} seeds or more."
         )
     return [f"{best} {figure(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
@@ -41,7 +41,7 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
 def figure(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
     """An agent's final regret or return as text.
 
-    ``interval`` adds its 95 % interval, or the range of seeds too few for one.
+    ``interval`` adds its 95 % interval, or the seeds' range if there are too few for one.
     """
     write = share if ranking["measure"] == "regret" else amount
     final = ranking["agents"][name]["final"]
@@ -54,7 +54,7 @@ def figure(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str
 
 
 def share(fraction: float) -> str:
-    """A fraction in percent, with the two digits that matter, down to a thousandth of a percent."""
+    """A fraction in percent, with two significant digits, down to a thousandth of a percent."""
     size = abs(100 * fraction)
     if size < 5e-4:
         return "0 %"
@@ -63,24 +63,24 @@ def share(fraction: float) -> str:
 
 
 def amount(value: float) -> str:
-    """A number with the four digits that matter."""
+    """A number with four significant digits."""
     if abs(value) >= 1000:
         return f"{value:,.0f}"
     return f"{value:#.4g}" if abs(value) >= 1 else f"{value:.4g}"
 
 
 def span(seconds: float) -> str:
-    """Seconds as text, with the two digits that matter."""
+    """Seconds as text, with two significant digits."""
     return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:,.0f} s"
 
 
 def listed(names: Sequence[str], word: str = "and") -> str:
-    """Names as a part of a sentence."""
+    """Names joined for a sentence."""
     return f" {word} ".join([*([", ".join(names[:-1])] if names[1:] else []), names[-1]])
 
 
 def _quickest(ranking: dict[str, Any]) -> str:
-    """Who comes near the optimum, or the best return, with the fewest steps and in least time."""
+    """The agents that come near the optimum, or the best return, in fewest steps and least time."""
     goal = "the optimum" if ranking["measure"] == "regret" else "the best return"
     near = f"within {HEADLINE:.0%} of {goal}".replace("%", " %")
     arrived = {
@@ -90,12 +90,12 @@ def _quickest(ranking: dict[str, Any]) -> str:
         if entry["threshold"] == HEADLINE and entry["steps"] is not None
     }
     if not arrived:
-        return f"No agent comes to stay {near}."
+        return f"No agent settles {near}."
     frugal = min(arrived, key=lambda name: arrived[name]["steps"])
     quick = min(arrived, key=lambda name: arrived[name]["seconds"])
     steps = f"{arrived[frugal]['steps']:,.0f}"
     seconds = f"{span(arrived[quick]['seconds'])} a seed"
     if len(arrived) == 1:
-        return f"Only {frugal} comes to stay {near}: after {steps} steps and {seconds}."
+        return f"Only {frugal} settles {near}, after {steps} steps and {seconds}."
     least = f"{quick} the least time" if quick != frugal else "the least time"
-    return f"To stay {near}, {frugal} needs the fewest steps ({steps}) and {least} ({seconds})."
+    return f"To settle {near}, {frugal} needs the fewest steps ({steps}) and {least} ({seconds})."

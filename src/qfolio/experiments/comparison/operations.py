@@ -1,4 +1,4 @@
-"""How much arithmetic an agent takes, counted in its program and not measured on any machine."""
+"""An agent's arithmetic operations, counted in its program, not measured on a machine."""
 
 import math
 from functools import partial
@@ -16,7 +16,7 @@ def operations_per_step(task: Task, agent: Agent) -> float | None:
     """Operations in products of matrices for each environment step, counted in the program.
 
     A product of (n, k) and (k, m) counts 2nkm, as processors are rated; all else is left out. None
-    where the task is not part of the program.
+    if the task is not part of the program.
     """
     state = jax.eval_shape(partial(begin, task, agent), jnp.uint32(0))
     learn = partial(advance, task, agent, learning=True)

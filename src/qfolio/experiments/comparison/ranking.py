@@ -1,11 +1,11 @@
-"""What follows from the results of several agents on one task: measures, a ranking, their pairs.
+"""The ranking of several agents on one task: measures of each, and tests of all pairs.
 
 A result is graded by its regret, the share of the exact optimum's return that it misses, or by its
-return where no optimum is known. Intervals are bootstraps over seeds (``qfolio.core.statistics``).
-Agents count as told apart where an exact rank test of their seeds says so, with Holm's correction
+return if no optimum is known. Intervals are bootstraps over seeds (``qfolio.core.statistics``).
+Agents are told apart if an exact rank test of their seeds rejects equality, with Holm's correction
 for the number of pairs: intervals of few seeds are too narrow, and one of many pairs is easily
-lucky. Seeds of two agents count as independent; where they share some luck (the same first weights,
-say), the test is only the more careful.
+lucky. Seeds of two agents count as independent; if they share some luck (such as initial weights),
+the test is conservative.
 """
 
 import math
@@ -27,34 +27,34 @@ from qfolio.core.statistics import (
 )
 
 THRESHOLDS = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
-"""Shares of the optimum that a learning curve may come within."""
+"""Regrets that a learning curve may reach."""
 
 HEADLINE = 0.1
 """The threshold of tables and sentences."""
 
 LEVEL = 0.05
-"""How often the comparison of all pairs may tell agents apart that are alike."""
+"""Probability that the comparison of all pairs tells equal agents apart."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What the seeds of one agent reached, and what they took; JSON values only.
+    """The results of one agent's seeds, and their cost; JSON values only.
 
     Attributes:
         returns: Mean return of each seed's final policy on the fixed starts.
-        optimum: The exact optimum on the same starts; None where it is not known.
-        starts, curve_starts: How many these are, and those along the learning curve.
+        optimum: The exact optimum on the same starts; None if it is unknown.
+        starts, curve_starts: Number of start states, finally and along the learning curve.
         curve_steps: Environment steps of a seed at each point of the learning curve.
         curve_returns: Greedy returns there, a row for each point.
         curve_optimum: The exact optimum on the starts of the curve.
-        episodes, env_steps: Of each seed, in training.
+        episodes, env_steps: Training episodes and steps of each seed.
         seconds_train, seconds_compile: For all seeds, side by side.
-        seconds_per_seed: Of training, on one core or as a share of its device.
+        seconds_per_seed: Training time, on one core or as a share of its device.
         steps_per_second: Environment steps of all seeds.
         operations_per_step: Multiplications and additions in products of matrices for each
-            environment step, learning included; None where nothing is compiled.
-        state_bytes: Of a seed's whole training: weights, optimiser, replay, environments.
-        policy_bytes, parameters: Of what is needed to act, in bytes and in numbers.
+            environment step, learning included; None if nothing is compiled.
+        state_bytes: A seed's training state: weights, optimiser, replay, environments.
+        policy_bytes, parameters: The size of the policy, in bytes and in numbers.
     """
 
     returns: list[float]
@@ -77,10 +77,10 @@ class Result:
 
 
 def rank(results: dict[str, Result]) -> dict[str, Any]:
-    """Everything that is derived from the results of two agents or more, as JSON values.
+    """The ranking of two agents or more, as JSON values.
 
     "measure" is "regret" (a share of the optimum, small is good) or "return"; "order" names the
-    agents, best first; "agents" holds the measures of each, "pairs" how each stands to each other.
+    agents, best first; "agents" holds the measures of each, "pairs" the tests of all pairs.
     "common_steps" is the shortest training, up to which "area" averages the learning curves.
     """
     graded = all(result.optimum for result in results.values())  # there is no share of zero
@@ -106,7 +106,7 @@ def rank(results: dict[str, Result]) -> dict[str, Any]:
 
 
 def regret(returns: Any, optimum: float) -> Floats:
-    """The share of the optimum's return that is missed; of zero there are none."""
+    """The share of the optimum's return that is missed; not finite if the optimum is zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((optimum - np.asarray(returns, dtype=float)) / np.abs(optimum))
 
@@ -120,21 +120,21 @@ def curve(result: Result, measure: str) -> Floats:
 
 
 def steps_within(steps: Sequence[int], regrets: Floats, threshold: float) -> list[int | None]:
-    """For each seed, at which point its curve comes within the threshold to stay; None if never.
+    """For each seed, the steps after which its regret stays within the threshold; None if never.
 
     steps: of the points. regrets: of shape (point, seed).
     """
     outside = ~(regrets <= threshold)
-    # The first point behind the last one outside.
+    # The first point after the last one outside.
     first = len(outside) - np.argmax(outside[::-1], axis=0)
     first = np.where(outside.any(0), first, 0)
     return [int(steps[i]) if i < len(steps) else None for i in first.tolist()]
 
 
 def middle_steps(steps: Sequence[int | None]) -> float | None:
-    """The interquartile mean, where seeds that never arrived count as slower than all others.
+    """The interquartile mean; seeds that never arrived count as slower than all others.
 
-    None where one of these lies in the middle half.
+    None if one of these lies in the middle half.
     """
     arrived = [float(count) for count in steps if count is not None]
     if len(arrived) < 0.75 * len(steps):
@@ -144,14 +144,14 @@ def middle_steps(steps: Sequence[int | None]) -> float | None:
 
 
 def area(steps: Sequence[int], values: Floats, until: int) -> Floats:
-    """Mean height of curves from the first step to ``until``, for values of shape (point, seed)."""
+    """Mean of curves from the first step to ``until``, for values of shape (point, seed)."""
     ends = np.append([x for x in steps if x < until], until)
     heights = np.stack([np.interp(ends, steps, column) for column in values.T])
     return np.asarray(np.trapezoid(heights, ends, axis=-1) / (ends[-1] - ends[0]))
 
 
 def fewest_seeds(pairs: int) -> int:
-    """The number of seeds from which on the rank test can tell agents apart among so many pairs."""
+    """The fewest seeds with which the rank test can tell agents apart among this many pairs."""
     return next(n for n in range(1, 100) if 2 * pairs / math.comb(2 * n, n) <= LEVEL)
 
 
@@ -165,7 +165,7 @@ def _final(result: Result, graded: bool) -> Floats:
 def _measures(
     result: Result, final: Floats, graded: bool, goal: float, common: int
 ) -> dict[str, Any]:
-    """final: regrets or returns of the seeds. goal: return of the best, where no optimum is."""
+    """final: regrets or returns of the seeds. goal: the best return, if no optimum is known."""
     returns = np.asarray(result.curve_returns, dtype=float)
     optimum = result.curve_optimum if graded and result.curve_optimum else goal
     heights = curve(result, "regret" if graded else "return")
@@ -185,7 +185,7 @@ def _measures(
 
 
 def _spread(values: Floats) -> dict[str, Any]:
-    """Interquartile mean over seeds, and its interval, which few seeds do not have."""
+    """Interquartile mean over seeds, and its interval; None for too few seeds."""
     interval = list(stratified_interval([values])) if len(values) >= FEWEST_SEEDS else None
     return {"iqm": float(interquartile_mean(values)), "interval": interval}
 
@@ -204,7 +204,7 @@ def _within(result: Result, regrets: Floats, threshold: float) -> dict[str, Any]
 
 
 def _pairs(scores: dict[str, Floats], order: Sequence[str], sign: float) -> list[dict[str, Any]]:
-    """How each agent stands to each of those behind it."""
+    """The tests of each agent against each of those ranked below it."""
     pairs = list(combinations(order, 2))
     p_values = holm([rank_test(scores[a], scores[b]) for a, b in pairs])
 

@@ -1,9 +1,9 @@
-"""Several agents on one task, trained one after the other on the same seeds, and its folder.
+"""A comparison: several agents on one task, trained one after another on the same seeds.
 
-The folder holds comparison.json (settings, written at the start; what each agent reached, added as
-soon as it is finished; and the ranking that follows), a run folder for each agent in agents/ (so
-that ``qfolio evaluate`` and ``watch`` know it) and, at the end, the report. What was stopped goes
-on from the last checkpoint of the agent that was training.
+The folder holds comparison.json (settings, written at the start; each agent's result, added when it
+is finished; and the ranking), a run folder for each agent in agents/ (for ``qfolio evaluate`` and
+``watch``) and, at the end, the report. A stopped comparison resumes from the last checkpoint of the
+agent that was training.
 """
 
 from collections.abc import Callable
@@ -36,14 +36,14 @@ from qfolio.experiments.run import Run
 FILE = "comparison.json"
 
 COARSE = 10
-"""Fewer points than these say little about when a learning curve came near the goal."""
+"""With fewer points, it is uncertain when a learning curve came near the goal."""
 
 
 @dataclass(frozen=True)
 class Entrant:
-    """An agent with the task as it needs it, and how long it trains.
+    """An agent with its variant of the task and its training budget.
 
-    preset: which settings these are, for people to read.
+    preset: the name of the settings, for readers.
     """
 
     task: Task
@@ -68,7 +68,7 @@ EntrantName = Annotated[str, msgspec.Meta(pattern=r"^[\w-]+(:[\w-]+)?$")]
 
 
 class ComparisonConfig(Config, frozen=True):
-    """The whole of comparison.json: what is compared, and what has come out so far."""
+    """The content of comparison.json: what is compared, and the results so far."""
 
     kind: ClassVar[str] = "comparison"
     format: ClassVar[int] = 2
@@ -90,13 +90,13 @@ class ComparisonConfig(Config, frozen=True):
     def __post_init__(self) -> None:
         seed_range(self.seeds, self.seed)
         if not self.results.keys() <= self.agents.keys():
-            raise QfolioError("there are results of agents that it does not have.")
+            raise QfolioError("there are results of unknown agents.")
 
 
 class Comparison:
-    """Made by ``create`` or ``open``; ``run`` trains and grades who is missing.
+    """Made by ``create`` or ``open``; ``run`` trains and grades the agents without a result.
 
-    results: by agent, of those that are finished. failures: why others could not be.
+    results: of the finished agents, by name. failures: the errors of the others.
     """
 
     def __init__(self, config: ComparisonConfig, folder: Path) -> None:
@@ -118,13 +118,15 @@ class Comparison:
         note: str = "",
         out: Path | str,
     ) -> "Comparison":
-        """A comparison before its first agent; those that do not fit are refused here.
+        """A comparison before its first agent.
+
+        Raises QfolioError if an agent does not fit the task or the memory.
 
         Args:
             entrants: Two agents or more, by name.
-            seeds: Trained of each, from ``seed`` on.
-            command: What was typed to start it, for the report.
-            note: What readers of the report should know, in a sentence.
+            seeds: Number of seeds of each, from ``seed``.
+            command: The command that started it, for the report.
+            note: A remark for the report, in a sentence.
             out: A new or empty folder.
         """
         if len(entrants) < 2:
@@ -138,7 +140,7 @@ class Comparison:
         described = {name: describe(one.task, one.agent) for name, one in entrants.items()}
         tasks = list(dict.fromkeys(entry.pop("task") for entry in described.values()))
         if len(tasks) > 1:
-            raise QfolioError(f"A comparison has one task, and here are {', '.join(tasks)}.")
+            raise QfolioError(f"A comparison has one task, but these are {', '.join(tasks)}.")
         config = ComparisonConfig(
             task=tasks[0],
             seeds=int(seeds),
@@ -175,7 +177,7 @@ class Comparison:
         A first Ctrl-C stops after the current chunk and sets ``interrupted``. An agent that
         diverges is left out and noted in ``failures``.
 
-        listen: called with an agent's name before it trains; makes the listener to its training.
+        listen: called with an agent's name before it trains; returns the listener of its training.
         """
         with locked(self.folder):
             self._run(listen)
@@ -199,15 +201,15 @@ class Comparison:
             self._write()
 
     def finish(self) -> dict[str, Any]:
-        """The whole of comparison.json, with the ranking of all agents that are finished."""
+        """The content of comparison.json, with the ranking of all finished agents."""
         if len(self.results) < 2:
             reasons = "; ".join(f"{name}: {why}" for name, why in self.failures.items())
-            raise QfolioError(f"There are not two agents to compare. {reasons}")
+            raise QfolioError(f"There are fewer than two agents to compare. {reasons}")
         self._write()
         return read_json(self.folder / FILE)
 
     def notes(self) -> list[str]:
-        """What a reader has to know before he compares, in sentences."""
+        """Caveats for the comparison, in sentences."""
         notes = [f"{name} could not be trained. {why}" for name, why in self.failures.items()]
         notes += filter(None, [self.config.note])
         entrants = {name: self.entrants[name] for name in self.entrants if name in self.results}
@@ -226,14 +228,14 @@ class Comparison:
         coarse = [name for name in entrants if len(self.results[name].curve_steps) < COARSE]
         if coarse:
             notes.append(
-                f"The learning curves of {listed(coarse)} have fewer than {COARSE} points, as so "
-                "much is trained between two looks: what they need to come near the goal is less "
+                f"The learning curves of {listed(coarse)} have fewer than {COARSE} points, because "
+                "evaluations are far apart: these agents need fewer steps to come near the goal "
                 "than stated."
             )
         return notes
 
     def _comparable(self) -> str:
-        """Whether start states, lengths and optima are alike, found by looking at them."""
+        """Whether start states, lengths and optima are equal, by comparing them."""
         tasks = [entrant.task for name, entrant in self.entrants.items() if name in self.results]
         starts = [jax.vmap(task.reset)(start_keys()) for task in tasks]
         optima = [result.optimum for result in self.results.values()]
@@ -284,7 +286,7 @@ def _folder_name(name: str) -> str:
 
 
 def _require_fit(name: str, entrant: Entrant, seeds: int) -> None:
-    """Raises QfolioError where an agent cannot learn the task, by tracing and not by computing."""
+    """Raises QfolioError if an agent cannot learn the task; traces without computing."""
     try:
         state = jax.eval_shape(partial(begin, entrant.task, entrant.agent), jnp.uint32(0))
         devices.require_memory(state, seeds)
@@ -302,7 +304,7 @@ def _entrant(task: str, entry: EntrantConfig) -> Entrant:
 
 
 def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
-    """Who has which value of a task's setting; None where all have the same."""
+    """The agents of each value of a task's setting; None if all have the same."""
     values: dict[str, list[str]] = {}
     for name, entry in tasks.items():
         value = entry[key]
@@ -312,7 +314,7 @@ def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
 
 
 def _result(run: Run) -> Result:
-    """Grades a finished run and measures what it took."""
+    """Grades a finished run and measures its cost."""
     summary = run.summary()
     seeds = len(run.population.seeds)
     solution, curve_optimum = run.task.optimum(), None

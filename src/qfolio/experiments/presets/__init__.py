@@ -1,4 +1,4 @@
-"""Hyperparameters that belong together: what was tuned for which task."""
+"""Presets: hyperparameters tuned for each task and agent."""
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import AGENTS, GYM, TASKS
@@ -14,17 +14,17 @@ PRESETS: Presets = {
     **gymnasium.PRESETS,
     **portfolio.PRESETS,
 }
-"""By task and agent."""
+"""Presets by task and agent."""
 
 
 def default_agent(task: str) -> str:
-    """The first agent that has presets for a task, which may be none that there is."""
+    """The first agent that has presets for a task, or a default; the task need not exist."""
     default = "dqn" if task in (*TASKS, "portfolio") else "ppo"
     return next((agent for name, agent in PRESETS if name == task), default)
 
 
 def presets_of(task: str, agent: str) -> dict[str, Preset]:
-    """By name; there are at least the agent's defaults where it or the task is not qfolio's."""
+    """Presets by name; the agent's defaults if it or the task is not qfolio's."""
     known = PRESETS.get((task, agent), {})
     if known or (task in (*TASKS, "portfolio") and agent in AGENTS):
         return known
@@ -36,9 +36,9 @@ def presets_of(task: str, agent: str) -> dict[str, Preset]:
 
 
 def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
-    """The preset of that name; raises QfolioError where there is none."""
+    """The preset of that name; raises QfolioError if there is none."""
     presets = presets_of(task, agent)
     if name not in presets:
-        there = f"there is {', '.join(presets)}" if presets else "there is none at all"
+        there = f"choose from {', '.join(presets)}" if presets else "there are none"
         raise QfolioError(f"there is no preset {name!r} for {agent} on {task}; {there}.")
     return presets[name]

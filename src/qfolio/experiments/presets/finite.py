@@ -38,11 +38,11 @@ _GRID_PENDULUM = {
 }
 
 
-_SARSA = {"epsilon_start": 0.05, "epsilon_end": 0.05}  # what SARSA learns counts its exploration
+_SARSA = {"epsilon_start": 0.05, "epsilon_end": 0.05}  # SARSA's values include exploration
 
 
 def _tables(task: str, settings: dict[str, Any], episodes: int) -> dict[tuple[str, str], Any]:
-    """Presets of the tabular agents that differ in nothing but their algorithm."""
+    """Presets of the tabular agents that differ only in their algorithm."""
     names = ("q-learning", "sarsa", "expected-sarsa", "double-q", "dyna-q")
     return {(task, name): {"fast": Preset(name, settings, episodes, seeds=8)} for name in names}
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from qfolio.experiments.presets.preset import Preset, Presets
 
-# Small inputs count (input_gain), and the few bad ends travel back fast (n_steps).
+# Small inputs matter (input_gain), and the rare bad ends must propagate fast (n_steps).
 _DQN = {
     "hidden": (128, 128),
     "input_gain": 3.0,
@@ -54,9 +54,9 @@ PRESETS: Presets = {
     ("gym:CartPole-v1", "dqn"): _dqn("CartPole-v1", 120_000, discount=0.98, epsilon_end=0.05),
     ("gym:CartPole-v1", "ppo"): {"fast": of_any("CartPole-v1", "ppo", 100_000, **_PPO)},
     ("gym:Acrobot-v1", "dqn"): _dqn("Acrobot-v1", 60_000),
-    # The goal is hardly ever found by chance. A push that lasts gets there; and what was never
-    # tried keeps its value of about 0, above all that was, unless returns over steps, a stream for
-    # V or a flat first layer level it down.
+    # The goal is hardly ever found by chance. Persistent pushes reach it; and untried actions keep
+    # their initial value of about 0, above all tried ones, unless multi-step returns, a stream for
+    # V or a flat first layer lower it.
     ("gym:MountainCar-v0", "dqn"): _dqn(
         "MountainCar-v0",
         400_000,

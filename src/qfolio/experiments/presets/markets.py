@@ -19,13 +19,13 @@ _DQN = {
     "discount": 0.97,
     "learning_rate": 3e-2,
     "learning_rate_final": 0.0,
-    "epsilon_end": 1.0,  # what is explored does not matter where all actions are learned
+    "epsilon_end": 1.0,  # exploration does not matter, since all actions are learned
     "reward_scale": 100.0,
 }
 
 
 def _pathwise(episodes: int, **changes: Any) -> dict[str, Preset]:
-    """An episode is a rollout, so that each starts from a holding drawn anew."""
+    """Episodes as long as rollouts, so that each rollout starts from a random holding."""
     changes["episode_steps"] = changes["rollout_length"]
     return {"fast": Preset("pathwise", {**_PATHWISE, **changes}, episodes, seeds=5)}
 

@@ -1,4 +1,4 @@
-"""Presets for the pendulum, seen and unseen, and for Catch."""
+"""Presets for the pendulum, with and without its velocity, and for Catch."""
 
 import math
 from typing import Any
@@ -151,7 +151,7 @@ _TORQUE = {
 }
 
 
-_MODEL = {  # 2,000 real steps, with 4 gradient steps of SAC for each behind the first 200
+_MODEL = {  # 2,000 real steps, with 4 gradient steps of SAC for each after the first 200
     **_TORQUE,
     "num_envs": 1,
     "episode_steps": 40,
@@ -182,7 +182,7 @@ PRESETS: Presets = {
         "best": Preset("dqn", _BEST, episodes=24_032, seeds=8),
         "categorical": Preset("dqn", _CATEGORICAL, episodes=8608, seeds=8),
         "rainbow": Preset("dqn", _RAINBOW, episodes=8608, seeds=8),
-        # Each hyperparameter of the report that qfolio grew out of; they are DQN's defaults.
+        # The hyperparameters of the report that qfolio grew out of; they are DQN's defaults.
         "report": Preset("dqn", {}, episodes=600, seeds=1),
     },
     ("pendulum/hidden", "dqn"): {

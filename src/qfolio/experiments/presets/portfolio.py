@@ -38,9 +38,9 @@ _PATHWISE = {
 }
 
 
-# The agents below estimate gradients from what their own actions earned. They take few steps, as
-# there is far more noise than signal in daily returns, discount fast, as a trade is paid for and
-# earns within days, and explore near what they hold, as each trade costs.
+# The agents below estimate gradients from the rewards of their own actions. They take few gradient
+# steps, because daily returns have far more noise than signal, discount strongly, because a trade
+# pays off within days, and explore near their holdings, because trades cost.
 _ON_POLICY = {
     "network": "mlp",
     "hidden": (16, 16),
@@ -99,7 +99,7 @@ def _on_weights(agent: str, settings: dict[str, Any], episodes: int) -> dict[str
 
 
 def of_any(agent: str) -> Preset:
-    """An agent's own defaults, on the task that the other agents have."""
+    """An agent's own defaults, on the other agents' task."""
     return Preset(agent, {}, episodes=800, seeds=5, task=_TASK)
 
 

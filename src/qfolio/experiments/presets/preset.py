@@ -1,4 +1,4 @@
-"""What a preset is."""
+"""The type of a preset."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
 
 
 class Preset(NamedTuple):
-    """An agent's settings, and how far it is trained, with how many seeds, unless told otherwise.
+    """An agent's settings, with the default budget and number of seeds.
 
-    That is a number of episodes, or of steps of an agent's environments where episodes end early.
+    The budget is in episodes, or in steps of all environments if episodes may end early.
     """
 
     agent: str
     settings: dict[str, Any]
     episodes: int = 0
     seeds: int = 1
-    task: Mapping[str, Any] = MappingProxyType({})  # of the task's settings, those it goes with
+    task: Mapping[str, Any] = MappingProxyType({})  # the task's settings that it was tuned for
     steps: int = 0
 
     def build(self, **changes: Any) -> "Agent":
@@ -31,9 +31,9 @@ class Preset(NamedTuple):
 
     @property
     def budget(self) -> Budget:
-        """How far each seed is trained."""
+        """The budget of each seed."""
         return Budget(steps=self.steps) if self.steps else Budget(self.episodes)
 
 
 Presets = dict[tuple[str, str], dict[str, Preset]]
-"""By task and agent, and then by name."""
+"""Presets by task and agent, and then by name."""

@@ -1,11 +1,11 @@
-"""The trials of a hyperparameter search, on disk; Optuna stands behind.
+"""The trials of a hyperparameter search on disk, in Optuna's journal.
 
-journal.log is Optuna's own record: lines of JSON, appended, nothing of which is ever unpickled. Any
-number of processes may work on one journal. Each holds a file under processes/ locked while it
-lives, so that the others can tell when it is dead and try its trials anew.
+journal.log is Optuna's own record: lines of JSON, appended, and never unpickled. Any number of
+processes may work on one journal. Each keeps a file under processes/ locked while it lives, so that
+the others can detect its death and retry its trials.
 
-What is proposed next depends on the finished trials alone, not on how often a process was stopped:
-a search that was killed and resumed proposes what an unbroken one does.
+Proposals depend on the finished trials alone, not on how often a process was stopped: a search that
+was killed and resumed proposes the same as an uninterrupted one.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from optuna.trial import TrialState
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.tuning.search import Dimension, Value
 
-optuna.logging.set_verbosity(optuna.logging.WARNING)  # else it prints a line for every trial
+optuna.logging.set_verbosity(optuna.logging.WARNING)  # otherwise it prints a line for every trial
 
 _KNOWN = (TrialState.COMPLETE, TrialState.PRUNED)
 _HELD = (*_KNOWN, TrialState.RUNNING)
@@ -36,14 +36,14 @@ class Trial(NamedTuple):
 
     number: int
     values: dict[str, Value]  # of the searched settings
-    returns: tuple[float | None, ...]  # greedy, by seed; None where the loss was no longer finite
+    returns: tuple[float | None, ...]  # greedy, by seed; None if the loss was not finite
     is_preset: bool
-    at_random: bool  # drawn from the whole space, not chosen for what was known
+    at_random: bool  # drawn from the whole space, not chosen by the sampler
     seconds: float  # its share of its batch's time, compiling included
 
     @property
     def value(self) -> float:
-        """The mean over seeds; NaN where one of them diverged."""
+        """The mean over seeds; NaN if one of them diverged."""
         return float(np.mean([math.nan if x is None else x for x in self.returns]))
 
 
@@ -58,7 +58,7 @@ class Journal:
     """The trials of a search in its folder."""
 
     def __init__(self, folder: Path, space: Sequence[Dimension], *, at_random: int) -> None:
-        """Reads the journal, or begins one.
+        """Opens the journal, or creates one.
 
         at_random: trials drawn at random before the sampler chooses.
         """
@@ -67,7 +67,7 @@ class Journal:
         path = folder / "journal.log"
         lock = JournalFileOpenLock(str(path))
         try:
-            _mend(path, lock)
+            _drop_cut_line(path, lock)
             self._study = optuna.create_study(
                 storage=JournalStorage(JournalFileBackend(str(path), lock)),
                 study_name="qfolio",
@@ -76,10 +76,10 @@ class Journal:
             )
             self.trials()
         except (ValueError, LookupError, TypeError, AttributeError, AssertionError) as error:
-            raise QfolioError(f"{path} is damaged ({error}); restore it, or search anew.") from None
+            raise QfolioError(f"{path} is damaged ({error}); restore it, or start over.") from None
 
     def trials(self) -> list[Trial]:
-        """The trials that all processes have finished, in the order of their proposal."""
+        """The finished trials of all processes, in order of their proposal."""
         found = []
         for trial in self._study.get_trials(states=_KNOWN):
             noted = trial.user_attrs
@@ -92,7 +92,7 @@ class Journal:
         return found
 
     def in_hand(self) -> int:
-        """Number of trials that processes are training."""
+        """Number of trials in training, in all processes."""
         return len(self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
 
     @contextlib.contextmanager
@@ -112,7 +112,7 @@ class Journal:
         preset: a configuration to propose first, if it lies within the space.
         """
         with FileLock(self.folder / "asking.lock"):
-            self._give_up_the_dead()
+            self._fail_dead_trials()
             self._enqueue(preset)
             states = [trial.state for trial in self._study.get_trials(deepcopy=False)]
             held = sum(state in _HELD for state in states)
@@ -143,13 +143,13 @@ class Journal:
         self._study.tell(asked.trial, state=TrialState.FAIL)
 
     def _sampler(self, known: int, in_hand: int) -> optuna.samplers.TPESampler:
-        """What proposes one trial, from how many are finished and how many are being trained.
+        """A sampler for one trial, seeded by the numbers of finished and running trials.
 
-        A sampler that lived on would go on with random numbers that a resumed search lacks.
+        A sampler that was reused would have random state that a resumed search lacks.
         """
         return optuna.samplers.TPESampler(
             seed=int(np.random.SeedSequence((known, in_hand)).generate_state(1)[0]),
-            constant_liar=True,  # keeps those of a batch apart
+            constant_liar=True,  # spreads the trials of a batch
             n_startup_trials=self._at_random,
         )
 
@@ -166,7 +166,7 @@ class Journal:
             stored = {dim.key: dim.stored(preset[dim.name]) for dim in self.space}
             self._study.enqueue_trial(stored, user_attrs={"preset": True})
 
-    def _give_up_the_dead(self) -> None:
+    def _fail_dead_trials(self) -> None:
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             process = trial.user_attrs.get("process")
             place = self.folder / "processes" / str(process)
@@ -180,12 +180,12 @@ class Journal:
 
 
 def best_of(trials: Sequence[Trial]) -> Trial | None:
-    """The trial with the highest mean return, where one kept a finite loss."""
+    """The trial with the highest mean return; None if none kept a finite loss."""
     finite = [trial for trial in trials if math.isfinite(trial.value)]
     return max(finite, key=lambda trial: trial.value, default=None)
 
 
-def _mend(journal: Path, lock: JournalFileOpenLock) -> None:
+def _drop_cut_line(journal: Path, lock: JournalFileOpenLock) -> None:
     """Removes a last line that a crash has cut short; Optuna could not read past it."""
     if not journal.exists():
         return

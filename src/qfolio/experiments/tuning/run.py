@@ -1,9 +1,9 @@
-"""A hyperparameter search: configurations chosen by Optuna, trained many at a time.
+"""A hyperparameter search: configurations chosen by Optuna, trained in batches.
 
 Configurations × seeds are the members of one population, so that a batch of them is one compiled
-program. The folder holds study.json (what is searched, written once), the journal of all trials
-and, at the end, summary.json. Any number of processes may work on one folder at once; one that
-starts later, or again, goes on from what the journal says.
+program. The folder holds study.json (the search, written once), the journal of all trials and, at
+the end, summary.json. Any number of processes may work on one folder at once; one that starts
+later, or again, continues from the journal.
 """
 
 import math
@@ -41,18 +41,18 @@ STUDY = "study.json"
 Count = Annotated[int, msgspec.Meta(ge=1, lt=2**20)]
 
 STARTS = 256
-"""Start states that configurations are compared on."""
+"""Start states on which configurations are compared."""
 
 FRESH = 1000
-"""First of the fresh seeds that the best configuration is retrained with at the end."""
+"""First of the fresh seeds with which the best configuration is retrained at the end."""
 
 RANDOM = 0.5
-"""Share of the trials that are drawn at random before Optuna's sampler takes over, whose own trials
-gather around the best and do not show what happens elsewhere."""
+"""Share of the trials that are drawn at random before Optuna's sampler takes over; the sampler's
+own trials gather around the best and do not cover the space."""
 
 
 def tuning_keys(n: int = STARTS) -> Key[Array, " start"]:
-    """Keys of the start states for tuning, none of which is used to grade results.
+    """Keys of the start states for tuning, which are never used to grade results.
 
     Choosing by the graded starts would bias every grade upwards.
     """
@@ -74,7 +74,7 @@ class Progress:
 
 
 class _Share(Listener):
-    """Tells which share of several trainings, one after the other, is done."""
+    """Reports the finished share of several trainings in sequence."""
 
     def __init__(self, tell: Callable[[float], None], number: int, count: int) -> None:
         self.tell, self.number, self.count = tell, number, count
@@ -84,7 +84,7 @@ class _Share(Listener):
 
 
 class Study(Config, kw_only=True, frozen=True):
-    """What is searched, by training whom, and how far."""
+    """The configuration of a search."""
 
     kind: ClassVar[str] = "search"
     format: ClassVar[int] = 2
@@ -110,7 +110,7 @@ class Study(Config, kw_only=True, frozen=True):
 
     @property
     def budget(self) -> Budget:
-        """How far each agent is trained."""
+        """The budget of each agent."""
         return Budget(self.episodes, self.steps)
 
 
@@ -146,15 +146,15 @@ class Tuning:
         """A search before its first trial.
 
         Args:
-            task: What to learn.
-            agent: Gives the settings that are not searched; it came from ``preset``.
-            space: What is searched.
-            trials: How many configurations in all.
-            seeds: Agents that each configuration is judged by.
-            budget: How far each agent is trained.
+            task: The task to learn.
+            agent: The agent of ``preset``, with the settings that are not searched.
+            space: The searched settings.
+            trials: Number of configurations in all.
+            seeds: Seeds of each configuration.
+            budget: The budget of each agent.
             batch: Configurations trained at once.
             fresh_seeds: Seeds of the final comparison, which the search never uses.
-            preset: The name of the preset, for people to read.
+            preset: The name of the preset, for readers.
             out: A new or empty folder.
         """
         _require_counts(trials=trials, batch=batch, seeds=seeds, fresh_seeds=fresh_seeds)
@@ -181,7 +181,7 @@ class Tuning:
     def open(
         cls, folder: Path | str, *, trials: int | None = None, batch: int | None = None
     ) -> "Tuning":
-        """A search as its journal tells it, to join or to go on with.
+        """A search from its folder, to join or to continue.
 
         trials: a new number of configurations in all. batch: of this process alone.
         """
@@ -206,11 +206,11 @@ class Tuning:
         listener: Callable[[Progress], None] | None = None,
         chunk_listener: Callable[[float], None] | None = None,
     ) -> None:
-        """Trains batch after batch until there are as many trials as the configuration says.
+        """Trains batch after batch until the configured number of trials is reached.
 
-        Ctrl-C stops after the current chunk and sets ``interrupted``; a batch that it leaves
-        unfinished is proposed again when the search goes on. chunk_listener: told how much of a
-        batch is done.
+        Ctrl-C stops after the current chunk and sets ``interrupted``; an unfinished batch is
+        proposed again when the search is resumed. chunk_listener: called with the finished share of
+        a batch.
         """
         preset = {dim.name: search.own_value(self.agent, dim) for dim in self.space}
         batch, total = self.config.batch, self.config.trials
@@ -233,12 +233,12 @@ class Tuning:
         keys: Key[Array, " start"],
         listener: Callable[[float], None] | None = None,
     ) -> tuple[Float[np.ndarray, "agent seed"], float]:
-        """Mean greedy returns of each agent and seed, NaN where the loss did not stay finite.
+        """Mean greedy returns of each agent and seed, NaN if the loss did not stay finite.
 
-        Also returns the seconds that compiling took. Agents that share all settings which shape the
-        program are one population. All of a population take as many steps as the episodes would
-        if none ended early, so that an agent's result does not depend on its company. Raises
-        KeyboardInterrupt where Ctrl-C stops it before the end.
+        Also returns the seconds spent on compiling. Agents that share all settings which shape the
+        program form one population. All its members take as many steps as the episodes would if
+        none ended early, so that an agent's result does not depend on the others. Raises
+        KeyboardInterrupt if Ctrl-C stops it before the end.
         """
         groups = defaultdict(list)
         for index, agent in enumerate(agents):
@@ -264,8 +264,8 @@ class Tuning:
     def conclude(self, listener: Callable[[float], None] | None = None) -> dict[str, Any]:
         """Trains the best configuration and the preset with fresh seeds, and grades both.
 
-        They are graded on the fixed start states, which the search never used. The result is
-        written to summary.json, and read from there while the best is the same.
+        They are graded on the fixed start states, which the search never used. The result is cached
+        in summary.json for as long as the best configuration is the same.
         """
         trials = self.journal.trials()
         found = best_of(trials)

@@ -35,8 +35,8 @@ USUAL = {
     "exploration_noise": "0.01..1",
     "initial_temperature": "0.01..1",
 }
-"""Settings that are searched by default, where an agent has them. A range surrounds the agent's own
-value; these are the ranges where that value is 0, 1 or infinite and so gives no scale."""
+"""Settings that are searched by default, if an agent has them. A range surrounds the agent's own
+value; these ranges apply if that value is 0, 1 or infinite and so gives no scale."""
 
 AROUND = 10.0
 """A default range spans the agent's own value divided by this and multiplied by it."""
@@ -49,7 +49,7 @@ PROGRAMS = 64
 class Dimension:
     """One searched setting: a range on a scale, or choices.
 
-    scale: "linear", "log", "near-one" (the logarithm of what is missing to 1) or "choice".
+    scale: "linear", "log", "near-one" (the logarithm of 1 − value) or "choice".
     """
 
     name: str
@@ -120,7 +120,7 @@ class Dimension:
 
     def around(self, value: float) -> "Dimension":
         """The dimension with a range around a value, unless that value gives no scale."""
-        whole = 1.0 if self.high <= 1 else math.inf  # what is a share stays one
+        whole = 1.0 if self.high <= 1 else math.inf  # shares stay at most 1
         if self.scale == "near-one" and 0 < value < 1:
             missing = _missing(value)
             ends = (_missing(min(missing * AROUND, 1 - 1e-3)), _missing(missing / AROUND))
@@ -141,7 +141,7 @@ def parse(assignments: Iterable[str], kind: type["Agent"]) -> list[Dimension]:
         if not (name and equals and text.strip()):
             raise QfolioError(
                 "--search takes name=low..high or name=a|b|c, for example "
-                f"learning_rate=1e-4..1e-2; {assignment!r} is not."
+                f"learning_rate=1e-4..1e-2; not {assignment!r}."
             )
         if name in space:
             raise QfolioError(f"--search names {name} twice.")
@@ -150,7 +150,7 @@ def parse(assignments: Iterable[str], kind: type["Agent"]) -> list[Dimension]:
 
 
 def dimension(name: str, text: str, kind: type["Agent"]) -> Dimension:
-    """Parses one dimension; raises QfolioError where the text is no valid range or list."""
+    """Parses one dimension; raises QfolioError if the text is not a valid range or list."""
     prefix, colon, rest = text.partition(":")
     scale, body = (prefix.strip(), rest) if colon else ("", text)
     low, dots, high = body.partition("..")
@@ -169,13 +169,13 @@ def dimension(name: str, text: str, kind: type["Agent"]) -> Dimension:
     ends = [settings.convert(kind, {name: end.strip()})[name] for end in (low, high)]
     if name not in numbers(kind):
         raise QfolioError(
-            f"{name} shapes the program, so each of its values is compiled for itself; name them: "
+            f"{name} shapes the program, so each value is compiled separately; list the values: "
             f"{name}={_written(ends[0])}|{_written(ends[1])}."
         )
     bottom, top = ends
     if not (bottom < top and math.isfinite(bottom) and math.isfinite(top)):
         raise QfolioError(
-            f"{name}={text} is no range; the first number must be below the second, both finite."
+            f"{name}={text} is not a range; the first number must be below the second, both finite."
         )
     scale = scale or _scale(bottom, top)
     if (scale == "log" and bottom <= 0) or (scale == "near-one" and top >= 1):
@@ -201,7 +201,7 @@ def numbers(kind: type["Agent"]) -> list[str]:
 def require_buildable(
     kind: type["Agent"], base: Mapping[str, Any], space: Sequence[Dimension]
 ) -> None:
-    """Raises QfolioError where the end of a range or a choice is no valid setting."""
+    """Raises QfolioError if the end of a range or a choice is not a valid setting."""
     if not space:
         raise QfolioError(
             f"{kind.__name__} has no setting that is searched by default; name some with --search."
@@ -228,7 +228,7 @@ def own_value(agent: "Agent", dim: Dimension) -> Value:
 
 
 def written(settings: Mapping[str, Any]) -> list[str]:
-    """Settings as ``name=value``, as ``--set`` takes them."""
+    """Settings as ``name=value``, in the format of ``--set``."""
     return [f"{name}={_written(value)}" for name, value in settings.items()]
 
 
@@ -238,7 +238,7 @@ def positions(space: Sequence[Dimension], values: Mapping[str, Value]) -> np.nda
 
 
 def _scale(low: float, high: float) -> str:
-    """Logarithmic where the ends, or their distances from 1, are a factor of 10 apart."""
+    """Logarithmic if the ends, or their distances from 1, are a factor of 10 apart."""
     if low > 0 and high / low >= 10:
         return "log"
     if high < 1 and _missing(low) / _missing(high) >= 10:
@@ -247,7 +247,7 @@ def _scale(low: float, high: float) -> str:
 
 
 def _missing(share: float) -> float:
-    """1 less a share, without the digits that rounding adds."""
+    """1 minus a share, without rounding digits."""
     return float(f"{1 - share:.10g}")
 
 
@@ -256,7 +256,7 @@ def _canonical(kind: type["Agent"], name: str, choice: str) -> str:
 
 
 def _written(value: Any) -> str:
-    """A setting as ``--set`` takes it."""
+    """A setting in the format of ``--set``."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list | tuple):

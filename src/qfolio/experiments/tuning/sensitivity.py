@@ -1,9 +1,9 @@
-"""How much each hyperparameter matters, from the trials of a search.
+"""The sensitivity of results to each hyperparameter, from the trials of a search.
 
 Importance is the share of the variation of results that a setting explains by itself (fANOVA:
 Hutter, Hoos and Leyton-Brown 2014), over the whole space. The effect of one setting comes from a
-Gaussian process fitted to the trials: what it expects where that setting moves along its scale and
-all others stay as they are in the best quarter of the trials.
+Gaussian process fitted to the trials: its prediction as that setting moves along its scale while
+all others stay as in the best quarter of the trials.
 """
 
 import math
@@ -37,11 +37,11 @@ _LEAST_REGRET = 1e-4
 
 @dataclass(frozen=True)
 class Outcome:
-    """How good a return is, on the scale that figures show: the higher, the better.
+    """The scale of returns in figures (heights): higher is better.
 
-    With a known optimum that is the logarithm of the regret, on which one disaster does not hide
-    all other differences. Without one it is the return, and what is far below the middle counts as
-    being at ``floor``.
+    With a known optimum it is minus the logarithm of the regret, so that one outlier does not hide
+    all other differences. Without one it is the return, and returns far below the median are
+    clipped to ``floor``.
     """
 
     optimum: float | None
@@ -85,9 +85,9 @@ class Effect:
     """The effect of one setting."""
 
     dimension: Dimension
-    share: float  # of the variation, by itself
+    share: float  # of the variation that it explains by itself
     places: Floats  # on its scale: POINTS of them, or one for each choice
-    heights: Floats  # expected there, all else as in the best quarter
+    heights: Floats  # predicted there, with all else as in the best quarter
     robust: NDArray[np.bool_]  # whether the expectation is within the tolerance of its best
 
     @property
@@ -115,13 +115,13 @@ class Sensitivity:
 
     outcome: Outcome
     effects: list[Effect]
-    explained: float  # R² of the fitted model on trials left out; how far to trust the effects
+    explained: float  # R² of the fitted model on held-out trials
 
 
 def sensitivity(
     space: Sequence[Dimension], trials: Sequence[Trial], optimum: float | None
 ) -> Sensitivity | None:
-    """Importance and effect of each setting; None where there are too few trials."""
+    """Importance and effect of each setting; None if there are too few trials."""
     values = [trial.value for trial in trials]
     if np.isfinite(values).sum() < ENOUGH:
         return None
@@ -141,7 +141,7 @@ def sensitivity(
         moved = np.repeat(best[None], len(places), 0)
         moved[:, :, column] = places[:, None]
         expected = model(moved.reshape(-1, len(space))).reshape(moved.shape[:2])
-        expected = np.minimum(expected, heights.max()).mean(1)  # it overshoots beside cliffs
+        expected = np.minimum(expected, heights.max()).mean(1)  # it overshoots next to cliffs
         robust = outcome.loss(expected) <= outcome.loss(expected.max()) + TOLERANCE
         effects.append(Effect(dim, shares[column], places, expected, robust))
     effects.sort(key=lambda effect: -effect.share)
@@ -151,7 +151,7 @@ def sensitivity(
 def _shares(space: Sequence[Dimension], table: Floats, heights: Floats) -> list[float]:
     """The share of the variation that each setting explains by itself, from Optuna's fANOVA.
 
-    It weighs values evenly, so it gets the places on their scales instead of the values.
+    fANOVA weights values evenly, so it is given positions on the scales instead of values.
     """
     import optuna
     from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
@@ -177,7 +177,7 @@ def _shares(space: Sequence[Dimension], table: Floats, heights: Floats) -> list[
 
 
 class _Model:
-    """A Gaussian process over the places of configurations; choices are a column for each."""
+    """A Gaussian process over positions of configurations; choices are one-hot encoded."""
 
     def __init__(self, space: Sequence[Dimension], table: Floats, heights: Floats) -> None:
         from sklearn.exceptions import ConvergenceWarning
@@ -193,7 +193,7 @@ class _Model:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a bound of a length was reached
             self._process.fit(inputs, heights)
-        # What it expects of each trial from all others (Rasmussen & Williams 2006, eq. 5.12).
+        # Leave-one-out predictions (Rasmussen & Williams 2006, eq. 5.12).
         inverse = np.linalg.inv(self._process.kernel_(inputs))
         scaled = (heights - heights.mean()) / heights.std()
         errors = inverse @ scaled / np.diag(inverse)
@@ -211,14 +211,14 @@ class _Model:
 
 
 def verdicts(found: Sensitivity | None, trials: Sequence[Trial]) -> list[str]:
-    """What matters and what does not, in plain sentences."""
+    """Which settings matter, in sentences."""
     if found is None:
         return [f"{ENOUGH} trials with a finite loss are needed to say what matters."]
     effects = found.effects
     if found.explained < 0.2:
         return [
             f"{len(trials)} trials do not tell what matters: a model fitted to them predicts "
-            f"trials left out hardly better than their mean does (R² {found.explained:.2f})."
+            f"held-out trials hardly better than their mean does (R² {found.explained:.2f})."
         ]
     drawn = [trial.value for trial in trials if trial.at_random]
     sentences = []
@@ -243,8 +243,8 @@ def verdicts(found: Sensitivity | None, trials: Sequence[Trial]) -> list[str]:
         names = listed([e.dimension.name for e in idle])
         verb = "does" if len(idle) == 1 else "do"
         sentences.append(
-            f"{names} hardly {verb}: once the others are right, at least three quarters of what "
-            f"was searched costs no more than {found.outcome.tolerance}."
+            f"{names} hardly {verb}: once the others are right, at least three quarters of the "
+            f"searched range costs no more than {found.outcome.tolerance}."
         )
     narrow = min(effects, key=lambda e: e.width)
     if narrow.width < 0.5 and not narrow.dimension.choices:

@@ -1,7 +1,7 @@
-"""What a whole backtest shows, and how much of it may be luck: numbers, intervals and tests.
+"""The statistics of a whole backtest: measures, intervals and tests.
 
-``measures.py``, ``bootstrap.py`` and ``sharpe.py`` say what each number is, ``verdict.py`` what
-follows from them in words. In JSON, infinite and undefined numbers are null.
+``measures.py``, ``bootstrap.py`` and ``sharpe.py`` define each number, ``verdict.py`` states the
+conclusions in words. In JSON, infinite and undefined numbers are null.
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ KINDS = ("agent", "ensemble", "baseline")
 class Strategy(NamedTuple):
     """The track records of one strategy over the test days, one row per seed.
 
-    A baseline that draws nothing at random has one row, and so has an ensemble.
+    A deterministic baseline has one row, and so has an ensemble.
     """
 
     kind: str  # one of KINDS
@@ -66,7 +66,7 @@ class Measure:
 
 @dataclasses.dataclass(frozen=True)
 class SharpeTest:
-    """How likely a Sharpe ratio is to be more than luck; moments are means over the seeds."""
+    """Tests of whether a Sharpe ratio is more than luck; moments are means over the seeds."""
 
     skewness: float
     kurtosis: float  # 3 for a normal distribution
@@ -79,19 +79,19 @@ class SharpeTest:
 
 @dataclasses.dataclass(frozen=True)
 class StrategyAssessment:
-    """All that is known of one strategy."""
+    """The statistics of one strategy."""
 
     kind: str
     seeds: int
     measures: dict[str, Measure]  # by the names in MEASURES
     to_reference: Difference | None  # none for the reference itself
-    to_best_baseline: Difference | None  # none for it, and where the reference is the best
+    to_best_baseline: Difference | None  # none for it, and if the reference is the best
     sharpe_test: SharpeTest
 
 
 @dataclasses.dataclass(frozen=True)
 class Assessment:
-    """The statistics of a whole backtest, in plain numbers."""
+    """The statistics of a whole backtest."""
 
     first_date: str  # of the first and the last return, year-month-day
     last_date: str
@@ -127,27 +127,27 @@ def assess(
     """Compute every statistic of a backtest.
 
     Agents and ensembles are compared in growth with a reference and with the best baseline, the
-    one that grew most over the very days of the test; ``differences.py`` says how.
+    one that grew most over the days of the test; see ``differences.py``.
 
-    One block length serves all strategies, since they share the resampled days: the longest that
-    their returns (mean over seeds) or squared returns ask for. Squares persist for months, and
-    shorter blocks would make volatility and drawdown look more certain than they are.
+    All strategies share the resampled days and so one block length: the longest that their returns
+    (mean over seeds) or squared returns require. Squared returns are autocorrelated for months, and
+    shorter blocks would make intervals of volatility and drawdown too narrow.
 
     Equal arguments give equal results, and the order of a strategy's seeds does not matter.
 
     Args:
-        strategies: A name for each, at least one baseline among them; all on the same days.
+        strategies: By name, at least one baseline among them; all on the same days.
         dates: Days on which the returns were earned, shape (periods,), strictly increasing.
         periods_per_year: For example 252 for days of trading.
-        reference: The name of the baseline that was chosen beforehand to compare with.
-        earlier_trials: How many trials there were on these days before. Every seed of every agent
-            and every ensemble is counted already.
-        resamples: How many histories the bootstrap draws.
+        reference: The name of the baseline chosen in advance for comparison.
+        earlier_trials: Number of earlier trials on these days, in addition to every seed of every
+            agent and every ensemble.
+        resamples: Number of histories that the bootstrap draws.
         seed: Seed of the drawing.
 
     Raises:
         QfolioError: Shapes do not fit, numbers are missing or out of range, there are fewer than
-            two periods, or the reference is no baseline.
+            two periods, or the reference is not a baseline.
     """
     tracks = _tracks(strategies)
     baselines = [name for name, entry in strategies.items() if entry[0] == "baseline"]
@@ -161,10 +161,10 @@ def assess(
     if periods < 2 or resamples < 1 or not periods_per_year > 0:
         raise QfolioError(
             f"The statistics of a backtest need at least two periods and one resample, and a "
-            f"positive number of periods per year; these are {periods}, {resamples} and "
+            f"positive number of periods per year; they are {periods}, {resamples} and "
             f"{periods_per_year}."
         )
-    # All seeds of all strategies side by side, so that they get the same days.
+    # All seeds of all strategies together, so that they share the resampled days.
     rng = np.random.default_rng(seed)
     table = np.concatenate([_canonical(track) for track in tracks.values()], axis=1)
     block = _common_block([_canonical(track)[0].mean(axis=0) for track in tracks.values()])
@@ -211,7 +211,7 @@ def assess(
                 sharpe_test=_sharpe_test(
                     _canonical(track)[0],
                     mean_over_seeds(sampled[name].observed["sharpe"]),
-                    trials if name in judged else 1,  # nobody searched among baselines' seeds
+                    trials if name in judged else 1,  # baselines were not selected among trials
                     variance,
                     periods_per_year,
                 ),
@@ -251,8 +251,8 @@ def _sharpe_test(
 def _trial_variance(annual: list[float], periods: int, periods_per_year: float) -> float:
     """The variance of the trials' Sharpe ratios per period.
 
-    At least that of an estimate from normal returns without skill: seeds of one agent are alike,
-    and their spread says too little of what other trials could have found by luck.
+    At least that of an estimate from normal returns without skill: seeds of one agent are similar,
+    and their spread understates what other trials could have found by luck.
     """
     known = np.sort(annual)  # so that the order of the seeds cannot move the last digit
     luck = 1 / (periods - 1)
@@ -262,14 +262,14 @@ def _trial_variance(annual: list[float], periods: int, periods_per_year: float) 
 
 
 def _common_block(series: list[Floats]) -> float:
-    """The longest block that any of the series or its squared deviations asks for."""
+    """The longest block that any of the series or its squared deviations requires."""
     return max(
         max(block_length(values), block_length((values - values.mean()) ** 2)) for values in series
     )
 
 
 def _canonical(track: Floats) -> Floats:
-    """Seeds in an order that follows from their numbers alone: (3, seeds, periods)."""
+    """The seeds sorted by their values: (3, seeds, periods)."""
     return track[:, sorted(range(track.shape[1]), key=lambda seed: track[:, seed].tobytes())]
 
 
@@ -293,7 +293,7 @@ def _tracks(
         if track.ndim != 3:
             raise QfolioError(
                 f"The returns of {name} have the shape {track.shape[1:]}; "
-                f"one row per seed and one column per period is needed."
+                f"it must have one row per seed and one column per period."
             )
     if len({track.shape[-1] for track in tracks.values()}) > 1:
         lengths = ", ".join(f"{name} {track.shape[-1]}" for name, track in tracks.items())

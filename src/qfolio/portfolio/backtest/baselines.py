@@ -1,7 +1,7 @@
 """Baselines: the rules that agents are compared with.
 
-A baseline decides as an agent does: it sees the rows up to a decision and what it holds, and names
-target weights. ``orders.py`` asks it over the folds of a test; skfolio fits the optimisers.
+A baseline decides as an agent does: it sees the rows up to a decision and its holding, and returns
+target weights. ``orders.py`` runs it over the folds of a test; skfolio fits the optimisers.
 """
 
 import warnings
@@ -18,13 +18,13 @@ Bools = NDArray[np.bool_]
 
 
 class History(NamedTuple):
-    """What a baseline knows when it decides, with T rows up to the decision and N assets."""
+    """The data of a baseline's decision, with T rows up to the decision and N assets."""
 
     dates: NDArray[np.datetime64]  # (T,)
     prices: Floats  # (T, N), NaN before an asset's first price
     train: slice  # rows of the fold's training window, which ends at its first decision or earlier
     tradable: Bools  # (N,), assets that may be held; they have prices in the whole training window
-    cap: float  # most that one asset may weigh when it is ordered
+    cap: float  # largest weight of one asset when it is ordered
 
     @property
     def returns(self) -> Floats:
@@ -34,21 +34,21 @@ class History(NamedTuple):
 
 
 class Baseline(ABC):
-    """A rule that decides on weights; subclass it, and make it without arguments.
+    """A rule that decides on weights; subclasses take no constructor arguments.
 
-    A warning that ``decide`` raises becomes a note in the report, with the baseline and the fold.
+    A warning in ``decide`` becomes a note in the report, with the baseline and the fold.
 
     Attributes:
-        calendar: When ``decide`` is called. "fold": at the first decision of each fold; what it
-            names is the target of every row of the fold, so that drift is traded back daily.
-            "row": at every row; None then leaves the holding to drift.
+        calendar: When ``decide`` is called. "fold": at the first decision of each fold; its result
+            is the target of every row of the fold, so that drift is traded back daily.
+            "row": at every row; None then lets the holding drift.
     """
 
     calendar: ClassVar[Literal["fold", "row"]] = "fold"
 
     @abstractmethod
     def decide(self, history: History, held: Floats) -> Floats | None:
-        """Name target weights, or give no order.
+        """Return target weights, or None for no order.
 
         Args:
             history: All rows up to the decision, and none after it.
@@ -79,9 +79,9 @@ class BuyAndHold(Baseline):
 class Fitted(Baseline):
     """An optimiser of skfolio, fitted to the training window of each fold.
 
-    Where it finds no solution, weights are equal and a warning says so. Where it knows no cap, the
-    excess goes to the assets below the cap, in proportion to their weights. Where the assets cannot
-    hold everything within the cap, all are at the cap and the rest is cash.
+    If it finds no solution, weights are equal, with a warning. If it does not support a cap, the
+    excess goes to the assets below the cap, in proportion to their weights. If the cap is too low
+    for the assets to hold everything, all are at the cap and the rest is cash.
     """
 
     @abstractmethod
@@ -96,7 +96,7 @@ class Fitted(Baseline):
         from skfolio.exceptions import SkfolioError
 
         try:
-            # skfolio says ValueError where no portfolio has a positive return or returns are few.
+            # skfolio raises ValueError if no portfolio has a positive return or returns are few.
             found = np.maximum(self.optimizer(history.cap).fit(history.returns).weights_, 0)
             if not 0 < found.sum() < np.inf:
                 raise ValueError("the weights found are not numbers")
@@ -152,10 +152,10 @@ class HierarchicalRiskParity(Fitted):
 
 
 def baseline(name: str) -> Baseline:
-    """Make the baseline of a name, or of ``module:Name`` where that module has been imported.
+    """Make a baseline by its name, or by ``module:Name`` if that module has been imported.
 
     Raises:
-        QfolioError: There is none, or only a file names its module.
+        QfolioError: There is none, or its module has not been imported.
     """
     made: Baseline = imported("baseline", name)()
     return made
@@ -168,7 +168,7 @@ def equal_weights(history: History) -> Floats:
 
 
 def with_cash(weights: ArrayLike, history: History) -> Floats:
-    """Weights of the tradable assets as a target: cash first, which has what they leave."""
+    """Weights of the tradable assets as a target: cash, the rest, comes first."""
     wanted = np.asarray(weights, dtype=float)
     target = np.zeros(len(history.tradable) + 1)
     target[1:][history.tradable] = wanted

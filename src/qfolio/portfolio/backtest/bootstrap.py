@@ -1,4 +1,4 @@
-"""The stationary bootstrap of track records: how measures vary in other samples of a market."""
+"""The stationary bootstrap of track records."""
 
 import math
 
@@ -18,7 +18,7 @@ from qfolio.portfolio.backtest.measures import (
 )
 
 LEVEL = 0.95
-"""Coverage of all intervals, and the probability from which on something counts as evidence."""
+"""Coverage of all intervals, and the probability required for a claim."""
 
 _CHUNK = 2_000_000  # resampled days held at a time: tens of megabytes, whatever the resamples
 
@@ -59,15 +59,15 @@ def block_length(series: ArrayLike) -> float:
 def stationary_bootstrap_indices(
     periods: int, block: float, resamples: int, rng: np.random.Generator
 ) -> NDArray[np.int32]:
-    """Draw the days of resampled histories: blocks of geometric length, in a circle.
+    """Draw the days of resampled histories: circular blocks of geometric length.
 
     Politis & Romano (1994), "The stationary bootstrap": each day follows the one before with
-    probability 1 − 1/block, and is any day otherwise; the first day follows the last.
+    probability 1 − 1/block, and is otherwise a random day; the first day follows the last.
 
     Args:
-        periods: How many days there are.
+        periods: Number of days.
         block: The mean length of a block, at least 1; at 1 the days are independent draws.
-        resamples: How many histories to draw.
+        resamples: Number of histories to draw.
         rng: Source of randomness.
 
     Returns:
@@ -79,7 +79,7 @@ def stationary_bootstrap_indices(
     begun = np.maximum.accumulate(
         np.where(jump, day, 0), axis=1
     )  # when the block began; the first at 0
-    # Where a block began we draw its distance from the calendar; within the block it stays.
+    # Each block draws its shift from the calendar, which is constant within the block.
     shift = np.take_along_axis(rng.integers(periods, size=shape, dtype=np.int32), begun, axis=1)
     shift += day
     return np.where(shift >= periods, shift - np.int32(periods), shift)
@@ -96,8 +96,9 @@ def bootstrap_measures(
 ) -> dict[str, Floats]:
     """Compute ``measures`` on histories resampled by the stationary bootstrap.
 
-    The same days are drawn for all series. Averages over a resampled history need only how often
-    each day was drawn, so they are one matrix product; the drawdown alone follows the order.
+    The same days are drawn for all series. Averages over a resampled history depend only on how
+    often each day was drawn, so they are one matrix product; only the drawdown depends on the
+    order.
 
     Args:
         returns, turnover, cost: As in ``measures``, shape (series, periods), at least two periods.
@@ -133,9 +134,9 @@ def bootstrap_measures(
 
 
 def percentile_interval(samples: Floats, level: float = LEVEL) -> Floats:
-    """Return the ends, shape (2, …), of the middle part of the samples along the first axis.
+    """Return the percentile interval of samples along the first axis, shape (2, …).
 
-    Both ends are samples.
+    Its ends are samples.
     """
     count = len(samples)
     tail = max(math.floor((count + 1) * (1 - level) / 2), 1)

@@ -1,14 +1,15 @@
-"""How strategies differ on the same days: intervals, p-values, and what is found after correction.
+"""Differences of strategies on the same days: intervals, p-values and corrected findings.
 
 Intervals and p-values come from the same resampled histories. A history draws the days and,
 independently for each strategy, its seeds: S − 1 of S with replacement, since S of S would
 understate the variance of the mean by the factor (S − 1)/S (McCarthy & Snowden 1985).
 
-Whatever is not a baseline is tested in growth against the reference, which was chosen beforehand,
-and against the best baseline, which nobody could have named beforehand. That choice is counted: to
-beat the best is to beat every baseline, so the largest of their p-values holds (an
+Agents and ensembles are tested in growth against the reference, which was chosen in advance, and
+against the best baseline, which is known only in hindsight. The tests account for that choice:
+beating the best means beating every baseline, so the largest of their p-values applies (an
 intersection–union test, Berger 1982); falling short of the best has the p-value of White's reality
-check (2000), which draws the best anew. Holm's correction for all of these comparisons decides.
+check (2000), which selects the best in each resample. Holm's correction for all of these
+comparisons decides.
 """
 
 import dataclasses
@@ -23,10 +24,10 @@ from qfolio.portfolio.backtest.bootstrap import LEVEL, percentile_interval
 from qfolio.portfolio.backtest.measures import Floats, Range, log_growth, paired_difference
 
 MARGIN = 1e-6
-"""Of growth a year: less than this is rounding, and no evidence of anything."""
+"""Smaller differences in annual growth are rounding errors."""
 
 Pair = tuple[str, str]
-"""The names of a strategy and of what it is compared with."""
+"""The names of a strategy and of its comparison."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,8 +35,8 @@ class Difference:
     """A strategy minus a reference on the same days.
 
     Each interval is of this difference alone, with a level of 95 %, over days and seeds. The
-    p-values and what is found belong to the difference in growth; a baseline, of which nobody
-    claims anything, has none.
+    p-values and the finding concern the difference in growth; baselines are not tested and have
+    none.
     """
 
     reference: str
@@ -43,17 +44,17 @@ class Difference:
     growth_interval: Range
     sharpe: float  # of annual Sharpe ratios
     sharpe_interval: Range
-    p: float | None = None  # two-sided; counts the choice of the best baseline
+    p: float | None = None  # two-sided; accounts for the choice of the best baseline
     p_holm: float | None = None  # corrected for all comparisons of the backtest; decides
     finding: Literal["better", "worse", "none"] | None = None
 
 
 class Sampled(NamedTuple):
-    """The measures of one strategy by seed, as observed and as drawn again."""
+    """The measures of one strategy by seed, observed and resampled."""
 
     observed: dict[str, Floats]  # (seeds,)
     drawn: dict[str, Floats]  # (resamples, seeds): the same days for all
-    picks: NDArray[np.int64]  # (resamples, seeds drawn): which seeds, if they are drawn, too
+    picks: NDArray[np.int64]  # (resamples, seeds drawn): the resampled seeds
 
 
 def compare(
@@ -64,7 +65,7 @@ def compare(
     Args:
         sampled: By strategy.
         baselines: Which of them are baselines.
-        reference: The baseline that was chosen beforehand.
+        reference: The baseline that was chosen in advance.
         best: The baseline that grew most.
     """
     differences = {
@@ -98,13 +99,13 @@ class Tails(NamedTuple):
 
 
 def tails_to(ours: Sampled, theirs: Sampled) -> Tails:
-    """P-values against one that was chosen beforehand.
+    """P-values against a strategy chosen in advance.
 
-    They invert the interval: where one is at most 2.5 %, the 95 % interval lies on its side of
-    zero, and nowhere else.
+    They invert the interval: one is at most 2.5 % exactly if the 95 % interval lies on its side of
+    zero.
     """
     drawn = _drawn(ours, theirs, "growth")
-    return Tails(_share(~(drawn > MARGIN)), _share(~(drawn < -MARGIN)))  # NaN speaks for neither
+    return Tails(_share(~(drawn > MARGIN)), _share(~(drawn < -MARGIN)))  # NaN counts for neither
 
 
 def tails_to_best(ours: Sampled, rivals: Sequence[Sampled]) -> Tails:
@@ -112,20 +113,20 @@ def tails_to_best(ours: Sampled, rivals: Sequence[Sampled]) -> Tails:
     each = [tails_to(ours, rival) for rival in rivals]
     observed = np.array([_observed(ours, rival, "growth") for rival in rivals])
     drawn = np.stack([_drawn(ours, rival, "growth") for rival in rivals])
-    # How far the luckiest rival gets ahead if none is truly better.
+    # The lead of the luckiest rival if none is truly better.
     ahead = (observed[:, None] - drawn).max(axis=0)
     reality_check = _share(~(ahead < -observed.min()))
     alone = each[int(observed.argmin())]
     return Tails(
         better=max(tails.better for tails in each),
-        worse=max(reality_check, alone.worse),  # no claim that the interval does not allow
+        worse=max(reality_check, alone.worse),  # no claim that contradicts the interval
     )
 
 
 def _corrected(
     differences: Mapping[Pair, Difference], tails: Mapping[Pair, Tails]
 ) -> dict[Pair, Difference]:
-    """The tested differences with their p-values and what follows from them."""
+    """The tested differences with their p-values and findings."""
     p_values = [min(1.0, 2 * min(each)) for each in tails.values()]
     found = {}
     rows = zip(tails.items(), p_values, holm(p_values).tolist(), strict=True)
@@ -156,7 +157,7 @@ def _observed(ours: Sampled, theirs: Sampled, key: str) -> float:
 
 
 def _drawn(ours: Sampled, theirs: Sampled, key: str) -> Floats:
-    """In each resampled history, of shape (resamples,)."""
+    """The difference in each resampled history, of shape (resamples,)."""
     scale = log_growth if key == "growth" else np.asarray
     means = [
         np.take_along_axis(scale(each.drawn[key]), each.picks, axis=1).mean(axis=1)
@@ -166,5 +167,5 @@ def _drawn(ours: Sampled, theirs: Sampled, key: str) -> Floats:
 
 
 def _share(hits: NDArray[np.bool_]) -> float:
-    """Of the resamples, the observed history counted as one of them."""
+    """The share of hits, counting the observed history as one resample."""
     return float((1 + hits.sum()) / (1 + hits.size))

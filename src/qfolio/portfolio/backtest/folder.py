@@ -1,9 +1,9 @@
 """The folder of a backtest.
 
 It holds config.json (settings, written once), prices.safetensors (the table),
-policies/AGENT/FOLD.safetensors (weights, written as soon as a group of folds is trained; of the
-latest, the whole learning state), training/AGENT/FOLD.csv (a row for each training episode) and, at
-the end, returns.csv, weights.csv, summary.json and the report.
+policies/AGENT/FOLD.safetensors (weights, written as soon as a group of folds is trained; for the
+latest policy, the whole learning state), training/AGENT/FOLD.csv (a row for each training episode)
+and, at the end, returns.csv, weights.csv, summary.json and the report.
 """
 
 import csv
@@ -45,7 +45,7 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class BacktestConfig(Config, frozen=True):
-    """What a backtest is."""
+    """The configuration of a backtest."""
 
     kind: ClassVar[str] = "backtest"
     format: ClassVar[int] = 2
@@ -73,7 +73,7 @@ class BacktestConfig(Config, frozen=True):
     def __post_init__(self) -> None:
         seed_range(self.seeds, self.seed)
         if not {"source", "rows", "first", "last", "digest"} <= self.prices.keys():
-            raise QfolioError("prices is not described.")
+            raise QfolioError("the description of prices is incomplete.")
         for name, entry in self.agents.items():
             Budget(entry.episodes)
             if name in BASELINES:
@@ -89,7 +89,7 @@ class BacktestFolder:
         self.path = path
 
     def write(self, config: BacktestConfig, prices: Prices) -> None:
-        """What is there from the start."""
+        """Writes the configuration and the prices."""
         write_config(self.path / "config.json", config)
         arrays = {
             "dates": prices.dates.astype("datetime64[s]").astype(np.int64),
@@ -99,11 +99,11 @@ class BacktestFolder:
         write_arrays(self.path / "prices.safetensors", arrays)
 
     def read_config(self) -> BacktestConfig:
-        """Raises QfolioError where the folder holds no backtest of this version."""
+        """Raises QfolioError if the folder holds no backtest of this version."""
         return read_config(self.path / "config.json", BacktestConfig)
 
     def read_prices(self, config: BacktestConfig) -> Prices:
-        """The table; raises QfolioError where it is damaged or not the configuration's."""
+        """The table; raises QfolioError if it is damaged or not the configuration's."""
         path = self.path / "prices.safetensors"
         arrays = read_arrays(path)
         try:
@@ -117,7 +117,7 @@ class BacktestFolder:
                 note=str(config.prices.get("note", "")),
             )
         except (KeyError, ValueError, QfolioError) as error:
-            raise QfolioError(f"{path} is damaged ({error}); restore it or run anew.") from None
+            raise QfolioError(f"{path} is damaged ({error}); restore it or start over.") from None
         if prices.digest != config.prices["digest"]:
             raise QfolioError(f"{path} does not belong to config.json beside it; restore the two.")
         return prices
@@ -136,7 +136,7 @@ class BacktestFolder:
         write_bytes(self._records(agent, fold), _csv(header, (row.values() for row in rows)))
 
     def read_records(self, agent: str, fold: str) -> list[Row]:
-        """The training episodes of a fold; none where their table is missing."""
+        """The training episodes of a fold; none if their table is missing."""
         path = self._records(agent, fold)
         if not path.exists():
             return []

@@ -11,7 +11,7 @@ from qfolio.core.errors import QfolioError
 class Fold(NamedTuple):
     """The training window of a policy, and the rows at which it then decides."""
 
-    name: str  # date of the first return that it earns, with the time where rows are intraday
+    name: str  # date of its first return, with the time if rows are intraday
     train: slice
     decisions: slice
     recent: slice  # the final ``train``-length window
@@ -30,7 +30,7 @@ class Fold(NamedTuple):
 def walk_forward(
     dates: np.ndarray, train: str, test: str, lag: int, expanding: bool = False
 ) -> list[Fold]:
-    """Consecutive folds, without a gap between their returns.
+    """Consecutive folds, without gaps between their returns.
 
     Training ends at the row of the first decision. A decision at row t earns the return to row
     t + lag + 1, so the last lag + 1 decisions are purged and no reward is earned later. Windows of
@@ -50,7 +50,7 @@ def walk_forward(
     # Row of the first return of the first fold.
     start = _after(dates, 0, train)
     while start < len(dates):
-        end = min(_after(dates, start, test), len(dates))  # behind its last return
+        end = min(_after(dates, start, test), len(dates))  # the row after its last return
         first = start - lag - 1
         recent = _before(dates, first, train) if folds else 0
         begin = 0 if expanding else recent
@@ -63,13 +63,13 @@ def walk_forward(
     if not folds:
         raise QfolioError(
             f"{len(dates)} rows, {str(dates[0])[:10]} to {str(dates[-1])[:10]}, leave nothing to "
-            f"test after train={train}; shorten it, or bring more rows."
+            f"test after train={train}; shorten it, or give more rows."
         )
     return folds
 
 
 def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) -> Fold:
-    """The training window of tomorrow's policy: the end of the table, or all of it."""
+    """The training window of tomorrow's policy: the last ``train`` of the table, or all of it."""
     end = len(dates)
     recent = _before(dates, end - 1, train)
     begin = 0 if expanding else recent
@@ -77,7 +77,7 @@ def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) ->
 
 
 def spell(date: np.datetime64, dates: np.ndarray) -> str:
-    """A date as text, with the time where rows are less than a day apart."""
+    """A date as text, with the time if rows are less than a day apart."""
     days = dates.astype("datetime64[D]")
     if (days[1:] > days[:-1]).all():
         return str(date.astype("datetime64[D]"))
@@ -93,7 +93,7 @@ def parse_length(text: str) -> tuple[int, str]:
 
 
 def _after(dates: np.ndarray, row: int, length: str) -> int:
-    """The first row that is ``length`` or more after ``row``; len(dates) where there is none."""
+    """The first row that is ``length`` or more after ``row``; len(dates) if there is none."""
     count, unit = parse_length(length)
     if unit == "d":
         return min(row + count, len(dates))
@@ -109,7 +109,7 @@ def _before(dates: np.ndarray, row: int, length: str) -> int:
 
 
 def _shift(date: np.datetime64, count: int, unit: str) -> np.datetime64:
-    """A calendar date some months or weeks away; the last of a month stays a last."""
+    """A calendar date some months or weeks away; clipped to the end of its month."""
     day = date.astype("datetime64[D]")
     if unit == "w":
         return day + np.timedelta64(7 * count, "D")

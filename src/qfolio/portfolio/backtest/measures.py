@@ -35,7 +35,7 @@ def measures(
 
         - growth: geometric mean, as a simple annual rate; a total loss gives −1;
         - volatility: standard deviation (n − 1) of the returns;
-        - sharpe: mean over standard deviation, the risk-free rate taken as 0;
+        - sharpe: mean over standard deviation, with a risk-free rate of 0;
         - sortino: mean over the downside deviation, the root mean square of min(return, 0);
         - drawdown: the maximum drawdown below an earlier peak (or the start), between 0 and 1;
         - calmar: growth over drawdown;
@@ -54,7 +54,7 @@ def measures(
 
 
 def drawdown(returns: ArrayLike) -> Floats:
-    """Return how far wealth is below its running peak, as a share of the peak.
+    """Return the drawdown: how far wealth is below its running peak, as a share of the peak.
 
     Args:
         returns: Simple returns of shape (..., periods).
@@ -98,7 +98,7 @@ def monthly(returns: ArrayLike, dates: ArrayLike) -> tuple[list[int], Floats]:
 def per_period(track: Floats, centre: Floats) -> Floats:
     """Quantities whose means over time give all measures but the drawdown: (7, ..., periods)."""
     returns, turnover, cost = track
-    deviation = returns - centre[..., None]  # centred, or the variance would lose its digits
+    deviation = returns - centre[..., None]  # centred, or the variance would lose precision
     ruined = returns == -1
     log_net = np.log1p(np.where(ruined, 0, returns))
     log_free = log_net - np.log1p(-cost)
@@ -142,7 +142,7 @@ def ratio_or_zero(above: ArrayLike, below: ArrayLike) -> Floats:
 
 
 def paired_difference(first: Floats, second: Floats) -> Floats:
-    """First less second; 0 where both lost everything or rounding cannot tell them apart."""
+    """First minus second; 0 if both lost everything or differ by rounding only."""
     with np.errstate(invalid="ignore"):
         return np.where(np.isclose(first, second, rtol=0, atol=1e-12), 0.0, first - second)
 
@@ -155,7 +155,7 @@ def deviations(values: Floats) -> Floats:
 
 
 def log_growth(returns: Floats) -> Floats:
-    """Of simple returns; −∞ for a total loss."""
+    """Log growth of simple returns; −∞ for a total loss."""
     with np.errstate(divide="ignore"):
         return np.log1p(returns)
 
@@ -163,7 +163,7 @@ def log_growth(returns: Floats) -> Floats:
 def deepest_drawdown(steps: Floats, days: NDArray[np.int32]) -> Floats:
     """The maximum drawdown of every resampled history.
 
-    Goes through time once, for all histories and series at a time, and keeps no history: below
+    Goes through time once, for all histories and series at a time, and stores no path: relative to
     its peak, log wealth follows depth ← min(depth + log return, 0).
 
     Args:
@@ -197,7 +197,7 @@ def checked_track(
     return np.stack(arrays)
 
 
-# The least and the greatest value; rounding may leave a turnover or a cost a hair below zero.
+# The least and the greatest value; rounding may leave a turnover or a cost slightly below zero.
 _BOUNDS = {"returns": (-1.0, 1e100), "turnover": (-1e-9, 1e100), "cost": (-1e-9, 1 - 1e-9)}
 
 

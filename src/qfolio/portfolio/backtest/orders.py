@@ -1,4 +1,4 @@
-"""What a baseline orders over the folds of a test, asked row by row without a look ahead."""
+"""A baseline's orders over the folds of a test, row by row without look-ahead."""
 
 import warnings
 from collections.abc import Sequence
@@ -28,9 +28,9 @@ class Fold(Protocol):
 
 
 class Orders(NamedTuple):
-    """Decisions of shape (D, N + 1), cash first, NaN for no order, and what went wrong on the way.
+    """Decisions of shape (D, N + 1), cash first, NaN for no order, and notes.
 
-    Notes are sentences for the person who reads the results.
+    Notes are sentences for the report about problems in the decisions.
     """
 
     decisions: Floats
@@ -50,26 +50,26 @@ def orders(
     """Ask a baseline for its decisions on every row of the folds.
 
     Args:
-        name: What notes and errors call the baseline.
-        baseline: Decides; handed the rows up to each decision only.
-        folds: Folds whose decisions follow one another without a gap, in order of time. The
+        name: The baseline's name in notes and errors.
+        baseline: The baseline; it sees only the rows up to each decision.
+        folds: Folds whose decisions follow one another without gaps, in order of time. The
             training rows of a fold end with the row of its first decision or earlier.
-        dates: Of the rows, shape (rows,).
+        dates: Dates of the rows, shape (rows,).
         values: Prices of shape (rows, N); NaN before an asset's first price.
-        tradable: Which assets a fold may hold, of shape (folds, N); those with prices in all of
-            its training rows if None.
-        cap: Most that one asset may weigh when it is ordered.
+        tradable: Which assets a fold may hold, of shape (folds, N) (default: those with prices in
+            all of its training rows).
+        cap: Largest weight of one asset when it is ordered.
 
     Returns:
-        Decisions for the rows from the first to the last fold's, and notes that name the fold.
+        Decisions for all rows of the folds, and notes that name the fold.
 
     Raises:
         QfolioError: The folds have a gap or look ahead, a fold may hold no asset, an asset that it
-            may hold has no price in its training rows, or the baseline names weights that are off
+            may hold has no price in its training rows, or the baseline returns weights that are off
             the simplex, above the cap or in an asset that may not be held.
     """
     prices = np.array(values, dtype=float)
-    prices.flags.writeable = False  # a baseline that wrote to it would change what others see
+    prices.flags.writeable = False  # shared by all baselines
     _check(folds)
     ordered, row_ordered = np.eye(prices.shape[1] + 1)[0], folds[0].decisions.start
     parts, notes = [], []
@@ -109,7 +109,7 @@ def _tradable(fold: Fold, prices: Floats, chosen: Bools | None) -> Bools:
 
 
 def _drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
-    """Weights ordered at one row's prices, as they are at another's."""
+    """Weights ordered at one row's prices, drifted to another's."""
     worth = weights.copy()
     bought = weights[1:] > 0  # others may have no price yet
     worth[1:][bought] *= now[bought] / then[bought]
@@ -117,7 +117,7 @@ def _drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
 
 
 def _checked(name: str, wanted: ArrayLike, history: History) -> Floats:
-    """A baseline's target weights, or a QfolioError that says what is wrong with them."""
+    """A baseline's target weights; raises QfolioError if they are invalid."""
     target = np.asarray(wanted, dtype=float)
     where = f"The baseline {name} at {str(history.dates[-1])[:10]}"
     if target.shape != (len(history.tradable) + 1,):
@@ -127,7 +127,7 @@ def _checked(name: str, wanted: ArrayLike, history: History) -> Floats:
         )
     if not abs(target.sum() - 1) <= TOLERANCE or target.min() < -TOLERANCE:
         raise QfolioError(
-            f"{where} gives weights that sum to {target.sum():.8g}, the least of them "
+            f"{where} gives weights that sum to {target.sum():.8g}, with a minimum of "
             f"{target.min():.3g}; they must sum to 1 and not be negative."
         )
     if (target[1:][~history.tradable] > 0).any():

@@ -1,4 +1,4 @@
-"""What trained agents decide over the folds of a backtest."""
+"""The decisions of trained agents over the folds of a backtest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,25 +24,25 @@ class Entry:
 
 
 class Stretch(NamedTuple):
-    """A fold to decide over."""
+    """A fold with the agents trained on it."""
 
     task: Portfolio  # the part of the table that the fold trained on
-    members: PyTree  # what the agents learned there, with a leading seed axis
+    members: PyTree  # the agents' weights, with a leading seed axis
     fold: Fold
 
 
 def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: bool) -> np.ndarray:
-    """Decisions over all folds, (seed, day, entry); each goes on with what the last one held.
+    """Decisions over all folds, (seed, day, entry); each fold starts with the last one's holding.
 
-    With ``together`` it is the mean of all seeds that trades, as one, and ``seeds`` is 1. The
-    agents see their portfolio in float32; the replay is in float64.
+    With ``together`` one portfolio follows the mean of all seeds, and ``seeds`` is 1. The agents
+    see their portfolio in float32; the replay is in float64.
     """
     held = np.zeros((seeds, 1 + len(stretches[0].task.limits)))
     held[:, 0] = 1.0
     days = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
     parts = []
     for (task, members, fold), count in zip(stretches, days, strict=True):
-        # One length serves all folds; what lies behind a fold's end is cut off.
+        # One length for all folds, so that one program serves all; the surplus is cut off.
         start = fold.decisions.start
         targets, after = follow(task, agent, members, start, held, max(days), together=together)
         parts.append(targets[:, :count])

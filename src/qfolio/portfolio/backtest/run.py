@@ -1,7 +1,7 @@
 """A walk-forward backtest.
 
-Agents are trained anew for each fold, all seeds and several folds in one program, and once more on
-the latest rows, for tomorrow's weights. What they then decide is replayed with exact costs in
+Agents are trained from scratch for each fold, all seeds and several folds in one program, and once
+more on the latest rows, for tomorrow's weights. Their decisions are replayed with exact costs in
 float64, beside classical allocators under the same rules.
 """
 
@@ -40,15 +40,15 @@ from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
 
 LATEST = "latest"
-"""Name of the policies that were trained on the last rows of the table."""
+"""Name of the policies trained on the last rows of the table."""
 
 EQUAL_WEIGHT = "equal-weight"
 
 TOGETHER = "-together"
-"""Behind an agent's name: all its seeds as one, which is the policy for tomorrow."""
+"""Suffix of an agent's ensemble: the mean of all its seeds, which is the policy for tomorrow."""
 
 FOLDS_AT_ONCE = 8
-"""Folds that train at once where members advance in lockstep; what is done after them stays."""
+"""Folds that train at once if members advance in lockstep; results are kept after each group."""
 
 
 class Backtest:
@@ -82,7 +82,7 @@ class Backtest:
                 f"{min(both)} is an agent and a baseline; give the agent another name."
             )
         self.interrupted = False
-        self._policies: dict[tuple[str, str], Any] = {}  # of a backtest without a folder
+        self._policies: dict[tuple[str, str], Any] = {}  # without a folder
         self._records: dict[tuple[str, str], list[Row]] = {}  # likewise
         for task in self.tasks.values():
             for job in self._jobs:
@@ -114,22 +114,22 @@ class Backtest:
 
         Args:
             prices: The table.
-            agents: What to train, by name: presets, whose task settings say window, menu, reward,
-                …, or agents of your own.
+            agents: The agents to train, by name: presets, whose task settings include window, menu,
+                reward, …, or agents of your own.
             train, test: Lengths such as "5y", "6m" or "500d"; with ``expanding``, training keeps
                 its start.
             lag: Rows from a decision to its execution.
-            cost: Of trading one way, as a fraction.
-            cap: Most that one asset may weigh.
-            cost_model: What trades and holdings cost, in training and replay alike: a name of the
-                registry, or your own as ``module:Name``.
-            baselines: What agents are compared with, likewise; equal weights always are.
+            cost: One-way trading cost, as a fraction of the value traded.
+            cap: Largest weight of one asset.
+            cost_model: Cost of trading and holding, in training and replay: a name of the registry,
+                or your own as ``module:Name``.
+            baselines: Names of the baselines, likewise; equal weights are always included.
             seeds: Agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
-            episodes: How long each agent without a preset trains in a fold.
+            episodes: Training episodes in a fold of each agent without a preset.
             task: Settings of the portfolio task for agents without a preset.
-            trials: Earlier trials on these prices, for the deflated Sharpe ratio to count; those of
-                the default table (``prices.table.DEFAULT_TRIALS``) are known and come on top.
-            command: What was typed to start it, for the report.
+            trials: Earlier trials on these prices, for the deflated Sharpe ratio; those of the
+                default table (``prices.table.DEFAULT_TRIALS``) are added to them.
+            command: The command that started it, for the report.
             out: A new or empty folder; without it nothing is written.
         """
         if not agents:
@@ -168,7 +168,7 @@ class Backtest:
     def open(cls, folder: Path | str, agents: Mapping[str, Agent] | None = None) -> "Backtest":
         """A backtest as its last finished group of folds left it.
 
-        agents: by name, those that are not among the agents that qfolio registers.
+        agents: by name, those that are not registered with qfolio.
         """
         files = BacktestFolder(Path(folder))
         config = files.read_config()
@@ -185,7 +185,7 @@ class Backtest:
 
     @property
     def folder(self) -> Path | None:
-        """Where the backtest is kept."""
+        """The folder of the backtest, if it has one."""
         return None if self._folder is None else self._folder.path
 
     def run(
@@ -193,14 +193,14 @@ class Backtest:
         listen: Callable[[Job, float, float], Sequence[Listener]] = lambda job, done, share: (),
         executor: Executor | None = None,
     ) -> None:
-        """Trains every fold of every agent that is not kept yet.
+        """Trains every fold of every agent that is not trained yet.
 
-        A first Ctrl-C stops after the current chunk and sets ``interrupted``; the folds of groups
-        that are finished stay.
+        A first Ctrl-C stops after the current chunk and sets ``interrupted``; finished groups of
+        folds are kept.
 
         Args:
-            listen: Called before each job, with the share of all jobs that is done and that of
-                the job; makes the listeners to its training.
+            listen: Called before each job, with the finished share of all jobs and the share of
+                this job; returns the listeners of its training.
             executor: Where the jobs run (default: in this process).
         """
         jobs = [job for name in self.agents for job in self._missing(name)]
@@ -244,20 +244,20 @@ class Backtest:
         )
 
     def keep(self, agent: str | None, policy: Policy) -> None:
-        """Keeps a policy that has gone on learning as the agent's for tomorrow."""
+        """Stores an updated policy as the agent's policy for tomorrow."""
         learning = _learning(policy.learner, policy.updates, policy.learned)
         self._keep_policy(self._name(agent), LATEST, learning)
 
     def records(self, agent: str, fold: str) -> list[Row]:
-        """Every training episode of an agent in a fold, all seeds, in the order of time."""
+        """Every training episode of an agent in a fold, all seeds, in order of time."""
         if self._folder is None:
             return self._records.get((agent, fold), [])
         return self._folder.read_records(agent, fold)
 
     def entries(self) -> tuple[dict[str, Entry], list[str]]:
-        """Every strategy replayed over all folds, and notes on what went wrong on the way."""
+        """Every strategy replayed over all folds, and notes on problems."""
         notes = [
-            f"Fold {fold.name} does without {', '.join(self._late(fold))}, which started too late."
+            f"Fold {fold.name} leaves out {', '.join(self._late(fold))}, which started too late."
             for fold in self.folds
             if self._late(fold)
         ]
@@ -276,13 +276,13 @@ class Backtest:
 
     @property
     def dates(self) -> np.ndarray:
-        """Of the returns of the test, shape (day,)."""
+        """Dates of the test's returns, shape (day,)."""
         shift = self.config.lag + 1
         first, last = self.folds[0].decisions.start, self.folds[-1].decisions.stop
         return self.prices.dates[first + shift : last + shift]
 
     def assess(self, entries: dict[str, Entry], since: str | None = None) -> assessment.Assessment:
-        """The statistics of all strategies, over all days of the test or those from a date on."""
+        """The statistics of all strategies, over the whole test or from a date on."""
         first = 0 if since is None else int(np.searchsorted(self.dates, np.datetime64(since)))
         days = slice(first, None)
         return assessment.assess(
@@ -316,11 +316,11 @@ class Backtest:
         self._folder.write_summary({**assessed.to_json(), "verdicts": verdicts(assessed)})
 
     def _name(self, agent: str | None) -> str:
-        """Of an agent: the first, if none is named."""
+        """An agent's name (default: the first); raises QfolioError if it is unknown."""
         name = next(iter(self.agents)) if agent is None else agent
         if name not in self.agents:
             raise QfolioError(
-                f"The backtest has no agent {name!r}; there is {', '.join(self.agents)}."
+                f"The backtest has no agent {name!r}; choose from {', '.join(self.agents)}."
             )
         return name
 
@@ -359,7 +359,7 @@ class Backtest:
         )
 
     def _late(self, fold: Fold) -> list[str]:
-        """Assets that a fold does without."""
+        """The assets that a fold leaves out."""
         tradable = fold.tradable(self.prices.values)
         return [name for name, yes in zip(self.prices.assets, tradable, strict=True) if not yes]
 
@@ -369,7 +369,7 @@ class Backtest:
         return self._folder.has_policy(name, fold)
 
     def _keep(self, name: str, fold: str, trained: TrainedFold) -> None:
-        """The records first: the policy says that the fold is trained."""
+        """Writes the records first: the policy marks the fold as trained."""
         if self._folder is None:
             self._records[name, fold] = trained.rows
         else:
@@ -386,7 +386,7 @@ class Backtest:
             self._folder.write_policy(name, fold, tree)
 
     def _members(self, name: str, job: str) -> Any:
-        """What the agents of a fold learned."""
+        """The weights of a fold's agents."""
         agent = self.agents[name]
         state = state_template(self.tasks[name], agent, self.config.seeds)
         return self._load(name, job, agent.weights(state))
@@ -394,7 +394,7 @@ class Backtest:
     def _load(self, name: str, job: str, template: Any) -> Any:
         if not self._is_trained(name, job):
             where = f"qfolio backtest --resume {self.folder}" if self.folder else "run()"
-            raise QfolioError(f"The backtest is not finished; go on with {where} first.")
+            raise QfolioError(f"The backtest is not finished; continue with {where} first.")
         if self._folder is None:
             return self._policies[name, job]
         return self._folder.read_policy(name, job, template)
@@ -422,7 +422,7 @@ class Backtest:
 
 
 def _learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, Any]:
-    """What is kept of the policy for tomorrow: one file, so that it is always of one piece."""
+    """The policy for tomorrow as one tree, so that its file is always consistent."""
     seconds = np.array(learned, "datetime64[s]").astype(np.int64)
     return {"learner": learner, "updates": np.array(updates), "learned": seconds}
 
@@ -430,14 +430,16 @@ def _learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, A
 def _described(
     name: str, agent: Preset | Agent, episodes: int | None, task: Mapping[str, Any]
 ) -> AgentConfig:
-    """An agent as the configuration holds it."""
+    """An agent's configuration."""
     if isinstance(agent, Preset):
         described = settings.describe(agent.build())
         return AgentConfig(
             agent=agent.agent, settings=described, task=dict(agent.task), episodes=agent.episodes
         )
     if episodes is None:
-        raise QfolioError(f"{name} has no preset; say with episodes how long it trains in a fold.")
+        raise QfolioError(
+            f"{name} has no preset; give episodes, the length of its training in a fold."
+        )
     return AgentConfig(
         agent=name_of(agent),
         settings=settings.describe(agent),

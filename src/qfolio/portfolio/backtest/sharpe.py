@@ -1,4 +1,4 @@
-"""Sharpe ratios against luck: probabilistic, deflated, and the track record they need."""
+"""Significance of Sharpe ratios: probabilistic, deflated, and the minimum track record."""
 
 import math
 
@@ -7,7 +7,7 @@ import numpy as np
 from qfolio.portfolio.backtest.bootstrap import LEVEL
 from qfolio.portfolio.backtest.measures import Floats, deviations, ratio_or_zero
 
-# Every Sharpe ratio in these formulas is per period, never annual: an annual one would count each
+# Every Sharpe ratio in these formulas is per period, not annual: an annual one would count each
 # period as a whole year of evidence.
 
 
@@ -21,7 +21,7 @@ def probabilistic_sharpe(
 
     Args:
         sharpe: Observed Sharpe ratio per period, not annual.
-        periods: How many returns it was computed from.
+        periods: Number of returns that it was computed from.
         skewness: γ₃ of the returns, 0 for normal ones.
         kurtosis: γ₄ of the returns, 3 for normal ones.
         benchmark: SR*, per period.
@@ -37,10 +37,10 @@ def probabilistic_sharpe(
 def minimum_track_record(
     sharpe: float, skewness: float, kurtosis: float, benchmark: float = 0.0, level: float = LEVEL
 ) -> float:
-    """Return how many periods it takes until the probabilistic Sharpe ratio reaches a level.
+    """Return the number of periods until the probabilistic Sharpe ratio reaches a level.
 
     Bailey & López de Prado (2012): 1 + (1 − γ₃ SR + (γ₄ − 1)/4 SR²) (z / (SR − SR*))², infinite
-    where the Sharpe ratio does not exceed the benchmark. Arguments as in ``probabilistic_sharpe``.
+    if the Sharpe ratio does not exceed the benchmark. Arguments as in ``probabilistic_sharpe``.
     """
     from scipy.special import ndtri
 
@@ -57,11 +57,11 @@ def expected_maximum_sharpe(trials: int, variance: float) -> float:
 
     Bailey & López de Prado (2014), "The deflated Sharpe ratio":
     √V ((1 − γ) Φ⁻¹(1 − 1/N) + γ Φ⁻¹(1 − 1/(N e))) with the Euler–Mascheroni constant γ; 0 for one
-    trial, which nobody has picked.
+    trial, which involves no selection.
 
     Args:
         trials: N, every attempt whose result might have been reported.
-        variance: V of the trials' Sharpe ratios; per period if the result is to be so.
+        variance: V of the trials' Sharpe ratios, per period for a result per period.
     """
     from scipy.special import ndtri
 
@@ -74,7 +74,7 @@ def expected_maximum_sharpe(trials: int, variance: float) -> float:
 def deflated_sharpe(
     sharpe: float, periods: int, skewness: float, kurtosis: float, trials: int, variance: float
 ) -> float:
-    """Return the probability that a Sharpe ratio exceeds what the best of N trials owes to luck.
+    """Return the probability that the true Sharpe ratio exceeds the best of N trials without skill.
 
     Bailey & López de Prado (2014): the probabilistic Sharpe ratio against the expected maximum.
     Arguments as in ``probabilistic_sharpe`` and ``expected_maximum_sharpe``, all per period.
@@ -84,12 +84,12 @@ def deflated_sharpe(
 
 
 def _sharpe_variance(sharpe: float, skewness: float, kurtosis: float) -> float:
-    """Times n − 1: the variance of an estimated Sharpe ratio (Mertens 2002)."""
+    """The variance of an estimated Sharpe ratio, times n − 1 (Mertens 2002)."""
     return 1 - skewness * sharpe + (kurtosis - 1) / 4 * sharpe**2
 
 
 def skewness_and_kurtosis(returns: Floats) -> tuple[float, float]:
-    """Skewness and kurtosis, averaged over the rows; those of a normal where nothing varies."""
+    """Skewness and kurtosis, averaged over the rows; 0 and 3 for constant rows."""
     centred = deviations(returns)
     spread = np.sqrt((centred**2).mean(axis=-1))
     still = spread == 0

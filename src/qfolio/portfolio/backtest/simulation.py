@@ -1,9 +1,9 @@
 """Replay of decisions on real prices, in double precision, with exact costs.
 
-The one rule of timing: a decision at row t sees prices up to row t and names target weights at the
-prices of row t. That is an order in shares, scaled to what the wealth affords. It is executed at
-the close of row t + lag, after prices have moved the holding and the order alike, and the cost of
-that trade is charged to the return of row t + lag + 1.
+The rule of timing: a decision at row t sees prices up to row t and sets target weights at the
+prices of row t. This is an order in shares, scaled to the wealth. It is executed at the close of
+row t + lag, after prices have moved both the holding and the order, and the cost of that trade is
+charged to the return of row t + lag + 1.
 """
 
 import operator
@@ -20,7 +20,7 @@ TOLERANCE = 1e-6
 """How far weights may be off the simplex; within it they are projected back."""
 
 BLOCK = 60_000
-"""Numbers per array in a block of work: several such arrays fit into a core's cache."""
+"""Numbers per array in a block: several such arrays fit into a core's cache."""
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -71,10 +71,10 @@ def simulate(
         decisions: Target weights of shape (..., D, N + 1), cash first, for D rows in succession;
             a row of NaN gives no order.
         first: Row of the first decision.
-        cost: Cost of trading one way, as a fraction of the value traded, 0 ≤ cost < 1; or a model
+        cost: One-way trading cost, as a fraction of the value traded, 0 ≤ cost < 1; or a model
             of the costs of trading and holding.
         lag: Rows between a decision and its trade, 0 or more.
-        start: Weights held at row ``first``, of shape (N + 1,) or (..., N + 1); all cash if None.
+        start: Weights held at row ``first``, of shape (N + 1,) or (..., N + 1) (default: all cash).
 
     Returns:
         The returns of rows first + lag + 1 to first + lag + D, and the trades before them.
@@ -82,7 +82,7 @@ def simulate(
     Raises:
         QfolioError: There are too few rows, cost or lag is out of range, a price is not positive
             or missing after an asset's start, or weights are off the simplex by more than 1e-6 or
-            positive where the asset has no price yet.
+            positive before the asset's first price.
     """
     prices, begun = _prices(values)
     orders = np.asarray(decisions, dtype=float)
@@ -118,8 +118,8 @@ def simulate(
     market = _Market(shown, begun[first:], first, days, lag, cost)
     orders, held = orders.reshape(-1, days, entries), held.reshape(-1, entries)
     result = [*(np.empty(orders.shape[:2]) for _ in range(3)), np.empty(orders.shape)]
-    # glibc gives large freed arrays back to the system, which is slower than the arithmetic on
-    # them, but not those that are smaller than one that was freed before.
+    # glibc returns large freed arrays to the system, which is slower than the arithmetic on them,
+    # unless a larger array has been freed before.
     np.empty(2**21)
     columns = max(1, BLOCK // entries)
     together = max(1, columns // max(1, days))
@@ -131,10 +131,10 @@ def simulate(
 
 
 class _Market:
-    """The prices from the first decision to the last return, and what holding and trading cost.
+    """The prices from the first decision to the last return, and the cost model.
 
-    What a unit of cash and of each asset grows to has the entries as first axis, in memory, too:
-    numpy then adds up a few long rows instead of many short ones.
+    Growth factors of cash and assets have the entries as first axis, also in memory: numpy then
+    sums a few long rows instead of many short ones.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class _Market:
         return self.grown(decided, trade + self.lag)
 
     def grown(self, start: Rows, end: Rows) -> Floats:
-        """What a unit of each entry grows to from one row to another."""
+        """Growth factors of each entry from one row to another."""
         relatives = self.prices[end] / self.prices[start]
         return np.asarray(self.costs.carry(relatives, Context(rows=end - start)))
 
@@ -164,17 +164,17 @@ def _replay(
     columns: int,
     result: list[Floats],
 ) -> None:
-    """Fills in the result of orders of shape (S, D, N + 1), some days of it at a time.
+    """Computes the result of orders of shape (S, D, N + 1), some days at a time.
 
-    Arrays in here have the shape (N + 1, S, days). Whatever moves with prices alone is worth
-    weights times relatives, so that only sums have to be divided by.
+    Arrays in here have the shape (N + 1, S, days). Between trades, weights times relatives give
+    values, which are normalised only by their sums.
     """
     returns, turnover, paid, weights = result
     start, given = _on_simplex(market, held[:, None], 0)
     if not given.all():
         raise QfolioError("The start weights are NaN; give weights that sum to 1, or none at all.")
     start = start[..., 0].T
-    worth = (start * market.moved(np.array(0), np.array(0))).T  # of what is held at the next trade
+    worth = (start * market.moved(np.array(0), np.array(0))).T  # of the holding at the next trade
     latest = np.full((len(orders), 1), -1)  # day of the last order
     for low in range(0, market.days, columns):
         now = slice(low, min(low + columns, market.days))
@@ -220,8 +220,8 @@ def _on_simplex(market: _Market, weights: Floats, day: int) -> tuple[Floats, Boo
         if not fits.all():
             who, when = np.argwhere(~fits)[0]
             raise QfolioError(
-                f"Weights at row {market.first + day + when} sum to {total[who, when]:.8g}, the "
-                f"least of them is {least[who, when]:.3g}; they must sum to 1 and not be negative "
+                f"Weights at row {market.first + day + when} sum to {total[who, when]:.8g}, with a "
+                f"minimum of {least[who, when]:.3g}; they must sum to 1 and not be negative "
                 "(or all be NaN, which gives no order)."
             )
     if (least < 0).any():
@@ -239,7 +239,7 @@ def _on_simplex(market: _Market, weights: Floats, day: int) -> tuple[Floats, Boo
 
 
 def _prices(values: ArrayLike) -> tuple[Floats, Bools]:
-    """Checked prices, with an asset's first price before its start, and where it has one."""
+    """Checked prices, with each asset's first price filled in before its start, and a mask."""
     prices = np.asarray(values, dtype=float)
     if prices.ndim != 2:
         raise QfolioError(f"Prices have the shape {prices.shape}; it must be (rows, assets).")

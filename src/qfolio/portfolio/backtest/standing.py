@@ -1,4 +1,4 @@
-"""How an agent of a finished backtest stands against equal weights."""
+"""The verdict on an agent of a finished backtest against equal weights."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +13,8 @@ class Standing:
     """The verdict of a backtest on the policy that ``allocate`` follows, all seeds together.
 
     agent: its name.
-    verdict: the sentence of the report; empty where the backtest is not finished.
-    worse: Whether the verdict is that it falls short of equal weights.
+    verdict: the sentence of the report; empty if the backtest is not finished.
+    worse: whether it falls short of equal weights.
     """
 
     agent: str
@@ -26,7 +26,7 @@ class Standing:
         """The standing of an agent, from summary.json in the folder of its backtest.
 
         Raises:
-            QfolioError: The file is damaged or does not know the agent.
+            QfolioError: The file is damaged or does not contain the agent.
         """
         path = folder / "summary.json"
         if not path.exists():
@@ -37,7 +37,7 @@ class Standing:
             agents = [name for name, entry in strategies.items() if entry["kind"] == "agent"]
             if agent not in agents:
                 raise QfolioError(
-                    f"The backtest has no agent {agent!r}; there is {', '.join(agents)}."
+                    f"The backtest has no agent {agent!r}; choose from {', '.join(agents)}."
                 )
             name = f"{agent}{TOGETHER}" if f"{agent}{TOGETHER}" in strategies else agent
             worse = strategies[name]["to_reference"]["finding"] == "worse"
@@ -48,11 +48,11 @@ class Standing:
             ) from None
 
     def require_sound(self, folder: Path, named: bool) -> None:
-        """Raise QfolioError where the policy should not be traded without a second thought.
+        """Raise QfolioError unless the policy may be traded without an explicit override.
 
         Args:
-            folder: Of the backtest, for the message.
-            named: Whether the user asked for this very agent.
+            folder: The backtest's folder, for the message.
+            named: Whether the user named this agent.
         """
         if not self.verdict:
             raise QfolioError(
@@ -62,6 +62,6 @@ class Standing:
             )
         if self.worse and not named:
             raise QfolioError(
-                f"In its own backtest, {self.verdict.rstrip('.')}; to trade it all the same, add "
+                f"In its own backtest, {self.verdict.rstrip('.')}; to trade it nevertheless, add "
                 f"--agent {self.agent} or --anyway."
             )

@@ -15,10 +15,10 @@ from qfolio.portfolio.task import Portfolio
 
 
 class TrainedFold(NamedTuple):
-    """What the agents of a fold learned.
+    """The trained agents of a fold.
 
-    learner: their states, with a leading seed axis. rows: of every training episode, in the order
-    in which they finished.
+    learner: their states, with a leading seed axis. rows: one for every training episode, in order
+    of time.
     """
 
     learner: PyTree
@@ -45,7 +45,7 @@ class FoldsJob:
         return f"{self.agent_name}/{self.folds[0]}"
 
     def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:
-        """By fold; None where Ctrl-C stopped it."""
+        """The trained folds by name; None if Ctrl-C stopped it."""
         tasks = [task for task in self.tasks for _ in self.seeds]
         population = Population(tasks, self.agent, self.seeds * len(self.folds))
         kept = _RowsByFold(self)

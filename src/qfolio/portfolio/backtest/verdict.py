@@ -1,4 +1,4 @@
-"""What a backtest shows, in sentences: whom an agent beats, and whether its return may be luck."""
+"""Verdicts of a backtest in sentences: which baselines an agent beats, and whether by luck."""
 
 import math
 
@@ -27,15 +27,15 @@ def verdicts(assessment: Assessment) -> dict[str, list[str]]:
 
 
 def tested(strategy: StrategyAssessment) -> list[Difference]:
-    """To the reference, and to the best baseline where that is another."""
+    """The differences to the reference, and to the best baseline if that is another."""
     pair = (strategy.to_reference, strategy.to_best_baseline)
     return [each for each in pair if each is not None and each.finding is not None]
 
 
 def verdict(name: str, difference: Difference, assessment: Assessment) -> str:
-    """What a comparison in growth shows.
+    """The verdict of a comparison in growth.
 
-    Holm's correction over all comparisons of the backtest decides what is claimed.
+    Holm's correction over all comparisons of the backtest decides on the claim.
     """
     found, numbers = finding(name, difference), evidence(difference, assessment)
     return f"{found}: the difference in annual growth is {numbers}."
@@ -49,7 +49,7 @@ def finding(name: str, difference: Difference) -> str:
 def evidence(difference: Difference, assessment: Assessment) -> str:
     """The numbers of a verdict: the difference, its interval and the p-value that decides."""
     low, high = difference.growth_interval
-    # As many digits as it takes to tell an end from zero.
+    # Enough digits to tell an end from zero.
     ends = [abs(100 * end) for end in (low, high) if end and math.isfinite(end)]
     digits = next((d for d in range(1, 7) if all(round(end, d) for end in ends)), 7)
     middle, left, right = (
@@ -73,10 +73,10 @@ def p_value(p: float) -> str:
 
 
 def luck(name: str, strategy: StrategyAssessment) -> str:
-    """What a deflated Sharpe ratio shows.
+    """The verdict of a deflated Sharpe ratio.
 
-    It answers whether there is a return for the risk at all, after picking among trials. Whether
-    an agent is better than a baseline is another question, which ``verdict`` answers.
+    It tests whether there is a return for the risk at all, given the selection among trials.
+    ``verdict`` tests whether an agent is better than a baseline.
     """
     test, sharpe = strategy.sharpe_test, strategy.measures["sharpe"].mean
     bar = "zero"

@@ -22,7 +22,7 @@ from qfolio.portfolio.prices.vocabulary import (
 RANGE = frozenset({"open", "high", "low"})
 TRADED = RANGE | {"volume"}
 UNNAMED = "these bars"
-LONGEST = 100  # characters of a name that is looked into
+LONGEST = 100  # characters of a name that is parsed
 
 _WORDS = "|".join(
     re.escape(word).replace("\\ ", r"[\s_.-]*")
@@ -36,7 +36,7 @@ _BEGINS = re.compile(rf"(?P<kind>{_WORDS}){_GAP}(?P<asset>.+)", re.I)
 class Bar(NamedTuple):
     """One column of an asset's bars."""
 
-    kind: str  # as the table calls it, such as Adj Close; empty where the asset's name is all
+    kind: str  # as the table calls it, such as Adj Close; empty if the name is the asset's alone
     column: int
 
 
@@ -71,12 +71,12 @@ def pick_prices(
             taken = [table.names[j] for j in chosen if j not in others]
             findings.note(f"prices are those of {listing(taken)}; left out: {listing(left)}")
         else:
-            findings.note(f"left out, because there are no prices in it: {listing(left)}")
+            findings.note(f"left out, because they hold no prices: {listing(left)}")
     return tuple(assets[j] for j in chosen), tuple(chosen)
 
 
 def columns_of_kind(table: Table, name: str) -> dict[str, int]:
-    """By asset, the columns of this kind in a header on two levels."""
+    """The columns of this kind by asset, in a header on two levels."""
     for k in (0, 1):
         found = {pair[1 - k]: j for j, pair in table.levels.items() if pair[k] == name}
         if found and kind(name):
@@ -112,7 +112,7 @@ def _of_levels(table: Table, columns: Sequence[int], findings: Findings) -> dict
 
 
 def _of_one_asset(table: Table, columns: Sequence[int], findings: Findings) -> dict[str, list[Bar]]:
-    """The bars of a table of one asset; none where the columns are prices of several."""
+    """The bars of a table of one asset; none if the columns are prices of several."""
     bars = [Bar(table.names[j], j) for j in columns if kind(table.names[j])]
     closes = [bar for bar in bars if plain(bar.kind) in ("close", *ADJUSTED_NAMES)]
     prices = [bar for bar in bars if is_price(bar.kind)]
@@ -123,18 +123,18 @@ def _of_one_asset(table: Table, columns: Sequence[int], findings: Findings) -> d
         return {}
     if beside := [table.names[j] for j in columns if not kind(table.names[j])]:
         findings.error(
-            f"{listing(bar.kind for bar in bars)} are columns of one asset, but beside them stands "
+            f"{listing(bar.kind for bar in bars)} are columns of one asset, but there is also "
             f"{listing(beside)}",
-            advice="Remove what is no price, name features with features= (--features), or give a "
-            "table with a column 'ticker'.",
+            advice="Remove columns that are not prices, name features with features= (--features), "
+            "or give a table with a column 'ticker'.",
         )
     return {min(prices, key=_rank).kind if prices else UNNAMED: bars}
 
 
 def _of_names(table: Table, columns: Sequence[int]) -> tuple[dict[str, list[Bar]], list[int]]:
-    """Bars by asset, as told by names such as AAPL_Volume, and the columns of other prices.
+    """Bars by asset, from names such as AAPL_Volume, and the columns of other prices.
 
-    High, Low and Vol are parts of assets' names, too (of factor portfolios, for instance): they
+    High, Low and Vol may also be parts of assets' names (of factor portfolios, for instance): they
     count only beside a price of the same asset. Volumes are never prices.
     """
     names = {j: table.names[j] for j in columns if len(table.names[j]) <= LONGEST}

@@ -1,6 +1,6 @@
-"""What one cell of a table says: a number, a date, or nothing.
+"""Reads one cell of a table: a number, a date, or nothing.
 
-What can be read in two ways is not read.
+Ambiguous cells are errors.
 """
 
 import math
@@ -41,7 +41,7 @@ def is_missing(cell: Any) -> bool:
 
 
 def label(cell: Any) -> str:
-    """An asset's name; text stays as it is, for NA and NULL are names of assets, too."""
+    """An asset's name; text is kept as it is, because NA and NULL are names of assets, too."""
     if isinstance(cell, str):
         return cell.strip()
     if is_missing(cell):
@@ -76,7 +76,7 @@ def currencies(cells: np.ndarray) -> set[str]:
 
 
 def not_a_number(cell: Any, decimal: str) -> str:
-    """What is wrong with a cell that should hold a number."""
+    """Why a cell is not a number, for a message."""
     said = str(cell).strip()
     text, _ = _bare(said)
     if _TWO_READINGS.fullmatch(text):
@@ -136,12 +136,12 @@ def _bare(cell: str) -> tuple[str, str]:
 
 
 def dates(cells: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
-    """Cells as datetime64[s] (NaT: missing or unreadable), and by row what is wrong with them.
+    """Cells as datetime64[s] (NaT: missing or unreadable), and complaints by row.
 
-    Dates and times are read as such, as are ISO 8601 and similar texts (2020-01-31, 2020/1/31,
-    20200131, 2020-01-31 16:00+01:00), and 31/01/2020 or 01/31/2020 where at least one cell of the
-    column shows which number is the day. Times with a zone lose it: dates at midnight of their own
-    zone stay the date they name, all others become UTC.
+    Accepts dates and times, ISO 8601 and similar texts (2020-01-31, 2020/1/31, 20200131,
+    2020-01-31 16:00+01:00), and 31/01/2020 or 01/31/2020 if at least one cell of the column shows
+    which number is the day. Time zones are dropped: if all times are midnight in their own zones,
+    the dates stay; otherwise times become UTC.
     """
     import pandas as pd
 
@@ -174,7 +174,7 @@ def dates(cells: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
 
 
 def readable_date(text: str) -> bool:
-    """True for text that is a date, whichever number may be the day."""
+    """True for text that is a date, whichever number is the day."""
     return isinstance(_moment(text, "day"), datetime) or bool(_year_last(text))
 
 
@@ -183,7 +183,7 @@ def _year_last(cell: Any) -> re.Match[str] | None:
 
 
 def _moment(cell: Any, order: str | None) -> datetime | str:
-    """A date, with its zone if it has one, or what is wrong with it."""
+    """A date, with its zone if it has one, or a complaint."""
     if is_missing(cell):
         return NO_DATE
     try:

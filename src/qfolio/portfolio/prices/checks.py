@@ -18,7 +18,7 @@ LATE = ("error", "drop-asset", "trim", "join")
 def examine(
     table: Table, missing: str, late: str, features: tuple[str, ...], date: str | None
 ) -> tuple[dict[str, Any], list[Finding]]:
-    """The arguments of ``Prices`` (none where the table has errors), and all findings.
+    """The arguments of ``Prices`` (none if the table has errors), and all findings.
 
     Raises:
         QfolioError: ``missing`` or ``late`` is not one of the choices.

@@ -1,4 +1,4 @@
-"""Tells which column of a table holds dates, which assets, which prices and which features."""
+"""Finds the columns of a table that hold dates, assets, prices and features."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from qfolio.portfolio.prices.vocabulary import (
     plain,
 )
 
-LOOKED_AT = 1000  # cells of a column that tell what it holds
+LOOKED_AT = 1000  # cells of a column that are examined to tell its content
 
 
 class Feature(NamedTuple):
@@ -30,10 +30,10 @@ class Feature(NamedTuple):
 
 @dataclass(frozen=True)
 class Columns:
-    """What the columns of a table hold, by their places in it.
+    """The columns of a table by content, as their indices.
 
-    date: where the dates are.
-    asset: where a long table names the asset of a row; None in a wide one.
+    date: the column of dates.
+    asset: the column of assets' names in a long table; None in a wide one.
     assets: names of the assets of a wide table; empty in a long one.
     prices: one for each asset of a wide table; a single one in a long table.
     """
@@ -46,7 +46,7 @@ class Columns:
 
 
 def text_columns(names: tuple[str, ...], date: str | None) -> set[int]:
-    """Columns of a text file that hold dates or names, though they may look like numbers."""
+    """Columns of a text file that hold dates or names, even if they look like numbers."""
     known = DATE_NAMES + ASSET_NAMES
     return {0, *(j for j, name in enumerate(names) if plain(name) in known or name == date)}
 
@@ -62,7 +62,7 @@ def find_columns(
     if when is None:
         findings.error(
             "there is no column of dates",
-            advice="Name it 'date', or say which column it is with date= (--date).",
+            advice="Name it 'date', or give its name with date= (--date).",
         )
         return None
     counted = (j for j in columns if j != when and _counts_rows(table, j))
@@ -186,7 +186,7 @@ def _long_columns(
 
 
 def _are_labels(cells: np.ndarray) -> bool:
-    """True for cells that are text, or whole numbers of which few differ: prices are neither."""
+    """True for cells that are text, or few different whole numbers: prices are neither."""
     values, wrong = numbers(cells)
     if wrong[:LOOKED_AT].any():
         return True

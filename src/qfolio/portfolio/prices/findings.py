@@ -1,4 +1,4 @@
-"""Findings: what is wrong or odd in a price table, and what to do about it."""
+"""Findings: errors, warnings and notes on a price table, with advice."""
 
 import difflib
 from collections.abc import Iterable, Mapping
@@ -9,18 +9,18 @@ import numpy as np
 
 from qfolio.core.text import quote
 
-LISTED = 5  # findings of one kind that are named one by one; the others are counted
+LISTED = 5  # findings of one kind that are listed; the others are counted
 
 Severity = Literal["error", "warning", "note"]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong with a table, or ``count`` of a kind.
+    """One finding on a table, or ``count`` of a kind.
 
-    An error stops the table from being read. A warning is something odd, and a note says how the
-    table was read. Rows are counted as people see them: in text files from 1, header included, as
-    spreadsheets and editors do; in data frames and Parquet files from 0.
+    An error stops the table from being read, a warning reports something implausible, and a note
+    says how the table was read. Rows are counted as users see them: in text files from 1, header
+    included, as in spreadsheets and editors; in data frames and Parquet files from 0.
     """
 
     severity: Severity
@@ -32,7 +32,7 @@ class Finding:
     count: int = 1
 
     def __str__(self) -> str:
-        """Where and what, on one line."""
+        """Location and message, on one line."""
         row = None if self.row is None else f"row {self.row}"
         date = f"({self.date})" if row and self.date else self.date
         spot = " ".join(part for part in (row, date) if part)
@@ -63,7 +63,7 @@ class Findings(list[Finding]):
 
     @property
     def bad(self) -> bool:
-        """True where there is an error."""
+        """True if there is an error."""
         return any(finding.severity == "error" for finding in self)
 
 
@@ -86,6 +86,6 @@ def listing(names: Iterable[str]) -> str:
 
 
 def hint(name: str, known: Iterable[str]) -> str:
-    """A question in brackets that names the closest known name; nothing if none is close."""
+    """A question in brackets with the closest known name; empty if none is close."""
     close = difflib.get_close_matches(name, [k for k in known if k], n=1)
     return f" (did you mean {quote(close[0])}?)" if close else ""

@@ -1,4 +1,4 @@
-"""How often a table has rows."""
+"""The frequency of a table's rows."""
 
 import numpy as np
 
@@ -14,16 +14,16 @@ def spacing(dates: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def every_day(dates: np.ndarray) -> bool:
-    """True where weekends have rows as other days have."""
+    """True if weekends have rows, too."""
     weekday = (dates.astype("datetime64[D]").astype(np.int64) + 3) % 7  # 1970-01-01: Thursday
     return float((weekday >= 5).mean()) > 0.1 if len(dates) else False
 
 
 def periods_per_year(dates: np.ndarray) -> float:
-    """Rows of a year: 252 of business days, 365 of all days, 52, 12, 4 or 1 of longer periods.
+    """Rows per year: 252 for business days, 365 for all days, 52, 12, 4 or 1 for longer periods.
 
-    Within a day, the bars of a usual day (the median over those seen) times the days of a year;
-    for any other spacing, the rows that fit into a year.
+    Intraday: the median number of bars per day times the days per year; any other spacing: its
+    mean.
     """
     if len(dates) < 2:
         return TRADING_DAYS

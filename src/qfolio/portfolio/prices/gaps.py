@@ -1,4 +1,4 @@
-"""Treats missing prices and assets that start late as the user chose."""
+"""Treats missing prices and late assets as the user chose."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from qfolio.portfolio.prices.grid import Grid, report_cells
 
 @dataclass(frozen=True)
 class Rest:
-    """What remains of a grid after the user's choices: rows from ``head`` on, and these assets."""
+    """The rest of a grid after the user's choices: rows from ``head`` on, and these assets."""
 
     head: int
     assets: np.ndarray  # columns of the grid
@@ -121,8 +121,8 @@ def _treat_late_starts(
     if late == "error":
         _report_assets(
             grid, behind,
-            lambda j: f"the first price is that of {day(grid.dates[span.start[j]])}, the table's "
-            f"{day(grid.dates[span.head])}",
+            lambda j: f"the first price is on {day(grid.dates[span.start[j]])}, the table starts "
+            f"on {day(grid.dates[span.head])}",
             "with a late start",
             "Choose how to treat late starts: late='drop-asset', 'trim' or 'join' (--late).",
             findings,
@@ -152,7 +152,7 @@ def _report_assets(
     advice: str,
     findings: Findings,
 ) -> None:
-    """An error for each of these assets; ``kind`` is what those have in common that are counted."""
+    """An error for each of these assets; ``kind`` describes those that are only counted."""
     found: Sequence[int] = np.flatnonzero(which).tolist()
     for j in found[:LISTED]:
         name = f"{quote(grid.assets[j])}: " if grid.long else ""

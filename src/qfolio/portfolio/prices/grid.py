@@ -1,4 +1,4 @@
-"""A table's cells by date and asset, whichever way the table is laid out."""
+"""A table's cells by date and asset, for wide and long tables."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class Block:
     """One kind of number, prices or a feature, by date and asset (or by date alone)."""
 
     values: np.ndarray  # (rows, assets or 1), NaN where missing or wrong
-    wrong: np.ndarray  # of the same shape: where something stands that is not a number
+    wrong: np.ndarray  # of the same shape: cells with content that is not a number
     columns: tuple[int, ...]  # the table's column of each column here
     name: str  # "price" or "feature"
     by_asset: bool  # False for a feature of the whole market
@@ -49,7 +49,7 @@ class Grid:
         }
 
     def subject(self, block: Block, j: int) -> str:
-        """What a finding is about: the price, or in a long table the price of which asset."""
+        """The subject of a finding: the price, or in a long table the price of an asset."""
         return f"the {block.name}" + (f" of {quote(self.assets[j])}" if self.long else "")
 
 
@@ -61,7 +61,7 @@ def report_cells(
     advice: str,
     findings: Findings,
 ) -> None:
-    """An error for each cell of the mask; ``what`` is wrong, or tells it from row and asset."""
+    """An error for each cell of the mask; ``what`` is the message, or gives it by row and asset."""
     spots = np.argwhere(mask)
     for i, j in spots[:LISTED].tolist():
         said = f" {what}" if isinstance(what, str) else f": {what(i, j)}"
@@ -73,7 +73,7 @@ def report_cells(
 
 
 def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
-    """The grid of a table; None where it would be far too large."""
+    """The grid of a table; None if it would be far too large."""
     prices = columns.prices
     if len(signs := sorted(set().union(*(currencies(table.columns[j]) for j in prices)))) > 1:
         findings.error(
@@ -122,7 +122,7 @@ def _wide(
 def _in_order(
     table: Table, name: str, moments: np.ndarray, lines: np.ndarray, findings: Findings
 ) -> np.ndarray:
-    """The rows, turned around where the newest comes first; errors where there is no order."""
+    """The rows, reversed if the newest comes first; errors if they are not in order."""
     known = lines[~np.isnat(moments[lines])]
     steps = np.diff(moments[known]).astype(np.int64)
     if (steps > 0).all():
@@ -136,7 +136,7 @@ def _in_order(
         before = first.setdefault(moments[line], line)
         if before != line:
             row = table.first_row + before
-            repeated[line] = f"the date {day(moments[line])} stands in row {row} already"
+            repeated[line] = f"the date {day(moments[line])} is already in row {row}"
     for line in known[1:][steps < 0].tolist():
         if line not in repeated:
             unsorted[line] = f"the date {day(moments[line])} comes after a later one"
@@ -168,7 +168,7 @@ def _long(
     size = len(days) * len(assets)
     if size > MOST_CELLS and len(lines) < SPARSEST * size:
         findings.error(
-            f"{len(assets):,} assets on {len(days):,} dates have {len(lines):,} prices only, "
+            f"{len(assets):,} assets on {len(days):,} dates have only {len(lines):,} prices, "
             "so that nearly all are missing",
             advice="Check the columns of dates and assets, or keep the assets that matter.",
         )
@@ -176,8 +176,8 @@ def _long(
     place = i * len(assets) + j
     _, first, back = np.unique(place, return_index=True, return_inverse=True)
     repeated = {
-        int(lines[k]): f"{quote(assets[j[k]])} on {day(days[i[k]])} stands in row "
-        f"{table.first_row + int(lines[first[back[k]]])} already"
+        int(lines[k]): f"{quote(assets[j[k]])} on {day(days[i[k]])} is already in row "
+        f"{table.first_row + int(lines[first[back[k]]])}"
         for k in np.flatnonzero(first[back] != np.arange(len(place))).tolist()
     }
     advice = "Remove one of the two rows."
@@ -185,7 +185,7 @@ def _long(
 
     def pivot(column: np.ndarray, empty: Any) -> np.ndarray:
         grid = np.full(size, empty, dtype=column.dtype)
-        grid[place[::-1]] = column[::-1]  # the first of repeated rows stands
+        grid[place[::-1]] = column[::-1]  # the first of repeated rows is kept
         return grid.reshape(len(days), len(assets))
 
     blocks = [

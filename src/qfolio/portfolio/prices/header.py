@@ -11,11 +11,11 @@ _PAIR = re.compile(r"""\((["'])(.*?)\1, (["'])(.*?)\3\)""")  # how pandas writes
 
 
 class Header(NamedTuple):
-    """What stands above a table."""
+    """The header of a table."""
 
     names: tuple[str, ...]  # of the columns; of two levels, both with a space between
-    levels: dict[int, tuple[str, str]]  # both levels, by column, where there are two
-    lines: int = 1  # of the file that it takes
+    levels: dict[int, tuple[str, str]]  # both levels, by column, if there are two
+    lines: int = 1  # its length in the file
 
 
 def name_columns(names: Iterable[Any]) -> Header:

@@ -1,4 +1,4 @@
-"""Reports cells that are no prices, impossible moves, likely splits and gaps in time."""
+"""Reports cells that are not prices, impossible moves, likely splits and gaps in time."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from qfolio.portfolio.prices.grid import Block, Grid, report_cells
 
 FEWEST_ROWS, FEW_ROWS = 3, 60
 LEAST_JUMP = 0.3  # in log; the smallest split, 3/2, is 0.41
-LARGEST_MOVE = 1e6  # within one row; beyond it relatives and their products leave float32
+LARGEST_MOVE = 1e6  # within one row; beyond it relatives and their products overflow float32
 SPLITS = (1.5, 2, 3, 4, 5, 6, 7, 8, 10, 15, 20, 25, 30, 50, 100, 1000)
 
 
@@ -68,7 +68,7 @@ def _complaint(grid: Grid, block: Block, i: int, j: int) -> str:
 
 
 def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
-    """Report moves that no market makes, and moves as large as those of an unadjusted split."""
+    """Report implausibly large moves, and moves that look like unadjusted splits."""
     values = np.where(np.isfinite(rest.values) & (rest.values > 0), rest.values, np.nan)
     with np.errstate(over="ignore", divide="ignore", under="ignore"):
         relatives = values[1:] / values[:-1]
@@ -90,7 +90,7 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
     ratios = np.log(np.array(SPLITS))
     splits = []
     for j in np.flatnonzero((sizes > LEAST_JUMP).any(axis=0)).tolist():
-        # The usual move: a median is not misled by the jumps that are looked for.
+        # The usual move: the median is robust to the jumps in question.
         usual = float(np.median(sizes[:, j][sizes[:, j] > 0])) / 0.6745
         for i in np.flatnonzero(sizes[:, j] > max(LEAST_JUMP, 6 * usual)).tolist():
             distances = np.abs(ratios - sizes[i, j])
@@ -121,15 +121,15 @@ def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:
         )
         return
     if len(dates) < FEW_ROWS:
-        findings.warn(f"the table has {amount(len(dates), 'row')} only, too few to learn from")
+        findings.warn(f"the table has only {amount(len(dates), 'row')}, too few to learn from")
     if len(rest.assets) == 1:
-        findings.warn(f"there is one asset only, {quote(grid.assets[rest.assets[0]])}")
+        findings.warn(f"there is only one asset, {quote(grid.assets[rest.assets[0]])}")
     steps, usual = spacing(dates)
     closed = 0.0 if every_day(dates) else 7.0  # markets with weekends have holidays, too
     long = np.flatnonzero(steps > 3 * usual + closed)
     for k in long[:LISTED].tolist():
         findings.warn(
-            f"the row before is that of {day(dates[k])}, {steps[k]:.4g} days earlier "
+            f"the previous row is {day(dates[k])}, {steps[k]:.4g} days earlier "
             f"(usual: {usual:.4g})",
             row=None if grid.long else grid.spot(grid.prices, rest.head + int(k) + 1, 0)["row"],
             date=day(dates[k + 1]),

@@ -31,10 +31,10 @@ class Table:
     """Columns of equal length: float64, datetime64 or, where kinds are mixed, objects.
 
     names: one for each column; of a header on two levels, both with a space between.
-    first_row: the number people give the first row: 2 below a header of one line, 0 in a data
+    first_row: the number of the first row for users: 2 below a header of one line, 0 in a data
         frame.
-    decimal: the mark that stands before the fraction of a number.
-    levels: both levels of the header, by column, where there are two.
+    decimal: the decimal mark.
+    levels: both levels of the header, by column, if there are two.
     """
 
     names: tuple[str, ...]
@@ -50,11 +50,11 @@ def read(source: Any, texts: Callable[[tuple[str, ...]], set[int]]) -> Table:
 
     Args:
         source: Path of a CSV or Parquet file, or a data frame that narwhals knows.
-        texts: Tells from the names of a text file which of its columns must stay text, because
-            0700, NA and TRUE may be names of assets.
+        texts: Returns, from the column names of a text file, the columns that must stay text,
+            because 0700, NA and TRUE may be names of assets.
 
     Raises:
-        QfolioError: There is no table here.
+        QfolioError: The source cannot be read as a table.
     """
     if not isinstance(source, str | Path):
         return _from_frame(source)
@@ -147,7 +147,7 @@ def _from_parquet(content: bytes, name: str) -> Table:
         frame = pyarrow.parquet.ParquetFile(io.BytesIO(content)).read()
     except Exception as error:  # damaged files raise a dozen different kinds
         raise QfolioError(
-            f"{quote(name)} is no Parquet file or is damaged ({quote(error, 100)})."
+            f"{quote(name)} is damaged or not a Parquet file ({quote(error, 100)})."
         ) from None
     names = frame.column_names
     if len(set(names)) < len(names):  # narwhals would not take them; the caller names them
@@ -173,11 +173,11 @@ def _from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set
     header = parse_header(records)
     if len(header.names) < 2:
         raise QfolioError(
-            f"{quote(name)} has one column only, {quote(header.names[0])}; a table needs several, "
+            f"{quote(name)} has only one column, {quote(header.names[0])}; a table needs several, "
             "separated by commas, semicolons or tabs."
         )
     plain = texts(header.names)
-    # pandas takes the first row's width for that of all, and would cut longer ones silently.
+    # pandas assumes the first row's width for all rows, and would silently cut longer ones.
     width = max(len(record) for record in (header.names, *records[header.lines :][:1]))
     layout = _Layout(header, separator, blank + header.lines, width)
     table = _parse(text, name, layout, plain, ".")
@@ -187,7 +187,7 @@ def _from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set
 
 
 class _Layout(NamedTuple):
-    """How a text file is laid out."""
+    """The layout of a text file."""
 
     header: Header
     separator: str
@@ -254,7 +254,7 @@ def _parse(text: str, source: str, layout: _Layout, plain: set[int], decimal: st
 
 
 def _uses_decimal_commas(table: Table, plain: set[int]) -> bool:
-    """True where cells such as 12,5 abound and no point shows that points are meant."""
+    """True if cells such as 12,5 outnumber numbers with a decimal point."""
     commas = points = 0
     for j, cells in enumerate(table.columns):
         if j in plain:

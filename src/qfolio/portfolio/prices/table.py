@@ -1,7 +1,7 @@
-"""Price tables: read, checked cell by cell, and only then turned into numbers.
+"""Price tables: read, checked cell by cell, and then converted to numbers.
 
-A gap is an error until the user chooses how to treat it. Gaps are only ever filled forward: a price
-filled from a later one would tell an agent the future.
+A gap is an error until the user chooses how to treat it. Gaps are only filled forward: a price
+filled from a later one would leak the future to an agent.
 """
 
 import hashlib
@@ -26,22 +26,22 @@ DEFAULT_NOTE = (
     "that hold them look better than they could have been at the time."
 )
 DEFAULT_TRIALS = 51
-"""Trials made on the default table before, as docs/results.md tells them one by one."""
+"""Earlier trials on the default table, as docs/results.md lists them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prices:
-    """A checked price table; its arrays cannot be written to.
+    """A checked price table; its arrays are read-only.
 
     Attributes:
         dates: datetime64[s] of shape (rows,), strictly increasing.
         assets: Names of the columns, each different.
         values: float64 of shape (rows, assets), finite and positive; NaN only before an asset's
-            first row, where ``load`` was told late="join".
+            first row, if loaded with late="join".
         features: float64 of shape (rows, assets, channels); NaN only before an asset's first row.
         feature_names: Names of the channels.
-        source: Where the table comes from.
-        note: A caveat for readers of any result on the table.
+        source: The origin of the table.
+        note: A caveat for readers of results on the table.
 
     Raises:
         QfolioError: The arrays break one of these rules.
@@ -109,7 +109,7 @@ class Prices:
 
     @property
     def periods_per_year(self) -> float:
-        """Rows of a year, as the dates show; cf. ``frequency.periods_per_year``."""
+        """Rows per year, from the dates; cf. ``frequency.periods_per_year``."""
         return periods_per_year(self.dates)
 
     @property
@@ -216,7 +216,7 @@ def check(
 
 
 def describe(prices: Prices) -> dict[str, Any]:
-    """What a report says about a table, as JSON values."""
+    """A description of a table for reports, as JSON values."""
     return {
         "source": prices.source,
         "rows": len(prices),
@@ -232,14 +232,14 @@ def describe(prices: Prices) -> dict[str, Any]:
 
 
 def trials_on(source: str) -> int:
-    """How many earlier trials are known on prices from a source; they count against luck."""
+    """Known earlier trials on prices from a source, for the deflated Sharpe ratio."""
     return DEFAULT_TRIALS if source == DEFAULT_SOURCE else 0
 
 
 def _read(
     source: Any, missing: str, late: str, features: Sequence[str], date: str | None
 ) -> tuple[Prices | None, list[Finding]]:
-    """The prices (None where the table has errors) and all findings."""
+    """The prices (None if the table has errors) and all findings."""
     label, note = "", ""
     if source is None:
         from skfolio.datasets import load_sp500_dataset

@@ -1,4 +1,4 @@
-"""The names that columns of price tables usually have."""
+"""Usual column names of price tables."""
 
 import re
 
@@ -22,7 +22,7 @@ KINDS = {
         "chg%", "repaired?",
     ),
 }  # fmt: skip
-"""What a column of one asset may hold, and how such columns are called."""
+"""The kinds of columns of one asset, and their usual names."""
 
 _KIND = {name: kind for kind, names in KINDS.items() for name in names}
 
@@ -33,7 +33,7 @@ def plain(name: str) -> str:
 
 
 def kind(name: str) -> str | None:
-    """What a column of this name holds (a key of ``KINDS``); None for any other name."""
+    """The kind of a column of this name (a key of ``KINDS``); None for any other name."""
     return _KIND.get(plain(name))
 
 

@@ -40,7 +40,7 @@ class Ar1(OneAsset):
         require(self, "rho", lambda x: 0 <= x <= 0.999, "from 0 to 0.999")
         require(self, "noise volatility", lambda x: 0 < x <= 10, "above 0 and at most 10")
         require_cost(self)
-        # Five standard deviations of the signal and of the return must leave something.
+        # Five standard deviations of the signal and the return must leave the price positive.
         worst = abs(self.drift) + 5 * abs(self.slope) * self.spread + 5 * self.volatility
         if worst >= 1:
             raise QfolioError(

@@ -1,7 +1,7 @@
-"""What the markets with known answers share: an exact policy, and scenes to draw it in.
+"""The base of the markets with known answers: an exact policy, and scenes to draw it in.
 
-``rule`` reads the few numbers that say what a policy does (a fraction, the edges of a no-trade
-region, a trading rate), so that a learned policy can be set beside the exact one.
+``rule`` extracts the few numbers that describe a policy (a fraction, the edges of a no-trade
+region, a trading rate), to compare a learned policy with the exact one.
 """
 
 import abc
@@ -31,7 +31,7 @@ class Synthetic(ExogenousTask):
 
     @abc.abstractmethod
     def scenes(self) -> list[tuple[str, Any]]:
-        """Market states to draw a policy in, with what to call them."""
+        """Names and market states in which to draw a policy."""
 
     def optimum(self) -> FollowedOptimum:
         return FollowedOptimum(self, self.best())
@@ -45,8 +45,8 @@ class SyntheticMarket(Market, Synthetic):
     """Cash and assets with a known best policy."""
 
     def optimum(self) -> FollowedOptimum:
-        # The best policy names weights, also where an agent is to choose from a menu.
-        task: Any = self  # whose menu is a field, which an abstract one is not to the type checker
+        # The best policy returns weights, even if agents choose from a menu.
+        task: Any = self  # to the type checker, the abstract menu is not a field
         return FollowedOptimum(dataclasses.replace(task, menu=""), self.best())
 
 

@@ -23,8 +23,8 @@ class GarleanuPedersen(Synthetic):
     """A position in one asset with a fading signal, quadratic risk and quadratic trading costs.
 
     Gârleanu & Pedersen (2013): the return is loading · f, f' = (1 − φ)f + ε; holding x costs
-    ½γσ²x² of risk, a trade Δx costs ½λσ²Δx². Rewards come weighted by their discount, so that a
-    return is the paper's objective.
+    ½γσ²x² of risk, a trade Δx costs ½λσ²Δx². Rewards include their discount, so that the return is
+    the paper's objective.
     """
 
     loading: float = number(1.0)

@@ -14,7 +14,7 @@ from qfolio.solvers.kelly import kelly
 
 
 class Kelly(OneAsset):
-    """A bet, repeated: the stake becomes ``up`` times itself with ``probability`` or ``down``."""
+    """A repeated bet: the stake is multiplied by ``up`` with ``probability``, else by ``down``."""
 
     up: float = number(1.1)
     down: float = number(0.9)

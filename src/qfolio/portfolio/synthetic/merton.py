@@ -38,7 +38,7 @@ class Merton(SyntheticMarket):
     @staticmethod
     @cache
     def table() -> np.ndarray:
-        """Relatives of each scenario, shape (scenario, asset), with just the moments stated."""
+        """Relatives of each scenario, shape (scenario, asset), with exactly the given moments."""
         normal = np.random.default_rng(1969).standard_normal((Merton.scenarios, 3))
         normal -= normal.mean(0)
         normal = np.linalg.solve(np.linalg.cholesky(np.cov(normal.T)), normal.T)
@@ -54,7 +54,7 @@ class Merton(SyntheticMarket):
         return jax.random.randint(key, (), 0, self.scenarios, jnp.int32)
 
     def features(self, market: Array) -> Float[Array, "asset time channel"]:
-        return jnp.eye(3)[:, None, :]  # which asset it is: nothing else tells them apart
+        return jnp.eye(3)[:, None, :]  # one-hot: nothing else tells the assets apart
 
     def relatives(self, market: Array, next_market: Array) -> Relatives:
         moved = jnp.asarray(self.table(), jnp.float32)[next_market]

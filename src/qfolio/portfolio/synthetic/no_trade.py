@@ -16,10 +16,10 @@ from qfolio.portfolio.synthetic.base import OneAsset, require_cost
 from qfolio.solvers.no_trade import NoTradeRegion, no_trade_region_discrete
 
 PROBES = 1001
-"""Holdings, from all cash to all in the asset, of which a policy's edges are read."""
+"""Holdings, from all cash to all in the asset, that probe a policy's edges."""
 
 NO_TRADE = 1e-4
-"""Changes of weight up to this count as none."""
+"""Smaller changes of a weight do not count as trades."""
 
 
 class NoTrade(OneAsset):
@@ -91,10 +91,10 @@ class NoTrade(OneAsset):
         return policy
 
     def rule(self, policy: Policy) -> dict[str, float | None]:
-        """The edges: what holders of too little, and of too much, trade to at last.
+        """The edges of the no-trade region.
 
-        Holdings are probed from all cash up, and from all in the asset down, until one stands as it
-        is; the edge is where the one before it trades to. None where even the extreme stands.
+        Holdings are probed from all cash up, and from all in the asset down, until one is not
+        traded; the edge is the target of the one before it. None if even the extreme is not traded.
         """
         held = np.linspace(0, 1, PROBES, dtype=np.float32)
         wanted = self.weights(policy, jnp.array(0.0), held)

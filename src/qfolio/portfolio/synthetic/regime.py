@@ -17,7 +17,7 @@ from qfolio.solvers.regime import regime
 class Regime(OneAsset):
     """One asset that grows by ``mean`` a step in good times and loses it in bad ones.
 
-    Each regime lasts another step with probability ``stay``; it is seen, and earns at once.
+    Each regime lasts another step with probability ``stay``; it is observed before it pays.
     """
 
     stay: float = number(0.95)
@@ -49,7 +49,7 @@ class Regime(OneAsset):
         table = jnp.asarray(solution.policy)
 
         def policy(state: Position) -> Array:
-            # Costs and rewards are linear in the weight: each part of it is a position by itself.
+            # Costs and rewards are linear in the weight, so each part of it is its own position.
             enters, stays = table[state.market, 0], table[state.market, 1]
             weight = state.holding.weights[1]
             weight = stays * weight + enters * (1 - weight)

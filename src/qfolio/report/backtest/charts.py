@@ -1,4 +1,4 @@
-"""The numbers behind the page's charts, thinned until a browser draws them at once."""
+"""The data of the page's charts, thinned so that a browser draws them quickly."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ POINTS = 1500
 """Most points of a line; longer tests are thinned evenly."""
 
 AREAS = 300
-"""Most points of a chart of weights; each is a mean over consecutive days."""
+"""Most points of a weights chart; each is a mean over consecutive days."""
 
 NAMED = 10
-"""How many assets a chart of weights names; the others are drawn as one."""
+"""How many assets a weights chart names; the others are drawn as one."""
 
 
 def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> dict[str, Any]:
-    """Return what the page's script draws, in the order of the names."""
+    """Return the data of the page's script, in the order of the names."""
     days = len(data.dates)
-    # The last day of every stretch, and before them all the start.
+    # The last day of every block; the start comes before them.
     ends = np.arange(days - 1, -1, -days_per_point(days))[::-1]
     start = data.dates[:1] - min(np.timedelta64(1, "D"), *np.diff(data.dates[:2]))
     months, firsts = np.unique(data.dates.astype("datetime64[M]"), return_index=True)
@@ -60,7 +60,7 @@ def _lines(
     series: StrategySeries, ends: NDArray[np.intp], months: NDArray[np.intp]
 ) -> dict[str, Any]:
     middle, low, high = (np.append(1, line[ends]) for line in across_seeds(wealth_paths(series)))
-    # The deepest fall since the point before, so that thinning hides no trough.
+    # The deepest drawdown since the point before, so that thinning hides no trough.
     deepest = np.maximum.reduceat(median_drawdown(series), np.append(0, ends[:-1] + 1))
     several = len(series.returns) > 1
     return {
@@ -79,14 +79,14 @@ def _areas(
 ) -> list[dict[str, Any]]:
     """Return, for each strategy, its weights by block of days: cash, the largest, and the rest.
 
-    An asset has the same colour wherever it is named, as long as there are colours.
+    An asset has the same colour in all charts; colours repeat when there are too few.
     """
     colours: dict[int, str] = {}
     result = []
     for table in weights:
         mean = table.mean(axis=0)
         ranked = (np.argsort(-mean[1:], kind="stable") + 1).tolist()
-        # One asset left over is better named than called others.
+        # A single remaining asset is named instead of called others.
         count = NAMED if len(ranked) > NAMED + 1 else len(ranked)
         top, rest = ranked[:count], ranked[count:]
         for asset in top:
@@ -107,12 +107,12 @@ def _areas(
 
 
 def days_per_point(days: int) -> int:
-    """How many days there are to a point of a line."""
+    """Days per point of a line."""
     return math.ceil(days / POINTS)
 
 
 def _texts(dates: NDArray[np.datetime64]) -> list[str]:
-    """Dates as plotly and people read them, with the time of day where there is one."""
+    """Dates as text for plotly and readers, with the time of day if there is one."""
     whole = (dates == dates.astype("datetime64[D]")).all()
     texts = np.datetime_as_string(dates, unit="D" if whole else "m").tolist()
     return [text.replace("T", " ") for text in texts]
@@ -129,7 +129,7 @@ def _compact(values: Floats, digits: int = 4, *, positive: bool = False) -> list
 
 
 def latest_values(lines: dict[str, Any]) -> dict[str, str]:
-    """The values at the end, which the legends show until a pointer asks for others."""
+    """The final values, which legends show until the pointer selects a date."""
     wealth = lines["wealth"][-1] or 0
     return {
         "wealth": number(wealth, 0 if wealth >= 100 else 1 if wealth >= 10 else 2),

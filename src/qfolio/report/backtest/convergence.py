@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS = 20
-"""Of a curve: the training's episodes, in the order of time, in as many parts of one length."""
+"""Points of a curve: the training's episodes in order of time, in parts of equal length."""
 
 EVIDENCE = 2.0
-"""Standard errors by which returns must rise to be called rising."""
+"""Standard errors by which returns must rise to count as rising."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FoldTraining:
 
     @classmethod
     def of(cls, returns: Numbers) -> FoldTraining | None:
-        """From the returns of all episodes in the order of time; None where they are too few."""
+        """From the returns of all episodes in order of time; None if there are too few."""
         if len(returns) < 2 * POINTS:
             return None
         values = np.asarray(returns, dtype=float)

@@ -1,4 +1,4 @@
-"""What the report of a backtest is made from."""
+"""The data of a backtest's report."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from qfolio.report.data import Floats
 
 @dataclass(frozen=True)
 class StrategySeries:
-    """What one strategy did on D days of the test, with S seeds (1 for a baseline) and N assets.
+    """The results of one strategy on D days, with S seeds (1 for a baseline) and N assets.
 
     Attributes:
         kind: 'agent', 'ensemble' or 'baseline'.
         returns: Simple returns net of costs, shape (S, D).
         turnover: Value bought plus value sold as a share of the wealth, shape (S, D).
-        cost: Share of the wealth that each day's trade cost, shape (S, D).
+        cost: Cost of each day's trade as a share of the wealth, shape (S, D).
         weights: Weights after the trade, cash first, the mean over the seeds, shape (D, N + 1).
     """
 
@@ -43,15 +43,15 @@ class BacktestData:
         assessment: The statistics of these strategies on these days.
         dates: Days on which the returns were earned, shape (D,), strictly increasing.
         assets: Names of the N assets, in the order of the weights.
-        strategies: By the names that the assessment has, too.
-        prices: Where the prices come from: source, rows, assets, first and last (dates), note
-            (what has to be said wherever a result on them is shown, such as survivorship; may be
-            empty) and digest.
-        config: All settings, a nested dictionary. Where it has cost (one way, a fraction), lag
-            (in rows), cap, train, test (lengths) and expanding, the page also says them in words.
+        strategies: By the same names as in the assessment.
+        prices: The origin of the prices: source, rows, assets, first and last (dates), note (a
+            caveat to show with every result on them, such as survivorship; may be empty) and
+            digest.
+        config: All settings, a nested dictionary. If it has cost (one way, a fraction), lag (in
+            rows), cap, train, test (lengths) and expanding, the page also says them in words.
         folds: For each fold name, train_first, train_last, test_first and test_last (ISO dates).
-        notes: What did not go as planned, in sentences.
-        training: By agent, how training went in each fold; none where records are missing.
+        notes: Problems of the backtest, in sentences.
+        training: The training of each fold, by agent; none if records are missing.
     """
 
     title: str
@@ -68,10 +68,10 @@ class BacktestData:
 
 
 def require_fit(data: BacktestData) -> None:
-    """Raise QfolioError where strategies, assessment, dates and assets do not fit together."""
+    """Raise QfolioError if strategies, assessment, dates and assets do not fit together."""
     if set(data.strategies) != set(data.assessment.strategies):
         raise QfolioError(
-            "The series are of other strategies than the statistics; report those of one backtest."
+            "The series and the statistics are of different strategies; report one backtest."
         )
     days = (len(data.dates),)
     for name, series in data.strategies.items():

@@ -1,4 +1,4 @@
-"""Key figures of a test, and what its account says of settings, seeds and trials."""
+"""Key figures of a test, and its settings, seeds and trials in words."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def _counted(count: int, noun: str) -> str:
 
 
 def unit_of(periods_per_year: float) -> str:
-    """What a period is called."""
+    """The name of a period."""
     known = {"day": (240, 370), "week": (48, 54), "month": (11, 13)}
     fitting = (name for name, (low, high) in known.items() if low <= periods_per_year <= high)
     return next(fitting, "period")
 
 
 def _counts(test: Assessment) -> str:
-    """The trials of this backtest in words: agents with their seeds, and ensembles apart."""
+    """The trials of this backtest in words: agents with their seeds, and ensembles separately."""
     kinds = Counter(entry.kind for entry in test.strategies.values())
     seeds = [entry.seeds for entry in test.strategies.values() if entry.kind == "agent"]
     if len(set(seeds)) == 1:
@@ -70,7 +70,7 @@ def few_seeds(test: Assessment) -> bool:
 
 
 def account(data: BacktestData) -> dict[str, Any]:
-    """Return what the account of the test says; None where the settings do not tell."""
+    """Return the settings for the description of the test; None for those that are unknown."""
     test, settings = data.assessment, data.config
     return {
         "cost": _basis_points(settings["cost"]) if "cost" in settings else None,

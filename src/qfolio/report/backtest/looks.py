@@ -1,4 +1,4 @@
-"""How a backtest's strategies are drawn, in every figure of its report alike."""
+"""The look of a backtest's strategies, the same in every figure of its report."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "penta
 
 @dataclass(frozen=True)
 class Look:
-    """Agents and ensembles are strong and coloured, baselines thin and grey."""
+    """The line style of a strategy: agents and ensembles coloured, baselines thin and grey."""
 
     colour: str  # a key of palette.LIGHT and palette.DARK
     width: float
@@ -23,7 +23,7 @@ class Look:
 
 
 def looks_of(names: list[str], data: BacktestData) -> dict[str, Look]:
-    """By strategy."""
+    """The look of each strategy."""
     looks, agents, others = {}, 0, 0
     for name in names:
         if data.strategies[name].kind != "baseline":

@@ -1,9 +1,9 @@
-"""Writing the report of a backtest: one self-contained page with live charts, and one picture.
+"""The report of a backtest: one self-contained page with interactive charts, and one image.
 
-The page holds plotly.js, its data and its own script, and its Content-Security-Policy names these
-scripts by their hashes: nothing else can run in it, and nothing is loaded from anywhere. All words
-that a user can choose (titles, names of strategies and assets, settings) are escaped by the
-template or set as plain text; plotly, which reads markup in names, gets only numbers.
+The page holds plotly.js, its data and its own script, and its Content-Security-Policy lists the
+hashes of these scripts: nothing else can run in it, and it loads nothing. All text that a user can
+choose (titles, names of strategies and assets, settings) is escaped by the template or set as plain
+text; plotly, which interprets markup in names, gets only numbers.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def write_backtest_report(folder: Path, data: BacktestData) -> None:
     """Write report.html and wealth.png into a folder.
 
     Args:
-        folder: Where to write; made if missing.
-        data: What to report.
+        folder: The folder to write to; created if missing.
+        data: The data of the report.
 
     Raises:
         OSError: A file cannot be written.
@@ -50,7 +50,7 @@ def write_backtest_report(folder: Path, data: BacktestData) -> None:
     page = render_backtest(data)
     folder.mkdir(parents=True, exist_ok=True)
     save_png(folder / "wealth.png", draw_wealth, data, LEAD)
-    # Bytes, because scripts whose line ends are changed no longer have the hash that lets them run.
+    # Bytes, because changed line ends would change the scripts' hashes.
     (folder / "report.html").write_bytes(page.encode("utf-8"))
 
 

@@ -18,10 +18,10 @@ def across_seeds(values: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def median_drawdown(series: StrategySeries) -> Floats:
-    """Drawdown after each day, the median over the seeds; positive, of shape (days,)."""
+    """Median drawdown over the seeds after each day; positive, of shape (days,)."""
     return np.asarray(np.median(drawdown(series.returns), axis=0))
 
 
 def cost_share(series: StrategySeries) -> Floats:
-    """Share of the wealth that the costs so far have taken, the mean over the seeds, (days,)."""
+    """Cumulative cost as a share of wealth, the mean over the seeds, of shape (days,)."""
     return np.asarray((1 - np.cumprod(1 - series.cost, axis=1)).mean(axis=0))

@@ -47,7 +47,7 @@ def statistics_rows(name: str, data: BacktestData) -> list[dict[str, str]]:
 
 
 def _over_seeds(measure: Measure) -> tuple[float, ...]:
-    """The ends of the interval over seeds, or of the range of seeds too few for one."""
+    """The ends of the interval over seeds, or of the seeds' range if there are too few."""
     if measure.over_seeds is not None:
         return measure.over_seeds
     values = measure.per_seed
@@ -55,7 +55,7 @@ def _over_seeds(measure: Measure) -> tuple[float, ...]:
 
 
 def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None]:
-    """Growth and Sharpe ratio less those of the reference, and of the best baseline."""
+    """Growth and Sharpe ratio minus those of the reference, and of the best baseline."""
     entry = data.assessment.strategies[name]
     cells: list[dict[str, str] | None] = []
     for each in (entry.to_reference, entry.to_best_baseline):
@@ -78,7 +78,7 @@ def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None
 
 
 def _telling(value: float, digits: int) -> int:
-    """How many decimals it takes, if more than usual, until a small number does not look like 0."""
+    """The decimals, at least ``digits``, with which a small number does not round to 0."""
     if value == 0 or not math.isfinite(value):
         return digits
     return next((d for d in range(digits, 6) if round(value, d)), digits)
@@ -110,7 +110,7 @@ def luck_rows(names: list[str], data: BacktestData) -> list[dict[str, Any]]:
 
 
 def month_tables(names: list[str], data: BacktestData) -> list[tuple[str, list[_Year]]]:
-    """Return for each strategy its returns by month, the mean over the seeds, with shades."""
+    """Return each strategy's mean returns over the seeds by month, with shades."""
     tables = []
     for name in names:
         years, table = monthly(data.strategies[name].returns, data.dates)
@@ -118,7 +118,9 @@ def month_tables(names: list[str], data: BacktestData) -> list[tuple[str, list[_
         whole = np.where(empty, np.nan, np.nanprod(1 + table, axis=-1, keepdims=True) - 1)
         tables.append((years, np.concatenate([table, whole], axis=-1).mean(axis=0)))
     sizes = np.abs([table[:, :12] for _, table in tables])
-    scale = float(np.nanquantile(sizes, 0.95)) or 1.0  # of all, so that shades can be compared
+    scale = (
+        float(np.nanquantile(sizes, 0.95)) or 1.0
+    )  # the same for all tables, so that shades compare
 
     def cell(value: float) -> tuple[str, str]:
         if math.isnan(value):
@@ -140,7 +142,7 @@ def month_tables(names: list[str], data: BacktestData) -> list[tuple[str, list[_
 
 
 def fold_rows(folds: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the folds with the places of their stretches on the whole span, in %."""
+    """Return the folds with start and length of their windows, in % of the whole span."""
     if not folds:
         return []
     keys = ("train_first", "train_last", "test_first", "test_last")

@@ -12,7 +12,7 @@ from qfolio.report.rendering import percent
 
 
 def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
-    """Return each agent's verdicts, and where on a common axis (in %) their intervals lie."""
+    """Return each agent's verdicts, and their intervals' positions on a common axis (in %)."""
     test = data.assessment
     agents = [
         (name, tested(test.strategies[name]))
@@ -29,7 +29,7 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
     low, high = min(ends, default=0.0), max(ends, default=0.0)
     ticks = _ticks(min(low, 0), max(high, 0))
     low, high = min(low, ticks[0]), max(high, ticks[-1])
-    margin = 0.04 * (high - low) or 1.0  # any, where there is nothing to show
+    margin = 0.04 * (high - low) or 1.0  # any, if there is nothing to show
 
     def place(value: float) -> float:
         share = (value - low + margin) / (high - low + 2 * margin)
@@ -64,7 +64,7 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _digits(ticks: list[float]) -> int:
-    """How many decimals tell these fractions apart as percentages."""
+    """The decimals with which these fractions are exact percentages."""
     return next(
         (d for d in range(5) if all(abs(100 * t - round(100 * t, d)) < 1e-9 for t in ticks)), 5
     )

@@ -1,4 +1,4 @@
-"""The picture of a backtest: wealth and drawdown."""
+"""The figure of a backtest: wealth and drawdown."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
         style: dict[str, Any] = {
             "color": colour,
             "linewidth": 0.75 * look.width,
-            # Lengths are in widths of the line.
+            # Lengths are in units of the line's width.
             "linestyle": (0, tuple(float(part) / look.width for part in look.dash.split()))
             if look.dash
             else "solid",

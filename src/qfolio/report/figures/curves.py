@@ -35,9 +35,9 @@ def overestimation(target: Target, data: ReportData) -> None:
 
 
 def draw_learning_curve(data: ReportData, width: float) -> Figure:
-    """Draw the greedy return over training, and once more near the optimum where that helps.
+    """Draw the greedy return over training, and a close-up near the optimum if useful.
 
-    In a market, where training returns are not drawn, the comparison is.
+    In a market, the comparison is drawn instead of training returns.
     """
     window = _near_optimum(data)
     panels = 1 if window is None else 2
@@ -74,7 +74,7 @@ def draw_learning_curve(data: ReportData, width: float) -> Figure:
 
 
 def draw_overestimation(data: ReportData, width: float) -> Figure:
-    """Draw how far the action values lie above the returns that really followed."""
+    """Draw how far the action values lie above the realised returns."""
     figure = new_figure(width, 3.5 if width > NARROW else 3.2)
     axes = figure.subplots()
     _line_axes(axes, "", "training episodes")
@@ -88,7 +88,7 @@ def draw_overestimation(data: ReportData, width: float) -> Figure:
     axes.set_ylim(low, high)
     # On a phone, long names do not fit beside each other.
     beside = width > NARROW or sum(len(curve.label) for curve in curves) < 32
-    axes.set_title("Action value less the return that followed", pad=26 if beside else 40)
+    axes.set_title("Action value minus realised return", pad=26 if beside else 40)
     if clipped:
         _line_label(axes, high, "beginning off the scale", below=True, color=palette.MUTED)
     axes.legend(
@@ -139,7 +139,7 @@ def _draw_runs(
 
 
 def _draw_training(axes: Axes, data: ReportData) -> None:
-    """Draw the median return of the exploring agents in some 60 bins of episodes."""
+    """Draw the median return of the exploring agents in about 60 bins of episodes."""
     if data.training_episodes.size == 0:
         return
     edges = np.linspace(data.training_episodes.min(), data.training_episodes.max() + 1, 61)
@@ -183,7 +183,7 @@ def _line_label(
 
 
 def _cut_beginning(axes: Axes, optimum: float) -> None:
-    """Leave off the scale what lies far below zero, where a market can throw beginners."""
+    """Cut returns far below zero off the scale, which untrained agents can have in a market."""
     low, high = axes.get_ylim()
     floor = min(0.0, optimum) - 2 * abs(optimum)
     if low < floor:
@@ -192,7 +192,7 @@ def _cut_beginning(axes: Axes, optimum: float) -> None:
 
 
 def _near_optimum(data: ReportData) -> tuple[float, float, float] | None:
-    """Return the left, lower and upper ends of the close view, or None where none is needed."""
+    """Return the left, lower and upper ends of the close view, or None if none is needed."""
     if np.isnan(data.optimum):
         return None
     returns, episodes = data.curve.returns, data.curve.episodes

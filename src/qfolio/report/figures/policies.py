@@ -1,4 +1,4 @@
-"""What learned policies want in a market beside what is best."""
+"""Targets of the learned policies and the best one in a market."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from qfolio.report.figures.style import (
 
 
 def policy(target: Target, data: ReportData) -> None:
-    """Save what the learned policies want beside what is best as PNG.
+    """Save the targets of the learned policies and the best one as PNG.
 
     Raises:
         ValueError: The data has no policy of a market.
@@ -38,7 +38,7 @@ def policy(target: Target, data: ReportData) -> None:
 
 
 def draw_policy(data: ReportData, width: float) -> Figure:
-    """Draw what the learned policies want in a market, and what is best."""
+    """Draw the targets of the learned policies and the best one in a market."""
     drawn = data.market.policy if data.market else None
     if drawn is None:
         raise ValueError("the policy figure needs the policies of a market")
@@ -48,7 +48,7 @@ def draw_policy(data: ReportData, width: float) -> Figure:
 
 
 def _draw_responses(drawn: Responses, width: float) -> Figure:
-    """Draw what is wanted over what is held: weights by scene, or all scenes of a position."""
+    """Draw targets over holdings: weights by scene, or positions in all scenes."""
     count = len(drawn.scenes) if drawn.weights else 1
     columns = min(2, count)
     rows = -(-count // columns)
@@ -77,7 +77,7 @@ def _draw_responses(drawn: Responses, width: float) -> Figure:
     for panel in axes[-1]:
         panel.set_xlabel(f"{noun} held")
     for panel in axes[:, 0]:
-        panel.set_ylabel(f"{noun} wanted")
+        panel.set_ylabel(f"target {noun}")
     legend_above(figure, lines, few=width <= NARROW)
     return figure
 
@@ -100,9 +100,9 @@ def _draw_scene(axes: Axes, drawn: Responses, scene: int) -> dict[str, Any]:
 
 
 def _draw_no_trade(axes: Axes, drawn: Responses, place: float | None) -> None:
-    """Draw the diagonal, where what is wanted is what is held, and the region of no trade.
+    """Draw the diagonal, where target and holding are equal, and the no-trade region.
 
-    place: where on the diagonal to write what it is.
+    place: where on the diagonal to write its label, if at all.
     """
     low, high = drawn.held[0], drawn.held[-1]
     axes.plot([low, high], [low, high], color=palette.MUTED, linewidth=0.8, zorder=1.5)

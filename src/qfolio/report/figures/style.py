@@ -1,4 +1,4 @@
-"""The style of all figures, and how one is saved as PNG or put into a page as SVG."""
+"""The style of all figures, and their output as PNG or inline SVG."""
 
 from __future__ import annotations
 
@@ -78,15 +78,15 @@ _style_lock = threading.Lock()
 
 
 def inline_svg(draw: Callable[[T, float], Figure], data: T, width: float) -> str:
-    """Return a figure as an SVG element to be put into a page.
+    """Return a figure as an SVG element for a page.
 
     Texts stay texts in the font of the page, colours refer to the variables of the page
     (see palette.CSS_VARIABLES), and the element has no fixed size.
 
     Args:
         draw: One of the draw_ functions of this module.
-        data: What to draw.
-        width: Width in inches at which the letters have their natural size.
+        data: The data to draw.
+        width: Width in inches at which letters have their natural size.
     """
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
@@ -112,7 +112,7 @@ def svgs(draw: Callable[[T, float], Figure], data: T, width: float) -> dict[str,
 
 
 def save_png(target: Target, draw: Callable[[T, float], Figure], data: T, width: float) -> None:
-    """Save what a function draws from some data in the style of all figures."""
+    """Save a function's figure of some data in the style of all figures."""
     _save(draw, data, width, target, format="png", dpi=160, facecolor=palette.PAPER)
 
 
@@ -185,7 +185,7 @@ def percent_axis(axis: Any) -> None:
 
 
 def percent_tick(tick: float) -> str:
-    """A fraction as the label of a tick, with the digits that it has: 0.1 %, 2.5 %, 5 %."""
+    """A fraction as the label of a tick, with as many digits as needed: 0.1 %, 2.5 %, 5 %."""
     return percent(tick, next(n for n in range(16) if math.isclose(round(tick, 2 + n), tick)))
 
 
