@@ -4,7 +4,10 @@ Compiling takes most of a test's time, so programs are hardly optimised here; ``
 them as users do (QFOLIO_TEST_OPTIMIZED=1).
 """
 
+import ctypes
+import gc
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -21,7 +24,9 @@ if "QFOLIO_TEST_OPTIMIZED" not in os.environ:
     ]
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
 
-install_import_hook("qfolio", "typechecker.check")  # before the first import of the package
+# Not the adapters: scikit-learn's habit is to take any setting and to check it when fitting.
+WINGS = "core solvers learning agents tasks experiments portfolio report commands"
+install_import_hook([f"qfolio.{wing}" for wing in WINGS.split()], "typechecker.check")
 
 import jax  # noqa: E402
 
@@ -31,6 +36,8 @@ from qfolio.core.population import programs_of  # noqa: E402
 from qfolio.tasks.pendulum import Pendulum  # noqa: E402
 
 devices.configure()
+# Also the many little ones, which other files and the other process would compile again.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -39,6 +46,9 @@ def forget_programs():
     yield
     programs_of.cache_clear()
     jax.clear_caches()
+    gc.collect()
+    if sys.platform == "linux":  # glibc keeps what was freed, gigabytes of it
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture

@@ -1,8 +1,12 @@
 """What checks the types of arguments in tests.
 
-As for mypy, an int is a float where one is asked for. numpy's own types are wider than what they
-say at run time: a comparison is a bool, a tuple is an ``ArrayLike``, days are ``datetime64``.
+As for mypy, an int is a float where one is asked for. Some types hold more than they say at run
+time: a comparison of numpy's is a bool, a sum over all axes an array, a tuple an ``ArrayLike``, days
+are ``datetime64``, and a buffer is an ``IO``.
 """
+
+import io
+from typing import IO
 
 import numpy as np
 from beartype import BeartypeConf, FrozenDict, beartype
@@ -12,7 +16,14 @@ check = beartype(
     conf=BeartypeConf(
         is_pep484_tower=True,
         hint_overrides=FrozenDict(
-            {bool: bool | np.bool_, ArrayLike: object, NDArray[np.datetime64]: np.ndarray}
+            {
+                bool: bool | np.bool_,
+                ArrayLike: object,
+                NDArray[np.float64]: NDArray[np.float64] | np.float64,
+                NDArray[np.datetime64]: np.ndarray,
+                IO[bytes]: io.IOBase,
+                IO[str]: io.IOBase,
+            }
         ),
     )
 )

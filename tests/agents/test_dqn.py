@@ -48,15 +48,16 @@ structure: Any = jax.tree.structure  # the type of what it gives declares no ==
 
 def rollout(agent, observation=1.0, reward=1.0, terminated=False, truncated=False):
     shape = (1, agent.num_envs)
+    full = lambda shape, value: jnp.asarray(np.full(shape, value))  # noqa: E731
     return Transition(
         state=None,
-        observation=np.full((*shape, 3), observation, np.float32),
-        action=np.zeros(shape, np.int32),
-        reward=np.full(shape, reward, np.float32),
+        observation=full((*shape, 3), np.float32(observation)),
+        action=full(shape, np.int32(0)),
+        reward=full(shape, np.float32(reward)),
         next_state=None,
-        next_observation=np.full((*shape, 3), observation + 1, np.float32),
-        terminated=np.full(shape, terminated),
-        truncated=np.full(shape, truncated),
+        next_observation=full((*shape, 3), np.float32(observation + 1)),
+        terminated=full(shape, terminated),
+        truncated=full(shape, truncated),
     )
 
 
@@ -522,7 +523,9 @@ def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):
     step = rollout(agent, observation=3.0)
     after, metrics = jit(agent.learn)(task, before, step, jax.random.key(1))
     replay = jit(agent.observe)(before, step).replay
-    losses_of = jit(lambda *args: agent._losses(*args, 0.99, jax.random.key(0)))
+    losses_of = jit(
+        lambda online, target, batch: agent._losses(online, target, batch, 0.99, jax.random.key(0))
+    )
     draw = jit(lambda replay, key: (replay.draw(key, 6), replay.at(replay.draw(key, 6))))
     index, batch = draw(replay, jax.random.key(1))
     losses = losses_of(before.online, before.target, batch)

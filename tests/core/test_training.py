@@ -142,7 +142,7 @@ def test_hyperparameters_can_differ_between_members(task, agent):
 
     def weights_after(rate):
         varied = eqx.tree_at(lambda a: a.learning_rate, agent, rate)
-        state = begin(task, varied, jnp.array(0))
+        state = begin(task, varied, jnp.array(0, jnp.uint32))
         state, _ = advance(task, varied, state, jnp.array(15), learning=True)
         return state.agent.online.mlp.weights[0]
 

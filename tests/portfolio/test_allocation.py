@@ -1,7 +1,6 @@
 """The trades that lead from holdings to target weights."""
 
-from types import SimpleNamespace
-from typing import Any
+import dataclasses
 
 import numpy as np
 import pytest
@@ -10,22 +9,33 @@ from qfolio.commands.portfolio import allocate
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.allocation import Allocation, require_fresh
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
 
 PRICES = Prices(
     np.array(["2024-12-30", "2024-12-31"], "datetime64[s]"),
     ("A", "B"),
     np.array([[10.0, 50], [20, 40]]),
 )
+TASK = Portfolio.of(
+    Prices(np.arange(8).astype("datetime64[D]"), ("A", "B"), np.ones((8, 2))), window=1, horizon=1
+)
+
+
+class Fixed(Policy):
+    """Wants the same weights whatever it sees."""
+
+    def __init__(self, wanted, cost):
+        self.wanted = dict(zip(("cash", "A", "B"), wanted, strict=True))
+        self.task = dataclasses.replace(TASK, cost=cost)
+
+    def weights(self, prices, holdings=None, **options):
+        return self.wanted
 
 
 def plan(weights, shares, cash, cost=0.01, **options):
-    names = ("cash", "A", "B")
-    policy: Any = SimpleNamespace(
-        weights=lambda prices, held: dict(zip(names, weights, strict=True)),
-        task=SimpleNamespace(cost=cost),
-    )
-    return Allocation.of(policy, PRICES, np.array(shares, float), cash, **options)
+    return Allocation.of(Fixed(weights, cost), PRICES, np.array(shares, float), cash, **options)
 
 
 def test_from_cash_by_hand():

@@ -7,6 +7,7 @@ deviations.
 """
 
 import math
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -66,7 +67,7 @@ class Learned(actor_critic.Learned):
 
 
 def actor_loss(
-    actor: Actor, critics: Critics, observation: PyTree, saturation_penalty: Scalar
+    actor: Actor, critics: Callable[..., Array], observation: PyTree, saturation_penalty: Scalar
 ) -> tuple[Float[Array, ""], Metrics]:
     """Minus the mean of Q(s, π(s)), by the smallest of the critics.
 

@@ -7,7 +7,7 @@ how. docs/policy_gradients.md has the formulas.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -213,7 +213,7 @@ def _coordinates(actions: Actions) -> int:
 def _zero_output(network: Network) -> Network:
     """The network with an output layer of zeros: the first policy is the same everywhere."""
 
-    def last(network: Network) -> tuple[Array, Array]:
+    def last(network: Network) -> Any:  # equinox passes networks of placeholders
         mlp = network.mlp if isinstance(network, Flat) else network.network.head
         return mlp.weights[-1], mlp.biases[-1]
 

@@ -18,6 +18,7 @@ from typing import NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from qfolio.core.errors import QfolioError
@@ -29,7 +30,7 @@ from qfolio.learning.targets import bootstrap, td_target
 Values = Float[Array, "state action"]
 
 
-Tables = Float[Array, "table state action"]
+Tables = Float[Array | np.ndarray, "*member table state action"]
 """One table, or two for double Q-learning, which acts on their mean."""
 
 

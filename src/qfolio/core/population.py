@@ -213,7 +213,7 @@ def programs_of(form: Hashable) -> dict[str, Any]:
 
 def _split(
     members: Sequence[PyTree],
-) -> tuple[list[np.ndarray], list[Array], Callable[[Any, Any], PyTree], Hashable]:
+) -> tuple[list[np.ndarray], list[Any], Callable[[Any, Any], PyTree], Hashable]:
     """Splits the members' numbers and arrays into own and shared ones.
 
     Numbers are own, so that one program serves all members; an array is shared if it is the same
@@ -233,7 +233,7 @@ def _split(
     ]
     shared = [column[0] for column, mine in zip(columns, is_own, strict=True) if not mine]
 
-    def join(own: list[Array], shared: list[Array]) -> PyTree:
+    def join(own: list[Array], shared: list[Any]) -> PyTree:
         mine, common = iter(own), iter(shared)
         return jax.tree.unflatten(structure, [next(mine if m else common) for m in is_own])
 

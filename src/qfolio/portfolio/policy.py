@@ -236,7 +236,7 @@ class Policy:
             )
         return table
 
-    def holdings(self, holdings: Mapping[str, float] | None) -> np.ndarray:
+    def holdings(self, holdings: Mapping[str, Any] | None) -> np.ndarray:
         """Weights with cash first, from weights by asset."""
         held = np.zeros(1 + len(self.assets))
         given = {} if holdings is None else dict(holdings)

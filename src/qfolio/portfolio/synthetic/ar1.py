@@ -48,7 +48,7 @@ class Ar1(OneAsset):
             )
 
     @property
-    def spread(self) -> float:
+    def spread(self) -> Float[Array, ""] | float:
         """Standard deviation of the signal."""
         return self.noise / (1 - self.rho**2) ** 0.5
 

@@ -47,7 +47,7 @@ class GarleanuPedersen(Synthetic):
         return Box(1)
 
     @property
-    def spread(self) -> float:
+    def spread(self) -> Float[Array, ""] | float:
         """Standard deviation of the factor."""
         return self.noise / (1 - (1 - self.phi) ** 2) ** 0.5
 

@@ -58,8 +58,8 @@ def draw_value(data: ReportData, width: float) -> Figure:
 
 
 def _draw_values(axes: Panels, maps: Maps, learned: Floats) -> None:
-    low = min(learned.min(), maps.exact_value.min())
-    high = max(learned.max(), maps.exact_value.max())
+    both = np.stack([learned, maps.exact_value])
+    low, high = float(both.min()), float(both.max())
     values = colours("value", palette.VALUE_MAP)
     for panel, table in zip(axes, (learned, maps.exact_value), strict=True):
         image = _draw_map(panel, maps, table, values, low, high, "bilinear")
