@@ -207,6 +207,17 @@ def test_epsilon_decays_with_finished_episodes(task):
     np.testing.assert_allclose(values, expected, rtol=1e-5)
 
 
+def test_epsilon_falls_along_a_line(task):
+    """From 1 to 0.1 over 8 steps of two environments, and then no further."""
+    agent = DQN(hidden=(4,), num_envs=2, epsilon_end=0.1, epsilon_steps=8.0)
+    state = agent.init(task, jax.random.key(0))
+    values = []
+    for _ in range(6):
+        values.append(float(agent.monitor(state)["epsilon"]))
+        state = agent.observe(state, rollout(agent, truncated=True))
+    np.testing.assert_allclose(values, [1, 0.775, 0.55, 0.325, 0.1, 0.1], rtol=1e-6)
+
+
 @pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
 def test_explores_with_probability_epsilon(task, epsilon):
     agent = DQN(num_envs=1, epsilon_start=epsilon, epsilon_end=epsilon)
@@ -254,6 +265,7 @@ def test_adam_equals_its_formula(task):
         {"v_max": -10.0, "values": "categorical"},
         {"huber_delta": float("inf"), "values": "quantile"},
         {"noise_scale": -1.0}, {"persistence": 1.5}, {"importance_steps": 0.0},
+        {"epsilon_steps": -1.0},
     ],
 )  # fmt: skip
 def test_refuses_what_makes_no_sense(settings):

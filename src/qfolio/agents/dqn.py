@@ -31,7 +31,7 @@ from qfolio.core.fields import constant, number, require, sizes, static
 from qfolio.core.mdp import Agent, Discrete, ExogenousTask, Metrics, Task, Transition
 from qfolio.learning import heads, optimizer
 from qfolio.learning.distributional import ValueConfig, Values
-from qfolio.learning.exploration import EpsilonSchedule, epsilon_greedy
+from qfolio.learning.exploration import EpsilonSchedule, LinearSchedule, epsilon_greedy
 from qfolio.learning.heads import HeadConfig
 from qfolio.learning.networks import Network, NetworkConfig
 from qfolio.learning.optimizer import CosineSchedule
@@ -48,7 +48,7 @@ class DQNState(eqx.Module):
     optimizer: optimizer.Optimizer
     replay: Replay
     episodes: Int[Array, ""]  # finished; ε follows it
-    steps: Int[Array, ""]  # of each environment; the target network follows them
+    steps: Int[Array, ""]  # of each environment; the target network follows them, and a linear ε
 
 
 Learned = tuple[Network, optimizer.Optimizer, Priorities | None]
@@ -98,6 +98,7 @@ class DQN(Agent):
     epsilon_start: float = number(1.0)
     epsilon_end: float = number(0.01)
     epsilon_decay: float = number(0.995)  # factor per finished episode
+    epsilon_steps: float = constant(0.0)  # steps of a linear fall of ε; 0: epsilon_decay holds
     persistence: float = constant(0.0)  # share of exploring steps that repeat the last action
     huber_delta: float = number(math.inf)  # |TD error| beyond which the loss is linear
     reward_scale: float = number(1.0)  # the network learns values of scaled rewards
@@ -115,6 +116,7 @@ class DQN(Agent):
         require(self, "target_update_interval", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "epsilon_steps", lambda x: 0 <= x <= 1e30, "from 0 to 1e30")
         fractions = "discount tau epsilon_start epsilon_end epsilon_decay persistence"
         exponents = " priority_exponent importance_exponent"
         require(self, fractions + exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
@@ -147,9 +149,11 @@ class DQN(Agent):
             self.learning_rate, self.learning_rate_final, self.learning_rate_steps
         )
 
-    @property
-    def _epsilon(self) -> EpsilonSchedule:
-        return EpsilonSchedule(self.epsilon_start, self.epsilon_end, self.epsilon_decay)
+    def _epsilon(self, state: DQNState) -> Float[Array, ""]:
+        start, end = self.epsilon_start, self.epsilon_end
+        if self.epsilon_steps:
+            return LinearSchedule(start, end, self.epsilon_steps)(1.0 * self.num_envs * state.steps)
+        return EpsilonSchedule(start, end, self.epsilon_decay)(state.episodes)
 
     @property
     def _importance(self) -> ImportanceSchedule:
@@ -195,7 +199,7 @@ class DQN(Agent):
         return self._replay.warm_up
 
     def monitor(self, state: DQNState) -> Metrics:
-        return {"epsilon": self._epsilon(state.episodes)}
+        return {"epsilon": self._epsilon(state)}
 
     def carry_over(self, state: DQNState, fresh: DQNState) -> DQNState:
         return eqx.tree_at(lambda s: s.replay, state, fresh.replay)
@@ -217,7 +221,7 @@ class DQN(Agent):
         if self.noisy:
             key, noise_key = jax.random.split(key)
             online = heads.draw_noise(online, noise_key)
-        epsilon = self._epsilon(state.episodes)
+        epsilon = self._epsilon(state)
         last = state.replay.latest().action if self.persistence else None
         return epsilon_greedy(key, self._q(online, observation), epsilon, last, self.persistence)
 

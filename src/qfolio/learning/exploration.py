@@ -22,6 +22,19 @@ class EpsilonSchedule(NamedTuple):
         return jnp.maximum(self.epsilon_end, self.epsilon_start * self.epsilon_decay**episodes)
 
 
+class LinearSchedule(NamedTuple):
+    """ε, which falls along a line and then stays (Mnih et al. 2015)."""
+
+    epsilon_start: Scalar
+    epsilon_end: Scalar
+    epsilon_steps: Scalar  # steps until it stays
+
+    def __call__(self, steps: Float[Array, ""]) -> Float[Array, ""]:
+        """ε after so many steps."""
+        left = jnp.maximum(1 - steps / self.epsilon_steps, 0.0)
+        return self.epsilon_end + left * (self.epsilon_start - self.epsilon_end)
+
+
 def epsilon_greedy(
     key: PRNGKeyArray,
     values: Float[Array, "batch action"],
