@@ -196,6 +196,26 @@ def test_the_target_network_follows_softly(task):
     np.testing.assert_allclose(after.target.mlp.weights[0], expected, rtol=1e-5, atol=1e-7)
 
 
+def test_learns_once_from_several_steps(task):
+    """Two rollouts of three steps; the target network is copied at the fourth step."""
+    agent = DQN(
+        hidden=(4,), num_envs=2, batch_size=4, train_freq=3, target_update_interval=4, tau=1.0
+    )
+    assert agent.rollout_steps == 3
+    state = agent.init(task, jax.random.key(0))
+    steps = jax.tree.map(
+        lambda *x: jnp.concatenate(x), *(rollout(agent, float(i)) for i in (1, 2, 3))
+    )
+    copied = []
+    for i in range(2):
+        state, _ = agent.learn(task, state, steps, jax.random.key(i))
+        copied.append(bool((state.target.mlp.weights[0] == state.online.mlp.weights[0]).all()))
+    assert (int(state.steps), int(state.replay.size), int(state.optimizer.count)) == (6, 12, 2)
+    stored = state.replay.unpack(state.replay.rows[:12]).observation[:, 0]
+    np.testing.assert_array_equal(stored, [1, 1, 2, 2, 3, 3] * 2)
+    assert copied == [False, True]
+
+
 def test_epsilon_decays_with_finished_episodes(task):
     agent = DQN(num_envs=1, epsilon_start=1.0, epsilon_end=0.5, epsilon_decay=0.9)
     state = agent.init(task, jax.random.key(0))
@@ -265,7 +285,7 @@ def test_adam_equals_its_formula(task):
         {"v_max": -10.0, "values": "categorical"},
         {"huber_delta": float("inf"), "values": "quantile"},
         {"noise_scale": -1.0}, {"persistence": 1.5}, {"importance_steps": 0.0},
-        {"epsilon_steps": -1.0},
+        {"epsilon_steps": -1.0}, {"train_freq": 0}, {"train_freq": 4, "persistence": 0.5},
     ],
 )  # fmt: skip
 def test_refuses_what_makes_no_sense(settings):

@@ -70,7 +70,8 @@ class DQN(Agent):
     num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     batch_size: int = static(64)
-    gradient_steps: int = static(1)  # gradient steps per step of all environments
+    train_freq: int = static(1)  # steps of all environments between times of learning
+    gradient_steps: int = static(1)  # gradient steps each time
     replay_capacity: int = static(50_000)  # transitions
     learning_starts: int = static(64)  # transitions stored before learning
     double: bool = static(False)
@@ -110,16 +111,21 @@ class DQN(Agent):
         self._networks.check()
         self._schedule.check()
         self._value_config.check()
-        require(self, "gradient_steps", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        counts = "train_freq gradient_steps target_update_interval"
+        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "importance_steps", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-        require(self, "target_update_interval", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "epsilon_steps", lambda x: 0 <= x <= 1e30, "from 0 to 1e30")
         fractions = "discount tau epsilon_start epsilon_end epsilon_decay persistence"
         exponents = " priority_exponent importance_exponent"
         require(self, fractions + exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
+        if self.persistence and self.train_freq > 1:
+            raise QfolioError(
+                f"train_freq is {self.train_freq}, and persistence needs the last action at each "
+                "step; set train_freq=1 or persistence=0."
+            )
         if self.all_actions:
             hindsight.require_plain({name: getattr(self, name) for name in hindsight.PLAIN})
         if self.market_baseline and self.batch_size < 2:
@@ -195,6 +201,10 @@ class DQN(Agent):
             steps=zero,
         )
 
+    @property
+    def rollout_steps(self) -> int:
+        return self.train_freq
+
     def warm_up(self) -> int:
         return self._replay.warm_up
 
@@ -240,7 +250,11 @@ class DQN(Agent):
         return eqx.tree_at(
             lambda s: (s.replay, s.episodes, s.steps),
             state,
-            (state.replay.add(stored), state.episodes + finished, state.steps + 1),
+            (
+                state.replay.extend(stored),
+                state.episodes + finished,
+                state.steps + self.train_freq,
+            ),
         )
 
     def learn(
@@ -251,7 +265,7 @@ class DQN(Agent):
         learned = (state.online, state.optimizer, state.replay.priorities)
         learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         online, adam, priorities = learned
-        due = state.steps % self.target_update_interval == 0
+        due = state.steps % self.target_update_interval < self.train_freq
         rate = self.tau if self.target_update_interval == 1 else jnp.where(due, self.tau, 0)
         target = follow(state.target, online, rate)
         replay = dataclasses.replace(state.replay, priorities=priorities)
