@@ -18,7 +18,7 @@ from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
 from qfolio.learning.distributions import Gaussian, LogisticNormal, Squashed
-from qfolio.learning.exploration import uniform
+from qfolio.learning.exploration import OrnsteinUhlenbeck, uniform
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import Scale, squash, unsquash
 from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
@@ -495,6 +495,33 @@ def test_noise_stays_among_the_actions():
     np.testing.assert_allclose(given, [[0.0, 0.6, 0.4]], atol=1e-6)
 
 
+def test_noise_lasts_and_starts_anew_with_each_episode():
+    """Lillicrap et al.: θ = 0.15. Of n steps the variance is Σ 0.85²ⁱ, and 0.85 of a step stays."""
+    theta, n = 0.15, 50_000
+    first = OrnsteinUhlenbeck.begin(jax.random.key(0), (n, 1))
+    second = first.step(theta, jnp.zeros(n, bool))
+    third = second.step(theta, jnp.arange(n) < n // 2)
+    np.testing.assert_allclose(first.value.std(), 1, rtol=0.02)
+    np.testing.assert_allclose(second.value.var(), 1 + 0.85**2, rtol=0.02)
+    np.testing.assert_allclose((first.value * second.value).mean(), 0.85, rtol=0.03)
+    ended, others = np.split(np.asarray(third.value), 2)
+    np.testing.assert_allclose(ended.var(), 1, rtol=0.03)
+    np.testing.assert_allclose(others.var(), 1 + 0.85**2 + 0.85**4, rtol=0.03)
+
+
+def test_an_actor_explores_by_noise_that_lasts():
+    agent = DDPG(hidden=(8,), num_envs=2, noise_theta=0.15, exploration_noise=0.2)
+    state, observation = agent.init(Aim(), jax.random.key(0)), jnp.zeros((2, 1))
+    for _ in range(2):
+        action = agent.explore(state, observation, jax.random.key(1))
+        expected = agent.policy(state.learned.actor, observation) + 2 * 0.2 * state.noise.value
+        np.testing.assert_allclose(action, jnp.clip(expected, -2, 2), rtol=1e-6)
+        before, state = state, agent.observe(state, rollout_of(jnp.zeros((1, 2))))
+        assert (state.noise.value != before.noise.value).all()
+    # Independent noise leaves no trace in a checkpoint.
+    assert DDPG(hidden=(8,)).init(Aim(), jax.random.key(0)).noise is None
+
+
 def test_warm_up_explores_at_random_and_learning_by_the_actor():
     agent = DDPG(hidden=(8,), num_envs=500, learning_starts=1000, exploration_noise=0.0)
     state = agent.init(Pendulum(torques=0), jax.random.key(0))
@@ -556,6 +583,7 @@ def test_fits_markets(kind, network, task):
     ("kind", "settings"),
     [
         (DDPG, {"exploration_noise": -0.1}), (DDPG, {"batch_size": 0}), (TD3, {"policy_delay": 0}),
+        (DDPG, {"noise_theta": 1.5}),
         (TD3, {"target_noise": -1.0}), (SAC, {"spread": 0.0}), (SAC, {"initial_temperature": 0.0}),
         (SAC, {"discount": 1.5}), (SAC, {"learning_starts": 100, "replay_capacity": 50}),
         (SAC, {"network": "mpl"}), (SAC, {"hidden": ()}),

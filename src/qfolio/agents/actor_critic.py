@@ -169,7 +169,7 @@ class ActorCritic(Agent, Generic[L]):
         """What gradient steps will change; ``observation`` is an example."""
 
     @abc.abstractmethod
-    def explore(self, learned: L, observation: PyTree, key: PRNGKeyArray) -> Array:
+    def explore(self, state: ActorCriticState[L], observation: PyTree, key: PRNGKeyArray) -> Array:
         """Actions for a batch of observations, with exploration."""
 
     @abc.abstractmethod
@@ -190,7 +190,7 @@ class ActorCritic(Agent, Generic[L]):
     def act(self, state: ActorCriticState[L], observation: PyTree, key: PRNGKeyArray) -> Array:
         random_key, key = jax.random.split(key)
         random = uniform(state.learned.actor.actions, random_key, self.num_envs)
-        action = self.explore(state.learned, observation, key)
+        action = self.explore(state, observation, key)
         return jnp.where(state.steps < self.warm_up(), random, action)
 
     def observe(self, state: State, rollout: Transition) -> State:

@@ -199,7 +199,7 @@ class MBPO(SAC):
             observation: Float[Array, "batch seen"], key: PRNGKeyArray
         ) -> tuple[Float[Array, "batch seen"], Experience]:
             act_key, key = jax.random.split(key)
-            action = self.explore(state.learned, observation, act_key)
+            action = self.explore(state, observation, act_key)
             step = model.imagine(observation, action, key)
             return jnp.where(step.terminal[:, None], starts, step.next_observation), step
 

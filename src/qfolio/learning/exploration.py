@@ -1,10 +1,11 @@
-"""How agents explore: ε-greedily, or by actions drawn uniformly."""
+"""How agents explore: ε-greedily, by noise that lasts, or by actions drawn uniformly."""
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from qfolio.core.mdp import Actions, Discrete, Simplex
 from qfolio.learning.targets import Scalar
@@ -58,6 +59,25 @@ def epsilon_greedy(
     drawn = jax.random.uniform(key, greedy.shape)
     explored = jnp.minimum(drawn / jnp.maximum(epsilon, 1e-30) * n, n - 1).astype(jnp.int32)
     return jnp.where(drawn < epsilon, explored, greedy)
+
+
+class OrnsteinUhlenbeck(eqx.Module):
+    """Noise that lasts: x ← (1 − θ) x + N(0, 1), from 0 in each episode (Lillicrap et al. 2016)."""
+
+    value: Float[Array, "environment entry"]  # of the next actions
+    key: UInt32[Array, "2"]
+
+    @staticmethod
+    def begin(key: PRNGKeyArray, shape: tuple[int, int]) -> "OrnsteinUhlenbeck":
+        noise = OrnsteinUhlenbeck(jnp.zeros(shape), jax.random.key_data(key))
+        return noise.step(1.0, jnp.ones(shape[0], bool))
+
+    def step(self, theta: Scalar, finished: Bool[Array, " environment"]) -> "OrnsteinUhlenbeck":
+        """The noise of the step behind one that may have ended its episode."""
+        key, draw_key = jax.random.split(jax.random.wrap_key_data(self.key))
+        kept = jnp.where(finished[:, None], 0.0, (1 - theta) * self.value)
+        drawn = jax.random.normal(draw_key, kept.shape)
+        return OrnsteinUhlenbeck(kept + drawn, jax.random.key_data(key))
 
 
 def uniform(actions: Actions, key: PRNGKeyArray, n: int) -> Array:
