@@ -274,6 +274,24 @@ def test_nothing_follows_what_is_terminal():
     assert_close(updated(agent, start, batch, following).critics, expected, 1e-5)
 
 
+def test_the_critics_weights_decay():
+    """At a price above all else, Adam's first step takes its rate off each weight's size."""
+    agent = DDPG(hidden=(8,), critic_weight_decay=1e8, learning_rate=1e-3)
+    start = begun(agent)
+    expected = jax.tree.map(lambda w: w - 1e-3 * jnp.sign(w), start.critics)
+    assert_close(updated(agent, start, batch_of()).critics, expected, 1e-6)
+
+
+def test_last_layers_start_small():
+    start = begun(DDPG(hidden=(64,), last_layer_bound=3e-3))
+    for mlp in (start.actor.network.mlp, start.critics.networks.mlp):
+        assert jnp.abs(mlp.weights[0]).max() > 0.3  # as elsewhere
+        assert 2.7e-3 < jnp.abs(mlp.weights[1]).max() < 3e-3
+        assert jnp.abs(mlp.biases[1]).max() < 3e-3
+    assert eqx.tree_equal(start.actor, start.target_actor)
+    assert eqx.tree_equal(start.critics, start.target_critics)
+
+
 def test_what_follows_is_brought_to_what_rewards_allow():
     """Rewards from −2 to 1, halved, with γ = 0.9: values from −10 to 5."""
     agent = DDPG(hidden=(8,), discount=0.9, reward_scale=0.5)
@@ -583,7 +601,8 @@ def test_fits_markets(kind, network, task):
     ("kind", "settings"),
     [
         (DDPG, {"exploration_noise": -0.1}), (DDPG, {"batch_size": 0}), (TD3, {"policy_delay": 0}),
-        (DDPG, {"noise_theta": 1.5}),
+        (DDPG, {"noise_theta": 1.5}), (DDPG, {"critic_weight_decay": -0.1}),
+        (DDPG, {"last_layer_bound": -0.1}),
         (TD3, {"target_noise": -1.0}), (SAC, {"spread": 0.0}), (SAC, {"initial_temperature": 0.0}),
         (SAC, {"discount": 1.5}), (SAC, {"learning_starts": 100, "replay_capacity": 50}),
         (SAC, {"network": "mpl"}), (SAC, {"hidden": ()}),

@@ -66,11 +66,18 @@ def critic_loss(
     batch: Experience,
     target: Float[Array, " batch"],
     huber_delta: Scalar,
+    weight_decay: float = 0.0,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Mean Huber loss of the errors to one target, summed over the critics; and what to report."""
+    """Mean Huber loss of the errors to one target, summed over the critics; and what to report.
+
+    weight_decay: what half the sum of all squared weights costs.
+    """
     q = critics(batch.observation, batch.action)
     loss = huber_loss(critics.errors(q, target), huber_delta).mean(1).sum()
-    return loss, {"loss": loss, "q": q.mean()}
+    metrics = {"loss": loss, "q": q.mean()}
+    if weight_decay:
+        loss += weight_decay / 2 * sum((x**2).sum() for x in jax.tree.leaves(critics))
+    return loss, metrics
 
 
 class Batch(NamedTuple):

@@ -29,7 +29,7 @@ from qfolio.core.fields import constant, number, require
 from qfolio.core.mdp import Box, Discrete, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.exploration import OrnsteinUhlenbeck
-from qfolio.learning.networks import outputs_of, saturation
+from qfolio.learning.networks import outputs_of, saturation, with_last_layer
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import Scalar, follow
 
@@ -95,11 +95,13 @@ class DDPG(ActorCritic[Learned]):
     exploration_noise: float = number(0.1)  # standard deviation of the noise, in units of the bound
     noise_theta: float = constant(1.0)  # share of the noise that a step forgets; 1: independent
     saturation_penalty: float = number(0.1)  # on outputs where tanh is flat; 0: none
+    critic_weight_decay: float = constant(0.0)  # price of half the critic's squared weights
+    last_layer_bound: float = constant(0.0)  # last layers start uniform in ± it; 0: in ±1/√inputs
 
     critics: ClassVar[int] = 1
 
     def __check_init__(self) -> None:
-        scales = "exploration_noise saturation_penalty"
+        scales = "exploration_noise saturation_penalty critic_weight_decay last_layer_bound"
         require(self, scales, lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "noise_theta", lambda x: 0 <= x <= 1, "between 0 and 1")
 
@@ -121,6 +123,10 @@ class DDPG(ActorCritic[Learned]):
         network = self.build(task, observation, outputs_of(task.actions), actor_key)
         actor = Actor(network, task.actions)
         critics = self.build_critics(task, observation, self.critics, critic_key)
+        if bound := self.last_layer_bound:
+            both = lambda x: (x[0].network, x[1].networks)  # noqa: E731
+            small = lambda network: with_last_layer(network, bound)  # noqa: E731
+            actor, critics = eqx.tree_at(both, (actor, critics), replace_fn=small)
         begin = optimizer.begin
         return Learned(actor, critics, critics, begin(actor), begin(critics), actor)
 
@@ -164,6 +170,7 @@ class DDPG(ActorCritic[Learned]):
             batch.steps,
             target,
             self.huber_delta,
+            self.critic_weight_decay,
         )
         learned = eqx.tree_at(lambda x: (x.critics, x.critic_adam), learned, (critics, adam))
         return learned, metrics

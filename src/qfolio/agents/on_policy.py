@@ -18,7 +18,7 @@ from qfolio.core.fields import number, require, sizes, static
 from qfolio.core.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
-from qfolio.learning.networks import Flat, Network, NetworkConfig, Outputs, outputs_of, saturation
+from qfolio.learning.networks import Network, NetworkConfig, Outputs, outputs_of, saturation
 from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.targets import Scalar, advantages
 
@@ -113,8 +113,10 @@ class OnPolicy(Agent):
         def build(outputs: Outputs, key: PRNGKeyArray) -> Network:
             return networks.build(self._networks, task, observation, outputs, key)
 
+        actor = build(outputs_of(task.actions), actor_key)
         weights = PolicyAndValue(
-            actor=_quiet(build(outputs_of(task.actions), actor_key)),
+            # A last layer of zeros: the first policy is the same everywhere.
+            actor=eqx.tree_at(networks.last_layer, actor, replace_fn=jnp.zeros_like),
             log_std=jnp.full(_coordinates(task.actions), jnp.log(self.initial_std)),
             critic=build(Outputs(1), critic_key),
             actions=task.actions,
@@ -206,13 +208,3 @@ def normalized(
 def _coordinates(actions: Actions) -> int:
     """How many standard deviations a policy has; a choice has none."""
     return actions.n if isinstance(actions, Box) else int(isinstance(actions, Simplex))
-
-
-def _quiet(network: Network) -> Network:
-    """The network with an output layer of zeros: the first policy is the same everywhere."""
-
-    def last(network: Network) -> tuple[Array, Array]:
-        mlp = network.mlp if isinstance(network, Flat) else network.network.head
-        return mlp.weights[-1], mlp.biases[-1]
-
-    return eqx.tree_at(last, network, replace_fn=jnp.zeros_like)

@@ -193,6 +193,18 @@ def saturation(
     return (jnp.maximum(jnp.abs(output) - reach, 0.0) ** 2).sum(-1)
 
 
+def last_layer(network: Any) -> Any:
+    """Weights and biases of the layer that gives the outputs."""
+    mlp = network.mlp if isinstance(network, Flat) else network.network.head
+    return mlp.weights[-1], mlp.biases[-1]
+
+
+def with_last_layer(network: Network, bound: float) -> Network:
+    """The network as it begins, but with a last layer that is uniform in ±``bound``."""
+    factor = bound * math.sqrt(last_layer(network)[0].shape[-2])
+    return eqx.tree_at(last_layer, network, replace_fn=lambda x: factor * x)
+
+
 def build(
     config: NetworkConfig,
     task: Task,
