@@ -282,6 +282,22 @@ def test_the_critics_weights_decay():
     assert_close(updated(agent, start, batch_of()).critics, expected, 1e-6)
 
 
+def test_the_action_may_enter_at_the_second_layer():
+    """Written out, with an action in units of its bound."""
+    start, batch = begun(DDPG(hidden=(8, 4), late_action=True)), batch_of()
+    first, later = jax.tree.map(
+        lambda x: x[0], (start.critics.networks.first, start.critics.networks.later)
+    )
+    x = np.maximum(batch.observation @ first.mlp.weights[0] + first.mlp.biases[0], 0)
+    x = np.concatenate([x, batch.action], 1)
+    assert jnp.abs(later.mlp.weights[0][8:]).max() < 0.5 / 9**0.5
+    x = np.maximum(x @ later.mlp.weights[0] + later.mlp.biases[0], 0)
+    expected = x @ later.mlp.weights[1] + later.mlp.biases[1]
+    np.testing.assert_allclose(
+        start.critics(batch.observation, batch.action)[0], expected[:, 0], rtol=1e-5
+    )
+
+
 def test_last_layers_start_small():
     start = begun(DDPG(hidden=(64,), last_layer_bound=3e-3))
     for mlp in (start.actor.network.mlp, start.critics.networks.mlp):

@@ -20,7 +20,7 @@ from qfolio.core.fields import number, require, sizes, static
 from qfolio.core.mdp import Actions, Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.exploration import uniform
-from qfolio.learning.networks import Flat, Network, NetworkConfig
+from qfolio.learning.networks import Flat, LateAction, Network, NetworkConfig
 from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
 from qfolio.learning.targets import Scalar, Scale, huber_loss, possible_values, td_target
@@ -267,14 +267,23 @@ class ActorCritic(Agent, Generic[L]):
         return networks.build(self._networks, task, observation, outputs, key)
 
     def build_critics(
-        self, task: Task, observation: PyTree, count: int, key: PRNGKeyArray
+        self, task: Task, observation: PyTree, count: int, key: PRNGKeyArray, *, late: bool = False
     ) -> Critics:
-        """Critics over everything that is observed and an action."""
+        """Critics over everything that is observed and an action.
+
+        late: the action enters at the second layer.
+        """
         assert not isinstance(task.actions, Discrete)
         action = uniform(task.actions, key, 1)[0]
         seen = sum(jnp.size(leaf) for leaf in jax.tree.leaves(observation))
         scale = jnp.broadcast_to(jnp.array(task.observation_scale), (seen,))
         gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
-        gains = jnp.append(gain, jnp.full(action.shape, 1 / task.actions.unit))
-        make = lambda key: Flat((observation, action), self.hidden, 1, key, gains)  # noqa: E731
+        both, unit = (observation, action), task.actions.unit
+        gains = jnp.append(gain, jnp.full(action.shape, 1 / unit))
+
+        def make(key: PRNGKeyArray) -> Network:
+            if late:
+                return LateAction(both, self.hidden, key, gain, 1 / unit)
+            return Flat(both, self.hidden, 1, key, gains)
+
         return Critics(make, count, Scale(self.value_rescaling), key)

@@ -25,7 +25,7 @@ from qfolio.agents.actor_critic import (
 )
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import constant, number, require
+from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Box, Discrete, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.exploration import OrnsteinUhlenbeck
@@ -95,6 +95,7 @@ class DDPG(ActorCritic[Learned]):
     exploration_noise: float = number(0.1)  # standard deviation of the noise, in units of the bound
     noise_theta: float = constant(1.0)  # share of the noise that a step forgets; 1: independent
     saturation_penalty: float = number(0.1)  # on outputs where tanh is flat; 0: none
+    late_action: bool = static(False)  # it enters the critic at the second layer
     critic_weight_decay: float = constant(0.0)  # price of half the critic's squared weights
     last_layer_bound: float = constant(0.0)  # last layers start uniform in ± it; 0: in ±1/√inputs
 
@@ -122,7 +123,8 @@ class DDPG(ActorCritic[Learned]):
         actor_key, critic_key = jax.random.split(key)
         network = self.build(task, observation, outputs_of(task.actions), actor_key)
         actor = Actor(network, task.actions)
-        critics = self.build_critics(task, observation, self.critics, critic_key)
+        count, late = self.critics, self.late_action
+        critics = self.build_critics(task, observation, count, critic_key, late=late)
         if bound := self.last_layer_bound:
             both = lambda x: (x[0].network, x[1].networks)  # noqa: E731
             small = lambda network: with_last_layer(network, bound)  # noqa: E731

@@ -41,6 +41,33 @@ class Flat(eqx.Module):
         return self.mlp(_rows(observation, self.states, self.encoder))
 
 
+class LateAction(eqx.Module):
+    """An MLP over an observation; an action enters at its second layer (Lillicrap et al. 2016)."""
+
+    first: Flat  # over the observation alone
+    later: Flat
+
+    def __init__(
+        self, seen: tuple[PyTree, Array], hidden: tuple[int, ...], key: PRNGKeyArray,
+        gain: Float[Array, "*inputs"] | float, action_gain: float,
+    ) -> None:  # fmt: skip
+        """seen: an observation and an action."""
+        (observation, action), (width, *rest) = seen, hidden
+        first_key, later_key = jax.random.split(key)
+        self.first = Flat(observation, (), width, first_key, gain)
+        gains = jnp.append(jnp.ones(width), jnp.full(action.shape, action_gain))
+        self.later = Flat((gains[:width], action), tuple(rest), 1, later_key, gains)
+
+    @property
+    def mlp(self) -> MLP:
+        """The layers that give the output."""
+        return self.later.mlp
+
+    def __call__(self, seen: tuple[PyTree, Array]) -> Float[Array, "batch 1"]:
+        observation, action = seen
+        return self.later((jax.nn.relu(self.first(observation)), action))
+
+
 def _rows(
     observation: PyTree, states: int | None, encoder: CNN | RNN | LSTM | None
 ) -> Float[Array, "batch inputs"]:
@@ -147,7 +174,7 @@ KINDS = ("flat", *SHARED)
 _READS = {"cnn": (2, 3), "rnn": (2,), "lstm": (2,)}
 """Dimensions of what an encoder reads: (time, channel), or (height, width, channel)."""
 
-Network = Flat | PerAsset
+Network = Flat | LateAction | PerAsset
 
 
 class NetworkConfig(NamedTuple):
@@ -195,7 +222,7 @@ def saturation(
 
 def last_layer(network: Any) -> Any:
     """Weights and biases of the layer that gives the outputs."""
-    mlp = network.mlp if isinstance(network, Flat) else network.network.head
+    mlp = network.network.head if isinstance(network, PerAsset) else network.mlp
     return mlp.weights[-1], mlp.biases[-1]
 
 
