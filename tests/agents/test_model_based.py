@@ -6,14 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.agents.mbpo import MBPO, Model, model_loss
+from qfolio.agents.mbpo import MBPO, Model, Remembered, model_loss
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Box, Discrete, Transition
 from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
 from qfolio.learning.encoders import MLP
-from qfolio.learning.replay import Experience
+from qfolio.learning.replay import Experience, Replay
 from qfolio.learning.targets import unsquash
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
@@ -154,6 +154,18 @@ def test_each_seed_draws_counts_of_its_own():
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.3
 
 
+def test_a_share_of_a_batch_is_real():
+    """5 % of 64 steps, as in Janner et al.: three, before the imagined ones."""
+    step = jax.tree.map(lambda x: x[0], steps())
+    real = Replay.empty(Remembered(step, jnp.ones(3)), 4, 4).add(
+        Remembered(steps(), jnp.ones((4, 3)))
+    )
+    imagined = Replay.empty(step, 4, 4).add(steps()._replace(reward=jnp.zeros(4)))
+    for ratio, count in ((0.0, 0), (0.05, 3), (1.0, 64)):
+        batch, _ = MBPO(**SMALL, real_ratio=ratio)._draw(real, imagined, jax.random.key(0))
+        np.testing.assert_array_equal(batch.reward > 0, np.arange(64) < count)
+
+
 @pytest.mark.slow
 def test_learns_values_from_imagined_steps():
     """The probe that test_actor_critic.py explains, with few real steps."""
@@ -192,7 +204,13 @@ def test_refuses_what_is_no_row_of_numbers(task):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"ensemble_size": 0}, {"model_hidden": ()}, {"model_rollout_length": 0}, {"n_steps": 2}],
+    [
+        {"ensemble_size": 0},
+        {"model_hidden": ()},
+        {"model_rollout_length": 0},
+        {"n_steps": 2},
+        {"real_ratio": 1.1},
+    ],
 )
 def test_refuses_what_makes_no_sense(settings):
     with pytest.raises(QfolioError, match=next(iter(settings))):

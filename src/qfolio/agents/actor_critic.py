@@ -80,6 +80,10 @@ def critic_loss(
     return loss, metrics
 
 
+Draw = Callable[[PRNGKeyArray], tuple[Experience, Discount]]
+"""A batch of steps, and the discount of what follows them."""
+
+
 class Batch(NamedTuple):
     """What a gradient step learns from."""
 
@@ -219,19 +223,22 @@ class ActorCritic(Agent, Generic[L]):
         self, task: Task, state: ActorCriticState[L], rollout: Transition, key: PRNGKeyArray
     ) -> tuple[ActorCriticState[L], Metrics]:
         state = self.observe(state, rollout)
-        learned, metrics = self.practise(state.learned, state.replay, state.rewards, key)
+        replay = state.replay
+
+        def draw(key: PRNGKeyArray) -> tuple[Experience, Discount]:
+            return join(replay, replay.draw(key, self.batch_size), self.discount)
+
+        learned, metrics = self.practise(state.learned, draw, state.rewards, key)
         return eqx.tree_at(lambda s: s.learned, state, learned), metrics
 
     def practise(
-        self, learned: L, replay: Replay, rewards: Float[Array, "2"], key: PRNGKeyArray
+        self, learned: L, draw: Draw, rewards: Float[Array, "2"], key: PRNGKeyArray
     ) -> tuple[L, Metrics]:
-        """``gradient_steps`` gradient steps on batches from a buffer."""
+        """``gradient_steps`` gradient steps on batches that are drawn."""
 
         def update(learned: L, key: PRNGKeyArray) -> tuple[L, Metrics]:
-            sample_key, key = jax.random.split(key)
-            index = replay.draw(sample_key, self.batch_size)
-            batch = Batch(*join(replay, index, self.discount), rewards)
-            return self.update(learned, batch, key)
+            draw_key, key = jax.random.split(key)
+            return self.update(learned, Batch(*draw(draw_key), rewards), key)
 
         learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         return learned, {**metrics, "q": metrics["q"] / self.reward_scale}

@@ -3,10 +3,12 @@
 An ensemble of networks learns from all real transitions how an action changes the observation, what
 it pays, and whether anything follows. From real observations the policy then goes on in imagination
 for a few steps, each predicted by a member drawn at random, and soft actor-critic learns from these
-steps. Members differ by where they began and by their data: each counts a real transition 0, 1, 2,
-… times (on-line bootstrap, Oza & Russell 2001). docs/model_based.md lists formulas and deviations.
+steps, and from a share of real ones where it is told to. Members differ by where they began and by
+their data: each counts a real transition 0, 1, 2, … times (on-line bootstrap, Oza & Russell 2001).
+docs/model_based.md lists formulas and deviations.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,12 +20,12 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 from qfolio.agents.actor_critic import ActorCriticState, State
 from qfolio.agents.sac import SAC, Learned
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require, require_sizes, sizes, static
+from qfolio.core.fields import constant, number, require, require_sizes, sizes, static
 from qfolio.core.mdp import Actions, Discrete, Metrics, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.encoders import MLP
 from qfolio.learning.exploration import uniform
-from qfolio.learning.replay import Experience, Replay
+from qfolio.learning.replay import Discount, Experience, Replay
 from qfolio.learning.targets import squash, unsquash
 
 GAIN = 3.0
@@ -98,7 +100,7 @@ class MBPOState(ActorCriticState[Learned]):
 
 
 class MBPO(SAC):
-    """Soft actor-critic that learns from a learned model's steps alone."""
+    """Soft actor-critic that learns from a learned model's steps."""
 
     ensemble_size: int = static(5)  # networks in the ensemble
     model_hidden: tuple[int, ...] = sizes(128, 128)
@@ -107,12 +109,14 @@ class MBPO(SAC):
     model_rollout_batch: int = static(64)  # real observations that rollouts of the model start from
     model_rollout_length: int = static(5)  # steps of each
     model_replay_capacity: int = static(100_000)  # steps of the model that are kept
+    real_ratio: float = constant(0.0)  # share of real steps in a batch of soft actor-critic
 
     def __check_init__(self) -> None:
         counts = "ensemble_size model_updates model_rollout_batch model_rollout_length"
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "model_replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         require(self, "model_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "real_ratio", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "n_steps", lambda x: x == 1, "1: imagined steps stand alone")
         require_sizes(self, "model_hidden")
 
@@ -162,7 +166,8 @@ class MBPO(SAC):
         model_key, imagine_key, key = jax.random.split(key, 3)
         model, model_adam, metrics = self._study(now, model_key)
         imagined = self._imagine(model, now, imagine_key)
-        learned, more = self.practise(now.learned, imagined, now.rewards, key)
+        draw = partial(self._draw, now.replay, imagined)
+        learned, more = self.practise(now.learned, draw, now.rewards, key)
         now = MBPOState(
             learned, now.replay, now.steps, now.rewards, model, model_adam, imagined,
             now.bootstrap_key,
@@ -205,6 +210,17 @@ class MBPO(SAC):
 
         _, steps = lax.scan(step, starts, jax.random.split(key, self.model_rollout_length))
         return state.imagined.add(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps))
+
+    def _draw(
+        self, replay: Replay, imagined: Replay, key: PRNGKeyArray
+    ) -> tuple[Experience, Discount]:
+        """A batch of imagined steps, and first the real ones among them."""
+        real = round(self.real_ratio * self.batch_size)
+        if not real:
+            return imagined.sample(key, self.batch_size), self.discount
+        real_key, key = jax.random.split(key)
+        both = replay.sample(real_key, real).step, imagined.sample(key, self.batch_size - real)
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *both), self.discount
 
     def carry_over(self, state: State, fresh: State) -> State:
         assert isinstance(fresh, MBPOState)
