@@ -34,7 +34,7 @@ from qfolio.learning.distributional import ValueConfig, Values
 from qfolio.learning.exploration import EpsilonSchedule, LinearSchedule, epsilon_greedy
 from qfolio.learning.heads import HeadConfig
 from qfolio.learning.networks import Network, NetworkConfig
-from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.priorities import ImportanceSchedule, Priorities
 from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
 from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
@@ -96,6 +96,9 @@ class DQN(Agent):
     learning_rate: float = number(1e-3)
     learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
+    optimizer: str = static("adam")  # or rmsprop, rmsprop-centered, sgd
+    rmsprop_decay: float = constant(0.95)  # share of the squared gradients' mean that a step keeps
+    optimizer_epsilon: float = constant(1e-8)  # added to what a gradient is divided by
     epsilon_start: float = number(1.0)
     epsilon_end: float = number(0.01)
     epsilon_decay: float = number(0.995)  # factor per finished episode
@@ -110,6 +113,7 @@ class DQN(Agent):
         self._replay.check()
         self._networks.check()
         self._schedule.check()
+        self._optimizer.check()
         self._value_config.check()
         counts = "train_freq gradient_steps target_update_interval"
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
@@ -148,6 +152,10 @@ class DQN(Agent):
     def _head(self) -> HeadConfig:
         noise = self.noise_scale if self.noisy else None
         return HeadConfig(self._values.atoms, self.dueling, noise)
+
+    @property
+    def _optimizer(self) -> OptimizerConfig:
+        return OptimizerConfig(self.optimizer, self.rmsprop_decay, self.optimizer_epsilon)
 
     @property
     def _schedule(self) -> CosineSchedule:
@@ -195,7 +203,7 @@ class DQN(Agent):
         return DQNState(
             online=online,
             target=online,
-            optimizer=optimizer.begin(online),
+            optimizer=optimizer.begin(online, self._optimizer),
             replay=self._replay.empty(row),
             episodes=zero,
             steps=zero,

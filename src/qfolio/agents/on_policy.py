@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from qfolio.core.fields import number, require, sizes, static
+from qfolio.core.fields import constant, number, require, sizes, static
 from qfolio.core.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
 from qfolio.learning.networks import Network, NetworkConfig, Outputs, outputs_of, saturation
-from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.targets import Scalar, advantages
 
 REACH = 2.0
@@ -70,6 +70,9 @@ class OnPolicy(Agent):
     learning_rate: float = number(3e-4)
     learning_rate_final: float = number(1.0)  # share of it that is left at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
+    optimizer: str = static("adam")  # or rmsprop, rmsprop-centered, sgd
+    rmsprop_decay: float = constant(0.99)  # share of the squared gradients' mean that a step keeps
+    optimizer_epsilon: float = constant(1e-8)  # added to what a gradient is divided by
     max_grad_norm: float = number(0.5)  # longer gradients are cut to it
     value_coef: float = number(0.5)  # of the critic's mean squared error in the loss
     entropy_coef: float = number(0.0)  # of the policy's entropy, which the loss rewards
@@ -90,11 +93,16 @@ class OnPolicy(Agent):
         require(self, "initial_std", lambda x: 1e-9 <= x <= 1e9, "from 10⁻⁹ to 10⁹")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         self._schedule.check()
+        self._optimizer.check()
         self._networks.check()
 
     @property
     def _networks(self) -> NetworkConfig:
         return NetworkConfig(self.network, self.hidden, self.input_gain)
+
+    @property
+    def _optimizer(self) -> OptimizerConfig:
+        return OptimizerConfig(self.optimizer, self.rmsprop_decay, self.optimizer_epsilon)
 
     @property
     def _schedule(self) -> CosineSchedule:
@@ -121,7 +129,7 @@ class OnPolicy(Agent):
             critic=build(Outputs(1), critic_key),
             actions=task.actions,
         )
-        return OnPolicyState(weights, optimizer.begin(weights))
+        return OnPolicyState(weights, optimizer.begin(weights, self._optimizer))
 
     def warm_up(self) -> int:
         return 0
