@@ -63,6 +63,8 @@ class OnPolicy(Agent):
 
     network: str = static("flat")  # over everything observed; or mlp, cnn, rnn, shared by assets
     hidden: tuple[int, ...] = sizes(64, 64)  # of the actor, and of the critic
+    activation: str = static("relu")  # of the hidden units; or tanh, silu
+    initialization: str = static("uniform")  # in ±1/√inputs; or orthogonal
     num_envs: int = static(8)  # stepped side by side
     rollout_length: int = static(128)  # steps of each environment that are learned from at once
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
@@ -98,7 +100,9 @@ class OnPolicy(Agent):
 
     @property
     def _networks(self) -> NetworkConfig:
-        return NetworkConfig(self.network, self.hidden, self.input_gain)
+        return NetworkConfig(
+            self.network, self.hidden, self.input_gain, self.activation, self.initialization
+        )
 
     @property
     def _optimizer(self) -> OptimizerConfig:

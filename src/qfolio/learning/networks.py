@@ -12,7 +12,16 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require, require_sizes
 from qfolio.core.market import MenuActions, View
 from qfolio.core.mdp import Actions, Box, Discrete, Simplex, Task
-from qfolio.learning.encoders import CNN, LSTM, MLP, RNN, Window, uniform
+from qfolio.learning.encoders import (
+    ACTIVATIONS,
+    CNN,
+    INITIALIZATIONS,
+    LSTM,
+    MLP,
+    RNN,
+    Window,
+    uniform,
+)
 from qfolio.learning.targets import Scalar
 
 
@@ -30,12 +39,14 @@ class Flat(eqx.Module):
     def __init__(
         self, observation: PyTree, hidden: tuple[int, ...], outputs: int, key: PRNGKeyArray,
         input_gain: Float[Array, "*inputs"] | float = 1.0, states: int | None = None,
-        encoder: CNN | RNN | LSTM | None = None,
+        encoder: CNN | RNN | LSTM | None = None, activation: str = "relu",
+        initialization: str = "uniform",
     ) -> None:  # fmt: skip
         self.states, self.encoder = states, encoder
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], observation)
         inputs = jax.eval_shape(lambda: _rows(batch, states, encoder)).shape[1]
-        self.mlp = MLP((inputs, *hidden, outputs), key, input_gain)
+        sizes = (inputs, *hidden, outputs)
+        self.mlp = MLP(sizes, key, input_gain, activation, initialization)
 
     def __call__(self, observation: PyTree) -> Float[Array, "batch outputs"]:
         return self.mlp(_rows(observation, self.states, self.encoder))
@@ -183,12 +194,21 @@ class NetworkConfig(NamedTuple):
     network: str  # ``flat``, an encoder of windows or images, or for markets one that assets share
     hidden: tuple[int, ...]  # units of each hidden layer
     input_gain: Scalar = 0.0  # of the first layer, observations taken to ±1; 0: as it is
+    activation: str = "relu"  # of the hidden units; other than relu where the network is flat
+    initialization: str = "uniform"  # the same
 
     def check(self) -> None:
         """Raises QfolioError where the settings make no sense."""
         require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
         require_sizes(self)
         require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        kinds = ", ".join(ACTIVATIONS)
+        require(self, "activation", lambda x: x in ACTIVATIONS, f"one of {kinds}")
+        kinds = ", ".join(INITIALIZATIONS)
+        require(self, "initialization", lambda x: x in INITIALIZATIONS, f"one of {kinds}")
+        if self.network != "flat":
+            require(self, "activation", lambda x: x == "relu", "relu unless network=flat")
+            require(self, "initialization", lambda x: x == "uniform", "uniform unless network=flat")
 
 
 class Outputs(NamedTuple):
@@ -245,13 +265,16 @@ def build(
     effect on a network that assets share. observation: an example. Raises QfolioError where the
     kind of network does not fit what is observed.
     """
-    kind, hidden, input_gain = config
+    kind, hidden, input_gain, activation, initialization = config
     # Small weights on a bounded observation make a function too smooth for some tasks.
     gain = jnp.where(input_gain > 0, input_gain / jnp.array(task.observation_scale), 1.0)
     if kind == "flat":
         assets = observation.holding.shape[-1] if isinstance(observation, View) else 0
         count = outputs.pooled + assets * outputs.each
-        return Flat(observation, hidden, count, key, gain, task.states)
+        return Flat(
+            observation, hidden, count, key, gain, task.states,
+            activation=activation, initialization=initialization,
+        )  # fmt: skip
     if not isinstance(observation, View):
         shape = jnp.shape(observation) if isinstance(observation, Array) else ()
         if kind not in _READS or len(shape) not in _READS[kind]:
