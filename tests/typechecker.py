@@ -1,8 +1,8 @@
 """What checks the types of arguments in tests.
 
-As for mypy, an int is a float where one is asked for. Some types hold more than they say at run
-time: a comparison of numpy's is a bool, a sum over all axes an array, a tuple an ``ArrayLike``, days
-are ``datetime64``, and a buffer is an ``IO``.
+As for mypy, an int is a float where one is asked for. Some types are wider than they say at run
+time: a comparison of numpy's is a bool, a sum over all axes is an array, a tuple is an
+``ArrayLike``, days are ``datetime64``, and a buffer is an ``IO``.
 """
 
 import io

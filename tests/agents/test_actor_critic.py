@@ -19,7 +19,7 @@ from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
 from qfolio.learning.distributions import Gaussian, LogisticNormal, Squashed
-from qfolio.learning.exploration import uniform
+from qfolio.learning.exploration import OrnsteinUhlenbeck, uniform
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import Scale, squash, unsquash
 from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
@@ -276,6 +276,40 @@ def test_nothing_follows_what_is_terminal():
     assert_close(updated(agent, start, batch, following).critics, expected, 1e-5)
 
 
+def test_the_critics_weights_decay():
+    """At a price above all else, Adam's first step takes its rate off each weight's size."""
+    agent = DDPG(hidden=(8,), critic_weight_decay=1e8, learning_rate=1e-3)
+    start = begun(agent)
+    expected = jax.tree.map(lambda w: w - 1e-3 * jnp.sign(w), start.critics)
+    assert_close(updated(agent, start, batch_of()).critics, expected, 1e-6)
+
+
+def test_the_action_may_enter_at_the_second_layer():
+    """Written out, with an action in units of its bound."""
+    start, batch = begun(DDPG(hidden=(8, 4), late_action=True)), batch_of()
+    first, later = jax.tree.map(
+        lambda x: x[0], (start.critics.networks.first, start.critics.networks.later)
+    )
+    x = np.maximum(batch.observation @ first.mlp.weights[0] + first.mlp.biases[0], 0)
+    x = np.concatenate([x, batch.action], 1)
+    assert jnp.abs(later.mlp.weights[0][8:]).max() < 0.5 / 9**0.5
+    x = np.maximum(x @ later.mlp.weights[0] + later.mlp.biases[0], 0)
+    expected = x @ later.mlp.weights[1] + later.mlp.biases[1]
+    np.testing.assert_allclose(
+        start.critics(batch.observation, batch.action)[0], expected[:, 0], rtol=1e-5
+    )
+
+
+def test_last_layers_start_small():
+    start = begun(DDPG(hidden=(64,), last_layer_bound=3e-3))
+    for mlp in (start.actor.network.mlp, start.critics.networks.mlp):
+        assert jnp.abs(mlp.weights[0]).max() > 0.3  # as elsewhere
+        assert 2.7e-3 < jnp.abs(mlp.weights[1]).max() < 3e-3
+        assert jnp.abs(mlp.biases[1]).max() < 3e-3
+    assert eqx.tree_equal(start.actor, start.target_actor)
+    assert eqx.tree_equal(start.critics, start.target_critics)
+
+
 def test_what_follows_is_brought_to_what_rewards_allow():
     """Rewards from −2 to 1, halved, with γ = 0.9: values from −10 to 5."""
     agent = DDPG(hidden=(8,), discount=0.9, reward_scale=0.5)
@@ -497,6 +531,35 @@ def test_noise_stays_among_the_actions():
     np.testing.assert_allclose(given, [[0.0, 0.6, 0.4]], atol=1e-6)
 
 
+def test_noise_lasts_and_starts_anew_with_each_episode():
+    """Lillicrap et al.: θ = 0.15. Of n steps the variance is Σ 0.85²ⁱ, and 0.85 of a step stays."""
+    theta, n = 0.15, 50_000
+    first = OrnsteinUhlenbeck.begin(jax.random.key(0), (n, 1))
+    second = first.step(theta, jnp.zeros(n, bool))
+    third = second.step(theta, jnp.arange(n) < n // 2)
+    np.testing.assert_allclose(first.value.std(), 1, rtol=0.02)
+    np.testing.assert_allclose(second.value.var(), 1 + 0.85**2, rtol=0.02)
+    np.testing.assert_allclose((first.value * second.value).mean(), 0.85, rtol=0.03)
+    ended, others = np.split(np.asarray(third.value), 2)
+    np.testing.assert_allclose(ended.var(), 1, rtol=0.03)
+    np.testing.assert_allclose(others.var(), 1 + 0.85**2 + 0.85**4, rtol=0.03)
+
+
+def test_an_actor_explores_by_noise_that_lasts():
+    agent = DDPG(hidden=(8,), num_envs=2, noise_theta=0.15, exploration_noise=0.2)
+    state, observation = agent.init(Aim(), jax.random.key(0)), jnp.zeros((2, 1))
+    for _ in range(2):
+        action = agent.explore(state, observation, jax.random.key(1))
+        assert state.noise is not None
+        expected = agent.policy(state.learned.actor, observation) + 2 * 0.2 * state.noise.value
+        np.testing.assert_allclose(action, jnp.clip(expected, -2, 2), rtol=1e-6)
+        before, state = state.noise, agent.observe(state, rollout_of(jnp.zeros((1, 2))))
+        assert state.noise is not None
+        assert (state.noise.value != before.value).all()
+    # Independent noise leaves no trace in a checkpoint.
+    assert DDPG(hidden=(8,)).init(Aim(), jax.random.key(0)).noise is None
+
+
 def test_warm_up_explores_at_random_and_learning_by_the_actor():
     agent = DDPG(hidden=(8,), num_envs=500, learning_starts=1000, exploration_noise=0.0)
     state = agent.init(Pendulum(torques=0), jax.random.key(0))
@@ -558,6 +621,8 @@ def test_fits_markets(kind, network, task):
     ("kind", "settings"),
     [
         (DDPG, {"exploration_noise": -0.1}), (DDPG, {"batch_size": 0}), (TD3, {"policy_delay": 0}),
+        (DDPG, {"noise_theta": 1.5}), (DDPG, {"critic_weight_decay": -0.1}),
+        (DDPG, {"last_layer_bound": -0.1}),
         (TD3, {"target_noise": -1.0}), (SAC, {"spread": 0.0}), (SAC, {"initial_temperature": 0.0}),
         (SAC, {"discount": 1.5}), (SAC, {"learning_starts": 100, "replay_capacity": 50}),
         (SAC, {"network": "mpl"}), (SAC, {"hidden": ()}),

@@ -212,6 +212,26 @@ def test_the_target_network_follows_softly(task):
     np.testing.assert_allclose(first_layer(after.target), expected, rtol=1e-5, atol=1e-7)
 
 
+def test_learns_once_from_several_steps(task):
+    """Two rollouts of three steps; the target network is copied at the fourth step."""
+    agent = DQN(
+        hidden=(4,), num_envs=2, batch_size=4, train_freq=3, target_update_interval=4, tau=1.0
+    )
+    assert agent.rollout_steps == 3
+    state = agent.init(task, jax.random.key(0))
+    steps = jax.tree.map(
+        lambda *x: jnp.concatenate(x), *(rollout(agent, float(i)) for i in (1, 2, 3))
+    )
+    copied = []
+    for i in range(2):
+        state, _ = agent.learn(task, state, steps, jax.random.key(i))
+        copied.append(bool((first_layer(state.target) == first_layer(state.online)).all()))
+    assert (int(state.steps), int(state.replay.size), int(state.optimizer.count)) == (6, 12, 2)
+    stored = state.replay.unpack(state.replay.rows[:12]).observation[:, 0]
+    np.testing.assert_array_equal(stored, [1, 1, 2, 2, 3, 3] * 2)
+    assert copied == [False, True]
+
+
 def test_epsilon_decays_with_finished_episodes(task):
     agent = DQN(num_envs=1, epsilon_start=1.0, epsilon_end=0.5, epsilon_decay=0.9)
     state = jit(agent.init)(task, jax.random.key(0))
@@ -221,6 +241,17 @@ def test_epsilon_decays_with_finished_episodes(task):
         state = jit(agent.observe)(state, rollout(agent, truncated=True))
     expected = [max(0.5, 0.9**i) for i in range(8)]
     np.testing.assert_allclose(values, expected, rtol=1e-5)
+
+
+def test_epsilon_falls_along_a_line(task):
+    """From 1 to 0.1 over 8 steps of two environments, and then no further."""
+    agent = DQN(hidden=(4,), num_envs=2, epsilon_end=0.1, epsilon_steps=8.0)
+    state = agent.init(task, jax.random.key(0))
+    values = []
+    for _ in range(6):
+        values.append(float(agent.monitor(state)["epsilon"]))
+        state = agent.observe(state, rollout(agent, truncated=True))
+    np.testing.assert_allclose(values, [1, 0.775, 0.55, 0.325, 0.1, 0.1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
@@ -270,6 +301,7 @@ def test_adam_equals_its_formula(task):
         {"v_max": -10.0, "values": "categorical"},
         {"huber_delta": float("inf"), "values": "quantile"},
         {"noise_scale": -1.0}, {"persistence": 1.5}, {"importance_steps": 0.0},
+        {"epsilon_steps": -1.0}, {"train_freq": 0}, {"train_freq": 4, "persistence": 0.5},
     ],
 )  # fmt: skip
 def test_refuses_what_makes_no_sense(settings):

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.agents.mbpo import MBPO, Model, model_loss
+from qfolio.agents.mbpo import MBPO, Model, Remembered, best_members, model_loss
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Box, Discrete, Transition
 from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
 from qfolio.learning.encoders import MLP
-from qfolio.learning.replay import Experience
+from qfolio.learning.replay import Experience, Replay
 from qfolio.learning.targets import unsquash
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
@@ -49,7 +49,7 @@ def constant_model(actions=None):
 def test_one_member_drawn_at_random_predicts_each_step():
     observation = jnp.tile(jnp.array([5.0, 7.0]), (3000, 1))
     action = jnp.zeros((3000, 1))
-    step = constant_model().imagine(observation, action, jax.random.key(0))
+    step = constant_model().imagine(observation, action, jnp.arange(3), jax.random.key(0))
     member = np.searchsorted([3.0, 8.0, 15.0], np.asarray(step.reward)) + 1
     np.testing.assert_allclose(step.reward, (member + 1) ** 2 - 1)
     np.testing.assert_allclose(np.bincount(member)[1:] / 3000, 1 / 3, atol=0.03)
@@ -57,6 +57,50 @@ def test_one_member_drawn_at_random_predicts_each_step():
     np.testing.assert_allclose(step.next_observation[:, 1], 7)
     np.testing.assert_array_equal(step.terminal, member == 3)
     np.testing.assert_array_equal(step.observation, observation)
+
+
+def test_only_elites_imagine():
+    observation = jnp.tile(jnp.array([5.0, 7.0]), (100, 1))
+    among = jnp.array([2, 0])
+    step = constant_model().imagine(observation, jnp.zeros((100, 1)), among, jax.random.key(0))
+    assert set(step.next_observation[:, 0].tolist()) == {6, 8}
+
+
+def test_members_are_judged_by_what_they_have_not_learned_from():
+    """Each by one step: their errors there are 5/4, 3.16/4 and 5.36/4."""
+    counts = jnp.ones((4, 3)).at[2, 0].set(0.0).at[0, 1].set(0.0).at[1, 2].set(0.0)
+    assert best_members(constant_model(), steps(), counts, 2).tolist() == [1, 0]
+
+
+def gaussian_model(log_variance):
+    """One member, whose mean is a change of (1, 0), a reward of 3 and no end."""
+    row = jnp.concatenate([jnp.array([1.0, 0, 1, 0]), jnp.full(4, log_variance)])[None]
+    return Model(Constant(row), jnp.array([1.0, 4.0]), Box(1, 2.0), gaussian=True)
+
+
+def bounded(log_variance):
+    """Kept softly between −10 and ½."""
+    below = 0.5 - np.log1p(np.exp(0.5 - log_variance))
+    return -10 + np.log1p(np.exp(below + 10))
+
+
+@pytest.mark.parametrize("log_variance", [-1.0, 99.0, -99.0])
+def test_the_likelihood_of_a_gaussian_model_by_hand(log_variance):
+    """Of the third step alone, whose changes it misses by 2 and 1; the loss is a mean over four."""
+    counts = jnp.zeros((4, 1)).at[2].set(1.0)
+    loss, _ = model_loss(gaussian_model(log_variance), steps(), counts)
+    kept = bounded(log_variance)
+    np.testing.assert_allclose(loss, (5 / 4 * math.exp(-kept) + kept) / 4, rtol=1e-4)
+
+
+def test_a_gaussian_model_draws_its_steps():
+    n, std = 20_000, math.exp(bounded(-1.0) / 2)
+    observation, among = jnp.zeros((n, 2)), jnp.arange(1)
+    step = gaussian_model(-1.0).imagine(observation, jnp.zeros((n, 1)), among, jax.random.key(0))
+    np.testing.assert_allclose(step.next_observation.mean(0), [1, 0], atol=0.05)
+    np.testing.assert_allclose(step.next_observation.std(0), [std, 4 * std], rtol=0.03)
+    ends = math.erfc(0.5 / std / math.sqrt(2)) / 2  # a number from N(0, std²) is above ½
+    np.testing.assert_allclose(step.terminal.mean(), ends, atol=0.015)
 
 
 def steps(n=4, actions=None):
@@ -155,6 +199,18 @@ def test_each_seed_draws_counts_of_its_own():
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.3
 
 
+def test_a_share_of_a_batch_is_real():
+    """5 % of 64 steps, as in Janner et al.: three, before the imagined ones."""
+    step = jax.tree.map(lambda x: x[0], steps())
+    real = Replay.empty(Remembered(step, jnp.ones(3)), 4, 4).add(
+        Remembered(steps(), jnp.ones((4, 3)))
+    )
+    imagined = Replay.empty(step, 4, 4).add(steps()._replace(reward=jnp.zeros(4)))
+    for ratio, count in ((0.0, 0), (0.05, 3), (1.0, 64)):
+        batch, _ = MBPO(**SMALL, real_ratio=ratio)._draw(real, imagined, jax.random.key(0))
+        np.testing.assert_array_equal(batch.reward > 0, np.arange(64) < count)
+
+
 @pytest.mark.slow
 def test_learns_values_from_imagined_steps():
     """The probe that test_actor_critic.py explains, with few real steps."""
@@ -193,7 +249,14 @@ def test_refuses_what_is_no_row_of_numbers(task):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"ensemble_size": 0}, {"model_hidden": ()}, {"model_rollout_length": 0}, {"n_steps": 2}],
+    [
+        {"ensemble_size": 0},
+        {"elites": 6},
+        {"model_hidden": ()},
+        {"model_rollout_length": 0},
+        {"n_steps": 2},
+        {"real_ratio": 1.1},
+    ],
 )
 def test_refuses_what_makes_no_sense(settings):
     with pytest.raises(QfolioError, match=next(iter(settings))):

@@ -1,3 +1,4 @@
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import pytest
 from jax import lax
 
 from qfolio.agents.dqn import DQN
+from qfolio.agents.ppo import PPO
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
@@ -16,7 +18,7 @@ from qfolio.core.mdp import Step
 from qfolio.core.population import Population
 from qfolio.experiments import presets
 from qfolio.learning import networks
-from qfolio.learning.encoders import CNN, LSTM, RNN
+from qfolio.learning.encoders import CNN, LSTM, MLP, RNN
 from qfolio.learning.networks import SHARED, NetworkConfig, Outputs, Shared
 from qfolio.tasks.catch import Catch
 from qfolio.tasks.hidden_pendulum import HiddenPendulum
@@ -80,6 +82,26 @@ def test_long_short_term_memory_by_hand():
         output = sigmoid(show) * np.tanh(cell)
     np.testing.assert_allclose(lstm(x), output, atol=1e-5)
     assert float(b[3:6].min()) > 1 - 2**-0.5  # the forget gate starts open
+
+
+def test_orthogonal_layers_by_hand():
+    """Columns are orthogonal, √2 long (1 in the last layer), and tanh stands between the layers."""
+    mlp = MLP((5, 3, 2), KEY, 2.0, "tanh", "orthogonal")
+    first, last = (np.asarray(weight) for weight in mlp.weights)
+    np.testing.assert_allclose(first.T @ first, 2.0**2 * 2 * np.eye(3), atol=1e-5)
+    np.testing.assert_allclose(last.T @ last, np.eye(2), atol=1e-5)
+    assert not any(bias.any() for bias in mlp.biases)
+    x = normal(4, 5)
+    np.testing.assert_allclose(mlp(x), np.tanh(x @ first) @ last, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["activation", "initialization"])
+def test_refuses_other_layers_than_there_are(name):
+    with pytest.raises(QfolioError, match=f"{name} is sine; it must be one of"):
+        dataclasses.replace(PPO(), **{name: "sine"})
+    with pytest.raises(QfolioError, match=f"{name} is .*; it must be .* unless network=flat"):
+        PPO(network="mlp", activation="tanh" if name == "activation" else "relu",
+            initialization="orthogonal")  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The trades that lead from holdings to target weights."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -133,21 +134,22 @@ def test_what_was_learned_is_kept_last(monkeypatch, tmp_path, capsys):
     """A refused allocation keeps nothing; assets may start late, long before the last row."""
     kept = []
 
-    def policy(updates):
-        return SimpleNamespace(
-            table=lambda prices: prices,
-            update=lambda prices: policy(updates + 1),
-            weights=lambda prices, held: {"cash": 1 / 2, "A": 1 / 4, "B": 1 / 4},
-            task=SimpleNamespace(cost=0.0),
-            updates=updates,
-            learned=np.datetime64("2024-12-31", "s"),
-        )
+    class Updated(Fixed):
+        def __init__(self, updates):
+            super().__init__([1 / 2, 1 / 4, 1 / 4], 0.0)
+            self.updates, self.learned = updates, np.datetime64("2024-12-31", "s")
+
+        def table(self, prices, **options):
+            return prices
+
+        def update(self, prices, episodes=None, *, listeners=(), **options):
+            return Updated(self.updates + 1)
 
     test_run = SimpleNamespace(
         prices=PRICES,
         agents={"dqn": None},
         config=SimpleNamespace(feature_names=[]),
-        policy=lambda agent: policy(0),
+        policy=lambda agent: Updated(0),
         keep=lambda agent, policy: kept.append((agent, policy.updates)),
     )
     monkeypatch.setattr(Backtest, "open", lambda folder: test_run)

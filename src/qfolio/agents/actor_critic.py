@@ -20,7 +20,7 @@ from qfolio.core.fields import number, require, sizes, static
 from qfolio.core.mdp import Actions, Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.exploration import uniform
-from qfolio.learning.networks import Flat, Network, NetworkConfig
+from qfolio.learning.networks import Flat, LateAction, Network, NetworkConfig
 from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
 from qfolio.learning.targets import Scalar, Scale, huber_loss, possible_values, td_target
@@ -66,11 +66,22 @@ def critic_loss(
     batch: Experience,
     target: Float[Array, " batch"],
     huber_delta: Scalar,
+    weight_decay: float = 0.0,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Mean Huber loss of the errors to one target, summed over the critics; and metrics."""
+    """Mean Huber loss of the errors to one target, summed over the critics; and metrics.
+
+    weight_decay: the loss adds half of it times the sum of all squared weights.
+    """
     q = critics(batch.observation, batch.action)
     loss = huber_loss(critics.errors(q, target), huber_delta).mean(1).sum()
-    return loss, {"loss": loss, "q": q.mean()}
+    metrics = {"loss": loss, "q": q.mean()}
+    if weight_decay:
+        loss += weight_decay / 2 * sum((x**2).sum() for x in jax.tree.leaves(critics))
+    return loss, metrics
+
+
+Draw = Callable[[PRNGKeyArray], tuple[Experience, Discount]]
+"""A batch of steps, and the discount of what follows them."""
 
 
 class Batch(NamedTuple):
@@ -171,7 +182,7 @@ class ActorCritic(Agent, Generic[L]):
         """The networks and optimisers before training; ``observation`` is an example."""
 
     @abc.abstractmethod
-    def explore(self, learned: L, observation: PyTree, key: PRNGKeyArray) -> Array:
+    def explore(self, state: ActorCriticState[L], observation: PyTree, key: PRNGKeyArray) -> Array:
         """Actions for a batch of observations, with exploration."""
 
     @abc.abstractmethod
@@ -192,7 +203,7 @@ class ActorCritic(Agent, Generic[L]):
     def act(self, state: ActorCriticState[L], observation: PyTree, key: PRNGKeyArray) -> Array:
         random_key, key = jax.random.split(key)
         random = uniform(state.learned.actor.actions, random_key, self.num_envs)
-        action = self.explore(state.learned, observation, key)
+        action = self.explore(state, observation, key)
         return jnp.where(state.steps < self.warm_up(), random, action)
 
     def observe(self, state: State, rollout: Transition) -> State:
@@ -214,19 +225,22 @@ class ActorCritic(Agent, Generic[L]):
         self, task: Task, state: ActorCriticState[L], rollout: Transition, key: PRNGKeyArray
     ) -> tuple[ActorCriticState[L], Metrics]:
         state = self.observe(state, rollout)
-        learned, metrics = self.practise(state.learned, state.replay, state.rewards, key)
+        replay = state.replay
+
+        def draw(key: PRNGKeyArray) -> tuple[Experience, Discount]:
+            return join(replay, replay.draw(key, self.batch_size), self.discount)
+
+        learned, metrics = self.practise(state.learned, draw, state.rewards, key)
         return eqx.tree_at(lambda s: s.learned, state, learned), metrics
 
     def practise(
-        self, learned: L, replay: Replay, rewards: Float[Array, "2"], key: PRNGKeyArray
+        self, learned: L, draw: Draw, rewards: Float[Array, "2"], key: PRNGKeyArray
     ) -> tuple[L, Metrics]:
-        """``gradient_steps`` gradient steps on batches from a buffer."""
+        """``gradient_steps`` gradient steps on batches that are drawn."""
 
         def update(learned: L, key: PRNGKeyArray) -> tuple[L, Metrics]:
-            sample_key, key = jax.random.split(key)
-            index = replay.draw(sample_key, self.batch_size)
-            batch = Batch(*join(replay, index, self.discount), rewards)
-            return self.update(learned, batch, key)
+            draw_key, key = jax.random.split(key)
+            return self.update(learned, Batch(*draw(draw_key), rewards), key)
 
         learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         return learned, {**metrics, "q": metrics["q"] / self.reward_scale}
@@ -262,14 +276,23 @@ class ActorCritic(Agent, Generic[L]):
         return networks.build(self._networks, task, observation, outputs, key)
 
     def build_critics(
-        self, task: Task, observation: PyTree, count: int, key: PRNGKeyArray
+        self, task: Task, observation: PyTree, count: int, key: PRNGKeyArray, *, late: bool = False
     ) -> Critics:
-        """Critics over the whole observation and an action."""
+        """Critics over the whole observation and an action.
+
+        late: the action enters at the second layer.
+        """
         assert not isinstance(task.actions, Discrete)
         action = uniform(task.actions, key, 1)[0]
         seen = sum(jnp.size(leaf) for leaf in jax.tree.leaves(observation))
         scale = jnp.broadcast_to(jnp.array(task.observation_scale), (seen,))
         gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
-        gains = jnp.append(gain, jnp.full(action.shape, 1 / task.actions.unit))
-        make = lambda key: Flat((observation, action), self.hidden, 1, key, gains)  # noqa: E731
+        both, unit = (observation, action), task.actions.unit
+        gains = jnp.append(gain, jnp.full(action.shape, 1 / unit))
+
+        def make(key: PRNGKeyArray) -> Network:
+            if late:
+                return LateAction(both, self.hidden, key, gain, 1 / unit)
+            return Flat(both, self.hidden, 1, key, gains)
+
         return Critics(make, count, Scale(self.value_rescaling), key)

@@ -16,13 +16,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.agents import actor_critic
-from qfolio.agents.actor_critic import ActorCritic, Batch, Critics, critic_loss
+from qfolio.agents.actor_critic import (
+    ActorCritic,
+    ActorCriticState,
+    Batch,
+    Critics,
+    State,
+    critic_loss,
+)
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require
-from qfolio.core.mdp import Box, Discrete, Metrics, Simplex, Task
+from qfolio.core.fields import constant, number, require, static
+from qfolio.core.mdp import Box, Discrete, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
-from qfolio.learning.networks import outputs_of, saturation
+from qfolio.learning.exploration import OrnsteinUhlenbeck
+from qfolio.learning.networks import outputs_of, saturation, with_last_layer
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import Scalar, follow
 
@@ -78,17 +86,33 @@ def actor_loss(
     return saturation_penalty * saturation(actor.actions, output, REACH).mean() - value, {}
 
 
+class DDPGState(ActorCriticState[Learned]):
+    noise: OrnsteinUhlenbeck | None  # that lasts; None: each step's is independent
+
+
 class DDPG(ActorCritic[Learned]):
     """A deterministic actor and a critic, both with targets that follow them."""
 
     exploration_noise: float = number(0.1)  # standard deviation of the noise, in units of the bound
+    noise_theta: float = constant(1.0)  # share of the noise that a step forgets; 1: independent
     saturation_penalty: float = number(0.1)  # on outputs where tanh is flat; 0: none
+    late_action: bool = static(False)  # it enters the critic at the second layer
+    critic_weight_decay: float = constant(0.0)  # price of half the critic's squared weights
+    last_layer_bound: float = constant(0.0)  # last layers start uniform in ± it; 0: in ±1/√inputs
 
     critics: ClassVar[int] = 1
 
     def __check_init__(self) -> None:
-        scales = "exploration_noise saturation_penalty"
+        scales = "exploration_noise saturation_penalty critic_weight_decay last_layer_bound"
         require(self, scales, lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "noise_theta", lambda x: 0 <= x <= 1, "between 0 and 1")
+
+    def init(self, task: Task, key: PRNGKeyArray) -> DDPGState:
+        start, noise = super().init(task, key), None
+        if self.noise_theta < 1:
+            shape = (self.num_envs, *start.replay.like.action.shape)
+            noise = OrnsteinUhlenbeck.begin(jax.random.split(key, 3)[2], shape)
+        return DDPGState(start.learned, start.replay, start.steps, start.rewards, noise)
 
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
         if isinstance(task.actions, Discrete):
@@ -100,7 +124,12 @@ class DDPG(ActorCritic[Learned]):
         actor_key, critic_key = jax.random.split(key)
         network = self.build(task, observation, outputs_of(task.actions), actor_key)
         actor = Actor(network, task.actions)
-        critics = self.build_critics(task, observation, self.critics, critic_key)
+        count, late = self.critics, self.late_action
+        critics = self.build_critics(task, observation, count, critic_key, late=late)
+        if bound := self.last_layer_bound:
+            both = lambda x: (x[0].network, x[1].networks)  # noqa: E731
+            small = lambda network: with_last_layer(network, bound)  # noqa: E731
+            actor, critics = eqx.tree_at(both, (actor, critics), replace_fn=small)
         begin = optimizer.begin
         return Learned(actor, critics, critics, begin(actor), begin(critics), actor)
 
@@ -108,11 +137,22 @@ class DDPG(ActorCritic[Learned]):
         return weights(observation)
 
     def explore(
-        self, learned: Learned, observation: PyTree, key: PRNGKeyArray
+        self, state: ActorCriticState[Learned], observation: PyTree, key: PRNGKeyArray
     ) -> Float[Array, "batch entry"]:
-        action = learned.actor(observation)
-        noise = self.exploration_noise * jax.random.normal(key, action.shape)
-        return learned.actor.perturb(action, noise)
+        assert isinstance(state, DDPGState)
+        actor = state.learned.actor
+        action = actor(observation)
+        lasting = state.noise
+        noise = jax.random.normal(key, action.shape) if lasting is None else lasting.value
+        return actor.perturb(action, self.exploration_noise * noise)
+
+    def observe(self, state: State, rollout: Transition) -> State:
+        state = super().observe(state, rollout)
+        if isinstance(state, DDPGState) and state.noise is not None:
+            finished = (rollout.terminated | rollout.truncated)[-1]
+            noise = state.noise.step(self.noise_theta, finished)
+            state = eqx.tree_at(lambda s: s.noise, state, noise)
+        return state
 
     def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
         learned, metrics = self.evaluate(learned, batch, key)
@@ -133,6 +173,7 @@ class DDPG(ActorCritic[Learned]):
             batch.steps,
             target,
             self.huber_delta,
+            self.critic_weight_decay,
         )
         learned = eqx.tree_at(lambda x: (x.critics, x.critic_adam), learned, (critics, adam))
         return learned, metrics

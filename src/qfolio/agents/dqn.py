@@ -31,10 +31,10 @@ from qfolio.core.fields import constant, number, require, sizes, static
 from qfolio.core.mdp import Agent, Discrete, ExogenousTask, Metrics, Task, Transition
 from qfolio.learning import heads, optimizer
 from qfolio.learning.distributional import ValueConfig, Values
-from qfolio.learning.exploration import EpsilonSchedule, epsilon_greedy
+from qfolio.learning.exploration import EpsilonSchedule, LinearSchedule, epsilon_greedy
 from qfolio.learning.heads import HeadConfig
 from qfolio.learning.networks import Network, NetworkConfig
-from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.priorities import ImportanceSchedule, Priorities
 from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
 from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
@@ -48,7 +48,7 @@ class DQNState(eqx.Module):
     optimizer: optimizer.Optimizer
     replay: Replay
     episodes: Int[Array, ""]  # finished; ε follows it
-    steps: Int[Array, ""]  # of each environment; the target network follows them
+    steps: Int[Array, ""]  # of each environment; the target network follows them, and a linear ε
 
 
 Learned = tuple[Network, optimizer.Optimizer, Priorities | None]
@@ -70,7 +70,8 @@ class DQN(Agent):
     num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     batch_size: int = static(64)
-    gradient_steps: int = static(1)  # gradient steps per step of all environments
+    train_freq: int = static(1)  # steps of all environments between times of learning
+    gradient_steps: int = static(1)  # gradient steps each time
     replay_capacity: int = static(50_000)  # transitions
     learning_starts: int = static(64)  # transitions stored before learning
     double: bool = static(False)
@@ -95,9 +96,13 @@ class DQN(Agent):
     learning_rate: float = number(1e-3)
     learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
+    optimizer: str = static("adam")  # or rmsprop, rmsprop-centered, sgd
+    rmsprop_decay: float = constant(0.95)  # share of the squared gradients' mean that a step keeps
+    optimizer_epsilon: float = constant(1e-8)  # added to what a gradient is divided by
     epsilon_start: float = number(1.0)
     epsilon_end: float = number(0.01)
     epsilon_decay: float = number(0.995)  # factor per finished episode
+    epsilon_steps: float = constant(0.0)  # steps of a linear fall of ε; 0: epsilon_decay holds
     persistence: float = constant(0.0)  # share of exploring steps that repeat the last action
     huber_delta: float = number(math.inf)  # |TD error| beyond which the loss is linear
     reward_scale: float = number(1.0)  # the network learns values of scaled rewards
@@ -110,16 +115,23 @@ class DQN(Agent):
         self._replay.check()
         self._networks.check()
         self._schedule.check()
+        self._optimizer.check()
         self._value_config.check()
-        require(self, "gradient_steps", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        counts = "train_freq gradient_steps target_update_interval"
+        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "importance_steps", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-        require(self, "target_update_interval", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "epsilon_steps", lambda x: 0 <= x <= 1e30, "from 0 to 1e30")
         fractions = "discount tau epsilon_start epsilon_end epsilon_decay persistence"
         exponents = " priority_exponent importance_exponent"
         require(self, fractions + exponents, lambda x: 0 <= x <= 1, "between 0 and 1")
+        if self.persistence and self.train_freq > 1:
+            raise QfolioError(
+                f"train_freq is {self.train_freq}, and persistence needs the last action at each "
+                "step; set train_freq=1 or persistence=0."
+            )
         if self.all_actions:
             hindsight.require_plain({name: getattr(self, name) for name in hindsight.PLAIN})
         if self.market_baseline and self.batch_size < 2:
@@ -144,14 +156,20 @@ class DQN(Agent):
         return HeadConfig(self._values.atoms, self.dueling, noise)
 
     @property
+    def _optimizer(self) -> OptimizerConfig:
+        return OptimizerConfig(self.optimizer, self.rmsprop_decay, self.optimizer_epsilon)
+
+    @property
     def _schedule(self) -> CosineSchedule:
         return CosineSchedule(
             self.learning_rate, self.learning_rate_final, self.learning_rate_steps
         )
 
-    @property
-    def _epsilon(self) -> EpsilonSchedule:
-        return EpsilonSchedule(self.epsilon_start, self.epsilon_end, self.epsilon_decay)
+    def _epsilon(self, state: DQNState) -> Float[Array, ""]:
+        start, end = self.epsilon_start, self.epsilon_end
+        if self.epsilon_steps:
+            return LinearSchedule(start, end, self.epsilon_steps)(1.0 * self.num_envs * state.steps)
+        return EpsilonSchedule(start, end, self.epsilon_decay)(state.episodes)
 
     @property
     def _importance(self) -> ImportanceSchedule:
@@ -187,17 +205,21 @@ class DQN(Agent):
         return DQNState(
             online=online,
             target=online,
-            optimizer=optimizer.begin(online),
+            optimizer=optimizer.begin(online, self._optimizer),
             replay=self._replay.empty(row),
             episodes=zero,
             steps=zero,
         )
 
+    @property
+    def rollout_steps(self) -> int:
+        return self.train_freq
+
     def warm_up(self) -> int:
         return self._replay.warm_up
 
     def monitor(self, state: DQNState) -> Metrics:
-        return {"epsilon": self._epsilon(state.episodes)}
+        return {"epsilon": self._epsilon(state)}
 
     def carry_over(self, state: DQNState, fresh: DQNState) -> DQNState:
         return eqx.tree_at(lambda s: s.replay, state, fresh.replay)
@@ -219,7 +241,7 @@ class DQN(Agent):
         if self.noisy:
             key, noise_key = jax.random.split(key)
             online = heads.draw_noise(online, noise_key)
-        epsilon = self._epsilon(state.episodes)
+        epsilon = self._epsilon(state)
         last = state.replay.latest().action if self.persistence else None
         return epsilon_greedy(key, self._q(online, observation), epsilon, last, self.persistence)
 
@@ -238,7 +260,11 @@ class DQN(Agent):
         return eqx.tree_at(
             lambda s: (s.replay, s.episodes, s.steps),
             state,
-            (state.replay.add(stored), state.episodes + finished, state.steps + 1),
+            (
+                state.replay.extend(stored),
+                state.episodes + finished,
+                state.steps + self.train_freq,
+            ),
         )
 
     def learn(
@@ -249,7 +275,7 @@ class DQN(Agent):
         learned = (state.online, state.optimizer, state.replay.priorities)
         learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         online, adam, priorities = learned
-        due = state.steps % self.target_update_interval == 0
+        due = state.steps % self.target_update_interval < self.train_freq
         rate = self.tau if self.target_update_interval == 1 else jnp.where(due, self.tau, 0)
         target = follow(state.target, online, rate)
         replay = dataclasses.replace(state.replay, priorities=priorities)

@@ -2,33 +2,45 @@
 
 An ensemble of networks learns from all real transitions how an action changes the observation, its
 reward, and whether the episode ends. From real observations the model then imagines a few steps of
-the policy, each predicted by a random member, and soft actor-critic learns from these steps.
-Members differ in their initial weights and data: each counts a real transition 0, 1, 2, … times
-(on-line bootstrap, Oza & Russell 2001). docs/model_based.md lists formulas and deviations.
+the policy, each predicted by a random member, and soft actor-critic learns from these steps, and
+from a share of real ones if one is set. Members differ in their initial weights and data: each
+counts a real transition 0, 1, 2, … times (on-line bootstrap, Oza & Russell 2001).
+docs/model_based.md lists formulas and deviations.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, PRNGKeyArray, UInt32
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
 from qfolio.agents.actor_critic import ActorCriticState, State
 from qfolio.agents.sac import SAC, Learned
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require, require_sizes, sizes, static
+from qfolio.core.fields import constant, number, require, require_sizes, sizes, static
 from qfolio.core.mdp import Actions, Discrete, Metrics, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.encoders import MLP
 from qfolio.learning.exploration import uniform
-from qfolio.learning.replay import Experience, Replay
+from qfolio.learning.replay import Discount, Experience, Replay
 from qfolio.learning.targets import squash, unsquash
 
 GAIN = 3.0
 """Gain of the model's first layer: inputs within ±1 should reach the bend of SiLU."""
+
+LOG_VARIANCE = (-10.0, 0.5)
+"""Where a predicted log variance is kept, softly (the first bounds of Chua et al. 2018)."""
+
+
+class Prediction(NamedTuple):
+    """Of every member."""
+
+    mean: Float[Array, "member batch seen+2"]
+    log_variance: Float[Array, "member batch seen+2"] | None  # None: no distribution
 
 
 class Model(eqx.Module):
@@ -37,16 +49,18 @@ class Model(eqx.Module):
     Their inputs are observations and actions scaled to ±1; they predict the change of the
     observation in units of its range, the reward's root, and whether the episode ends (as a number,
     0 or 1). Small rewards matter once large ones are avoided, and a root resolves them better.
+    gaussian: the outputs are the means of normal distributions and as many log variances.
     """
 
     members: Callable[[Array], Array]
     scale: Float[Array, " seen"]  # range of each component of an observation
     actions: Actions
+    gaussian: bool = eqx.field(static=True, default=False)
 
     def __call__(
         self, observation: Float[Array, "batch seen"], action: Array
-    ) -> Float[Array, "member batch seen+2"]:
-        """Every member's prediction."""
+    ) -> Float[Array, "member batch outputs"]:
+        """What every member's network gives."""
         if isinstance(self.actions, Discrete):
             action = jax.nn.one_hot(action, self.actions.n)
         else:
@@ -54,17 +68,37 @@ class Model(eqx.Module):
         inputs = jnp.concatenate([observation / self.scale, action], -1)
         return jax.vmap(lambda member: member(inputs))(self.members)
 
+    def predict(self, observation: Float[Array, "batch seen"], action: Array) -> Prediction:
+        outputs = self(observation, action)
+        if not self.gaussian:
+            return Prediction(outputs, None)
+        mean, log_variance = jnp.split(outputs, 2, -1)
+        low, high = LOG_VARIANCE
+        log_variance = high - jax.nn.softplus(high - log_variance)
+        return Prediction(mean, low + jax.nn.softplus(log_variance - low))
+
     def truth(self, step: Experience) -> Float[Array, "batch seen+2"]:
         """The true values of a prediction."""
         change = (step.next_observation - step.observation) / self.scale
         return jnp.column_stack([change, squash(step.reward), step.terminal])
 
     def imagine(
-        self, observation: Float[Array, "batch seen"], action: Array, key: PRNGKeyArray
+        self,
+        observation: Float[Array, "batch seen"],
+        action: Array,
+        among: Int[Array, " elite"],
+        key: PRNGKeyArray,
     ) -> Experience:
-        """A step of each row, as a random member predicts it."""
-        expected = self(observation, action)
-        member = jax.random.randint(key, expected.shape[1:2], 0, len(expected))
+        """A step of each row, as a random member of ``among`` predicts it.
+
+        Members that predict distributions draw from them.
+        """
+        expected, log_variance = self.predict(observation, action)
+        if log_variance is not None:
+            key, noise_key = jax.random.split(key)
+            noise = jax.random.normal(noise_key, expected.shape[1:])
+            expected += jnp.exp(log_variance / 2) * noise
+        member = among[jax.random.randint(key, expected.shape[1:2], 0, len(among))]
         drawn = expected[member, jnp.arange(len(member))]
         change, root, terminal = drawn[:, :-2], drawn[:, -2], drawn[:, -1] > 0.5
         follows = observation + self.scale * change
@@ -74,12 +108,37 @@ class Model(eqx.Module):
 def model_loss(
     model: Model, step: Experience, counts: Float[Array, "batch member"]
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Squared errors relative to the batch's variance, weighted by each member's counts."""
-    truth = model.truth(step)
-    unit = jnp.maximum(truth.std(0), 1e-2).at[-1].set(1.0)
-    errors = ((model(step.observation, step.action) - truth) / unit) ** 2
+    """Mean error of all members, weighted by each member's counts.
+
+    Squared errors are relative to the batch's variance; if members predict normal distributions,
+    errors are twice the negative log likelihood, up to a constant.
+    """
+    prediction = model.predict(step.observation, step.action)
+    if prediction.log_variance is None:
+        errors = squared_errors(model, prediction, step)
+    else:
+        error = prediction.mean - model.truth(step)
+        errors = error**2 * jnp.exp(-prediction.log_variance) + prediction.log_variance
     loss = (counts.T * errors.mean(-1)).mean(1).sum()
     return loss, {"model_loss": errors.mean()}
+
+
+def squared_errors(
+    model: Model, prediction: Prediction, step: Experience
+) -> Float[Array, "member batch seen+2"]:
+    """Of the means, relative to the batch's variance."""
+    truth = model.truth(step)
+    unit = jnp.maximum(truth.std(0), 1e-2).at[-1].set(1.0)
+    return ((prediction.mean - truth) / unit) ** 2
+
+
+def best_members(
+    model: Model, step: Experience, counts: Float[Array, "batch member"], elites: int
+) -> Int[Array, " elite"]:
+    """The members with the least squared errors on steps that they have not learned from."""
+    prediction = model.predict(step.observation, step.action)
+    errors = squared_errors(model, prediction, step).mean(-1)
+    return jnp.argsort(errors.mean(1, where=counts.T == 0))[:elites]
 
 
 class Remembered(NamedTuple):
@@ -99,21 +158,27 @@ class MBPOState(ActorCriticState[Learned]):
 
 
 class MBPO(SAC):
-    """Soft actor-critic that learns only from steps of a learned model."""
+    """Soft actor-critic that learns from the steps of a learned model."""
 
     ensemble_size: int = static(5)  # networks in the ensemble
+    elites: int = static(0)  # members that imagine, those with the least error; 0: all
+    gaussian_model: bool = static(False)  # members predict normal distributions; false: means
     model_hidden: tuple[int, ...] = sizes(128, 128)
     model_updates: int = static(4)  # gradient steps of the model per step of all environments
     model_learning_rate_ratio: float = number(1.0)  # its learning rate, as a share of the critics'
     model_rollout_batch: int = static(64)  # real observations that rollouts of the model start from
     model_rollout_length: int = static(5)  # steps of each
     model_replay_capacity: int = static(100_000)  # steps of the model that are kept
+    real_ratio: float = constant(0.0)  # share of real steps in a batch of soft actor-critic
 
     def __check_init__(self) -> None:
         counts = "ensemble_size model_updates model_rollout_batch model_rollout_length"
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "model_replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         require(self, "model_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        wanted = "from 0 to ensemble_size"
+        require(self, "elites", lambda x: 0 <= x <= self.ensemble_size, wanted)
+        require(self, "real_ratio", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "n_steps", lambda x: x == 1, "1: imagined steps are single")
         require_sizes(self, "model_hidden")
 
@@ -127,12 +192,14 @@ class MBPO(SAC):
             )
         actions = task.actions
         entries = actions.n if isinstance(actions, Discrete) else uniform(actions, key, 1).shape[1]
-        layers = (observation.size + entries, *self.model_hidden, observation.size + 2)
+        outputs = (observation.size + 2) * (2 if self.gaussian_model else 1)
+        layers = (observation.size + entries, *self.model_hidden, outputs)
         make = lambda key: MLP(layers, key, GAIN, "silu")  # noqa: E731
         model = Model(
             jax.vmap(make)(jax.random.split(model_key, self.ensemble_size)),
             jnp.broadcast_to(jnp.array(task.observation_scale), observation.shape),
             actions,
+            self.gaussian_model,
         )
         start = super().init(task, key)
         step = jax.tree.map(lambda x: x[0], start.replay.unpack(start.replay.rows[:1]))
@@ -163,7 +230,8 @@ class MBPO(SAC):
         model_key, imagine_key, key = jax.random.split(key, 3)
         model, model_adam, metrics = self._study(now, model_key)
         imagined = self._imagine(model, now, imagine_key)
-        learned, more = self.practise(now.learned, imagined, now.rewards, key)
+        draw = partial(self._draw, now.replay, imagined)
+        learned, more = self.practise(now.learned, draw, now.rewards, key)
         now = MBPOState(
             learned, now.replay, now.steps, now.rewards, model, model_adam, imagined,
             now.bootstrap_key,
@@ -194,18 +262,34 @@ class MBPO(SAC):
     def _imagine(self, model: Model, state: MBPOState, key: PRNGKeyArray) -> Replay:
         """The buffer of imagined steps, with new ones of the current policy and model."""
         start_key, key = jax.random.split(key)
+        among = jnp.arange(self.ensemble_size)
+        if self.elites:
+            start_key, elite_key = jax.random.split(start_key)
+            judged = state.replay.sample(elite_key, self.batch_size)
+            among = best_members(model, judged.step, judged.counts, self.elites)
         starts = state.replay.sample(start_key, self.model_rollout_batch).step.observation
 
         def step(
             observation: Float[Array, "batch seen"], key: PRNGKeyArray
         ) -> tuple[Float[Array, "batch seen"], Experience]:
             act_key, key = jax.random.split(key)
-            action = self.explore(state.learned, observation, act_key)
-            step = model.imagine(observation, action, key)
+            action = self.explore(state, observation, act_key)
+            step = model.imagine(observation, action, among, key)
             return jnp.where(step.terminal[:, None], starts, step.next_observation), step
 
         _, steps = lax.scan(step, starts, jax.random.split(key, self.model_rollout_length))
         return state.imagined.add(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps))
+
+    def _draw(
+        self, replay: Replay, imagined: Replay, key: PRNGKeyArray
+    ) -> tuple[Experience, Discount]:
+        """A batch of imagined steps, and first the real ones among them."""
+        real = round(self.real_ratio * self.batch_size)
+        if not real:
+            return imagined.sample(key, self.batch_size), self.discount
+        real_key, key = jax.random.split(key)
+        both = replay.sample(real_key, real).step, imagined.sample(key, self.batch_size - real)
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *both), self.discount
 
     def carry_over(self, state: State, fresh: State) -> State:
         assert isinstance(fresh, MBPOState)

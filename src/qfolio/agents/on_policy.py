@@ -7,19 +7,19 @@ how. docs/policy_gradients.md has the formulas.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from qfolio.core.fields import number, require, sizes, static
+from qfolio.core.fields import constant, number, require, sizes, static
 from qfolio.core.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
-from qfolio.learning.networks import Flat, Network, NetworkConfig, Outputs, outputs_of, saturation
-from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.networks import Network, NetworkConfig, Outputs, outputs_of, saturation
+from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.targets import Scalar, advantages
 
 REACH = 2.0
@@ -63,6 +63,8 @@ class OnPolicy(Agent):
 
     network: str = static("flat")  # over everything observed; or mlp, cnn, rnn, shared by assets
     hidden: tuple[int, ...] = sizes(64, 64)  # of the actor, and of the critic
+    activation: str = static("relu")  # of the hidden units; or tanh, silu
+    initialization: str = static("uniform")  # in ±1/√inputs; or orthogonal
     num_envs: int = static(8)  # stepped side by side
     rollout_length: int = static(128)  # steps of each environment that are learned from at once
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
@@ -70,6 +72,9 @@ class OnPolicy(Agent):
     learning_rate: float = number(3e-4)
     learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
+    optimizer: str = static("adam")  # or rmsprop, rmsprop-centered, sgd
+    rmsprop_decay: float = constant(0.99)  # of the running mean of squared gradients
+    optimizer_epsilon: float = constant(1e-8)  # added to the divisor of a gradient
     max_grad_norm: float = number(0.5)  # longer gradients are rescaled to it
     value_coef: float = number(0.5)  # of the critic's mean squared error in the loss
     entropy_coef: float = number(0.0)  # of the policy's entropy, which the loss rewards
@@ -92,11 +97,18 @@ class OnPolicy(Agent):
         require(self, "initial_std", lambda x: 1e-9 <= x <= 1e9, "from 10⁻⁹ to 10⁹")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         self._schedule.check()
+        self._optimizer.check()
         self._networks.check()
 
     @property
     def _networks(self) -> NetworkConfig:
-        return NetworkConfig(self.network, self.hidden, self.input_gain)
+        return NetworkConfig(
+            self.network, self.hidden, self.input_gain, self.activation, self.initialization
+        )
+
+    @property
+    def _optimizer(self) -> OptimizerConfig:
+        return OptimizerConfig(self.optimizer, self.rmsprop_decay, self.optimizer_epsilon)
 
     @property
     def _schedule(self) -> CosineSchedule:
@@ -115,13 +127,15 @@ class OnPolicy(Agent):
         def build(outputs: Outputs, key: PRNGKeyArray) -> Network:
             return networks.build(self._networks, task, observation, outputs, key)
 
+        actor = build(outputs_of(task.actions), actor_key)
         weights = PolicyAndValue(
-            actor=_zero_output(build(outputs_of(task.actions), actor_key)),
+            # A last layer of zeros: the first policy is the same everywhere.
+            actor=eqx.tree_at(networks.last_layer, actor, replace_fn=jnp.zeros_like),
             log_std=jnp.full(_coordinates(task.actions), jnp.log(self.initial_std)),
             critic=build(Outputs(1), critic_key),
             actions=task.actions,
         )
-        return OnPolicyState(weights, optimizer.begin(weights))
+        return OnPolicyState(weights, optimizer.begin(weights, self._optimizer))
 
     def warm_up(self) -> int:
         return 0
@@ -208,13 +222,3 @@ def normalized(
 def _coordinates(actions: Actions) -> int:
     """The number of a policy's standard deviations; discrete policies have none."""
     return actions.n if isinstance(actions, Box) else int(isinstance(actions, Simplex))
-
-
-def _zero_output(network: Network) -> Network:
-    """The network with an output layer of zeros: the first policy is the same everywhere."""
-
-    def last(network: Network) -> Any:  # equinox passes networks of placeholders
-        mlp = network.mlp if isinstance(network, Flat) else network.network.head
-        return mlp.weights[-1], mlp.biases[-1]
-
-    return eqx.tree_at(last, network, replace_fn=jnp.zeros_like)

@@ -160,8 +160,10 @@ class SAC(ActorCritic[Learned]):
             return None
         return weights.critics.every(observation).min(0) / self.reward_scale
 
-    def explore(self, learned: Learned, observation: PyTree, key: PRNGKeyArray) -> Array:
-        return learned.actor(observation).sample(key)
+    def explore(
+        self, state: ActorCriticState[Learned], observation: PyTree, key: PRNGKeyArray
+    ) -> Array:
+        return state.learned.actor(observation).sample(key)
 
     def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
         next_key, key = jax.random.split(key)

@@ -18,15 +18,20 @@ from qfolio.core.errors import QfolioError
 Gain = Float[Array, "*inputs"] | float
 """Factors of an encoder's first weights, one for each channel or for all."""
 
-ACTIVATIONS = {"relu": jax.nn.relu, "silu": jax.nn.silu}
+ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "silu": jax.nn.silu}
 """Activations by name: jax's functions cannot be pickled."""
+
+
+INITIALIZATIONS = ("uniform", "orthogonal")
+"""How layers start, by name."""
 
 
 class MLP(eqx.Module):
     """Fully connected layers with an activation between them and none after the last.
 
-    Weights and biases start uniform in ±1/√inputs (LeCun et al. 1998, section 4.6, up to √3); the
-    first layer's weights are multiplied by ``input_gain``, one factor for each input.
+    Weights and biases start uniform in ±1/√inputs (LeCun et al. 1998, section 4.6, up to √3), or
+    ``orthogonal``: weights times √2 (the last layer's times 1), and biases of 0 (Saxe et al. 2014).
+    The first layer's weights are multiplied by ``input_gain``, one factor for each input.
     """
 
     weights: list[Float[Array, "inputs outputs"]]
@@ -39,6 +44,7 @@ class MLP(eqx.Module):
         key: PRNGKeyArray,
         input_gain: Float[Array, "*inputs"] | float = 1.0,
         activation: str = "relu",
+        initialization: str = "uniform",
     ) -> None:
         self.weights, self.biases, self.activation = [], [], activation
         for inputs, outputs in pairwise(sizes):
@@ -46,6 +52,11 @@ class MLP(eqx.Module):
             bound = inputs**-0.5
             self.weights.append(uniform(weight_key, (inputs, outputs), bound))
             self.biases.append(uniform(bias_key, (outputs,), bound))
+            if initialization == "orthogonal":
+                last = len(self.weights) == len(sizes) - 1
+                draw = jax.nn.initializers.orthogonal(1.0 if last else math.sqrt(2))
+                self.weights[-1] = draw(weight_key, (inputs, outputs))
+                self.biases[-1] = jnp.zeros(outputs)
         self.weights[0] = jnp.broadcast_to(input_gain, sizes[:1])[:, None] * self.weights[0]
 
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:

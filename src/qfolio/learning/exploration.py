@@ -1,10 +1,11 @@
-"""Exploration: ε-greedy, or by uniformly drawn actions."""
+"""Exploration: ε-greedy, by correlated noise, or by uniformly drawn actions."""
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from qfolio.core.mdp import Actions, Discrete, Simplex
 from qfolio.learning.targets import Scalar
@@ -20,6 +21,19 @@ class EpsilonSchedule(NamedTuple):
     def __call__(self, episodes: Int[Array, ""]) -> Float[Array, ""]:
         """ε after this many finished episodes."""
         return jnp.maximum(self.epsilon_end, self.epsilon_start * self.epsilon_decay**episodes)
+
+
+class LinearSchedule(NamedTuple):
+    """ε, which falls along a line and then stays (Mnih et al. 2015)."""
+
+    epsilon_start: Scalar
+    epsilon_end: Scalar
+    epsilon_steps: Scalar  # steps until it stays
+
+    def __call__(self, steps: Float[Array, ""]) -> Float[Array, ""]:
+        """ε after so many steps."""
+        left = jnp.maximum(1 - steps / self.epsilon_steps, 0.0)
+        return self.epsilon_end + left * (self.epsilon_start - self.epsilon_end)
 
 
 def epsilon_greedy(
@@ -45,6 +59,25 @@ def epsilon_greedy(
     drawn = jax.random.uniform(key, greedy.shape)
     explored = jnp.minimum(drawn / jnp.maximum(epsilon, 1e-30) * n, n - 1).astype(jnp.int32)
     return jnp.where(drawn < epsilon, explored, greedy)
+
+
+class OrnsteinUhlenbeck(eqx.Module):
+    """Noise that lasts: x ← (1 − θ) x + N(0, 1), from 0 in each episode (Lillicrap et al. 2016)."""
+
+    value: Float[Array, "environment entry"]  # of the next actions
+    key: UInt32[Array, "2"]
+
+    @staticmethod
+    def begin(key: PRNGKeyArray, shape: tuple[int, int]) -> "OrnsteinUhlenbeck":
+        noise = OrnsteinUhlenbeck(jnp.zeros(shape), jax.random.key_data(key))
+        return noise.step(1.0, jnp.ones(shape[0], bool))
+
+    def step(self, theta: Scalar, finished: Bool[Array, " environment"]) -> "OrnsteinUhlenbeck":
+        """The noise of the step behind one that may have ended its episode."""
+        key, draw_key = jax.random.split(jax.random.wrap_key_data(self.key))
+        kept = jnp.where(finished[:, None], 0.0, (1 - theta) * self.value)
+        drawn = jax.random.normal(draw_key, kept.shape)
+        return OrnsteinUhlenbeck(kept + drawn, jax.random.key_data(key))
 
 
 def uniform(actions: Actions, key: PRNGKeyArray, n: int) -> Array:

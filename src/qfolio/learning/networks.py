@@ -12,7 +12,16 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require, require_sizes
 from qfolio.core.market import MenuActions, View
 from qfolio.core.mdp import Actions, Box, Discrete, Simplex, Task
-from qfolio.learning.encoders import CNN, LSTM, MLP, RNN, Window, uniform
+from qfolio.learning.encoders import (
+    ACTIVATIONS,
+    CNN,
+    INITIALIZATIONS,
+    LSTM,
+    MLP,
+    RNN,
+    Window,
+    uniform,
+)
 from qfolio.learning.targets import Scalar
 
 
@@ -30,15 +39,44 @@ class Flat(eqx.Module):
     def __init__(
         self, observation: PyTree, hidden: tuple[int, ...], outputs: int, key: PRNGKeyArray,
         input_gain: Float[Array, "*inputs"] | float = 1.0, states: int | None = None,
-        encoder: CNN | RNN | LSTM | None = None,
+        encoder: CNN | RNN | LSTM | None = None, activation: str = "relu",
+        initialization: str = "uniform",
     ) -> None:  # fmt: skip
         self.states, self.encoder = states, encoder
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], observation)
         inputs = jax.eval_shape(lambda: _rows(batch, states, encoder)).shape[1]
-        self.mlp = MLP((inputs, *hidden, outputs), key, input_gain)
+        sizes = (inputs, *hidden, outputs)
+        self.mlp = MLP(sizes, key, input_gain, activation, initialization)
 
     def __call__(self, observation: PyTree) -> Float[Array, "batch outputs"]:
         return self.mlp(_rows(observation, self.states, self.encoder))
+
+
+class LateAction(eqx.Module):
+    """An MLP over an observation; an action enters at its second layer (Lillicrap et al. 2016)."""
+
+    first: Flat  # over the observation alone
+    later: Flat
+
+    def __init__(
+        self, seen: tuple[PyTree, Array], hidden: tuple[int, ...], key: PRNGKeyArray,
+        gain: Float[Array, "*inputs"] | float, action_gain: float,
+    ) -> None:  # fmt: skip
+        """seen: an observation and an action."""
+        (observation, action), (width, *rest) = seen, hidden
+        first_key, later_key = jax.random.split(key)
+        self.first = Flat(observation, (), width, first_key, gain)
+        gains = jnp.append(jnp.ones(width), jnp.full(action.shape, action_gain))
+        self.later = Flat((gains[:width], action), tuple(rest), 1, later_key, gains)
+
+    @property
+    def mlp(self) -> MLP:
+        """The layers that give the output."""
+        return self.later.mlp
+
+    def __call__(self, seen: tuple[PyTree, Array]) -> Float[Array, "batch 1"]:
+        observation, action = seen
+        return self.later((jax.nn.relu(self.first(observation)), action))
 
 
 def _rows(
@@ -146,7 +184,7 @@ KINDS = ("flat", *SHARED)
 _READS = {"cnn": (2, 3), "rnn": (2,), "lstm": (2,)}
 """Dimensions of an encoder's input: (time, channel), or (height, width, channel)."""
 
-Network = Flat | PerAsset
+Network = Flat | LateAction | PerAsset
 
 
 class NetworkConfig(NamedTuple):
@@ -155,12 +193,21 @@ class NetworkConfig(NamedTuple):
     network: str  # flat, an encoder of windows or images, or in markets one that assets share
     hidden: tuple[int, ...]  # units of each hidden layer
     input_gain: Scalar = 0.0  # of the first layer, for observations scaled to ±1; 0: unscaled
+    activation: str = "relu"  # of the hidden units; relu unless the network is flat
+    initialization: str = "uniform"  # uniform unless the network is flat
 
     def check(self) -> None:
         """Raises QfolioError if the settings are invalid."""
         require(self, "network", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
         require_sizes(self)
         require(self, "input_gain", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        kinds = ", ".join(ACTIVATIONS)
+        require(self, "activation", lambda x: x in ACTIVATIONS, f"one of {kinds}")
+        kinds = ", ".join(INITIALIZATIONS)
+        require(self, "initialization", lambda x: x in INITIALIZATIONS, f"one of {kinds}")
+        if self.network != "flat":
+            require(self, "activation", lambda x: x == "relu", "relu unless network=flat")
+            require(self, "initialization", lambda x: x == "uniform", "uniform unless network=flat")
 
 
 class Outputs(NamedTuple):
@@ -192,6 +239,18 @@ def saturation(
     return (jnp.maximum(jnp.abs(output) - reach, 0.0) ** 2).sum(-1)
 
 
+def last_layer(network: Any) -> Any:
+    """Weights and biases of the layer that gives the outputs."""
+    mlp = network.network.head if isinstance(network, PerAsset) else network.mlp
+    return mlp.weights[-1], mlp.biases[-1]
+
+
+def with_last_layer(network: Network, bound: float) -> Network:
+    """The network as it begins, but with a last layer that is uniform in ±``bound``."""
+    factor = bound * math.sqrt(last_layer(network)[0].shape[-2])
+    return eqx.tree_at(last_layer, network, replace_fn=lambda x: factor * x)
+
+
 def build(
     config: NetworkConfig,
     task: Task,
@@ -205,13 +264,16 @@ def build(
     effect on a network that assets share. observation: an example. Raises QfolioError if the kind
     of network does not fit the observation.
     """
-    kind, hidden, input_gain = config
+    kind, hidden, input_gain, activation, initialization = config
     # Small weights on a bounded observation make a function too smooth for some tasks.
     gain = jnp.where(input_gain > 0, input_gain / jnp.array(task.observation_scale), 1.0)
     if kind == "flat":
         assets = observation.holding.shape[-1] if isinstance(observation, View) else 0
         count = outputs.pooled + assets * outputs.each
-        return Flat(observation, hidden, count, key, gain, task.states)
+        return Flat(
+            observation, hidden, count, key, gain, task.states,
+            activation=activation, initialization=initialization,
+        )  # fmt: skip
     if not isinstance(observation, View):
         shape = jnp.shape(observation) if isinstance(observation, Array) else ()
         if kind not in _READS or len(shape) not in _READS[kind]:

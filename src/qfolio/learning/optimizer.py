@@ -1,8 +1,12 @@
-"""Adam (Kingma & Ba 2015) with a cosine learning rate (Loshchilov & Hutter 2017)."""
+"""Gradient steps: Adam (Kingma & Ba 2015), or RMSProp and plain descent where a paper has them.
+
+The learning rate follows a cosine (Loshchilov & Hutter 2017).
+"""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -15,7 +19,50 @@ from qfolio.learning.targets import Scalar
 
 Weights = TypeVar("Weights", bound=PyTree)
 
-Optimizer: TypeAlias = optax.ScaleByAdamState
+KINDS = ("adam", "rmsprop", "rmsprop-centered", "sgd")
+"""Optimisers by name: RMSProp as in Mnih et al. (2016), or centred as in Mnih et al. (2015)."""
+
+
+class OptimizerConfig(NamedTuple):
+    """What an agent's settings say of its optimiser; the names are those of the settings."""
+
+    optimizer: str = "adam"
+    rmsprop_decay: float = 0.99  # share of the mean (of squared gradients) that a step keeps
+    optimizer_epsilon: float = 1e-8  # added to what a gradient is divided by
+
+    def check(self) -> None:
+        """Raises QfolioError where the settings make no sense."""
+        require(self, "optimizer", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
+        require(self, "rmsprop_decay", lambda x: 0 <= x < 1, "at least 0 and below 1")
+        require(self, "optimizer_epsilon", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+
+
+ADAM = OptimizerConfig()
+
+
+class Optimizer(eqx.Module):
+    """What an optimiser remembers; what its kind does not need stays zero."""
+
+    count: Int[Array, ""]  # gradient steps so far
+    mu: PyTree  # means of the gradients
+    nu: PyTree  # and of their squares
+    config: OptimizerConfig = eqx.field(static=True)
+
+    def direction(self, gradient: Weights) -> tuple[Weights, "Optimizer"]:
+        """Where to go, and what is remembered then."""
+        kind, decay, epsilon = self.config
+        if kind == "adam":
+            state = optax.ScaleByAdamState(self.count, self.mu, self.nu)
+            direction, state = optax.scale_by_adam(eps=epsilon).update(gradient, state)
+            return direction, Optimizer(state.count, state.mu, state.nu, self.config)
+        direction, mu, nu = gradient, self.mu, self.nu
+        if kind != "sgd":
+            mean = lambda old, new: decay * old + (1 - decay) * new  # noqa: E731
+            nu = jax.tree.map(lambda n, g: mean(n, g**2), nu, gradient)
+            mu = jax.tree.map(mean, mu, gradient) if kind == "rmsprop-centered" else mu
+            scaled = lambda g, m, n: g / jnp.sqrt(jnp.maximum(n - m**2, 0) + epsilon)  # noqa: E731
+            direction = jax.tree.map(scaled, gradient, mu, nu)
+        return direction, Optimizer(self.count + 1, mu, nu, self.config)
 
 
 class CosineSchedule(NamedTuple):
@@ -39,15 +86,16 @@ class CosineSchedule(NamedTuple):
         require(self, "learning_rate_final", lambda x: 0 <= x <= 1, "between 0 and 1")
 
 
-def begin(weights: Weights) -> Optimizer:
-    return optax.scale_by_adam().init(weights)
+def begin(weights: Weights, config: OptimizerConfig = ADAM) -> Optimizer:
+    state = optax.scale_by_adam().init(weights)
+    return Optimizer(state.count, state.mu, state.nu, config)
 
 
 def descend(
     weights: Weights, gradient: Weights, optimizer: Optimizer, rate: Scalar
 ) -> tuple[Weights, Optimizer]:
     """One step down the gradient."""
-    direction, optimizer = optax.scale_by_adam().update(gradient, optimizer)
+    direction, optimizer = optimizer.direction(gradient)
     updates = jax.tree.map(lambda d: -rate * d, direction)
     return optax.apply_updates(weights, updates), optimizer
 

@@ -120,6 +120,13 @@ class Replay(eqx.Module):
         priorities = Priorities.empty(capacity) if prioritized else None
         return Replay(jnp.zeros((capacity, numbers)), zero, zero, priorities, like, width, steps)
 
+    def extend(self, rows: PyTree) -> "Replay":
+        """Appends rows in the order of time, ``width`` of them for each step."""
+        if len(jax.tree.leaves(rows)[0]) == self.width:
+            return self.add(rows)
+        by_step = jax.tree.map(lambda x: x.reshape(-1, self.width, *x.shape[1:]), rows)
+        return lax.scan(lambda replay, rows: (replay.add(rows), None), self, by_step)[0]
+
     def add(self, rows: PyTree) -> "Replay":
         """Appends ``width`` rows."""
         packed = jnp.concatenate(

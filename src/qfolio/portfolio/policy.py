@@ -243,7 +243,7 @@ class Policy:
         for name, weight in given.items():
             if name != "cash" and name not in self.assets:
                 raise QfolioError(f"The holdings name {name!r}, which the policy does not know.")
-            if not isinstance(weight, Real) or not 0 <= weight <= 1 + 1e-9:
+            if not isinstance(weight, Real) or not 0 <= float(weight) <= 1 + 1e-9:
                 raise QfolioError(
                     f"The weight of {name!r} is {weight!r}; it must be a number from 0 to 1."
                 )
