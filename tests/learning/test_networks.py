@@ -1,4 +1,3 @@
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -97,8 +96,9 @@ def test_orthogonal_layers_by_hand():
 
 @pytest.mark.parametrize("name", ["activation", "initialization"])
 def test_refuses_other_layers_than_there_are(name):
+    wrong: dict[str, Any] = {name: "sine"}
     with pytest.raises(QfolioError, match=f"{name} is sine; it must be one of"):
-        dataclasses.replace(PPO(), **{name: "sine"})
+        PPO(**wrong)
     with pytest.raises(QfolioError, match=f"{name} is .*; it must be .* unless network=flat"):
         PPO(network="mlp", activation="tanh" if name == "activation" else "relu",
             initialization="orthogonal")  # fmt: skip

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equinox import filter_jit as jit
 
 from qfolio.core.mdp import Transition
 from qfolio.learning.priorities import FAN, Priorities
@@ -12,7 +13,7 @@ from qfolio.learning.targets import n_step
 def filled(capacity, writes, width=2, **options):
     replay = Replay.empty(jnp.array(0), capacity, width, **options)
     for i in range(writes):
-        replay = replay.add(jnp.arange(i * width, (i + 1) * width))
+        replay = jit(replay.add)(jnp.asarray(np.arange(i * width, (i + 1) * width)))
     return replay
 
 
@@ -29,12 +30,12 @@ def test_rounds_the_capacity_up_to_whole_writes():
 
 
 def test_samples_only_what_was_written():
-    sample = filled(1000, 3).sample(jax.random.key(0), 500)
+    sample = jit(filled(1000, 3).sample)(jax.random.key(0), 500)
     assert set(sample.tolist()) == {0, 1, 2, 3, 4, 5}
 
 
 def test_samples_a_full_buffer_uniformly():
-    sample = np.asarray(filled(8, 9).sample(jax.random.key(1), 8000))
+    sample = np.asarray(jit(filled(8, 9).sample)(jax.random.key(1), 8000))
     counts = np.bincount(sample, minlength=18)
     assert counts[:10].sum() == 0
     # Eight cells of 1,000 expected draws each: chi-square with 7 degrees of freedom, p = 0.001.
@@ -60,7 +61,7 @@ def test_rows_come_back_as_they_were():
 def test_only_rows_with_steps_after_them_are_drawn(prioritized, writes):
     """Of 2 × 5 rows, all but the newest two writes, and those equally often."""
     replay = filled(10, writes, steps=3, prioritized=prioritized)
-    drawn = np.asarray(replay.sample(jax.random.key(2), 2000))
+    drawn = np.asarray(jit(replay.sample)(jax.random.key(2), 2000))
     ready = np.arange(2 * max(0, writes - 5), 2 * (writes - 2))
     counts = np.bincount(drawn, minlength=2 * writes)
     assert counts.sum() == counts[ready].sum()
@@ -70,9 +71,9 @@ def test_only_rows_with_steps_after_them_are_drawn(prioritized, writes):
 @pytest.mark.parametrize("writes", [3, 5, 8])
 def test_the_rows_ahead_are_the_next_steps_of_the_same_environment(writes):
     replay = filled(10, writes, steps=3)
-    index = replay.draw(jax.random.key(3), 50)
-    ahead = np.asarray(replay.ahead(index))
-    first = np.asarray(replay.at(index))
+    index = jit(replay.draw)(jax.random.key(3), 50)
+    ahead = np.asarray(jit(replay.ahead)(index))
+    first = np.asarray(jit(replay.at)(index))
     np.testing.assert_array_equal(ahead, first + np.array([[0], [2], [4]]))
 
 
@@ -80,7 +81,7 @@ def test_returns_over_steps_by_hand():
     """Goes on; ends at once; ends at the second step; ends with the last."""
     reward = jnp.array([[1.0, 1.0, 1.0, 1.0], [2.0, 2.0, 2.0, 2.0], [4.0, 4.0, 4.0, 4.0]])
     last = jnp.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 1, 0, 1]], bool)
-    total, stop = n_step(reward, last, 0.5)
+    total, stop = jit(n_step)(reward, last, 0.5)
     np.testing.assert_allclose(total, [1 + 1 + 1, 1, 1 + 1, 1 + 1 + 1])
     assert stop.tolist() == [2, 0, 1, 2]
 
@@ -94,7 +95,7 @@ def test_steps_are_joined_up_to_the_end_of_their_episode():
     for i in range(3):
         observation = jnp.array([[2.0 * i], [2.0 * i + 1]])
         action = jnp.array([2 * i, 2 * i + 1], jnp.int32)
-        replay = replay.add(
+        replay = jit(replay.add)(
             Experience(
                 observation,
                 action,
@@ -104,7 +105,7 @@ def test_steps_are_joined_up_to_the_end_of_their_episode():
                 jnp.array(ends[i]),
             )
         )
-    joined, discount = join(replay, jnp.array([0, 1]), 0.5)
+    joined, discount = jit(join)(replay, jnp.array([0, 1]), 0.5)
     np.testing.assert_array_equal(joined.observation[:, 0], [0, 1])
     np.testing.assert_array_equal(joined.action, [0, 1])
     np.testing.assert_allclose(joined.reward, [1.5, 1.5])
@@ -126,8 +127,8 @@ def test_the_last_step_is_kept_where_it_is_asked_for():
 
 
 def priorities_of(values):
-    values = jnp.asarray(values, jnp.float32)
-    return Priorities.empty(len(values)).set(jnp.arange(len(values)), values)
+    index, values = np.arange(len(values)), np.asarray(values, np.float32)
+    return jit(Priorities.empty(len(values)).set)(jnp.asarray(index), jnp.asarray(values))
 
 
 @pytest.mark.parametrize("capacity", [1, FAN, FAN + 1, FAN**2, 300, 5000])
@@ -135,14 +136,16 @@ def test_every_level_holds_the_sums_of_the_next(capacity):
     rng = np.random.default_rng(0)
     expected, priorities = np.zeros(capacity), Priorities.empty(capacity)
     for _ in range(20):
-        index = np.unique(rng.integers(capacity, size=40))
+        index = rng.permutation(capacity)[:40]
         expected[index] = rng.random(len(index)).astype(np.float32)
-        priorities = priorities.set(jnp.array(index), jnp.array(expected[index], jnp.float32))
-    np.testing.assert_array_equal(priorities.levels[-1].reshape(-1)[:capacity], expected)
+        values = jnp.asarray(expected[index].astype(np.float32))
+        priorities = jit(priorities.set)(jnp.asarray(index), values)
+    leaves = np.asarray(priorities.levels[-1]).reshape(-1)
+    np.testing.assert_array_equal(leaves[:capacity], expected)
     np.testing.assert_allclose(priorities.total, expected.sum(), rtol=1e-5)
     for above, below in zip(priorities.levels, priorities.levels[1:], strict=False):
-        flat = above.reshape(-1)
-        np.testing.assert_allclose(flat[: len(below)], below.sum(1), rtol=1e-6)
+        flat = np.asarray(above).reshape(-1)
+        np.testing.assert_allclose(flat[: len(below)], np.asarray(below).sum(1), rtol=1e-6)
         assert not flat[len(below) :].any()
     assert priorities.levels[0].shape == (1, FAN)
 
@@ -150,7 +153,7 @@ def test_every_level_holds_the_sums_of_the_next(capacity):
 def test_rows_are_found_where_the_running_sum_exceeds_the_mass():
     values = np.random.default_rng(1).integers(0, 4, 700)  # sums are exact
     mass = np.arange(values.sum()) + 0.5
-    found = priorities_of(values).find(jnp.array(mass, jnp.float32))
+    found = jit(priorities_of(values).find)(jnp.array(mass, jnp.float32))
     np.testing.assert_array_equal(found, np.searchsorted(np.cumsum(values), mass, side="right"))
 
 
@@ -158,7 +161,7 @@ def test_rows_are_drawn_in_proportion():
     values = np.array([0.0, 1.0, 2.0, 0.0, 5.0, *[0.0] * 30, 8.0])
     priorities = priorities_of(values)
     keys = jax.random.split(jax.random.key(4), 500)
-    drawn = jax.vmap(lambda key: priorities.draw(key, 8))(keys)
+    drawn = jit(jax.vmap(lambda key: priorities.draw(key, 8)))(keys)
     counts = np.bincount(np.asarray(drawn).ravel(), minlength=len(values))
     expected = 4000 * values / values.sum()
     assert counts[values == 0].sum() == 0
@@ -168,7 +171,7 @@ def test_rows_are_drawn_in_proportion():
 
 def test_draws_are_stratified():
     """With as many draws as equal rows, each is drawn once."""
-    drawn = priorities_of(np.ones(64)).draw(jax.random.key(5), 64)
+    drawn = jit(priorities_of(np.ones(64)).draw)(jax.random.key(5), 64)
     assert sorted(drawn.tolist()) == list(range(64))
 
 
@@ -176,24 +179,26 @@ def test_no_row_of_zero_is_drawn_whatever_rounding_does():
     rng = np.random.default_rng(2)
     values = np.where(rng.random(5000) < 0.5, 0, rng.random(5000) ** 8).astype(np.float32)
     priorities = priorities_of(values)
-    ends = jnp.linspace(0.0, 1.0, 20_001) * priorities.total * 1.00001
-    assert (values[np.asarray(priorities.find(ends))] > 0).all()
+    ends = np.linspace(0.0, 1.00001, 20_001, dtype=np.float32) * float(priorities.total)
+    assert (values[np.asarray(jit(priorities.find)(jnp.asarray(ends)))] > 0).all()
 
 
 def test_new_rows_have_the_highest_priority_there_was():
     replay = filled(8, 2, prioritized=True)
-    priorities = replay.priorities.set(jnp.array([0, 1]), jnp.array([5.0, 0.5]))
-    priorities = priorities.set(jnp.array([0]), jnp.array([0.1]))
+    priorities = jit(replay.priorities.set)(jnp.array([0, 1]), jnp.array([5.0, 0.5]))
+    priorities = jit(priorities.set)(jnp.array([0]), jnp.array([0.1]))
     replay = Replay(replay.rows, replay.position, replay.size, priorities, replay.like, 2, 1)
-    replay = replay.add(jnp.array([4, 5]))
+    replay = jit(replay.add)(jnp.array([4, 5]))
     assert replay.priorities is not None
-    np.testing.assert_allclose(replay.priorities.of(jnp.arange(8)), [0.1, 0.5, 1, 1, 5, 5, 0, 0])
+    found = jit(replay.priorities.of)(jnp.arange(8))
+    np.testing.assert_allclose(found, [0.1, 0.5, 1, 1, 5, 5, 0, 0])
 
 
 def test_importance_weights_by_hand():
     """(N P)^−β over the largest in the batch: rows of 1, 2 and 4 of 8."""
     priorities = priorities_of([1.0, 2.0, 4.0, 1.0])
     index = jnp.array([0, 1, 2])
-    np.testing.assert_allclose(priorities.importance(index, 1.0), [1, 1 / 2, 1 / 4])
-    np.testing.assert_allclose(priorities.importance(index, 0.5), [1, 2**-0.5, 1 / 2], rtol=1e-6)
-    np.testing.assert_allclose(priorities.importance(index, 0.0), [1, 1, 1])
+    weights = jit(priorities.importance)
+    np.testing.assert_allclose(weights(index, 1.0), [1, 1 / 2, 1 / 4])
+    np.testing.assert_allclose(weights(index, 0.5), [1, 2**-0.5, 1 / 2], rtol=1e-6)
+    np.testing.assert_allclose(weights(index, 0.0), [1, 1, 1])

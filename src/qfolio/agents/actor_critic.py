@@ -143,9 +143,7 @@ class ActorCritic(Agent, Generic[L]):
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
     actor_learning_rate_ratio: float = number(0.3)  # the actor's, as a share of the critics'
     reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
-    input_gain: float = number(
-        0.0
-    )  # of the first layer, for observations scaled to ±1; 0: unscaled
+    input_gain: float = number(0.0)  # of the first layer, on inputs scaled to ±1; 0: unscaled
     huber_delta: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
     value_rescaling: bool = static(False)  # critics learn roots of values: small ones weigh more
     clip_bootstrap: bool = static(True)  # to the range of values possible with the rewards so far

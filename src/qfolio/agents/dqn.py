@@ -97,18 +97,16 @@ class DQN(Agent):
     learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
     optimizer: str = static("adam")  # or rmsprop, rmsprop-centered, sgd
-    rmsprop_decay: float = constant(0.95)  # share of the squared gradients' mean that a step keeps
-    optimizer_epsilon: float = constant(1e-8)  # added to what a gradient is divided by
+    rmsprop_decay: float = constant(0.95)  # of the running mean of squared gradients
+    optimizer_epsilon: float = constant(1e-8)  # added to the divisor of a gradient
     epsilon_start: float = number(1.0)
     epsilon_end: float = number(0.01)
     epsilon_decay: float = number(0.995)  # factor per finished episode
-    epsilon_steps: float = constant(0.0)  # steps of a linear fall of ε; 0: epsilon_decay holds
+    epsilon_steps: float = constant(0.0)  # of a linear decay in steps; 0: use epsilon_decay
     persistence: float = constant(0.0)  # share of exploring steps that repeat the last action
     huber_delta: float = number(math.inf)  # |TD error| beyond which the loss is linear
     reward_scale: float = number(1.0)  # the network learns values of scaled rewards
-    input_gain: float = number(
-        0.0
-    )  # of the first layer, for observations scaled to ±1; 0: unscaled
+    input_gain: float = number(0.0)  # of the first layer, on inputs scaled to ±1; 0: unscaled
     value_rescaling: bool = static(False)  # learn roots of values: small ones weigh more
 
     def __check_init__(self) -> None:

@@ -83,9 +83,7 @@ class OnPolicy(Agent):
     time_limit_terminal: bool = static(False)  # treats truncations as terminal
     saturation_penalty: float = number(0.1)  # on means far beyond the bounds; 0: none
     reward_scale: float = number(1.0)  # the critic learns values of scaled rewards
-    input_gain: float = number(
-        0.0
-    )  # of the first layer, for observations scaled to ±1; 0: unscaled
+    input_gain: float = number(0.0)  # of the first layer, on inputs scaled to ±1; 0: unscaled
 
     def __check_init__(self) -> None:
         require(self, "num_envs rollout_length", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
