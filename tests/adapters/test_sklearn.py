@@ -268,7 +268,7 @@ def test_its_portfolio_can_be_sent_and_copied_but_not_scaled():
         fitted.set_params(portfolio_params={"transaction_costs": 0.1}).predict(x[TRAIN:])
 
 
-@pytest.mark.parametrize("agent", ["pathwise", "dqn"])
+@pytest.mark.parametrize("agent", ["pathwise", pytest.param("dqn", marks=pytest.mark.slow)])
 def test_it_goes_on_learning_day_by_day(agent):
     x = returns()
     settings = TINY if agent == "pathwise" else {

@@ -90,7 +90,11 @@ def batch_of(n=6, actions=None):
 
 @pytest.mark.parametrize(
     ("kind", "rescale"),
-    [(DDPG, False), pytest.param(DDPG, True, marks=pytest.mark.slow), (TD3, False)],
+    [
+        (DDPG, False),
+        pytest.param(DDPG, True, marks=pytest.mark.slow),
+        pytest.param(TD3, False, marks=pytest.mark.slow),
+    ],
 )
 def test_a_deterministic_actor_finds_the_best_action_and_its_value(kind, rescale):
     noise = {"target_noise": 0.2, "target_noise_clip": 0.1} if kind is TD3 else {}
@@ -136,7 +140,8 @@ def test_a_soft_actor_finds_the_best_distribution_its_value_and_its_temperature(
     np.testing.assert_allclose(end.critics(STATES, BEST).mean(0), [1 + later, 1], rtol=0.02)
 
 
-@pytest.mark.parametrize("rescale", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("rescale", [False, True])
 def test_a_soft_choice_among_numbered_actions(rescale):
     agent = SAC(**SMALL, spread=0.5, value_rescaling=rescale)
     end = learned(OneState(), agent, 1500)
@@ -150,13 +155,8 @@ def test_a_soft_choice_among_numbered_actions(rescale):
     np.testing.assert_allclose(chosen, p, rtol=0.02)
 
 
-@pytest.mark.parametrize(
-    "agent",
-    [
-        pytest.param(DDPG(**SMALL, exploration_noise=0.1), marks=pytest.mark.slow),
-        SAC(**SMALL, spread=0.02),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", [DDPG(**SMALL, exploration_noise=0.1), SAC(**SMALL, spread=0.02)])
 def test_weights_on_a_simplex(agent):
     end = learned(AimWeights(), agent)
     weights = sac.Policy(end.actor, None) if isinstance(agent, SAC) else end.actor

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equinox import filter_jit as jit
 
 from qfolio.agents.mbpo import MBPO, Model, Remembered, best_members, model_loss
 from qfolio.core.errors import QfolioError
@@ -49,7 +50,7 @@ def constant_model(actions=None):
 def test_one_member_drawn_at_random_predicts_each_step():
     observation = jnp.tile(jnp.array([5.0, 7.0]), (3000, 1))
     action = jnp.zeros((3000, 1))
-    step = constant_model().imagine(observation, action, jnp.arange(3), jax.random.key(0))
+    step = jit(constant_model().imagine)(observation, action, jnp.arange(3), jax.random.key(0))
     member = np.searchsorted([3.0, 8.0, 15.0], np.asarray(step.reward)) + 1
     np.testing.assert_allclose(step.reward, (member + 1) ** 2 - 1)
     np.testing.assert_allclose(np.bincount(member)[1:] / 3000, 1 / 3, atol=0.03)
@@ -62,14 +63,14 @@ def test_one_member_drawn_at_random_predicts_each_step():
 def test_only_elites_imagine():
     observation = jnp.tile(jnp.array([5.0, 7.0]), (100, 1))
     among = jnp.array([2, 0])
-    step = constant_model().imagine(observation, jnp.zeros((100, 1)), among, jax.random.key(0))
+    step = jit(constant_model().imagine)(observation, jnp.zeros((100, 1)), among, jax.random.key(0))
     assert set(step.next_observation[:, 0].tolist()) == {6, 8}
 
 
 def test_members_are_judged_by_what_they_have_not_learned_from():
     """Each by one step: their errors there are 5/4, 3.16/4 and 5.36/4."""
     counts = jnp.ones((4, 3)).at[2, 0].set(0.0).at[0, 1].set(0.0).at[1, 2].set(0.0)
-    assert best_members(constant_model(), steps(), counts, 2).tolist() == [1, 0]
+    assert jit(best_members)(constant_model(), steps(), counts, 2).tolist() == [1, 0]
 
 
 def gaussian_model(log_variance):
@@ -88,7 +89,7 @@ def bounded(log_variance):
 def test_the_likelihood_of_a_gaussian_model_by_hand(log_variance):
     """Of the third step alone, whose changes it misses by 2 and 1; the loss is a mean over four."""
     counts = jnp.zeros((4, 1)).at[2].set(1.0)
-    loss, _ = model_loss(gaussian_model(log_variance), steps(), counts)
+    loss, _ = jit(model_loss)(gaussian_model(log_variance), steps(), counts)
     kept = bounded(log_variance)
     np.testing.assert_allclose(loss, (5 / 4 * math.exp(-kept) + kept) / 4, rtol=1e-4)
 
@@ -96,7 +97,9 @@ def test_the_likelihood_of_a_gaussian_model_by_hand(log_variance):
 def test_a_gaussian_model_draws_its_steps():
     n, std = 20_000, math.exp(bounded(-1.0) / 2)
     observation, among = jnp.zeros((n, 2)), jnp.arange(1)
-    step = gaussian_model(-1.0).imagine(observation, jnp.zeros((n, 1)), among, jax.random.key(0))
+    step = jit(gaussian_model(-1.0).imagine)(
+        observation, jnp.zeros((n, 1)), among, jax.random.key(0)
+    )
     np.testing.assert_allclose(step.next_observation.mean(0), [1, 0], atol=0.05)
     np.testing.assert_allclose(step.next_observation.std(0), [std, 4 * std], rtol=0.03)
     ends = math.erfc(0.5 / std / math.sqrt(2)) / 2  # a number from N(0, std²) is above ½
@@ -104,12 +107,13 @@ def test_a_gaussian_model_draws_its_steps():
 
 
 def steps(n=4, actions=None):
-    observation = jnp.stack([jnp.arange(n), jnp.arange(n)], 1).astype(jnp.float32)
+    observation = np.stack([np.arange(n), np.arange(n)], 1).astype(np.float32)
+    following = observation + np.array([[1, 4], [1, -4], [3, 4], [3, -4]], np.float32)
     return Experience(
-        observation=observation,
+        observation=jnp.asarray(observation),
         action=jnp.zeros((n, 1)),
         reward=jnp.array([3.0, 15, 3, 15]),
-        next_observation=observation + jnp.array([[1.0, 4], [1, -4], [3, 4], [3, -4]]),
+        next_observation=jnp.asarray(following),
         terminal=jnp.array([False, False, False, True]),
     )
 
@@ -123,7 +127,7 @@ def test_the_models_loss_by_hand():
     first = 1.0 / 4  # the first step, by the first member: only the second change is wrong, by 1
     third = (2**2 + 1 + 2**2 + 0.6**2) / 4  # the first step, by the third member
     second = (1 + 1 + 1 + 0.6**2) / 4  # the last step, by the second member
-    loss, _ = model_loss(model, step, counts)
+    loss, _ = jit(model_loss)(model, step, counts)
     np.testing.assert_allclose(loss, (first + 2 * third + second) / 4, rtol=1e-6)
 
 
@@ -166,7 +170,7 @@ def test_the_models_gradient_against_differences():
 
         slope = (loss(1e-6) - loss(-1e-6)) / 2e-6
         assert abs(slope) > 1e-3
-        np.testing.assert_allclose(jax.grad(loss)(0.0), slope, rtol=1e-6)
+        np.testing.assert_allclose(jax.jit(jax.grad(loss))(0.0), slope, rtol=1e-6)
 
 
 def test_each_member_counts_real_steps_as_often_as_chance_says():
@@ -195,19 +199,19 @@ def test_each_seed_draws_counts_of_its_own():
     population = Population(Aim(), agent, [0, 1])
     population.advance(20)  # steps that are only observed
     replay = population.fetch().agent.replay
-    first, second = (replay.unpack(jnp.array(rows)).counts[:80] for rows in replay.rows)
+    first, second = (np.asarray(jit(replay.unpack)(rows).counts[:80]) for rows in replay.rows)
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.3
 
 
 def test_a_share_of_a_batch_is_real():
     """5 % of 64 steps, as in Janner et al.: three, before the imagined ones."""
     step = jax.tree.map(lambda x: x[0], steps())
-    real = Replay.empty(Remembered(step, jnp.ones(3)), 4, 4).add(
-        Remembered(steps(), jnp.ones((4, 3)))
-    )
-    imagined = Replay.empty(step, 4, 4).add(steps()._replace(reward=jnp.zeros(4)))
+    real = Replay.empty(Remembered(step, jnp.ones(3)), 4, 4)
+    real = jit(real.add)(Remembered(steps(), jnp.ones((4, 3))))
+    imagined = Replay.empty(step, 4, 4)
+    imagined = jit(imagined.add)(steps()._replace(reward=jnp.zeros(4)))
     for ratio, count in ((0.0, 0), (0.05, 3), (1.0, 64)):
-        batch, _ = MBPO(**SMALL, real_ratio=ratio)._draw(real, imagined, jax.random.key(0))
+        batch, _ = jit(MBPO(**SMALL, real_ratio=ratio)._draw)(real, imagined, jax.random.key(0))
         np.testing.assert_array_equal(batch.reward > 0, np.arange(64) < count)
 
 

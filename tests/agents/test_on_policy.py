@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equinox import filter_jit as jit
 from scipy import stats
 
 from qfolio.agents.a2c import A2C
@@ -26,6 +27,7 @@ from qfolio.tasks.pendulum import Pendulum
 from probes import Aim, AimWeights, Endless, OneState, RewardDelay, TwoStates
 
 DISCOUNT = 0.9
+SLOW = pytest.mark.slow
 SMALL: dict[str, Any] = {"hidden": (16,), "num_envs": 3, "rollout_length": 4, "episode_steps": 4}
 AGENTS = {
     "reinforce": REINFORCE(**SMALL),
@@ -35,6 +37,7 @@ AGENTS = {
 TASKS = {"choice": Pendulum(torques=3), "numbers": Pendulum(torques=0), "weights": Merton()}
 
 
+@jit
 def a_rollout(agent, task, state, key):
     """Steps from made-up observations, with actions that the agent draws and made-up outcomes."""
     shape = (agent.rollout_length, agent.num_envs)
@@ -127,7 +130,7 @@ def test_minibatches_hold_every_row_once_and_whole():
 @pytest.mark.parametrize("n", [1, 5, 8])
 def test_every_order_is_as_likely(n):
     keys = jax.random.split(jax.random.key(0), 20_000)
-    orders = np.asarray(jax.vmap(lambda key: shuffled(key, n))(keys))
+    orders = np.asarray(jit(jax.vmap(lambda key: shuffled(key, n)))(keys))
     np.testing.assert_array_equal(np.sort(orders), np.broadcast_to(np.arange(n), orders.shape))
     for place in range(n):
         share = np.bincount(orders[:, place], minlength=n) / len(orders)
@@ -173,11 +176,11 @@ PAPER = {"normalize_advantages": False, "saturation_penalty": 0.0}
 @pytest.mark.parametrize(
     ("name", "kind", "changes"),
     [
-        ("reinforce", "numbers", {}),
+        pytest.param("reinforce", "numbers", {}, marks=SLOW),
         ("reinforce", "numbers", PAPER),
         ("a2c", "numbers", {}),
-        ("a2c", "numbers", PAPER),
-        ("ppo", "numbers", {}),
+        pytest.param("a2c", "numbers", PAPER, marks=SLOW),
+        pytest.param("ppo", "numbers", {}, marks=SLOW),
         ("ppo", "numbers", PAPER),
         ("ppo", "choice", {}),
         ("ppo", "weights", {}),
@@ -188,39 +191,41 @@ def test_loss_and_gradient(name, kind, changes):
     with jax.enable_x64(True):
         agent = dataclasses.replace(AGENTS[name], entropy_coef=0.1, rollout_length=16, **changes)
         task = TASKS[kind]
-        state = agent.init(task, jax.random.key(0))
+        state = jit(agent.init)(task, jax.random.key(0))
         rollout = a_rollout(agent, task, state, jax.random.key(1))
-        batch = agent.judge(state.weights, rollout, 0.8)
+        batch = jit(agent.judge)(state.weights, rollout, 0.8)
         # Some way from the policy that drew the actions, so that some ratios are clipped.
         leaves, structure = jax.tree.flatten(state.weights)
         noise = [
             np.random.default_rng(i).normal(0, 0.6, leaf.shape) for i, leaf in enumerate(leaves)
         ]
-        weights = jax.tree.unflatten(structure, [x + n for x, n in zip(leaves, noise, strict=True)])
+        moved = [np.asarray(x) + n for x, n in zip(leaves, noise, strict=True)]
+        weights = jax.tree.unflatten(structure, moved)
         loss = jax.jit(lambda weights: agent.loss(weights, batch)[0])
         if kind == "numbers":
             assert float(loss(weights)) == pytest.approx(
                 plain_loss(name, agent, weights, batch), rel=1e-6
             )
-        gradient = jax.grad(loss)(weights)
+        gradient = jax.jit(jax.grad(loss))(weights)
+        dot = lambda x, y: sum(jax.tree.leaves(jax.tree.map(lambda a, b: (a * b).sum(), x, y)))  # noqa: E731
         for seed in range(3):
             draw = np.random.default_rng(seed).normal
             direction = jax.tree.map(lambda x: draw(size=x.shape), weights)  # noqa: B023
-            along = lambda step: jax.tree.map(lambda w, d: w + step * d, weights, direction)  # noqa: B023, E731
-            expected = (loss(along(1e-6)) - loss(along(-1e-6))) / 2e-6
-            slope = sum(
-                jax.tree.leaves(jax.tree.map(lambda g, d: (g * d).sum(), gradient, direction))
+            ahead, behind = (
+                loss(jax.tree.map(lambda w, d: w + step * d, weights, direction))  # noqa: B023
+                for step in (1e-6, -1e-6)
             )
-            assert float(slope) == pytest.approx(float(expected), rel=1e-4, abs=1e-7)
+            slope = dot(jax.tree.map(np.asarray, gradient), direction)
+            assert float(slope) == pytest.approx(float(ahead - behind) / 2e-6, rel=1e-4, abs=1e-7)
 
 
 def test_the_critic_is_no_part_of_the_policys_gradient():
     agent = dataclasses.replace(AGENTS["a2c"], value_coef=0.0)
     task = TASKS["numbers"]
-    state = agent.init(task, jax.random.key(0))
+    state = jit(agent.init)(task, jax.random.key(0))
     rollout = a_rollout(agent, task, state, jax.random.key(1))
     loss = lambda weights: agent.loss(weights, agent.judge(state.weights, rollout, 1.0))[0]  # noqa: E731
-    gradient = jax.grad(loss)(state.weights)
+    gradient = jax.tree.map(np.asarray, jax.jit(jax.grad(loss))(state.weights))
     assert all((x == 0).all() for x in jax.tree.leaves(gradient.critic))
     assert all((x != 0).any() for x in (gradient.actor.mlp.weights[-1], gradient.log_std))
 
@@ -228,11 +233,13 @@ def test_the_critic_is_no_part_of_the_policys_gradient():
 def test_judging_is_what_the_formulas_say():
     agent, task = AGENTS["ppo"], TASKS["numbers"]
     agent = dataclasses.replace(agent, reward_scale=0.5)
-    state = agent.init(task, jax.random.key(0))
+    state = jit(agent.init)(task, jax.random.key(0))
     rollout = a_rollout(agent, task, state, jax.random.key(1))
-    batch = agent.judge(state.weights, rollout, 0.8)
-    value = np.asarray(jax.vmap(state.weights.value)(rollout.observation))
-    following = np.asarray(jax.vmap(state.weights.value)(rollout.next_observation))
+    batch = jit(agent.judge)(state.weights, rollout, 0.8)
+    values = jit(lambda x: jax.vmap(state.weights.value)(x))
+    value = np.asarray(values(rollout.observation))
+    following = np.asarray(values(rollout.next_observation))
+    rollout, batch = jax.tree.map(np.asarray, (rollout, batch))
     for column in range(agent.num_envs):
         advantage = 0.0
         for time in reversed(range(agent.rollout_length)):
@@ -256,11 +263,11 @@ def test_one_step_of_ppo_from_its_own_policy_is_the_policy_gradient():
     settings = {**SMALL, "max_grad_norm": np.inf}
     ppo = PPO(**settings, batch_size=12, epochs=1, gae_lambda=1.0)
     task, key = TASKS["choice"], jax.random.key(1)
-    state = ppo.init(task, jax.random.key(0))
+    state = jit(ppo.init)(task, jax.random.key(0))
     rollout = a_rollout(ppo, task, state, key)
     rollout = rollout._replace(truncated=rollout.truncated.at[-1].set(True))  # whole episodes
-    after, _ = ppo.learn(task, state, rollout, key)
-    expected, _ = REINFORCE(**settings).learn(task, state, rollout, key)
+    after, _ = jit(ppo.learn)(task, state, rollout, key)
+    expected, _ = jit(REINFORCE(**settings).learn)(task, state, rollout, key)
     compare = lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6)  # noqa: E731
     jax.tree.map(compare, after.weights, expected.weights)
     jax.tree.map(compare, after.optimizer.mu, expected.optimizer.mu)
@@ -278,7 +285,7 @@ def learned(agent, task, steps=4000, **changes):
     population = Population(task, agent, [0])
     while population.steps < steps:
         population.advance(steps - population.steps)
-    return jax.tree.map(lambda x: jnp.array(x[0]), population.weights())
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), population.weights())
 
 
 def test_one_state():
@@ -291,8 +298,8 @@ def test_one_state():
     "agent",
     [
         REINFORCE,
-        pytest.param(A2C, marks=pytest.mark.slow),
-        pytest.param(PPO, marks=pytest.mark.slow),
+        pytest.param(A2C, marks=SLOW),
+        pytest.param(PPO, marks=SLOW),
     ],
 )
 def test_two_states(agent):
@@ -303,26 +310,33 @@ def test_two_states(agent):
     np.testing.assert_allclose(weights.value(states), 1, rtol=0.02)
 
 
-@pytest.mark.parametrize("agent", [A2C, pytest.param(PPO, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("agent", [A2C, pytest.param(PPO, marks=SLOW)])
 def test_reward_delay(agent):
     values = learned(agent, RewardDelay()).value(jnp.eye(2))
     np.testing.assert_allclose(values, [DISCOUNT, 1], rtol=0.02)
 
 
-@pytest.mark.parametrize("agent", [REINFORCE, PPO])
+@pytest.mark.parametrize("agent", [REINFORCE, pytest.param(PPO, marks=SLOW)])
 def test_a_time_limit_is_not_the_end(agent):
     values = learned(agent, Endless(), steps=16_000, reward_scale=0.1).value(jnp.ones((1, 1)))
     np.testing.assert_allclose(10 * values, 1 / (1 - DISCOUNT), rtol=0.02)
 
 
-@pytest.mark.parametrize("agent", [REINFORCE, A2C, PPO])
+@pytest.mark.parametrize(
+    "agent",
+    [
+        pytest.param(REINFORCE, marks=SLOW),
+        pytest.param(A2C, marks=SLOW),
+        PPO,
+    ],
+)
 def test_numbers(agent):
     weights = learned(agent, Aim(), steps=8000)
     mode = weights.policy(jnp.array([[0.5], [-0.5]])).mode()
     np.testing.assert_allclose(mode, [[1], [-1]], atol=0.02)
 
 
-@pytest.mark.parametrize("agent", [pytest.param(A2C, marks=pytest.mark.slow), PPO])
+@pytest.mark.parametrize("agent", [pytest.param(A2C, marks=SLOW), PPO])
 def test_weights(agent):
     weights = learned(agent, AimWeights(), steps=8000)
     views = jax.vmap(AimWeights().observe)(jnp.array([0.5, -0.5]))
@@ -332,9 +346,9 @@ def test_weights(agent):
 @pytest.mark.parametrize(
     ("name", "task", "network"),
     [
-        ("ppo", Merton(), "mlp"),
-        pytest.param("a2c", Ar1(menu="tilts:0.1"), "flat", marks=pytest.mark.slow),
-        pytest.param("reinforce", Merton(menu="tilts:0.1"), "mlp", marks=pytest.mark.slow),
+        pytest.param("ppo", Merton(), "mlp", marks=SLOW),
+        pytest.param("a2c", Ar1(menu="tilts:0.1"), "flat", marks=SLOW),
+        pytest.param("reinforce", Merton(menu="tilts:0.1"), "mlp", marks=SLOW),
     ],
 )
 def test_markets(name, task, network):
@@ -350,11 +364,12 @@ def test_markets(name, task, network):
 
 
 def test_the_first_policy_is_the_same_everywhere():
-    state = AGENTS["ppo"].init(Merton(), jax.random.key(0))
-    views = jax.vmap(Merton().observe)(
-        jax.vmap(Merton().reset)(jax.random.split(jax.random.key(1), 3))
-    )
-    np.testing.assert_allclose(AGENTS["ppo"].policy(state.weights, views), 0.25, rtol=1e-6)
+    task, agent = Merton(), AGENTS["ppo"]
+    weights = jit(agent.init)(task, jax.random.key(0)).weights
+    seen = jax.vmap(lambda key: task.observe(task.reset(key)))
+    weights_chosen = jit(lambda keys: agent.policy(weights, seen(keys)))
+    keys = jax.random.split(jax.random.key(1), 3)
+    np.testing.assert_allclose(weights_chosen(keys), 0.25, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -386,17 +401,19 @@ def test_reinforce_learns_from_whole_episodes_alone(time_limit_terminal):
         time_limit_terminal=time_limit_terminal, max_grad_norm=np.inf, learning_rate=0.01,
     )  # fmt: skip
     task = TASKS["numbers"]
-    state = agent.init(task, jax.random.key(0))
+    state = jit(agent.init)(task, jax.random.key(0))
     rollout = a_rollout(agent, task, state, jax.random.key(1))
-    column = lambda *steps: jnp.zeros(6, bool).at[jnp.array(steps)].set(True)  # noqa: E731
-    truncated = jnp.zeros((6, 2), bool).at[2, 1].set(True)
-    shifted = jnp.roll(rollout.observation, -1, 0)
+    terminated, truncated = np.zeros((2, 6, 2), bool)
+    terminated[[1, 3, 0], [0, 0, 1]] = truncated[2, 1] = True
+    shifted = np.roll(rollout.observation, -1, 0)
+    following = np.where(truncated[..., None], rollout.next_observation, shifted)
     rollout = rollout._replace(
-        terminated=jnp.stack([column(1, 3), column(0)], 1),
-        truncated=truncated,
-        next_observation=jnp.where(truncated[..., None], rollout.next_observation, shifted),
+        terminated=jnp.asarray(terminated),
+        truncated=jnp.asarray(truncated),
+        next_observation=jnp.asarray(following),
     )
-    value = lambda x: np.asarray(jax.vmap(state.weights.value)(x))  # noqa: E731
+    values = jit(lambda x: jax.vmap(state.weights.value)(x))
+    value = lambda x: np.asarray(values(x))  # noqa: E731
     reward, following = np.asarray(rollout.reward), value(rollout.next_observation)
     limit = 0.0 if time_limit_terminal else following[2, 1]
     r = reward[:, 0]
@@ -405,8 +422,8 @@ def test_reinforce_learns_from_whole_episodes_alone(time_limit_terminal):
     second = [r[0], r[1] + (r[2] + limit / 2) / 2, r[2] + limit / 2]
     returns = np.array(first + second)
     rows = np.array([0, 0, 0, 0, 1, 1, 1]), np.array([0, 1, 2, 3, 0, 1, 2])
-    take = lambda x: jax.tree.map(lambda x: jnp.asarray(x)[rows[1], rows[0]], x)  # noqa: E731
-    observation, action = take(rollout.observation), take(rollout.action)
+    take = lambda x: jax.tree.map(lambda x: np.asarray(x)[rows[1], rows[0]], x)  # noqa: E731
+    observation, action = map(jnp.asarray, (take(rollout.observation), take(rollout.action)))
     advantage = returns - take(value(rollout.observation))
     scaled = (advantage - advantage.mean()) / advantage.std()
 
@@ -415,9 +432,9 @@ def test_reinforce_learns_from_whole_episodes_alone(time_limit_terminal):
         error = ((returns - weights.value(observation)) ** 2).mean()
         return agent.value_coef * error - (log_prob * scaled).mean()
 
-    after, _ = agent.learn(task, state, rollout, jax.random.key(2))
-    gradient = jax.grad(loss)(state.weights)
-    expected = jax.tree.map(lambda g: 0.1 * g, gradient)  # Adam's first moment
+    after, _ = jit(agent.learn)(task, state, rollout, jax.random.key(2))
+    gradient = jax.jit(jax.grad(loss))(state.weights)
+    expected = jax.tree.map(lambda g: np.float32(0.1) * g, gradient)  # Adam's first moment
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), after.optimizer.mu, expected
     )

@@ -268,7 +268,9 @@ def test_along_the_cliff_or_around_it(kind, path):
     ("task", "chosen"),
     [
         ("finite/frozen-lake", ["horizon=9"]),
-        ("pendulum/grid", ["angles=9", "speeds=9", "horizon=20"]),
+        pytest.param(
+            "pendulum/grid", ["angles=9", "speeds=9", "horizon=20"], marks=pytest.mark.slow
+        ),
     ],
 )
 def test_the_command_trains_and_reports(task, chosen, tmp_path, monkeypatch, capsys):

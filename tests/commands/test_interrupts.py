@@ -36,7 +36,7 @@ def test_the_first_ctrl_c_stops_after_the_chunk(tmp_path):
     assert (tmp_path / "run" / "checkpoint.safetensors").exists()
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_ctrl_c_while_it_compiles(tmp_path, count):
     """With an empty cache; no crash at the exit, and nothing more is done."""
     process = start(tmp_path / "run", QFOLIO_CACHE=str(tmp_path / "cache"))

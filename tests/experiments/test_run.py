@@ -83,7 +83,7 @@ IN_A_MARKET = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", IN_A_MARKET)
+@pytest.mark.parametrize("name", ["dqn", pytest.param("pathwise", marks=pytest.mark.slow)])
 def test_n_and_n_episodes_equal_2n_in_a_market(name, tmp_path):
     task, agent = IN_A_MARKET[name]
     create(task, agent, tmp_path / "straight", episodes=240, seeds=2).train()

@@ -170,7 +170,7 @@ def test_what_is_usually_searched_surrounds_the_agents_own_values():
         (["discount=0.9"], "leaves nothing to search"),
         (["discount=0.9|0.90"], "different choices"),
         (["hidden=8|x"], "whole numbers"),
-        (["batch_size=32..64"], r"name them: batch_size=32\|64"),
+        (["batch_size=32..64"], r"list the values: batch_size=32\|64"),
         (["discount=0.9..0.99", "discount=0.8..0.9"], "names discount twice"),
     ],
 )

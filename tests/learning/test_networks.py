@@ -191,7 +191,8 @@ def train(population, steps):
     return population
 
 
-@pytest.mark.parametrize("kind", [pytest.param("rnn", marks=pytest.mark.slow), "lstm"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["rnn", "lstm"])
 def test_an_agent_recalls_what_it_saw_first(kind):
     agent = DQN(**{**LEARNER, "network": kind, "hidden": (16,)})
     population = train(Population(Recall(), agent, [100]), 800)

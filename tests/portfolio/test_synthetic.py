@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equinox import filter_jit as jit
 
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
@@ -175,22 +176,23 @@ def test_gradient_of_a_rollout_against_finite_differences(tail):
     """Through costs, drift and the simplex, by hand; in the tail, decisions stand as they are."""
     task = Ar1(horizon=8, cost=0.01)
     agent = Pathwise(rollout_length=8, tail=tail, num_envs=3, hidden=(4, 4), simplex_penalty=0.0)
-    policy = agent.init(task, jax.random.key(2)).policy
-    starts = jax.vmap(task.reset)(jax.random.split(jax.random.key(5), 3))
-    markets = [starts.market]
+    policy = jit(agent.init)(task, jax.random.key(2)).policy
+    starts = jax.jit(jax.vmap(task.reset))(jax.random.split(jax.random.key(5), 3))
+    markets, after = [starts.market], jax.jit(jax.vmap(task.next_market))
     for key in jax.random.split(jax.random.key(6), 8):
-        markets.append(jax.vmap(task.next_market)(markets[-1], jax.random.split(key, 3)))
-    stack = lambda trees: jax.tree.map(lambda *x: jnp.stack(x), *trees)  # noqa: E731
-    holdings = jax.tree.map(lambda x: jnp.broadcast_to(x, (8, *x.shape)), starts.holding)
+        markets.append(after(markets[-1], jax.random.split(key, 3)))
+    stack = lambda trees: jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *trees)  # noqa: E731
+    holdings = stack([starts.holding] * 8)
     states = Position(stack(markets[:-1]), holdings)
     rollout = Transition(
-        states, jax.vmap(jax.vmap(task.observe))(states), jnp.zeros(8), jnp.zeros(8),
+        states, jax.jit(jax.vmap(jax.vmap(task.observe)))(states), jnp.zeros(8), jnp.zeros(8),
         Position(stack(markets[1:]), holdings), None, jnp.zeros(8), jnp.zeros(8),
     )  # fmt: skip
 
     def with_linear(linear):
         return eqx.tree_at(lambda p: p.network.linear, policy, linear)
 
+    @jax.jit
     def by_hand(linear):
         holding, total = starts.holding, 0.0
         for time in range(8):
@@ -198,15 +200,17 @@ def test_gradient_of_a_rollout_against_finite_differences(tail):
             view = jax.vmap(task.observe)(Position(markets[time], holding))
             settle = jax.vmap(task.settle)
             reward, holding = settle(markets[time], markets[time + 1], holding, acting(view))
-            total -= float(reward.sum()) / (3 * (8 - tail))
+            total -= reward.sum() / (3 * (8 - tail))
         return total
 
     linear = policy.network.linear
-    gradient = jax.grad(lambda x: agent._loss(with_linear(x), task, rollout))(linear)
+    gradient = jax.jit(jax.grad(lambda x: agent._loss(with_linear(x), task, rollout)))(linear)
     assert abs(gradient).max() > 1e-4
     for place in ((0, 0), (1, 1), (0, 1)):
-        bump = jnp.zeros_like(linear).at[place].set(1e-7)
-        slope = (by_hand(linear + bump) - by_hand(linear - bump)) / 2e-7
+        bump = np.zeros(linear.shape)
+        bump[place] = 1e-7
+        here = np.asarray(linear)
+        slope = (by_hand(here + bump) - by_hand(here - bump)) / 2e-7
         np.testing.assert_allclose(gradient[place], slope, rtol=1e-4, atol=1e-8)
 
 

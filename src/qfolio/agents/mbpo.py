@@ -39,8 +39,8 @@ LOG_VARIANCE = (-10.0, 0.5)
 class Prediction(NamedTuple):
     """Of every member."""
 
-    mean: Float[Array, "member batch seen+2"]
-    log_variance: Float[Array, "member batch seen+2"] | None  # None: no distribution
+    mean: Float[Array, "member batch prediction"]
+    log_variance: Float[Array, "member batch prediction"] | None  # None: no distribution
 
 
 class Model(eqx.Module):
@@ -77,7 +77,7 @@ class Model(eqx.Module):
         log_variance = high - jax.nn.softplus(high - log_variance)
         return Prediction(mean, low + jax.nn.softplus(log_variance - low))
 
-    def truth(self, step: Experience) -> Float[Array, "batch seen+2"]:
+    def truth(self, step: Experience) -> Float[Array, "batch prediction"]:
         """The true values of a prediction."""
         change = (step.next_observation - step.observation) / self.scale
         return jnp.column_stack([change, squash(step.reward), step.terminal])
@@ -125,7 +125,7 @@ def model_loss(
 
 def squared_errors(
     model: Model, prediction: Prediction, step: Experience
-) -> Float[Array, "member batch seen+2"]:
+) -> Float[Array, "member batch prediction"]:
     """Of the means, relative to the batch's variance."""
     truth = model.truth(step)
     unit = jnp.maximum(truth.std(0), 1e-2).at[-1].set(1.0)
