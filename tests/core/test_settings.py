@@ -8,6 +8,8 @@ from qfolio.agents.dqn import DQN
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
+from probes import OneState
+
 
 def test_text_becomes_the_fields_type():
     agent = settings.build(
@@ -81,3 +83,11 @@ def test_a_range_that_is_named_includes_its_ends(kind, name):
             if ends := re.search(r"(?:from|between) ([\d.,]+) (?:to|and) ([\d.,]+)", said):
                 low, high = (float(end.rstrip(".").replace(",", "")) for end in ends.groups())
                 assert not low <= value <= high, said
+
+
+def test_counts_shape_the_program():
+    class Careless(OneState):
+        size: int = 4
+
+    with pytest.raises(QfolioError, match=r"size of Careless .*; declare it as size: int = static"):
+        Careless()

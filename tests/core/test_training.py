@@ -9,7 +9,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population
 from qfolio.core.training import advance, begin
 
-from probes import Explosive, RewardDelay
+from probes import Endless, Explosive, RewardDelay
 
 
 def trained(task, agent, seeds, steps):
@@ -129,11 +129,31 @@ def test_steps_left_counts_those_of_all_environments(task, agent):
     assert (population.steps, population.steps_left(steps=61)) == (31, 0)
 
 
-def test_an_infinite_loss_stops_training():
-    agent = DQN(hidden=(4,), num_envs=2, batch_size=8, learning_starts=4, episode_steps=0)
-    population = Population(Explosive(), agent, [4, 5])
+class Blind(RewardDelay):
+    """Sees nothing from its second step on."""
+
+    def observe(self, state):
+        return super().observe(state) / (state < 0.5)
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "says"),
+    [
+        (
+            Endless(),
+            {"learning_rate": 1e30},
+            "loss of seed 4, 5 is no longer finite",
+        ),
+        (Explosive(), {}, "reward of Explosive is not finite at step 42 of an episode"),
+        (Blind(), {}, "observation of Blind is not finite after step 1 of an episode"),
+    ],
+)
+def test_an_infinite_loss_stops_training(task, changes, says):
+    """And what the task has done is not put down to the learning rate."""
+    agent = DQN(hidden=(4,), num_envs=2, batch_size=8, learning_starts=4, **changes)
+    population = Population(task, agent, [4, 5])
     population.advance(1000)  # warm-up
-    with pytest.raises(QfolioError, match="seed 4, 5 is no longer finite"):
+    with pytest.raises(QfolioError, match=says):
         population.advance(1000)
 
 

@@ -1,5 +1,6 @@
 """How agents and tasks declare and check their settings."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -34,6 +35,19 @@ def require(instance: Any, names: str, holds: Callable[[Any], bool], wanted: str
         value = getattr(instance, name)
         if isinstance(value, str | int | float | tuple) and not holds(value):  # not while traced
             raise QfolioError(f"{name} is {value}; it must be {wanted}.")
+
+
+def require_static(instance: Any) -> None:
+    """Raises QfolioError if a whole number is declared as an input of the program.
+
+    Whole numbers are counts, and counts shape the program.
+    """
+    for field in dataclasses.fields(instance):
+        if field.type in (int, "int") and not field.metadata.get("static"):
+            raise QfolioError(
+                f"{field.name} of {type(instance).__name__} is a whole number, which shapes the "
+                f"program; declare it as {field.name}: int = static(…), from qfolio.core.fields."
+            )
 
 
 def require_sizes(instance: Any, name: str = "hidden") -> None:

@@ -199,6 +199,9 @@ class HostPopulation(Population):
             self._require_healthy()
         return records
 
+    def _task_fault(self) -> None:
+        """None: what an environment returns is checked at each step."""
+
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
         """Greedy returns (member, start) from environments seeded by the keys.
 

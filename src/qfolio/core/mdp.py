@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
+from qfolio.core.fields import require_static
+
 
 class Discrete(eqx.Module):
     """A choice among ``n`` actions, numbered from 0."""
@@ -108,6 +110,9 @@ class Task(eqx.Module):
     else:
         horizon: eqx.AbstractVar[int]
         actions: eqx.AbstractVar[Actions]
+
+    def __check_init__(self) -> None:
+        require_static(self)
 
     @property
     def name(self) -> str:
@@ -228,6 +233,9 @@ class Agent(eqx.Module):
         num_envs: eqx.AbstractVar[int]
         episode_steps: eqx.AbstractVar[int]
         discount: eqx.AbstractVar[Any]
+
+    def __check_init__(self) -> None:
+        require_static(self)
 
     @property
     def rollout_steps(self) -> int:

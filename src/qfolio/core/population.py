@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
+from qfolio.core import faults
 from qfolio.core.devices import Members, require_memory
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import CURVE_STARTS, STARTS, Greedy, evaluate, tail_steps
@@ -127,12 +128,18 @@ class Population:
     def _require_healthy(self) -> None:
         healthy = self.healthy
         if not all(healthy):
+            if fault := self._task_fault():
+                raise QfolioError(fault)
             bad = {str(s): None for s, ok in zip(self.seeds, healthy, strict=True) if not ok}
             raise QfolioError(
                 f"The loss of seed {', '.join(bad)} is no longer finite after {self.steps} steps; "
                 "lower learning_rate, or bound the gradient (huber_delta or max_grad_norm, "
                 "whichever the agent has)."
             )
+
+    def _task_fault(self) -> str | None:
+        """Why the task and not the learning may be at fault."""
+        return faults.find(self.task, self.agent, self.seeds[0])
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
         """Greedy returns (member, start) and overestimation (member,) of the current policies.
