@@ -44,7 +44,7 @@ def learned(task, agent, steps=2000):
     population = Population(task, agent, [0])
     while population.steps < steps:
         population.advance(steps - population.steps)
-    return jax.tree.map(lambda x: jnp.array(x[0]), population.fetch().agent.learned)
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), population.fetch().agent.learned)
 
 
 def begun(agent, bound=2.0, seed=3):
@@ -74,6 +74,7 @@ def assert_close(one, other, atol):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), one, other)
 
 
+@eqx.filter_jit
 def batch_of(n=6, actions=None):
     keys = jax.random.split(jax.random.key(7), 4)
     return Experience(
@@ -125,6 +126,7 @@ def clipped_variance(scale, clip):
     return scale**2 * (1 - 2 * tail - 2 * z * density) + 2 * tail * clip**2
 
 
+@pytest.mark.slow
 def test_a_soft_actor_finds_the_best_distribution_its_value_and_its_temperature():
     """For a reward of −(a/2)² the best soft policy is normal with variance 2α."""
     end = learned(Aim(math.inf), SAC(**SMALL, spread=1.0, initial_temperature=0.2))
@@ -449,7 +451,7 @@ def test_the_soft_target_counts_the_next_steps_entropy():
     task = OneState()
     start = begin(agent, task, jnp.zeros(1), jax.random.key(3))
     batch = batch_of(actions=Discrete(2))
-    q, entropy = sac.expectations(
+    q, entropy = eqx.filter_jit(sac.expectations)(
         start.actor, start.critics, batch.next_observation, jax.random.key(0)
     )
     target = batch.reward + 0.9 * (q + 0.7 * entropy) * ~batch.terminal

@@ -184,6 +184,7 @@ def test_the_target_network_is_copied_every_period(task):
     assert same == [False, False, True, False, False, True]
 
 
+@pytest.mark.slow
 def test_the_report_presets_copies_come_at_the_end_of_each_episode():
     """Every hyperparameter of the report, and the step at which it copies: 200, 400, …"""
     agent, task = preset("report").build(), Pendulum()
@@ -218,13 +219,12 @@ def test_learns_once_from_several_steps(task):
         hidden=(4,), num_envs=2, batch_size=4, train_freq=3, target_update_interval=4, tau=1.0
     )
     assert agent.rollout_steps == 3
-    state = agent.init(task, jax.random.key(0))
-    steps = jax.tree.map(
-        lambda *x: jnp.concatenate(x), *(rollout(agent, float(i)) for i in (1, 2, 3))
-    )
+    state = jit(agent.init)(task, jax.random.key(0))
+    parts = [rollout(agent, float(i)) for i in (1, 2, 3)]
+    steps = jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts)
     copied = []
     for i in range(2):
-        state, _ = agent.learn(task, state, steps, jax.random.key(i))
+        state, _ = jit(agent.learn)(task, state, steps, jax.random.key(i))
         copied.append(bool((first_layer(state.target) == first_layer(state.online)).all()))
     assert (int(state.steps), int(state.replay.size), int(state.optimizer.count)) == (6, 12, 2)
     stored = state.replay.unpack(state.replay.rows[:12]).observation[:, 0]

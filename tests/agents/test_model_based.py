@@ -194,6 +194,7 @@ def test_each_member_counts_real_steps_as_often_as_chance_says():
     assert abs(np.corrcoef(counts.T)[0, 1]) < 0.1
 
 
+@pytest.mark.slow
 def test_each_seed_draws_counts_of_its_own():
     agent = MBPO(**SMALL)
     population = Population(Aim(), agent, [0, 1])

@@ -288,6 +288,7 @@ def learned(agent, task, steps=4000, **changes):
     return jax.tree.map(lambda x: jnp.asarray(x[0]), population.weights())
 
 
+@pytest.mark.slow
 def test_one_state():
     weights = learned(PPO, OneState())
     assert jax.nn.softmax(weights.policy(jnp.ones((1, 1))).logits)[0, 1] > 0.98
@@ -297,9 +298,9 @@ def test_one_state():
 @pytest.mark.parametrize(
     "agent",
     [
-        REINFORCE,
+        pytest.param(REINFORCE, marks=SLOW),
         pytest.param(A2C, marks=SLOW),
-        pytest.param(PPO, marks=SLOW),
+        PPO,
     ],
 )
 def test_two_states(agent):
@@ -336,7 +337,8 @@ def test_numbers(agent):
     np.testing.assert_allclose(mode, [[1], [-1]], atol=0.02)
 
 
-@pytest.mark.parametrize("agent", [pytest.param(A2C, marks=SLOW), PPO])
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", [A2C, PPO])
 def test_weights(agent):
     weights = learned(agent, AimWeights(), steps=8000)
     views = jax.vmap(AimWeights().observe)(jnp.array([0.5, -0.5]))

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equinox import filter_jit as jit
 
 from qfolio.agents.dqn import DQN
 from qfolio.agents.dyna_q import Counts, DynaQ
@@ -59,7 +60,7 @@ STEP = {"state": 1, "action": 0, "reward": 2.0, "next_state": 3}
 
 def transition(terminated=False, truncated=False, **changes):
     step = {**STEP, **changes}
-    row = lambda x: jnp.array([[x]])  # noqa: E731
+    row = lambda x: jnp.asarray(np.array([[x]]))  # noqa: E731
     numbers = {"state": row(0), "next_state": row(0), "observation": row(step["state"])}
     return Transition(
         **numbers, action=row(step["action"]), reward=row(step["reward"]),
@@ -71,14 +72,16 @@ def transition(terminated=False, truncated=False, **changes):
 def after(agent, *steps, seed=0):
     """What the agent's tables became, and how far that is from where they were."""
     task = Garnet(5, 2, 2)
-    state = agent.init(task, jax.random.key(0))
-    before = 10.0 * jnp.arange(5.0)[:, None] + jnp.arange(2.0)
+    state = jit(agent.init)(task, jax.random.key(0))
+    before = 10.0 * np.arange(5.0)[:, None] + np.arange(2.0)
     count = state.tables.shape[0]
-    before = jnp.stack([before + 100 * i for i in range(count)])
-    state = type(state)(**{**vars(state), "cells": state.cells.at[..., 0].set(before)})
+    before = np.stack([before + 100 * i for i in range(count)])
+    cells = np.array(state.cells)
+    cells[..., 0] = before
+    state = type(state)(**{**vars(state), "cells": jnp.asarray(cells)})
     for i, step in enumerate(steps):
-        state, _ = agent.learn(task, state, step, jax.random.key(seed + i))
-    return np.asarray(state.tables), np.asarray(state.tables - before)
+        state, _ = jit(agent.learn)(task, state, step, jax.random.key(seed + i))
+    return np.asarray(state.tables), np.asarray(state.tables) - before
 
 
 @pytest.mark.parametrize("ended", [{}, {"truncated": True}])
@@ -142,7 +145,7 @@ def test_double_q_selects_and_values_with_different_tables():
     cells = state.cells.at[:, 3, :, 0].set(jnp.array([[1.0, 2.0], [7.0, 5.0]]))
     state = type(state)(cells, state.episodes)
     for seed in range(6):
-        after, _ = DoubleQ(discount=1.0, learning_rate=1.0).learn(
+        after, _ = jit(DoubleQ(discount=1.0, learning_rate=1.0).learn)(
             Garnet(5, 2, 2), state, transition(reward=0.0), jax.random.key(seed)
         )
         learned = np.asarray(after.tables[:, 1, 0])

@@ -168,6 +168,7 @@ def test_it_learns_what_the_compiled_loop_learns():
     )
 
 
+@pytest.mark.slow
 def test_rollouts_are_those_of_the_compiled_loop():
     agent = PPO(
         hidden=(8,), num_envs=2, rollout_length=8, batch_size=8, epochs=2, learning_rate=1e-2
@@ -237,6 +238,7 @@ def test_numbers_that_do_not_begin_at_zero():
     np.testing.assert_array_equal(population.evaluate(start_keys(25)).returns, np.ones((1, 25)))
 
 
+@pytest.mark.slow
 def test_coordinates_reach_from_bound_to_bound():
     facts = task(Aim).facts
     given = facts.given(np.array([[-1, -1], [1, 1], [0, 0.5], [-9, 9]], np.float32))

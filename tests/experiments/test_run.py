@@ -83,7 +83,8 @@ IN_A_MARKET = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["dqn", pytest.param("pathwise", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", IN_A_MARKET)
 def test_n_and_n_episodes_equal_2n_in_a_market(name, tmp_path):
     task, agent = IN_A_MARKET[name]
     create(task, agent, tmp_path / "straight", episodes=240, seeds=2).train()
@@ -256,6 +257,7 @@ def test_damaged_tables_are_refused_or_skipped(task, agent, tmp_path, text):
         assert Run.open(tmp_path / "run").metrics == []
 
 
+@pytest.mark.slow
 def test_weights_that_are_not_finite_stop_training(task, tmp_path):
     agent = DQN(hidden=(4,), num_envs=2, batch_size=8, learning_starts=4, learning_rate=1e30)
     run = create(task, agent, tmp_path / "run")

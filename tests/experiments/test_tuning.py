@@ -242,6 +242,7 @@ def test_the_same_search_again_is_the_same(tmp_path, task, agent):
     assert strip(first) == strip(second)
 
 
+@pytest.mark.slow
 def test_configurations_of_several_programs(tmp_path, task, agent):
     ranges = ["hidden=16|8", "learning_rate=1e-4..5e-4"]
     work = start(tmp_path / "s", task, agent, *ranges, trials=6, batch=1)

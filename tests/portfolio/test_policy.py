@@ -49,7 +49,7 @@ def learned(name, agent=None, **changes):
     return train(table().between(0, 60), agent or chosen, **options)
 
 
-@pytest.fixture(scope="module", params=AGENTS)
+@pytest.fixture(scope="module", params=["pathwise", pytest.param("dqn", marks=pytest.mark.slow)])
 def policy(request):
     return learned(request.param)
 

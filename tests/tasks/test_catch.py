@@ -22,17 +22,19 @@ def test_enumeration_finds_the_optimum(task):
     step = jax.jit(jax.vmap(task.step, (0, 0, None)))
     first = int(task.reset(KEY).row)
     cells = np.array(list(product(range(task.columns), range(task.columns), range(3))))
-    ball, paddle, action = map(jnp.asarray, cells.T)
+    _, paddle, action = map(jnp.asarray, cells.T)
     value = np.zeros((task.columns, task.columns))
     for row in reversed(range(first, task.rows - 1)):
-        columns = jnp.concatenate([ball[:, None], jnp.zeros((len(ball), task.decoys), int)], 1)
-        states = CatchState(columns, jnp.full(len(ball), row), paddle)
+        columns = np.concatenate([cells[:, :1], np.zeros((len(cells), task.decoys), int)], 1)
+        states = CatchState(jnp.asarray(columns), jnp.asarray(np.full(len(cells), row)), paddle)
         after = step(states, action, KEY)
         assert bool(after.terminated.all()) == (row == task.rows - 2) == bool(after.terminated[0])
         following = np.where(after.terminated, 0, value[cells[:, 0], after.state.paddle])
-        value = (after.reward + following).reshape(task.columns, task.columns, 3).max(-1)
+        value = (
+            (np.asarray(after.reward) + following).reshape(task.columns, task.columns, 3).max(-1)
+        )
     keys = start_keys(64)
-    starts = jax.vmap(task.reset)(keys)
+    starts = jax.jit(jax.vmap(task.reset))(keys)
     np.testing.assert_array_equal(value[starts.columns[:, 0], starts.paddle], 1.0)
     np.testing.assert_array_equal(task.optimum().returns(keys), 1.0)
 
@@ -62,8 +64,8 @@ def test_the_picture_shows_all_there_is():
 @pytest.mark.parametrize("task", [Catch(rows=12, columns=11, decoys=3), Catch()])
 def test_the_ball_is_known_from_the_first_picture(task):
     """The only pixel above the paddle without one over or under it."""
-    starts = jax.vmap(task.reset)(jax.random.split(KEY, 500))
-    pictures = np.asarray(jax.vmap(task.observe)(starts))[..., 0]
+    starts = jax.jit(jax.vmap(task.reset))(jax.random.split(KEY, 500))
+    pictures = np.asarray(jax.jit(jax.vmap(task.observe))(starts))[..., 0]
     lonely = pictures[:, :-1].sum(1) == 1
     np.testing.assert_array_equal(lonely.sum(1), 1)
     np.testing.assert_array_equal(lonely.argmax(1), starts.columns[:, 0])
@@ -73,12 +75,13 @@ def test_the_ball_is_known_from_the_first_picture(task):
 
 def test_a_paddle_stays_in_the_picture_and_moves_as_told():
     task = Catch()
+    step = jax.jit(task.step)
     for paddle, action, expected in ((0, 0, 0), (4, 2, 4), (2, 0, 1), (2, 1, 2), (2, 2, 3)):
         state = CatchState(jnp.array([1]), jnp.array(0), jnp.array(paddle))
-        assert int(task.step(state, jnp.array(action), KEY).state.paddle) == expected
+        assert int(step(state, jnp.array(action), KEY).state.paddle) == expected
     for ball, reward in ((3, 1.0), (2, -1.0)):
         state = CatchState(jnp.array([ball]), jnp.array(8), jnp.array(2))
-        after = task.step(state, jnp.array(2), KEY)
+        after = step(state, jnp.array(2), KEY)
         assert bool(after.terminated)
         assert float(after.reward) == reward
 
@@ -106,5 +109,5 @@ def test_no_velocity_is_seen_nor_anything_older_than_the_window():
     faster = state._replace(pendulum=state.pendulum._replace(theta_dot=jnp.array(5.0)))
     np.testing.assert_array_equal(task.observe(faster), task.observe(state))
     older = state._replace(window=state.window.at[0].set(7.0))
-    step = lambda s: task.observe(task.step(s, jnp.array(3), KEY).state)  # noqa: E731
+    step = jax.jit(lambda s: task.observe(task.step(s, jnp.array(3), KEY).state))
     np.testing.assert_array_equal(step(older), step(state))

@@ -270,7 +270,8 @@ def test_the_policy_for_tomorrow(finished):
         policy.weights(latest.between(0, 5))
 
 
-@pytest.mark.parametrize("agent", ["pathwise", pytest.param("dqn", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", AGENTS)
 def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
     """The continual learning: from the rows that came since, and as if never written to disk."""
     folder = shutil.copytree(finished.folder, tmp_path / "copy")
