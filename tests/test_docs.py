@@ -54,7 +54,7 @@ def own(tmp_path, monkeypatch, prices):
         (name,) = re.findall(r"`(\w+)\.py`", before)
         (tmp_path / f"{name}.py").write_text(code)
         names.append(name)
-    assert names == ["corridor", "constant", "momentum", "downside", "interest"]
+    assert names == ["corridor", "constant", "momentum", "downside", "interest", "trend"]
     yield lambda: [sys.modules.pop(name, None) for name in names]
     for name in names:
         sys.modules.pop(name, None)
@@ -89,7 +89,9 @@ def test_the_page_about_own_parts(own, monkeypatch, capsys):
         "pathwise", "equal-weight", "minimum-variance", "Momentum"
     }  # fmt: skip
     config = json.loads(Path("runs/own/config.json").read_text())
-    assert config["agents"]["pathwise"]["task"]["reward"] == "downside:Downside"
+    task = config["agents"]["pathwise"]["task"]
+    assert task["reward"] == "downside:Downside"
+    assert task["signals"] == "momentum:120-20,trend:Trend:60"
     policy = [
         "allocate",
         "runs/backtest",

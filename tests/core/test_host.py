@@ -373,6 +373,7 @@ def test_names_and_presets():
 TINY = ["--set", "hidden=8", "num_envs=2", "batch_size=8", "learning_starts=16"]
 
 
+@pytest.mark.slow
 def test_the_command_trains_reports_and_goes_on(tmp_path, monkeypatch, capsys):
     folder = tmp_path / "run"
     start = ["train", "gym:CartPole-v1", "--agent", "dqn", "--seeds", "2", "--out", folder]

@@ -139,11 +139,7 @@ class Blind(RewardDelay):
 @pytest.mark.parametrize(
     ("task", "changes", "says"),
     [
-        (
-            Endless(),
-            {"learning_rate": 1e30},
-            "loss of seed 4, 5 is no longer finite",
-        ),
+        (Endless(), {"learning_rate": 1e30}, "loss of seed 4, 5 is no longer finite"),
         (Explosive(), {}, "reward of Explosive is not finite at step 42 of an episode"),
         (Blind(), {}, "observation of Blind is not finite after step 1 of an episode"),
     ],

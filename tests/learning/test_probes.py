@@ -66,7 +66,7 @@ def variants(*quick):
 
 @pytest.mark.parametrize(
     "changes",
-    variants("plain", "quantile", "rainbow categorical"),
+    variants("plain", "quantile"),
 )
 def test_two_states(changes):
     values = learned_values(TwoStates(), [[1.0], [-1.0]], **changes)

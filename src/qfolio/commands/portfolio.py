@@ -74,6 +74,7 @@ def backtest(
     rolling: bool = False,
     cap: float = 1.0,
     cost_model: str = "proportional",
+    signals: Name = None,
     baselines: Name = None,
     seeds: Count = None,
     seed: int = 0,
@@ -103,6 +104,9 @@ def backtest(
         rolling: Train on a window of fixed length instead of all rows so far.
         cap: Largest weight of one asset, from 0 to 1.
         cost_model: Cost of trading and holding: proportional, or your own as module:Name.
+        signals: Signals that agents observe beside returns, separated by commas, each with the rows
+            that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
+            own as module:Name (default: none).
         baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight
             is always among them (default: all of qfolio's).
         seeds: Agents of each kind (default: the preset's number).
@@ -135,7 +139,8 @@ def backtest(
     if resume is None:
         table = load(file, missing=missing, late=late, features=features, date=date)
         chosen = {name: _preset(agent, preset, episodes) for name, agent in _split(agents).items()}
-        chosen = _assign(chosen, settings.parse(assignments))
+        observed = {} if signals is None else {"signals": signals}
+        chosen = _assign(chosen, observed | settings.parse(assignments))
         folder = out or Path("runs") / f"backtest-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         run = Backtest.create(
             table,
@@ -267,6 +272,15 @@ def _known(kind: registry.Kind, name: str) -> str:
     return name
 
 
+def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
+    """The parts that a setting of the task names."""
+    from qfolio.portfolio.signals import names
+
+    if setting == "signals":
+        return [("signal", name) for name in names(value)]
+    return [("reward", value)] if setting == "reward" else []
+
+
 def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
     from qfolio.experiments import presets
 
@@ -277,7 +291,7 @@ def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
 
 def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
     """Presets with changed settings: of one agent (dqn.discount), of all that have it, or of the
-    task."""
+    task. Imports the modules of parts that they name."""
     from qfolio.portfolio.task import Portfolio
 
     used = set()
@@ -293,7 +307,9 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
             if rest in settings.names(kind):
                 own[rest] = value
             elif rest in settings.names(Portfolio) - own_options:
-                task[rest] = _known("reward", value) if rest == "reward" else value
+                for part, named in _named(rest, value):
+                    registry.find(part, named)
+                task[rest] = value
             else:
                 continue
             used.add(key)

@@ -2,7 +2,8 @@
 
 A user's own class is named ``module:Name``; the module may lie in the current directory. An
 installed package offers its classes as entry points in the groups ``qfolio.tasks``,
-``qfolio.agents``, ``qfolio.baselines``, ``qfolio.rewards`` and ``qfolio.costs``. Names that a user
+``qfolio.agents``, ``qfolio.baselines``, ``qfolio.rewards``, ``qfolio.costs`` and
+``qfolio.signals``. Names that a user
 types are imported (``find``). Names in a folder may come from someone else: they must be in modules
 that have already been imported (``imported``, ``build``).
 """
@@ -66,9 +67,23 @@ REWARDS = {
     "mean-variance": "qfolio.portfolio.rewards:MeanVariance",
     "differential-sharpe": "qfolio.portfolio.rewards:DifferentialSharpe",
 }
+SIGNALS = {
+    "momentum": "qfolio.portfolio.signals:Momentum",
+    "reversal": "qfolio.portfolio.signals:Reversal",
+    "volatility": "qfolio.portfolio.signals:Volatility",
+    "volatility-ratio": "qfolio.portfolio.signals:VolatilityRatio",
+    "high": "qfolio.portfolio.signals:High",
+    "moving-average": "qfolio.portfolio.signals:MovingAverage",
+    "maximum": "qfolio.portfolio.signals:Maximum",
+    "beta": "qfolio.portfolio.signals:Beta",
+    "residual-volatility": "qfolio.portfolio.signals:ResidualVolatility",
+    "correlation": "qfolio.portfolio.signals:Correlation",
+    "market-momentum": "qfolio.portfolio.signals:MarketMomentum",
+    "market-volatility": "qfolio.portfolio.signals:MarketVolatility",
+}
 COSTS = {"proportional": "qfolio.portfolio.costs:Proportional"}
 
-Kind = Literal["task", "agent", "baseline", "reward", "cost"]
+Kind = Literal["task", "agent", "baseline", "reward", "cost", "signal"]
 
 
 class Entries(NamedTuple):
@@ -89,6 +104,7 @@ ENTRIES: dict[Kind, Entries] = {
     "baseline": Entries(BASELINES, "qfolio.portfolio.backtest.baselines:Baseline"),
     "reward": Entries(REWARDS, "qfolio.portfolio.rewards:Reward"),
     "cost": Entries(COSTS, "qfolio.portfolio.costs:CostModel"),
+    "signal": Entries(SIGNALS, "qfolio.portfolio.signals:Signal"),
 }
 
 GYM = "gym:"

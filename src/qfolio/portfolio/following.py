@@ -22,10 +22,9 @@ TOLERANCE = 1e-4
 
 def on_table(task: Portfolio, prices: Prices) -> Portfolio:
     """The same task over all rows of another table, with the scale of its training data."""
-    other = Portfolio.arrays(prices)
-    rows = jnp.array(len(prices) - 1, jnp.int32)
-    where = lambda t: (t.log_relatives, t.extra, t.first_decision, t.last_decision)  # noqa: E731
-    return eqx.tree_at(where, task, (*other, jnp.array(task.window, jnp.int32), rows))
+    rows = jnp.array(task.window, jnp.int32), jnp.array(len(prices) - 1, jnp.int32)
+    where = lambda t: (t.first_decision, t.last_decision)  # noqa: E731
+    return eqx.tree_at(where, task.on(prices), rows)
 
 
 def follow(

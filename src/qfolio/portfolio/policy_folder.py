@@ -6,46 +6,59 @@ learning.safetensors the whole learning state, for updates.
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import PyTree
 
 from qfolio.core import settings
+from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import new_folder, read_json, read_tree, write_json, write_tree
+from qfolio.core.files import new_folder, read_tree, write_tree
 from qfolio.core.mdp import Agent
 from qfolio.core.registry import build, name_of
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.task import Portfolio
 
-FORMAT = 3
-"""Format of a policy's folder; raised whenever an older folder can no longer be read."""
+
+class PolicyConfig(Config, frozen=True):
+    """The configuration of a policy's folder."""
+
+    kind: ClassVar[str] = "policy"
+    format: ClassVar[int] = 4
+
+    agent: str
+    settings: dict[str, Any]
+    task: dict[str, Any]
+    assets: Annotated[list[str], msgspec.Meta(min_length=1)]
+    features: list[str]
+    seeds: Annotated[int, msgspec.Meta(ge=1, lt=2**20)]
+    rows: Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
+    updates: Annotated[int, msgspec.Meta(ge=0)]
+    learned: str
+    learns: bool
 
 
 def save(policy: Policy, folder: Path) -> None:
     """Writes a policy into a new or empty folder."""
+    config = PolicyConfig(
+        agent=name_of(policy.agent),
+        settings=settings.describe(policy.agent),
+        task=settings.describe(policy.task),
+        assets=list(policy.assets),
+        features=list(policy.features),
+        seeds=policy.seeds,
+        rows=policy.rows,
+        updates=policy.updates,
+        learned=str(policy.learned),
+        learns=policy.learner is not None,
+    )
     with new_folder(folder) as place:
-        write_json(
-            place / "policy.json",
-            {
-                "format": FORMAT,
-                "kind": "policy",
-                "agent": name_of(policy.agent),
-                "settings": settings.describe(policy.agent),
-                "task": settings.describe(policy.task),
-                "assets": list(policy.assets),
-                "features": list(policy.features),
-                "seeds": policy.seeds,
-                "rows": policy.rows,
-                "updates": policy.updates,
-                "learned": str(policy.learned),
-                "learns": policy.learner is not None,
-            },
-        )
+        write_config(place / "policy.json", config)
         kept = jax.tree.map(np.asarray, _kept(policy.task, policy.members))
         write_tree(place / "policy.safetensors", kept)
         if policy.learner is not None:
@@ -55,28 +68,22 @@ def save(policy: Policy, folder: Path) -> None:
 def read(folder: Path) -> Policy:
     """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
     path = folder / "policy.json"
-    config = read_json(path)
-    if config.get("format") != FORMAT or config.get("kind") != "policy":
-        raise QfolioError(f"{folder} holds no policy of this version.")
+    config = read_config(path, PolicyConfig)
     try:
-        agent: Agent = build("agent", config["agent"], config["settings"])
-        chosen = settings.convert(Portfolio, config["task"])
-        assets, features = tuple(config["assets"]), tuple(config["features"])
-        seeds, rows, updates = (int(config[name]) for name in ("seeds", "rows", "updates"))
-        learned, learns = np.datetime64(config["learned"], "s"), bool(config["learns"])
-        bounds = (len(assets) > 0, 1 <= seeds < 2**20, 1 <= rows < 2**31, updates >= 0)
-        if not all(bounds) or not all(isinstance(name, str) for name in assets + features):
-            raise ValueError
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise QfolioError(f"{path} is damaged: a setting is missing or invalid.") from None
-    task = _blank(len(assets), len(features), rows, **chosen)
-    state = state_template(task, agent, seeds)
+        learned = np.datetime64(config.learned, "s")
+    except ValueError:
+        raise QfolioError(f"{path} is damaged: learned is {config.learned!r}, no date.") from None
+    agent: Agent = build("agent", config.agent, config.settings)
+    task = _blank(config)
+    state = state_template(task, agent, config.seeds)
     template = _kept(task, agent.weights(state))
     kept = read_tree(path.with_name("policy.safetensors"), template)
     members = kept.pop("members")
     task = dataclasses.replace(task, **jax.tree.map(jnp.asarray, kept))
-    learner = read_tree(path.with_name("learning.safetensors"), state) if learns else None
-    return Policy(task, agent, members, assets, features, learner, updates, learned)
+    learner = read_tree(path.with_name("learning.safetensors"), state) if config.learns else None
+    return Policy(
+        task, agent, members, config.assets, config.features, learner, config.updates, learned
+    )
 
 
 def state_template(task: Portfolio, agent: Agent, seeds: int) -> PyTree:
@@ -95,19 +102,13 @@ def _kept(task: Portfolio, members: PyTree) -> dict[str, PyTree]:
     }
 
 
-def _blank(assets: int, features: int, rows: int, **chosen: Any) -> Portfolio:
-    """A task of the given number of training rows, without their prices."""
-    task = Portfolio(
-        log_relatives=jnp.zeros((0, assets)),
-        extra=jnp.zeros((0, assets, features)),
-        limits=jnp.zeros(assets),
-        center=jnp.zeros(1 + features),
-        scale=jnp.ones(1 + features),
-        first_decision=jnp.array(0, jnp.int32),
-        last_decision=jnp.array(0, jnp.int32),
-        **chosen,
+def _blank(config: PolicyConfig) -> Portfolio:
+    """The task without its prices."""
+    chosen = settings.convert(Portfolio, config.task)
+    task = Portfolio.blank(len(config.assets), len(config.features), **chosen)
+    shown = jax.tree.map(
+        lambda x: jnp.zeros((task.window, *x.shape[1:])), (task.log_relatives, task.extra)
     )
-    shown = (jnp.zeros((task.window, assets)), jnp.zeros((task.window, assets, features)))
-    last = jnp.array(rows - task.lag - 2, jnp.int32)
+    last = jnp.array(config.rows - task.lag - 2, jnp.int32)
     where = lambda t: (t.log_relatives, t.extra, t.first_decision, t.last_decision)  # noqa: E731
     return eqx.tree_at(where, task, (*shown, jnp.array(task.window, jnp.int32), last))

@@ -1,9 +1,9 @@
 """A portfolio of assets with given prices.
 
 State: the row of the price table, the portfolio. Observation: for each asset a window of log
-returns (and of any other features), and the current weights. Action: target weights, or a choice
-from a menu. A decision sees prices up to row t, is executed at the close of row t + lag, and earns
-the move to the row after. No observation at t depends on a later price.
+returns, of the table's features and of signals, and the current weights. Action: target weights, or
+a choice from a menu. A decision sees prices up to row t, is executed at the close of row t + lag,
+and earns the move to the row after. No observation at t depends on a later price.
 """
 
 from typing import Any
@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Position, Simplex
+from qfolio.portfolio import signals
 from qfolio.portfolio.market import Market, Relatives
 from qfolio.portfolio.prices.table import Prices
 
@@ -43,6 +44,8 @@ class Portfolio(Market):
     cost_model: str = static("proportional")
     max_weight: float = constant(1.0)  # of one asset
     menu: str = static("")
+    signals: str = static("")  # names of signals that are observed, see portfolio.signals
+    signal_scale: str = static("rank")  # of signals across assets: rank, z-score or raw
     reward: str = static("log")
     risk_aversion: float = number(3.0)
     sharpe_rate: float = number(0.01)
@@ -51,35 +54,50 @@ class Portfolio(Market):
     @staticmethod
     def of(prices: Prices, **settings: Any) -> "Portfolio":
         """A task on all rows of a table."""
-        values = prices.values
-        log_relatives, extra = Portfolio.arrays(prices)
-        channels = 1 + extra.shape[2]
-        task = Portfolio(
-            log_relatives=log_relatives,
-            extra=extra,
-            limits=jnp.ones(values.shape[1]),
-            center=jnp.zeros(channels),
-            scale=jnp.ones(channels),
+        task = Portfolio.blank(len(prices.assets), len(prices.feature_names), **settings)
+        first = ~np.isnan(prices.values[0])
+        return task.on(prices).part(0, len(prices) - 1, first)
+
+    @staticmethod
+    def blank(assets: int, features: int, **settings: Any) -> "Portfolio":
+        """A task without prices."""
+        channels = features + len(signals.parse(settings.get("signals", "")))
+        return Portfolio(
+            log_relatives=jnp.zeros((0, assets)),
+            extra=jnp.zeros((0, assets, channels)),
+            limits=jnp.zeros(assets),
+            center=jnp.zeros(1 + channels),
+            scale=jnp.ones(1 + channels),
             first_decision=jnp.array(0, jnp.int32),
             last_decision=jnp.array(0, jnp.int32),
             **settings,
         )
-        return task.part(0, len(values) - 1, ~np.isnan(values[0]))
 
-    @staticmethod
-    def arrays(prices: Prices) -> tuple[Array, Array]:
-        """``log_relatives`` and ``extra`` of a table."""
+    def on(self, prices: Prices) -> "Portfolio":
+        """The same task on another table, with all else as it is.
+
+        Raises QfolioError if the table is shorter than a signal looks back.
+        """
+        chosen = signals.parse(self.signals)
+        if len(prices) <= signals.lookback(chosen):
+            raise QfolioError(
+                f"{len(prices)} rows are too few: a signal looks back on "
+                f"{signals.lookback(chosen)}; bring more rows, or name signals that look back less."
+            )
         logs = np.zeros(prices.values.shape)
         logs[1:] = np.nan_to_num(np.diff(np.log(prices.values), axis=0))
-        extra = np.nan_to_num(prices.features)
-        return jnp.asarray(logs, jnp.float32), jnp.asarray(extra, jnp.float32)
+        computed = signals.compute(chosen, prices.values, self.signal_scale)
+        extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
+        where = lambda t: (t.log_relatives, t.extra)  # noqa: E731
+        arrays = jnp.asarray(logs, jnp.float32), jnp.asarray(extra, jnp.float32)
+        return eqx.tree_at(where, self, arrays)
 
     def __check_init__(self) -> None:
         require(self, "window horizon", lambda x: 1 <= x <= 100_000, "from 1 to 100,000")
         require(self, "lag", lambda x: 0 <= x <= 1000, "from 0 to 1000 rows")
         require(self, "max_weight", lambda x: 0 < x <= 1, "above 0 and at most 1")
         require(self, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
-        _ = self.costs, self.reward_function  # which check their own settings
+        _ = self.parts  # which check their own settings
 
     def part(self, first: int, last: int, tradable: np.ndarray | None = None) -> "Portfolio":
         """The same task on rows ``first`` to ``last`` alone.
@@ -115,6 +133,11 @@ class Portfolio(Market):
                 jnp.array(last - self.lag - 1, jnp.int32),
             ),
         )
+
+    @property
+    def parts(self) -> list[object]:
+        """Cost model, reward and signals, which a user may have named."""
+        return [self.costs, self.reward_function, *signals.parse(self.signals)]
 
     @property
     def actions(self) -> Actions:

@@ -220,10 +220,8 @@ class Backtest:
 
     @property
     def parts(self) -> list[object]:
-        """Agents, baselines, rewards and cost models, which may be of a user's own modules."""
-        tasks = [
-            part for task in self.tasks.values() for part in (task.costs, task.reward_function)
-        ]
+        """Agents, baselines and parts of tasks, which may be of a user's own modules."""
+        tasks = [part for task in self.tasks.values() for part in task.parts]
         return [*self.agents.values(), *self.baselines.values(), *tasks]
 
     def policy(self, agent: str | None = None) -> Policy:

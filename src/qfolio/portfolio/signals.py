@@ -1,0 +1,302 @@
+"""Signals: numbers for each asset and row, from prices up to that row.
+
+``signals="momentum:252-21,volatility:21"`` of a portfolio names some, each with the rows that it
+looks back on and the latest rows that it skips; a user's own are ``module:Name``, with rows or
+without. Agents observe them after the log return and the table's own features. By default each is
+ranked across assets, from −1 to 1, and nothing has to be fitted; a number that all assets share
+stays as it is. docs/signals.md lists formulas and sources.
+"""
+
+import abc
+import re
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+from numpy.typing import NDArray
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import static
+from qfolio.core.registry import SIGNALS, build
+
+Floats = NDArray[np.float64]
+
+SCALES = ("rank", "z-score", "raw")
+"""Across assets, row by row: ranks from −1 to 1; distances from the mean in standard deviations,
+cut at ±3; or the numbers themselves."""
+
+
+class Signal(eqx.Module):
+    """A number for each asset and row, which depends on no later row.
+
+    rows: how far it looks back. skip: latest rows that it leaves out.
+    """
+
+    shared: ClassVar[bool] = False
+    """Whether all assets have the same number, which then has no rank."""
+
+    rows: int = static(21)
+    skip: int = static(0)
+
+    def __check_init__(self) -> None:
+        if not 0 <= self.skip < self.rows <= 100_000:
+            raise QfolioError(
+                f"A signal looks back on {self.rows} rows and skips {self.skip}; it must look back "
+                "on 1 to 100,000 and skip fewer."
+            )
+
+    @abc.abstractmethod
+    def __call__(self, prices: Floats) -> Floats:
+        """The signal, shape (row, asset), NaN where it is unknown.
+
+        prices: of the same shape, NaN before an asset's first.
+        """
+
+
+class Momentum(Signal):
+    """Log return over the rows but the latest (Jegadeesh & Titman 1993)."""
+
+    def __call__(self, prices: Floats) -> Floats:
+        return _before(np.log(prices), self.skip) - _before(np.log(prices), self.rows)
+
+
+class Reversal(Momentum):
+    """Minus the log return (Jegadeesh 1990; Lehmann 1990)."""
+
+    def __call__(self, prices: Floats) -> Floats:
+        return -super().__call__(prices)
+
+
+class Volatility(Signal):
+    """Log standard deviation of log returns (Ang, Hodrick, Xing & Zhang 2006)."""
+
+    def __call__(self, prices: Floats) -> Floats:
+        return _log(_deviation(_before(_returns(prices), self.skip), self.rows - self.skip))
+
+
+class VolatilityRatio(Signal):
+    """Log ratio of the volatility over the latest ``skip`` rows to that over all."""
+
+    rows: int = static(252)
+    skip: int = static(21)
+
+    def __call__(self, prices: Floats) -> Floats:
+        returns = _returns(prices)
+        return _log(_deviation(returns, max(2, self.skip))) - _log(_deviation(returns, self.rows))
+
+
+class High(Signal):
+    """Log of the price over its maximum (George & Hwang 2004)."""
+
+    rows: int = static(252)
+
+    def __call__(self, prices: Floats) -> Floats:
+        past = _before(prices, self.skip)
+        return np.log(past / _rolling(past, self.rows - self.skip).max().to_numpy())
+
+
+class MovingAverage(Signal):
+    """Log of the price over its mean (Brock, Lakonishok & LeBaron 1992)."""
+
+    rows: int = static(200)
+
+    def __call__(self, prices: Floats) -> Floats:
+        past = _before(prices, self.skip)
+        return np.log(past / _rolling(past, self.rows - self.skip).mean().to_numpy())
+
+
+class Maximum(Signal):
+    """Largest return of a row (Bali, Cakici & Whitelaw 2011)."""
+
+    def __call__(self, prices: Floats) -> Floats:
+        past = _before(_returns(prices), self.skip)
+        return _rolling(past, self.rows - self.skip).max().to_numpy()
+
+
+class Beta(Signal):
+    """Slope of an asset's log returns on the market's, their mean (Sharpe 1964)."""
+
+    rows: int = static(252)
+
+    def __call__(self, prices: Floats) -> Floats:
+        returns = _before(_returns(prices), self.skip)
+        return _slope(returns, _market(returns), self.rows - self.skip)
+
+
+class ResidualVolatility(Signal):
+    """Log standard deviation of what beta leaves of log returns (Ang et al. 2006)."""
+
+    rows: int = static(252)
+
+    def __call__(self, prices: Floats) -> Floats:
+        rows = self.rows - self.skip
+        returns = _before(_returns(prices), self.skip)
+        market = _market(returns)
+        slope = _slope(returns, market, rows)
+        explained = slope**2 * _deviation(market, rows) ** 2
+        return _log(np.sqrt(np.maximum(_deviation(returns, rows) ** 2 - explained, 0)))
+
+
+class Correlation(Signal):
+    """Correlation of an asset's log returns with the mean of the others'."""
+
+    rows: int = static(252)
+
+    def __call__(self, prices: Floats) -> Floats:
+        rows = self.rows - self.skip
+        returns = _before(_returns(prices), self.skip)
+        known = ~np.isnan(returns)
+        others = np.nansum(returns, 1, keepdims=True) - np.nan_to_num(returns)
+        count = known.sum(1, keepdims=True) - known
+        others = np.where(known & (count > 0), others / np.maximum(count, 1), np.nan)
+        both = _covariance(returns, others, rows)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = both / (_deviation(returns, rows) * _deviation(others, rows))
+        return np.where(np.isfinite(ratio), ratio, np.nan)
+
+
+class MarketMomentum(Signal):
+    """Log return of the market, whose log returns are the mean of the assets' (shared)."""
+
+    shared = True
+    rows: int = static(252)
+
+    def __call__(self, prices: Floats) -> Floats:
+        past = _before(_market(_returns(prices)), self.skip)
+        rows = self.rows - self.skip
+        return rows * _rolling(past, rows).mean().to_numpy()
+
+
+class MarketVolatility(Signal):
+    """Log standard deviation of the market's log returns (shared; Moreira & Muir 2017)."""
+
+    shared = True
+
+    def __call__(self, prices: Floats) -> Floats:
+        past = _before(_market(_returns(prices)), self.skip)
+        return _log(_deviation(past, self.rows - self.skip))
+
+
+def parse(text: str) -> list[Signal]:
+    """The signals that a text names; raises QfolioError if there is no such signal."""
+    return [_named(part) for part in _parts(text)]
+
+
+def names(text: str) -> list[str]:
+    """The names in such a text, without rows."""
+    return [_split(part)[0] for part in _parts(text)]
+
+
+def lookback(signals: Sequence[Signal]) -> int:
+    """Rows before one at which all signals are known."""
+    return max((signal.rows for signal in signals), default=0)
+
+
+def compute(signals: Sequence[Signal], prices: Floats, scale: str = "rank") -> Floats:
+    """Signals of shape (row, asset, signal), 0 where one is unknown.
+
+    Raises QfolioError if the scale is unknown, or if a signal has the wrong shape or looks ahead.
+    """
+    if scale not in SCALES:
+        raise QfolioError(f"signal_scale is {scale!r}; it must be one of {', '.join(SCALES)}.")
+    found = [_scaled(_checked(signal, prices), signal.shared, scale) for signal in signals]
+    return np.stack(found, -1) if found else np.zeros((*prices.shape, 0))
+
+
+def _parts(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _split(text: str) -> tuple[str, dict[str, str]]:
+    """A signal's name, and its rows and skip if it has any."""
+    match = re.fullmatch(r"(.+?)(?::(\d+)(?:-(\d+))?)?", text)
+    assert match is not None  # anything is a name
+    name, *given = match.groups()
+    pairs = zip(("rows", "skip"), given, strict=True)
+    return name, {key: value for key, value in pairs if value is not None}
+
+
+def _named(text: str) -> Signal:
+    name, chosen = _split(text)
+    return build("signal", name, chosen)
+
+
+def _checked(signal: Signal, prices: Floats) -> Floats:
+    """The signal; a user's own is computed again without the latest rows."""
+    name = type(signal).__name__
+    found = np.asarray(signal(prices), float)
+    if found.shape != prices.shape:
+        raise QfolioError(
+            f"The signal {name} has the shape {found.shape}; it must be {prices.shape}, one number "
+            "for each row and asset."
+        )
+    if f"{type(signal).__module__}:{name}" not in SIGNALS.values():
+        for cut in np.linspace(1, len(prices) - 1, 4).astype(int):
+            if not np.array_equal(signal(prices[:cut])[-1], found[cut - 1], equal_nan=True):
+                raise QfolioError(
+                    f"The signal {name} looks ahead: its value at row {cut - 1} changes when later "
+                    "rows are taken away."
+                )
+    return found
+
+
+def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
+    if not shared and scale == "rank":
+        import pandas as pd
+
+        ranks = pd.DataFrame(values).rank(axis=1).to_numpy()
+        count = (~np.isnan(values)).sum(1, keepdims=True)
+        values = np.where(count > 1, 2 * (ranks - 1) / np.maximum(count - 1, 1) - 1, 0)
+    elif not shared and scale == "z-score":
+        known = ~np.isnan(values)
+        count = np.maximum(known.sum(1, keepdims=True), 1)
+        centred = values - np.nansum(values, 1, keepdims=True) / count
+        spread = np.sqrt(np.nansum(centred**2, 1, keepdims=True) / count)
+        values = np.clip(centred / np.where(spread > 0, spread, 1), -3, 3)
+    return np.nan_to_num(values, posinf=0, neginf=0)
+
+
+def _before(values: Floats, rows: int) -> Floats:
+    """The values that many rows before."""
+    return np.concatenate([np.full((min(rows, len(values)), *values.shape[1:]), np.nan),
+                           values[: max(0, len(values) - rows)]])  # fmt: skip
+
+
+def _returns(prices: Floats) -> Floats:
+    """Log returns, NaN in the first row."""
+    return np.log(prices) - _before(np.log(prices), 1)
+
+
+def _market(returns: Floats) -> Floats:
+    """The mean over the assets that are there, the same for each."""
+    known = ~np.isnan(returns)
+    count = known.sum(1, keepdims=True)
+    mean = np.nansum(returns, 1, keepdims=True) / np.maximum(count, 1)
+    return np.broadcast_to(np.where(count > 0, mean, np.nan), returns.shape)
+
+
+def _rolling(values: Floats, rows: int) -> Any:
+    import pandas as pd
+
+    return pd.DataFrame(values).rolling(rows, min_periods=rows)
+
+
+def _covariance(x: Floats, y: Floats, rows: int) -> Floats:
+    mean = lambda values: _rolling(values, rows).mean().to_numpy()  # noqa: E731
+    unknown = np.where(np.isnan(x) | np.isnan(y), np.nan, 0)
+    return mean(x * y) - mean(x + unknown) * mean(y + unknown)
+
+
+def _deviation(values: Floats, rows: int) -> Floats:
+    return _rolling(values, rows).std(ddof=0).to_numpy()
+
+
+def _slope(returns: Floats, market: Floats, rows: int) -> Floats:
+    variance = _deviation(market, rows) ** 2
+    return _covariance(returns, market, rows) / np.where(variance > 0, variance, np.nan)
+
+
+def _log(values: Floats) -> Floats:
+    """The logarithm; NaN for 0."""
+    return np.log(np.where(values > 0, values, np.nan))

@@ -1,0 +1,160 @@
+"""Signals: formulas by hand, no look at later rows, and what a portfolio makes of them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.registry import SIGNALS
+from qfolio.portfolio import signals
+from qfolio.portfolio.following import on_table
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+
+EACH = [f"{name}:8-2" for name in SIGNALS]
+
+
+def prices(rows=60, assets=5, seed=0):
+    rng = np.random.default_rng(seed)
+    values = 50 * np.exp(np.cumsum(rng.normal(0, 0.02, (rows, assets)), axis=0))
+    values[:25, -1] = np.nan  # it joins later
+    return values
+
+
+def signal(text, values):
+    (found,) = signals.parse(text)
+    return found(values)
+
+
+@pytest.mark.parametrize("text", EACH)
+def test_none_looks_ahead(text):
+    values = prices()
+    now = signal(text, values)
+    for row in (20, 30, 45):
+        later = values.copy()
+        later[row + 1 :] *= np.exp(
+            np.random.default_rng(row).normal(0, 0.3, later[row + 1 :].shape)
+        )
+        np.testing.assert_array_equal(signal(text, later)[: row + 1], now[: row + 1])
+        np.testing.assert_array_equal(signal(text, values[: row + 1]), now[: row + 1])
+
+
+@pytest.mark.parametrize("text", EACH)
+def test_each_is_known_from_its_last_row_on(text):
+    values = prices()
+    known = ~np.isnan(signal(text, values))
+    assert not known[:6].any()
+    assert known[8:, :4].all()
+    if not signals.parse(text)[0].shared:
+        assert not known[:25, 4].any()
+    assert known[34:].all()
+
+
+def test_formulas_by_hand():
+    values = prices(seed=3)[:, :4]
+    r = np.diff(np.log(values), axis=0)  # r[t − 1] is the return of row t
+    t = 40
+    market = r.mean(1)
+    last, skipped = slice(t - 8, t), slice(t - 8, t - 2)
+    level = np.log(values[t - 7 : t + 1])
+    expected = {
+        "momentum:8": np.log(values[t] / values[t - 8]),
+        "momentum:8-2": np.log(values[t - 2] / values[t - 8]),
+        "reversal:8": -np.log(values[t] / values[t - 8]),
+        "volatility:8": np.log(r[last].std(0)),
+        "volatility:8-2": np.log(r[skipped].std(0)),
+        "volatility-ratio:8-3": np.log(r[t - 3 : t].std(0) / r[last].std(0)),
+        "high:8": level[-1] - level.max(0),
+        "moving-average:8": np.log(values[t] / values[t - 7 : t + 1].mean(0)),
+        "maximum:8": r[last].max(0),
+        "market-momentum:8": np.full(4, market[last].sum()),
+        "market-volatility:8": np.full(4, np.log(market[last].std())),
+        "beta:8": [np.polyfit(market[last], r[last, i], 1)[0] for i in range(4)],
+        "correlation:8": [
+            np.corrcoef(r[last, i], np.delete(r[last], i, 1).mean(1))[0, 1] for i in range(4)
+        ],
+    }
+    for text, wanted in expected.items():
+        np.testing.assert_allclose(signal(text, values)[t], wanted, rtol=1e-8, err_msg=text)
+    slope = np.array(expected["beta:8"])
+    rest = r[last] - market[last, None] * slope
+    found = signal("residual-volatility:8", values)[t]
+    np.testing.assert_allclose(found, np.log(rest.std(0)), rtol=1e-8)
+
+
+class Level(signals.Signal):
+    def __call__(self, prices):
+        return prices
+
+
+class Tomorrow(signals.Signal):
+    def __call__(self, prices):
+        return np.vstack([prices[1:], prices[-1:]])
+
+
+class Short(signals.Signal):
+    def __call__(self, prices):
+        return prices[:-1]
+
+
+def test_scales_by_hand():
+    values = np.array(
+        [[1.0, 3.0, 2.0, np.nan], [5.0, 5.0, 9.0, 7.0], [4.0, np.nan, np.nan, np.nan]]
+    )
+    of = lambda scale: signals.compute([Level()], values, scale)[..., 0]  # noqa: E731
+    ranks = np.array([[-1, 1, 0, 0], [-2 / 3, -2 / 3, 1, 1 / 3], [0, 0, 0, 0]])
+    np.testing.assert_allclose(of("rank"), ranks)
+    unit = 1.5**0.5
+    np.testing.assert_allclose(of("z-score")[0], [-unit, unit, 0.0, 0.0])
+    np.testing.assert_allclose(of("z-score")[2], 0)
+    np.testing.assert_allclose(of("raw")[0], [1, 3, 2, 0])
+
+
+def test_what_all_assets_share_has_no_rank():
+    values = prices()[:, :4]
+    (shared,) = signals.parse("market-momentum:5")
+    found = signals.compute([shared], values, "rank")[..., 0]
+    np.testing.assert_array_equal(found[10:], shared(values)[10:])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("momentun:5", "there is no signal 'momentun'; did you mean momentum"),
+        ("momentum:0", "looks back on 0 rows"),
+        ("momentum:5-5", "5 rows and skips 5"),
+        ("test_nowhere:Mine", "is code of the module test_nowhere"),
+    ],
+)
+def test_what_is_no_signal(text, says):
+    with pytest.raises(QfolioError, match=says):
+        signals.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"), [(Tomorrow(), "Tomorrow looks ahead: its value at row"), (Short(), "shape")]
+)
+def test_a_signal_of_ones_own_is_checked(wrong, says):
+    with pytest.raises(QfolioError, match=says):
+        signals.compute([wrong], prices()[:, :4])
+    signals.compute([Level()], prices()[:, :4])
+
+
+def table(rows=60):
+    values = prices()[:rows, :3]
+    return Prices(np.datetime64("2020-01-01") + np.arange(rows), ("a", "b", "c"), values)
+
+
+def test_a_portfolio_observes_them():
+    text = "momentum:8-2,market-volatility:5"
+    task = Portfolio.of(table(), window=2, horizon=10, signals=text)
+    assert task.features(jnp.array(30)).shape == (3, 2, 3)
+    ranks = signals.compute(signals.parse(text), table().values)
+    np.testing.assert_allclose(task.extra, ranks, rtol=1e-6)
+    again = on_table(task, table(50))
+    np.testing.assert_array_equal(again.extra, task.extra[:50])
+    np.testing.assert_array_equal(again.scale, task.scale)
+    with pytest.raises(QfolioError, match="8 rows are too few: a signal looks back on 8"):
+        on_table(task, table(8))
+    with pytest.raises(QfolioError, match="signal_scale is 'log'"):
+        Portfolio.of(table(), window=2, horizon=10, signals=text, signal_scale="log")
