@@ -74,7 +74,12 @@ class Band(eqx.Module):
             + unit / 8 * jnp.array([-1.0, 1.0])
             + scale * self.network.answer(reading, holding)[1]
         )
-        assets = jnp.clip(holding, edges.min(-1), edges.max(-1))
+        # By selection: a minimum's gradient asks which entry equals it, which none does if the
+        # compiler computes the entries twice and rounds differently.
+        one, other = edges[..., 0], edges[..., 1]
+        swapped = other < one
+        low, high = jnp.where(swapped, other, one), jnp.where(swapped, one, other)
+        assets = lax.clamp(low, holding, high)
         if isinstance(self.actions, Box):
             return assets
         return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
