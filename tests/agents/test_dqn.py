@@ -34,6 +34,7 @@ from qfolio.learning.targets import (
     chosen,
     huber_loss,
     possible_values,
+    smallest,
     td_target,
 )
 from qfolio.portfolio.synthetic.ar1 import Ar1
@@ -66,6 +67,13 @@ def test_bootstrap_by_hand():
     online = jnp.array([[9.0, 0.0, 0.0], [0.0, 0.0, 7.0]])
     np.testing.assert_allclose(bootstrap(target, target), [3, 6])  # max: Mnih et al.
     np.testing.assert_allclose(bootstrap(target, online), [1, 4])  # double
+
+
+def test_the_smallest_estimate_by_hand():
+    values = jnp.array([[1.0, 5.0, 2.0], [3.0, 4.0, 2.0]])
+    np.testing.assert_array_equal(smallest(values), [1, 4, 2])
+    slope = jax.grad(lambda x: (smallest(x) * jnp.array([1.0, 10, 100])).sum())(values)
+    np.testing.assert_array_equal(slope, [[1, 0, 100], [0, 10, 0]])
 
 
 def test_td_target_by_hand():

@@ -32,7 +32,7 @@ from qfolio.learning import optimizer
 from qfolio.learning.exploration import OrnsteinUhlenbeck
 from qfolio.learning.networks import outputs_of, saturation, with_last_layer
 from qfolio.learning.replay import Experience
-from qfolio.learning.targets import Scalar, follow
+from qfolio.learning.targets import Scalar, follow, smallest
 
 REACH = 4.0
 """Output beyond which tanh counts as flat; there it is within 0.0007 of its bound."""
@@ -82,7 +82,7 @@ def actor_loss(
     saturation_penalty: cost of a unit of ``saturation``.
     """
     output = actor.network(observation)
-    value = critics(observation, actor.among(output)).min(0).mean()
+    value = smallest(critics(observation, actor.among(output))).mean()
     return saturation_penalty * saturation(actor.actions, output, REACH).mean() - value, {}
 
 

@@ -74,8 +74,7 @@ class Band(eqx.Module):
             + unit / 8 * jnp.array([-1.0, 1.0])
             + scale * self.network.answer(reading, holding)[1]
         )
-        # By selection: a minimum's gradient asks which entry equals it, which none does if the
-        # compiler computes the entries twice and rounds differently.
+        # By selection, as in targets.smallest.
         one, other = edges[..., 0], edges[..., 1]
         swapped = other < one
         low, high = jnp.where(swapped, other, one), jnp.where(swapped, one, other)

@@ -28,7 +28,7 @@ from qfolio.core.mdp import Actions, Discrete, Metrics, Simplex, Task
 from qfolio.learning import optimizer
 from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed
 from qfolio.learning.networks import Outputs, outputs_of
-from qfolio.learning.targets import Scalar, Scale, follow
+from qfolio.learning.targets import Scalar, Scale, follow, smallest
 
 LOG_STD = (-10.0, 2.0)
 """Bounds of a normal number's log standard deviation."""
@@ -80,14 +80,14 @@ def expectations(
     """
     policy = actor(observation)
     if isinstance(policy, Categorical):
-        q = critics.every(observation).min(0)
+        q = smallest(critics.every(observation))
         return (jax.nn.softmax(policy.logits) * q).sum(-1), policy.entropy()
     if isinstance(policy, Gaussian):
         action = policy.sample(key)
         log_prob = policy.log_prob(action)
     else:
         action, log_prob = policy.sample_and_log_prob(key)
-    return critics(observation, action).min(0), -log_prob
+    return smallest(critics(observation, action)), -log_prob
 
 
 def actor_loss(
@@ -158,7 +158,7 @@ class SAC(ActorCritic[Learned]):
         """Q(s, ·) in units of reward, if actions are numbered; includes later entropy."""
         if weights.critics is None:
             return None
-        return weights.critics.every(observation).min(0) / self.reward_scale
+        return smallest(weights.critics.every(observation)) / self.reward_scale
 
     def explore(
         self, state: ActorCriticState[Learned], observation: PyTree, key: PRNGKeyArray

@@ -17,6 +17,7 @@ from qfolio.agents.actor_critic import Batch, Critics
 from qfolio.agents.ddpg import DDPG, Learned
 from qfolio.core.fields import number, require, static
 from qfolio.core.mdp import Metrics
+from qfolio.learning.targets import smallest
 
 
 class TD3(DDPG):
@@ -47,7 +48,7 @@ class TD3(DDPG):
         noise = self.target_noise * jax.random.normal(key, action.shape)
         noise = jnp.clip(noise, -self.target_noise_clip, self.target_noise_clip)
         action = learned.target_actor.perturb(action, noise)
-        return learned.target_critics(observation, action).min(0)
+        return smallest(learned.target_critics(observation, action))
 
     def climbed(self, critics: Critics) -> Critics:
         if self.pessimistic_actor:

@@ -1,5 +1,6 @@
 """Targets and losses of values and policies, as pure functions."""
 
+from functools import reduce
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -30,6 +31,15 @@ def bootstrap(
     network evaluate; with ``selector = q_next`` this is max_a Q'(s', a) (Mnih et al. 2015).
     """
     return chosen(q_next, selector.argmax(1))
+
+
+def smallest(values: Float[Array, "critic *batch"]) -> Float[Array, "*batch"]:
+    """The smallest of several estimates, and its gradient.
+
+    By selection: the gradient of ``min`` asks which estimate equals it. None does, and the gradient
+    is 0/0, if a compiler computes the estimates twice and rounds them differently.
+    """
+    return reduce(lambda least, other: jnp.where(other < least, other, least), values)
 
 
 def td_target(
