@@ -21,6 +21,9 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import cache_directory, read_arrays, write_arrays
 from qfolio.core.mdp import Discrete, Step, Task
 
+OPTIMIZED: dict[str, int | str | bool] = {"xla_backend_optimization_level": 3}
+"""Options of the compiler, whatever its flags say: solving takes long without optimisation."""
+
 
 class GridOptimum:
     """The optimum of a deterministic task whose state is a pair of coordinates.
@@ -41,7 +44,10 @@ class GridOptimum:
     def returns(self, keys: Key[Array, " start"]) -> np.ndarray:
         """Undiscounted returns over the task's horizon of the optimal policy, one for each key."""
         starts = jax.vmap(self.task.reset)(keys)
-        solve = jax.jit(lambda: self._follow(self._solve(1.0, self.task.horizon), starts))
+        solve = jax.jit(
+            lambda: self._follow(self._solve(1.0, self.task.horizon), starts),
+            compiler_options=OPTIMIZED,
+        )
         name = np.asarray(jax.random.key_data(keys)).tobytes()
         return self._cached(name, lambda: {"returns": solve()})["returns"]
 
@@ -61,7 +67,8 @@ class GridOptimum:
             actions = self._action_values(values, discount).argmax(0)
             return {"value": values, "action": actions.astype(jnp.int32)}
 
-        solution = self._cached(f"stationary {discount}".encode(), jax.jit(solve))
+        compiled = jax.jit(solve, compiler_options=OPTIMIZED)
+        solution = self._cached(f"stationary {discount}".encode(), compiled)
         return solution["value"], solution["action"]
 
     @property
