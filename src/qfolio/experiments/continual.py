@@ -141,9 +141,9 @@ class Course(msgspec.Struct):
 FIRST = "first training"
 
 WAYS = {
-    "frozen": "the policy as it is",
-    "going on": "the same memory, a small learning rate",
-    "renewed": "an empty memory, schedules begun again",
+    "frozen": "the policy, unchanged",
+    "going on": "the same replay buffer, a small learning rate",
+    "renewed": "an empty replay buffer, restarted schedules",
     "fresh": "a new agent",
 }
 
