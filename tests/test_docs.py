@@ -112,7 +112,7 @@ def test_the_page_about_own_parts(own, monkeypatch, capsys):
     own()
     assert qfolio(monkeypatch, "backtest", "--resume", "runs/own") == 2
     assert "--trust" in capsys.readouterr().err
-    trusted = ["--trust", "momentum", "downside", "interest"]
+    trusted = ["--trust", "momentum", "downside", "interest", "trend"]
     assert qfolio(monkeypatch, "backtest", "--resume", "runs/own", *trusted) == 0
     own()
     assert run(evaluate) == 0
