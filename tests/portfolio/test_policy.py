@@ -45,7 +45,8 @@ def table(rows=ROWS, seed=0, features=1):
 
 def learned(name, agent=None, **changes):
     chosen, task = AGENTS[name]
-    options = {"seeds": 2, "episodes": 16, "window": WINDOW, "horizon": 10, **task, **changes}
+    own = {"window": WINDOW, "horizon": 10, "signals": "momentum:8-2", **task}
+    options = {"seeds": 2, "episodes": 16, **own, **changes}
     return train(table().between(0, 60), agent or chosen, **options)
 
 

@@ -87,17 +87,17 @@ def actor_loss(
 
 
 class DDPGState(ActorCriticState[Learned]):
-    noise: OrnsteinUhlenbeck | None  # that lasts; None: each step's is independent
+    noise: OrnsteinUhlenbeck | None  # correlated over time; None: independent at each step
 
 
 class DDPG(ActorCritic[Learned]):
     """A deterministic actor and a critic, both with targets that follow them."""
 
     exploration_noise: float = number(0.1)  # standard deviation of the noise, in units of the bound
-    noise_theta: float = constant(1.0)  # share of the noise that a step forgets; 1: independent
+    noise_theta: float = constant(1.0)  # mean reversion of the noise; 1: independent at each step
     saturation_penalty: float = number(0.1)  # on outputs where tanh is flat; 0: none
-    late_action: bool = static(False)  # it enters the critic at the second layer
-    critic_weight_decay: float = constant(0.0)  # price of half the critic's squared weights
+    late_action: bool = static(False)  # the action enters the critic at its second layer
+    critic_weight_decay: float = constant(0.0)  # coefficient of the critic's L2 penalty
     last_layer_bound: float = constant(0.0)  # last layers start uniform in ± it; 0: in ±1/√inputs
 
     critics: ClassVar[int] = 1
@@ -142,8 +142,8 @@ class DDPG(ActorCritic[Learned]):
         assert isinstance(state, DDPGState)
         actor = state.learned.actor
         action = actor(observation)
-        lasting = state.noise
-        noise = jax.random.normal(key, action.shape) if lasting is None else lasting.value
+        process = state.noise
+        noise = jax.random.normal(key, action.shape) if process is None else process.value
         return actor.perturb(action, self.exploration_noise * noise)
 
     def observe(self, state: State, rollout: Transition) -> State:

@@ -70,8 +70,8 @@ class DQN(Agent):
     num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     batch_size: int = static(64)
-    train_freq: int = static(1)  # steps of all environments between times of learning
-    gradient_steps: int = static(1)  # gradient steps each time
+    train_freq: int = static(1)  # steps of all environments between updates
+    gradient_steps: int = static(1)  # gradient steps of an update
     replay_capacity: int = static(50_000)  # transitions
     learning_starts: int = static(64)  # transitions stored before learning
     double: bool = static(False)

@@ -33,11 +33,11 @@ GAIN = 3.0
 """Gain of the model's first layer: inputs within ±1 should reach the bend of SiLU."""
 
 LOG_VARIANCE = (-10.0, 0.5)
-"""Where a predicted log variance is kept, softly (the first bounds of Chua et al. 2018)."""
+"""Soft bounds of a predicted log variance (the first bounds of Chua et al. 2018)."""
 
 
 class Prediction(NamedTuple):
-    """Of every member."""
+    """The predictions of all members."""
 
     mean: Float[Array, "member batch prediction"]
     log_variance: Float[Array, "member batch prediction"] | None  # None: no distribution
@@ -60,7 +60,7 @@ class Model(eqx.Module):
     def __call__(
         self, observation: Float[Array, "batch seen"], action: Array
     ) -> Float[Array, "member batch outputs"]:
-        """What every member's network gives."""
+        """The outputs of all members' networks."""
         if isinstance(self.actions, Discrete):
             action = jax.nn.one_hot(action, self.actions.n)
         else:
@@ -126,7 +126,7 @@ def model_loss(
 def squared_errors(
     model: Model, prediction: Prediction, step: Experience
 ) -> Float[Array, "member batch prediction"]:
-    """Of the means, relative to the batch's variance."""
+    """Squared errors of the means, relative to the batch's variance."""
     truth = model.truth(step)
     unit = jnp.maximum(truth.std(0), 1e-2).at[-1].set(1.0)
     return ((prediction.mean - truth) / unit) ** 2

@@ -24,14 +24,14 @@ class EpsilonSchedule(NamedTuple):
 
 
 class LinearSchedule(NamedTuple):
-    """ε, which falls along a line and then stays (Mnih et al. 2015)."""
+    """ε, which decays linearly to a constant (Mnih et al. 2015)."""
 
     epsilon_start: Scalar
     epsilon_end: Scalar
-    epsilon_steps: Scalar  # steps until it stays
+    epsilon_steps: Scalar  # steps of the decay
 
     def __call__(self, steps: Float[Array, ""]) -> Float[Array, ""]:
-        """ε after so many steps."""
+        """ε after this many steps."""
         left = jnp.maximum(1 - steps / self.epsilon_steps, 0.0)
         return self.epsilon_end + left * (self.epsilon_start - self.epsilon_end)
 
@@ -62,7 +62,7 @@ def epsilon_greedy(
 
 
 class OrnsteinUhlenbeck(eqx.Module):
-    """Noise that lasts: x ← (1 − θ) x + N(0, 1), from 0 in each episode (Lillicrap et al. 2016)."""
+    """Correlated noise: x ← (1 − θ) x + N(0, 1), from 0 in each episode (Lillicrap et al. 2016)."""
 
     value: Float[Array, "environment entry"]  # of the next actions
     key: UInt32[Array, "2"]
@@ -73,7 +73,7 @@ class OrnsteinUhlenbeck(eqx.Module):
         return noise.step(1.0, jnp.ones(shape[0], bool))
 
     def step(self, theta: Scalar, finished: Bool[Array, " environment"]) -> "OrnsteinUhlenbeck":
-        """The noise of the step behind one that may have ended its episode."""
+        """The noise of the next step; ``finished`` environments start again from 0."""
         key, draw_key = jax.random.split(jax.random.wrap_key_data(self.key))
         kept = jnp.where(finished[:, None], 0.0, (1 - theta) * self.value)
         drawn = jax.random.normal(draw_key, kept.shape)
