@@ -83,17 +83,22 @@ def test_formulas_by_hand():
 
 
 class Level(signals.Signal):
-    def __call__(self, prices):
+    def measure(self, prices, rows):
         return prices
 
 
+def test_a_signal_of_ones_own_skips_rows_as_the_others_do():
+    values = prices()[:, :4]
+    np.testing.assert_array_equal(Level(rows=8, skip=2)(values)[2:], values[:-2])
+
+
 class Tomorrow(signals.Signal):
-    def __call__(self, prices):
+    def measure(self, prices, rows):
         return np.vstack([prices[1:], prices[-1:]])
 
 
 class Short(signals.Signal):
-    def __call__(self, prices):
+    def measure(self, prices, rows):
         return prices[:-1]
 
 

@@ -21,7 +21,6 @@ Gain = Float[Array, "*inputs"] | float
 ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "silu": jax.nn.silu}
 """Activations by name: jax's functions cannot be pickled."""
 
-
 INITIALIZATIONS = ("uniform", "orthogonal")
 """How layers start, by name."""
 

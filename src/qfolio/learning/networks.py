@@ -240,13 +240,13 @@ def saturation(
 
 
 def last_layer(network: Any) -> Any:
-    """Weights and biases of the layer that gives the outputs."""
+    """Weights and biases of the output layer."""
     mlp = network.network.head if isinstance(network, PerAsset) else network.mlp
     return mlp.weights[-1], mlp.biases[-1]
 
 
 def with_last_layer(network: Network, bound: float) -> Network:
-    """The network as it begins, but with a last layer that is uniform in ±``bound``."""
+    """The network with its uniform last layer rescaled to ±``bound``."""
     factor = bound * math.sqrt(last_layer(network)[0].shape[-2])
     return eqx.tree_at(last_layer, network, replace_fn=lambda x: factor * x)
 

@@ -24,14 +24,14 @@ KINDS = ("adam", "rmsprop", "rmsprop-centered", "sgd")
 
 
 class OptimizerConfig(NamedTuple):
-    """What an agent's settings say of its optimiser; the names are those of the settings."""
+    """An agent's settings of its optimiser; the names are those of the settings."""
 
     optimizer: str = "adam"
-    rmsprop_decay: float = 0.99  # share of the mean (of squared gradients) that a step keeps
-    optimizer_epsilon: float = 1e-8  # added to what a gradient is divided by
+    rmsprop_decay: float = 0.99  # of the running mean of squared gradients
+    optimizer_epsilon: float = 1e-8  # added to the divisor of a gradient
 
     def check(self) -> None:
-        """Raises QfolioError where the settings make no sense."""
+        """Raises QfolioError if the settings are invalid."""
         require(self, "optimizer", lambda x: x in KINDS, f"one of {', '.join(KINDS)}")
         require(self, "rmsprop_decay", lambda x: 0 <= x < 1, "at least 0 and below 1")
         require(self, "optimizer_epsilon", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
@@ -41,7 +41,7 @@ ADAM = OptimizerConfig()
 
 
 class Optimizer(eqx.Module):
-    """What an optimiser remembers; what its kind does not need stays zero."""
+    """The state of an optimiser; arrays that its kind does not use stay zero."""
 
     count: Int[Array, ""]  # gradient steps so far
     mu: PyTree  # means of the gradients
@@ -49,7 +49,7 @@ class Optimizer(eqx.Module):
     config: OptimizerConfig = eqx.field(static=True)
 
     def direction(self, gradient: Weights) -> tuple[Weights, "Optimizer"]:
-        """Where to go, and what is remembered then."""
+        """The direction of descent, and the new state."""
         kind, decay, epsilon = self.config
         if kind == "adam":
             state = optax.ScaleByAdamState(self.count, self.mu, self.nu)

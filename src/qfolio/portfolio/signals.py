@@ -46,33 +46,41 @@ class Signal(eqx.Module):
                 "on 1 to 100,000 and skip fewer."
             )
 
-    @abc.abstractmethod
     def __call__(self, prices: Floats) -> Floats:
         """The signal, shape (row, asset), NaN where it is unknown.
 
         prices: of the same shape, NaN before an asset's first.
         """
+        return self.measure(_before(prices, self.skip), self.rows - self.skip)
+
+    @abc.abstractmethod
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        """The signal of each row, looking back on ``rows`` rows, with nothing left to skip.
+
+        prices: as known ``skip`` rows before, shape (row, asset), NaN where unknown.
+        """
 
 
 class Momentum(Signal):
-    """Log return over the rows but the latest (Jegadeesh & Titman 1993)."""
+    """Log return (Jegadeesh & Titman 1993)."""
 
-    def __call__(self, prices: Floats) -> Floats:
-        return _before(np.log(prices), self.skip) - _before(np.log(prices), self.rows)
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        logs = np.log(prices)
+        return logs - _before(logs, rows)
 
 
 class Reversal(Momentum):
     """Minus the log return (Jegadeesh 1990; Lehmann 1990)."""
 
-    def __call__(self, prices: Floats) -> Floats:
-        return -super().__call__(prices)
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        return -super().measure(prices, rows)
 
 
 class Volatility(Signal):
     """Log standard deviation of log returns (Ang, Hodrick, Xing & Zhang 2006)."""
 
-    def __call__(self, prices: Floats) -> Floats:
-        return _log(_deviation(_before(_returns(prices), self.skip), self.rows - self.skip))
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        return _log(_deviation(_returns(prices), rows))
 
 
 class VolatilityRatio(Signal):
@@ -82,8 +90,11 @@ class VolatilityRatio(Signal):
     skip: int = static(21)
 
     def __call__(self, prices: Floats) -> Floats:
+        return self.measure(prices, self.rows)
+
+    def measure(self, prices: Floats, rows: int) -> Floats:
         returns = _returns(prices)
-        return _log(_deviation(returns, max(2, self.skip))) - _log(_deviation(returns, self.rows))
+        return _log(_deviation(returns, max(2, self.skip))) - _log(_deviation(returns, rows))
 
 
 class High(Signal):
@@ -91,9 +102,8 @@ class High(Signal):
 
     rows: int = static(252)
 
-    def __call__(self, prices: Floats) -> Floats:
-        past = _before(prices, self.skip)
-        return np.log(past / _rolling(past, self.rows - self.skip).max().to_numpy())
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        return np.log(prices / _rolling(prices, rows).max().to_numpy())
 
 
 class MovingAverage(Signal):
@@ -101,17 +111,15 @@ class MovingAverage(Signal):
 
     rows: int = static(200)
 
-    def __call__(self, prices: Floats) -> Floats:
-        past = _before(prices, self.skip)
-        return np.log(past / _rolling(past, self.rows - self.skip).mean().to_numpy())
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        return np.log(prices / _rolling(prices, rows).mean().to_numpy())
 
 
 class Maximum(Signal):
     """Largest return of a row (Bali, Cakici & Whitelaw 2011)."""
 
-    def __call__(self, prices: Floats) -> Floats:
-        past = _before(_returns(prices), self.skip)
-        return _rolling(past, self.rows - self.skip).max().to_numpy()
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        return _rolling(_returns(prices), rows).max().to_numpy()
 
 
 class Beta(Signal):
@@ -119,9 +127,9 @@ class Beta(Signal):
 
     rows: int = static(252)
 
-    def __call__(self, prices: Floats) -> Floats:
-        returns = _before(_returns(prices), self.skip)
-        return _slope(returns, _market(returns), self.rows - self.skip)
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        returns = _returns(prices)
+        return _slope(returns, _market(returns), rows)
 
 
 class ResidualVolatility(Signal):
@@ -129,9 +137,8 @@ class ResidualVolatility(Signal):
 
     rows: int = static(252)
 
-    def __call__(self, prices: Floats) -> Floats:
-        rows = self.rows - self.skip
-        returns = _before(_returns(prices), self.skip)
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        returns = _returns(prices)
         market = _market(returns)
         slope = _slope(returns, market, rows)
         explained = slope**2 * _deviation(market, rows) ** 2
@@ -143,9 +150,8 @@ class Correlation(Signal):
 
     rows: int = static(252)
 
-    def __call__(self, prices: Floats) -> Floats:
-        rows = self.rows - self.skip
-        returns = _before(_returns(prices), self.skip)
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        returns = _returns(prices)
         known = ~np.isnan(returns)
         others = np.nansum(returns, 1, keepdims=True) - np.nan_to_num(returns)
         count = known.sum(1, keepdims=True) - known
@@ -162,10 +168,8 @@ class MarketMomentum(Signal):
     shared = True
     rows: int = static(252)
 
-    def __call__(self, prices: Floats) -> Floats:
-        past = _before(_market(_returns(prices)), self.skip)
-        rows = self.rows - self.skip
-        return rows * _rolling(past, rows).mean().to_numpy()
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        return rows * _rolling(_market(_returns(prices)), rows).mean().to_numpy()
 
 
 class MarketVolatility(Signal):
@@ -173,9 +177,8 @@ class MarketVolatility(Signal):
 
     shared = True
 
-    def __call__(self, prices: Floats) -> Floats:
-        past = _before(_market(_returns(prices)), self.skip)
-        return _log(_deviation(past, self.rows - self.skip))
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        return _log(_deviation(_market(_returns(prices)), rows))
 
 
 def parse(text: str) -> list[Signal]:
