@@ -156,10 +156,14 @@ def test_a_portfolio_observes_them():
     assert task.features(jnp.array(30)).shape == (3, 2, 3)
     ranks = signals.compute(signals.parse(text), table().values)
     np.testing.assert_allclose(task.extra, ranks, rtol=1e-6)
+    np.testing.assert_array_equal(
+        Portfolio.of(table(15), horizon=5, signals=text, window=2).extra, task.extra[:15]
+    )  # unknown at first, and so 0
+    assert not task.extra[:5].any()
     again = on_table(task, table(50))
     np.testing.assert_array_equal(again.extra, task.extra[:50])
     np.testing.assert_array_equal(again.scale, task.scale)
-    with pytest.raises(QfolioError, match="8 rows are too few: a signal looks back on 8"):
+    with pytest.raises(QfolioError, match="8 rows of prices are too few: a signal looks back on 8"):
         on_table(task, table(8))
     with pytest.raises(QfolioError, match="signal_scale is 'log'"):
         Portfolio.of(table(), window=2, horizon=10, signals=text, signal_scale="log")

@@ -292,7 +292,8 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         if task.states is not None:
             self.observation_space = spaces.Discrete(task.states)
         elif self._named:
-            self.observation_space = spaces.Dict({k: number(x) for k, x in seen._asdict().items()})
+            shown = {k: number(x) for k, x in seen._asdict().items() if x is not None}
+            self.observation_space = spaces.Dict(shown)
         else:
             self.observation_space = number(seen)
         actions = task.actions
@@ -334,7 +335,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
 
     def _as_numpy(self, observation: Any) -> Any:
         if self._named:
-            return {name: np.array(x) for name, x in observation._asdict().items()}
+            return {name: np.array(x) for name, x in observation._asdict().items() if x is not None}
         if isinstance(self.observation_space, spaces.Discrete):
             return np.int64(observation)
         return np.array(observation, np.float32)

@@ -13,6 +13,7 @@ class View(NamedTuple):
 
     features: Float[Array, "*batch asset time channel"]
     holding: Float[Array, "*batch asset"]  # weights, without cash
+    anchor: Float[Array, "*batch asset"] | None = None  # weights to depart from, if any
 
 
 class MenuActions(Discrete):

@@ -189,6 +189,15 @@ class ExogenousTask(Task):
     def next_market(self, market: PyTree, key: PRNGKeyArray) -> PyTree:
         """The next state of the market."""
 
+    @property
+    def moves(self) -> Float[Array, ""] | float:
+        """The number of moves in the market's data; infinite if they are drawn anew."""
+        return math.inf
+
+    def place(self, market: PyTree) -> Float[Array, ""]:
+        """The place of a state's move in the data, from 0 on; 0 if moves are drawn anew."""
+        return jnp.array(0.0)
+
     @abc.abstractmethod
     def draw_holding(self, key: PRNGKeyArray) -> PyTree:
         """A random holding, so that an agent learns to act from any."""

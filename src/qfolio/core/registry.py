@@ -39,6 +39,7 @@ TASKS = {
 AGENTS = {
     "dqn": "qfolio.agents.dqn:DQN",
     "pathwise": "qfolio.agents.pathwise:Pathwise",
+    "tilts": "qfolio.agents.tilts:Tilts",
     "q-learning": "qfolio.agents.tabular:QLearning",
     "sarsa": "qfolio.agents.tabular:Sarsa",
     "expected-sarsa": "qfolio.agents.tabular:ExpectedSarsa",

@@ -161,8 +161,16 @@ class Market(ExogenousTask):
     def intent(self, state: Position, action: Array) -> Float[Array, " entry"]:
         return self.target(state.holding.weights, action)
 
+    def anchor_weights(self, market: PyTree) -> Float[Array, " asset"] | None:
+        """The weights that a policy may depart from, if the market has any."""
+        return None
+
+    def view(self, market: PyTree, weights: Float[Array, " entry"]) -> View:
+        """The observation of a market, from weights held."""
+        return View(self.features(market), weights[1:], self.anchor_weights(market))
+
     def observe(self, state: Position) -> View:
-        return View(self.features(state.market), state.holding.weights[1:])
+        return self.view(state.market, state.holding.weights)
 
     def draw_holding(self, key: PRNGKeyArray) -> Holding:
         return self.hold(self.feasible.draw(key))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Position, Simplex
-from qfolio.portfolio import signals
+from qfolio.portfolio import anchors, signals
 from qfolio.portfolio.market import Market, Relatives
 from qfolio.portfolio.prices.table import Prices
 
@@ -33,6 +33,7 @@ class Portfolio(Market):
 
     log_relatives: Float[Array, "row asset"]  # log of price over the row before; 0 if unknown
     extra: Float[Array, "row asset feature"]
+    anchors: Float[Array, "row asset"]  # weights of the anchor; no rows without one
     limits: Float[Array, " asset"]  # largest weight of each asset; 0 where it cannot be traded
     center: Float[Array, " channel"]  # of the observed channels, from the rows of the part
     scale: Float[Array, " channel"]
@@ -46,6 +47,7 @@ class Portfolio(Market):
     menu: str = static("")
     signals: str = static("")  # names of signals that are observed, see portfolio.signals
     signal_scale: str = static("rank")  # of signals across assets: rank, z-score or raw
+    anchor: str = static("")  # that agents may depart from, see portfolio.anchors
     reward: str = static("log")
     risk_aversion: float = number(3.0)
     sharpe_rate: float = number(0.01)
@@ -65,6 +67,7 @@ class Portfolio(Market):
         return Portfolio(
             log_relatives=jnp.zeros((0, assets)),
             extra=jnp.zeros((0, assets, channels)),
+            anchors=jnp.zeros((0, assets)),
             limits=jnp.zeros(assets),
             center=jnp.zeros(1 + channels),
             scale=jnp.ones(1 + channels),
@@ -76,20 +79,16 @@ class Portfolio(Market):
     def on(self, prices: Prices) -> "Portfolio":
         """The same task on another table, with all else as it is.
 
-        Raises QfolioError if the table is shorter than a signal looks back.
+        Signals are 0 where they are not known yet.
         """
         chosen = signals.parse(self.signals)
-        if len(prices) <= signals.lookback(chosen):
-            raise QfolioError(
-                f"{len(prices)} rows are too few: a signal looks back on "
-                f"{signals.lookback(chosen)}; bring more rows, or name signals that look back less."
-            )
         logs = np.zeros(prices.values.shape)
         logs[1:] = np.nan_to_num(np.diff(np.log(prices.values), axis=0))
         computed = signals.compute(chosen, prices.values, self.signal_scale)
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
-        where = lambda t: (t.log_relatives, t.extra)  # noqa: E731
-        arrays = jnp.asarray(logs, jnp.float32), jnp.asarray(extra, jnp.float32)
+        followed = anchors.path(self.anchor, prices) if self.anchor else logs[:0]
+        where = lambda t: (t.log_relatives, t.extra, t.anchors)  # noqa: E731
+        arrays = [jnp.asarray(x, jnp.float32) for x in (logs, extra, followed)]
         return eqx.tree_at(where, self, arrays)
 
     def __check_init__(self) -> None:
@@ -161,6 +160,22 @@ class Portfolio(Market):
         others = lax.dynamic_slice_in_dim(self.extra, start, self.window)
         channels = jnp.concatenate([returns[..., None], others], -1)
         return jnp.swapaxes((channels - self.center) / self.scale, 0, 1)
+
+    def anchor_weights(self, market: Row) -> Float[Array, " asset"] | None:
+        """The anchor's weights; those of assets that cannot be traded go to the others."""
+        if not self.anchor:
+            return None
+        weights = lax.dynamic_index_in_dim(self.anchors, market, keepdims=False)
+        kept = jnp.where(self.limits > 0, weights, 0.0)
+        share = kept / jnp.maximum(kept.sum(), 1e-9)
+        return jnp.minimum(weights.sum() * share, self.limits)
+
+    @property
+    def moves(self) -> Float[Array, ""]:
+        return self.last_decision - self.first_decision + 1.0
+
+    def place(self, market: Row) -> Float[Array, ""]:
+        return 1.0 * (market - self.first_decision)
 
     def relatives(self, market: Row, next_market: Row) -> Relatives:
         # Rows up to market + lag + 1 exist for every decision that is settled.

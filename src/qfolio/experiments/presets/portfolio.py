@@ -94,6 +94,14 @@ _TD3 = {**_DDPG, "target_noise": 0.02, "target_noise_clip": 0.05}
 _SAC = {**_OFF_POLICY, "initial_temperature": 0.1}
 
 
+SIGNALS = (
+    "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,momentum:63,momentum:126,"
+    "momentum:252-21,momentum:42-21,volatility:21,volatility:126,volatility-ratio:252-21,high:252,"
+    "maximum:21,moving-average:10,moving-average:200,beta:252,residual-volatility:252,"
+    "correlation:252,market-volatility:63"
+)
+
+
 def _on_weights(agent: str, settings: dict[str, Any], episodes: int) -> dict[str, Preset]:
     return {"fast": Preset(agent, settings, episodes, seeds=5, task=_TASK)}
 
@@ -114,6 +122,15 @@ PRESETS: Presets = {
         ),
     },
     ("portfolio", "pathwise"): _on_weights("pathwise", _PATHWISE, episodes=800),
+    ("portfolio", "tilts"): {
+        "fast": Preset(
+            "tilts",
+            {},
+            episodes=2560,
+            seeds=5,
+            task={"window": 1, "horizon": 84, "signals": SIGNALS, "anchor": "equal-weight"},
+        )
+    },
     ("portfolio", "ppo"): _on_weights("ppo", _PPO, episodes=480),
     ("portfolio", "a2c"): _on_weights("a2c", _A2C, episodes=800),
     ("portfolio", "reinforce"): _on_weights("reinforce", _REINFORCE, episodes=960),

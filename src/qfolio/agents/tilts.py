@@ -1,0 +1,313 @@
+"""Anchored tilts: a policy that departs from an anchor as far as the evidence carries.
+
+Each asset has a score, linear in its signals and in their products with the state of the market
+(Brandt, Santa-Clara & Valkanov 2009). The target is the anchor, tilted by the scores; a learned
+share of the way to it is traded, outside a learned band. Everything is trained by the gradient of
+net utility through whole paths, as in ``pathwise.py``.
+
+Several members learn side by side, each without some blocks of the data. What a member earns over
+the anchor in the blocks that it has not seen is the evidence: the policy, the mean of the members,
+is shrunk to the anchor by it, after James & Stein (1961), and stays there without it.
+docs/tilts.md lists formulas and their sources.
+"""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from qfolio.core import simplex
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import number, require, static
+from qfolio.core.market import View
+from qfolio.core.mdp import Agent, ExogenousTask, Metrics, Position, Simplex, Task, Transition
+from qfolio.learning import optimizer
+from qfolio.learning.optimizer import CosineSchedule
+
+LARGEST = 3.0
+"""Inputs are clipped to ± this many standard deviations of the training data."""
+
+
+class Tilt(eqx.Module):
+    """Maps a view of the market to target weights, cash first.
+
+    The scores of assets are s = x·(θ + Θc) with an asset's inputs x, the latest of its features but
+    the first (its return), and their mean over the assets c, the state of the market: features that
+    rank assets have mean 0 and do not enter it. The target is the anchor times exp(s), rescaled to
+    the anchor's sum.
+    """
+
+    linear: Float[Array, " channel"]  # θ
+    interaction: Float[Array, "channel channel"]  # Θ
+    rate: Float[Array, ""]  # logit of the share of the way to the target that is traded
+    band: Float[Array, ""]  # log of the deviation that is not traded, relative to the anchor
+    actions: Simplex
+
+    @staticmethod
+    def start(channels: int, actions: Simplex) -> "Tilt":
+        """The anchor, 30 % of the way at each step, outside a band of 5 % of each weight."""
+        square = jnp.zeros((channels, channels))
+        rate, band = jnp.array(math.log(0.3 / 0.7)), jnp.array(math.log(0.05))
+        return Tilt(jnp.zeros(channels), square, rate, band, actions)
+
+    def scores(
+        self, features: Float[Array, "*batch asset time channel"]
+    ) -> Float[Array, "*batch asset"]:
+        inputs = jnp.clip(features[..., -1, 1:], -LARGEST, LARGEST)
+        weights = self.linear + inputs.mean(-2) @ self.interaction.T
+        return jnp.einsum("...ac,...c->...a", inputs, weights)
+
+    def target(self, view: View) -> Float[Array, "*batch entry"]:
+        """The tilted anchor, cash first, each asset's weight at most the cap."""
+        assert view.anchor is not None
+        total, open_to = view.anchor.sum(-1, keepdims=True), view.anchor > 0
+        scores = self.scores(view.features) + jnp.log(jnp.where(open_to, view.anchor, 1.0))
+        tilted = total * jax.nn.softmax(scores, where=open_to)
+        target = jnp.concatenate([1 - total, tilted], -1)
+        if self.actions.cap == 1:
+            return target
+        return simplex.project(target, jnp.asarray(self.actions.caps))
+
+    def traded(
+        self,
+        held: Float[Array, "*batch asset"],
+        target: Float[Array, "*batch entry"],
+        anchor: Float[Array, "*batch asset"],
+    ) -> Float[Array, "*batch entry"]:
+        """The order: part of the way from the weights held to the target.
+
+        What an asset is off its target beyond the band is traded at the rate, as far as purchases
+        and sales pay for each other. Cash beyond the target's is invested at once.
+        """
+        gap = target[..., 1:] - held
+        band = jnp.exp(self.band) * anchor
+        bought, sold = jnp.maximum(gap - band, 0.0), jnp.maximum(-gap - band, 0.0)
+        buying, selling = bought.sum(-1, keepdims=True), sold.sum(-1, keepdims=True)
+        matched = jnp.where(buying < selling, buying, selling)
+        trade = bought * _ratio(matched, buying) - sold * _ratio(matched, selling)
+        idle = 1 - held.sum(-1, keepdims=True) - target[..., :1]
+        assets = target[..., 1:]
+        source = jnp.where(idle > 0, assets, held)
+        invested = idle * source * _ratio(1.0, source.sum(-1, keepdims=True))
+        assets = held + jax.nn.sigmoid(self.rate) * trade + invested
+        return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
+
+
+class Evidence(NamedTuple):
+    """What the members earned over the anchor in the blocks that they have not seen."""
+
+    steps: Float[Array, " block"]  # earlier ones count less
+    total: Float[Array, " block"]  # of rewards over the anchor's
+    square: Float[Array, " block"]
+
+    @staticmethod
+    def none(blocks: int) -> "Evidence":
+        return Evidence(*jnp.zeros((3, blocks)))
+
+    def add(
+        self,
+        block: Int[Array, "time path"],
+        active: Float[Array, "time path"],
+        counted: Float[Array, "time path"],
+        memory: Array | float,
+    ) -> "Evidence":
+        """With the steps of a rollout, counted by 1 or 0; all else fades."""
+        new = (counted, counted * active, counted * active**2)
+        where = block.ravel()
+        return Evidence(
+            *(memory * old.at[where].add(x.ravel()) for old, x in zip(self, new, strict=True))
+        )
+
+    @property
+    def t(self) -> Float[Array, ""]:
+        """The t-statistic over blocks of mean over deviation: each weighs the same, calm or not."""
+        known = self.steps > 1
+        mean = _ratio(self.total, self.steps)
+        deviation = jnp.sqrt(jnp.maximum(_ratio(self.square, self.steps) - mean**2, 0.0))
+        ratio, blocks = _ratio(mean, deviation), known.sum()
+        center = _ratio((known * ratio).sum(), blocks)
+        spread = _ratio((known * (ratio - center) ** 2).sum(), jnp.maximum(blocks - 1.0, 0.0))
+        return _ratio(center * jnp.sqrt(1.0 * blocks), jnp.sqrt(spread))
+
+
+class TiltsState(eqx.Module):
+    """The state of a Tilts agent."""
+
+    members: Tilt  # with a leading member axis
+    policy: Tilt  # their mean, shrunk to the anchor by the evidence
+    optimizer: optimizer.Optimizer
+    evidence: Evidence
+
+
+class Tilts(Agent):
+    """Gradient ascent on net utility, with a penalty on tracking error and on tilts."""
+
+    members: int = static(4)  # each learns without every so-many-th block of the data
+    blocks: int = static(32)  # of the data, of equal length
+    num_envs: int = static(32)  # paths in a batch
+    rollout_length: int = static(84)  # steps of a path
+    head: int = static(21)  # of these, first steps that only lead to a holding
+    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
+    learning_rate: float = number(0.1)
+    learning_rate_final: float = number(0.0)  # share of it that remains at the end of the cosine
+    learning_rate_steps: float = number(80.0)  # gradient steps of the cosine
+    tracking_aversion: float = number(10.0)  # of the variance of rewards over the anchor's
+    ridge: float = number(0.3)  # on squared coefficients, divided by the moves of the data
+    threshold: float = number(2.0)  # t-statistic up to which the policy stays at the anchor
+    memory: float = number(0.9)  # share of the evidence that a gradient step keeps
+
+    def __check_init__(self) -> None:
+        require(self, "members blocks num_envs", lambda x: 1 <= x < 2**31, "at least 1")
+        require(self, "rollout_length", lambda x: x >= 2, "at least 2")
+        require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
+                f"rollout_length, {self.rollout_length}")  # fmt: skip
+        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "tracking_aversion ridge", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
+        require(self, "threshold", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
+        require(self, "memory", lambda x: 0 <= x < 1, "at least 0 and below 1")
+        self._schedule.check()
+        if self.members > self.blocks:
+            raise QfolioError(
+                f"members is {self.members}; with {self.blocks} blocks it can be at most "
+                f"{self.blocks}."
+            )
+
+    @property
+    def _schedule(self) -> CosineSchedule:
+        return CosineSchedule(
+            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
+        )
+
+    @property
+    def discount(self) -> None:
+        return None
+
+    @property
+    def rollout_steps(self) -> int:
+        return self.rollout_length
+
+    def init(self, task: Task, key: PRNGKeyArray) -> TiltsState:
+        view = task.observe(task.reset(key))
+        if not isinstance(task, ExogenousTask) or getattr(view, "anchor", None) is None:
+            raise QfolioError(
+                f"tilts departs from an anchor, and {task.name} has none; train it on a portfolio, "
+                "with a task setting such as anchor=equal-weight."
+            )
+        if not isinstance(task.actions, Simplex):
+            raise QfolioError("tilts gives weights; leave menu empty.")
+        one = Tilt.start(view.features.shape[-1] - 1, task.actions)
+        members = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.members, *x.shape)), one)
+        return TiltsState(members, one, optimizer.begin(members), Evidence.none(self.blocks))
+
+    def warm_up(self) -> int:
+        return 0
+
+    def monitor(self, state: TiltsState) -> Metrics:
+        return {
+            "evidence": state.evidence.t,
+            "share": self._share(state.evidence),
+            "rate": jax.nn.sigmoid(state.policy.rate),
+            "band": jnp.exp(state.policy.band),
+        }
+
+    def weights(self, state: TiltsState) -> Tilt:
+        return state.policy
+
+    def _share(self, evidence: Evidence) -> Float[Array, ""]:
+        """1 − (threshold/t)², and 0 for t up to the threshold."""
+        t = jnp.maximum(evidence.t, 1e-9)
+        return jnp.maximum(1 - (self.threshold / t) ** 2, 0.0)
+
+    def policy(self, weights: Tilt, observation: View) -> Float[Array, "batch entry"]:
+        assert observation.anchor is not None
+        target = weights.target(observation)
+        return weights.traded(observation.holding, target, observation.anchor)
+
+    def act(
+        self, state: TiltsState, observation: View, key: PRNGKeyArray
+    ) -> Float[Array, "batch entry"]:
+        return self.policy(state.policy, observation)
+
+    def observe(self, state: TiltsState, rollout: Transition) -> TiltsState:
+        return state
+
+    def learn(
+        self, task: Task, state: TiltsState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[TiltsState, Metrics]:
+        assert isinstance(task, ExogenousTask)
+        block = self._blocks(task, rollout)
+        counted = jnp.arange(self.rollout_length)[:, None] >= self.head
+        left_out = block % self.members == jnp.arange(self.members)[:, None, None]
+
+        def loss(members: Tilt) -> tuple[Array, tuple[Array, Array]]:
+            rewards, anchored = jax.vmap(lambda policy: self._paths(policy, task, rollout))(members)
+            active = rewards - anchored
+            seen = counted & ~left_out
+            steps = jnp.maximum(seen.sum((1, 2)), 1)
+            mean = lambda x: (seen * x).sum((1, 2)) / steps  # noqa: E731
+            variance = mean(active**2) - mean(active) ** 2
+            squares = (members.linear**2).sum(1) + (members.interaction**2).sum((1, 2))
+            utility = mean(rewards) - self.tracking_aversion / 2 * variance
+            return (self.ridge / task.moves * squares - utility).sum(), (utility.mean(), active)
+
+        gradient, (utility, active) = jax.grad(loss, has_aux=True)(state.members)
+        rate = self._schedule(state.optimizer.count + 1)
+        members, adam = optimizer.descend(state.members, gradient, state.optimizer, rate)
+        unseen = counted & left_out
+        evidence = state.evidence.add(
+            block, (unseen * active).sum(0), 1.0 * unseen.any(0), self.memory
+        )
+        mean = jax.tree.map(lambda x: x.mean(0), members)
+        tilts = lambda p: (p.linear, p.interaction)  # noqa: E731
+        share = self._share(evidence)
+        policy = eqx.tree_at(tilts, mean, replace_fn=lambda x: share * x)
+        return TiltsState(members, policy, adam, evidence), {"loss": -utility}
+
+    def _blocks(self, task: ExogenousTask, rollout: Transition) -> Int[Array, "time path"]:
+        """The block of each step; where moves are drawn anew, each path is of one block."""
+        place = jax.vmap(jax.vmap(task.place))(rollout.state.market)
+        own = jnp.arange(self.num_envs) % self.blocks
+        share = jnp.clip(place / task.moves, 0.0, 1.0)
+        found = jnp.minimum((self.blocks * share).astype(jnp.int32), self.blocks - 1)
+        return jnp.where(jnp.isfinite(task.moves), found, own)
+
+    def _paths(
+        self, policy: Tilt, task: ExogenousTask, rollout: Transition
+    ) -> tuple[Float[Array, "time path"], Float[Array, "time path"]]:
+        """Rewards of the policy along the rollout's market, and of the anchor.
+
+        Both begin at their own targets. The anchor is followed at the policy's rate and band.
+        """
+        view: View = rollout.observation
+        assert view.anchor is not None
+        target = policy.target(view)
+        anchor = jnp.concatenate([1 - view.anchor.sum(-1, keepdims=True), view.anchor], -1)
+        fixed = lax.stop_gradient(policy)
+
+        def step(holdings: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
+            market, next_market, first, weights, targets = moves
+
+            def settled(policy: Tilt, holding: PyTree, target: Array) -> tuple[Array, PyTree]:
+                held = jax.vmap(task.observe)(Position(market, holding)).holding
+                action = jnp.where(first, target, policy.traded(held, target, weights))
+                return jax.vmap(task.settle)(market, next_market, holding, action)
+
+            followers = zip((policy, fixed), holdings, targets, strict=True)
+            rewards, after = zip(*(settled(*each) for each in followers), strict=True)
+            return after, rewards
+
+        start = jax.tree.map(lambda x: x[0], rollout.state.holding)
+        first = jnp.arange(self.rollout_length) == 0
+        market, next_market = rollout.state.market, rollout.next_state.market
+        moves = (market, next_market, first, view.anchor, (target, anchor))
+        _, (rewards, anchored) = lax.scan(jax.checkpoint(step), (start, start), moves)
+        return rewards, anchored
+
+
+def _ratio(part: Array | float, whole: Array) -> Array:
+    """The ratio, 0 for a whole of 0."""
+    return jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), 0.0)

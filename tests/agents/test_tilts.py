@@ -1,0 +1,152 @@
+"""Anchored tilts: they trade as defined, find what is there, and stay where nothing is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.tilts import Evidence, Tilt, Tilts
+from qfolio.core.errors import QfolioError
+from qfolio.core.market import View
+from qfolio.core.mdp import Simplex
+from qfolio.core.population import Population
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+from qfolio.tasks.pendulum import Pendulum
+
+SMALL = {"num_envs": 16, "rollout_length": 42, "head": 10, "learning_rate_steps": 40.0}
+TASK = {
+    "window": 1,
+    "horizon": 42,
+    "signals": "momentum:21,volatility:21",
+    "anchor": "equal-weight",
+}
+
+
+def prices(values):
+    dates = np.datetime64("2000-01-03", "s") + np.arange(len(values)) * np.timedelta64(86400, "s")
+    return Prices(dates, tuple(f"a{i}" for i in range(values.shape[1])), values)
+
+
+def tilt(linear, rate=0.0, band=-20.0, cap=1.0):
+    count = len(linear)
+    return Tilt(
+        jnp.asarray(linear, float),
+        jnp.zeros((count, count)),
+        jnp.asarray(rate, float),
+        jnp.asarray(band, float),
+        Simplex(3, cap),
+    )
+
+
+def view(held, features=((0.0,), (0.0,), (0.0,)), anchor=(0.25, 0.25, 0.5)):
+    returns = jnp.zeros((3, 1))
+    channels = jnp.concatenate([returns, jnp.asarray(features, float)], -1)
+    return View(channels[:, None], jnp.asarray(held, float), jnp.asarray(anchor, float))
+
+
+def test_target_is_the_anchor_times_exponential_scores():
+    found = tilt([1.0]).target(view([0, 0, 0], [[np.log(2.0)], [0.0], [0.0]]))
+    np.testing.assert_allclose(found, [0, 0.4, 0.2, 0.4], atol=1e-6)
+
+
+def test_interaction_multiplies_inputs_with_their_mean_over_the_assets():
+    policy = Tilt(jnp.zeros(2), jnp.array([[0.0, 1.0], [0.0, 0.0]]), *jnp.zeros(2), Simplex(3))
+    features = jnp.array([[[0.0, 1.0, 0.5]], [[0.0, 0.0, 0.5]], [[0.0, -1.0, 0.5]]])
+    np.testing.assert_allclose(policy.scores(features), [0.5, 0.0, -0.5], atol=1e-6)
+
+
+def test_without_tilts_and_at_the_anchor_nothing_is_traded():
+    policy = tilt([0.0], band=np.log(0.1))
+    seen = view([0.26, 0.24, 0.5])
+    held = np.array([0, 0.26, 0.24, 0.5], np.float32)
+    np.testing.assert_array_equal(
+        policy.traded(seen.holding, policy.target(seen), seen.anchor), held
+    )
+
+
+def test_part_of_the_way_is_traded_beyond_the_band():
+    policy = tilt([0.0], rate=0.0, band=np.log(0.2))  # half of it
+    seen = view([0.40, 0.10, 0.50])  # off by 0.15 and -0.15, beyond the band by 0.1 each
+    found = policy.traded(seen.holding, policy.target(seen), seen.anchor)
+    np.testing.assert_allclose(found, [0, 0.35, 0.15, 0.5], atol=1e-6)
+
+
+def test_purchases_are_scaled_to_sales():
+    policy = tilt([0.0], rate=20.0, band=np.log(0.2))
+    seen = view([0.35, 0.20, 0.45])  # off by 0.1, -0.05, -0.05: one asset beyond its band
+    found = policy.traded(seen.holding, policy.target(seen), seen.anchor)
+    np.testing.assert_allclose(found, [0, 0.35, 0.20, 0.45], atol=1e-6)
+
+
+def test_cash_is_invested_at_once_in_proportion_to_the_target():
+    policy = tilt([0.0], rate=-20.0)
+    seen = view([0.0, 0.0, 0.0])
+    found = policy.traded(seen.holding, policy.target(seen), seen.anchor)
+    np.testing.assert_allclose(found, [0, 0.25, 0.25, 0.5], atol=1e-6)
+
+
+def test_target_keeps_the_cap():
+    found = tilt([1.0], cap=0.5).target(view([0, 0, 0], [[3.0], [0.0], [0.0]]))
+    assert found[1:].max() <= 0.5 + 1e-6
+    np.testing.assert_allclose(found.sum(), 1, atol=1e-6)
+
+
+def test_untradable_assets_stay_at_zero():
+    found = tilt([5.0]).target(view([0, 0, 0], [[0.0], [0.0], [3.0]], anchor=(0.5, 0.5, 0.0)))
+    np.testing.assert_allclose(found, [0, 0.5, 0.5, 0], atol=1e-6)
+
+
+def test_evidence_is_the_t_statistic_of_ratios_by_block():
+    rng = np.random.default_rng(0)
+    active = rng.normal(0.1, 1, (50, 3)) * [1.0, 10.0, 0.1]  # a block in each path
+    block = jnp.broadcast_to(jnp.arange(3), (50, 3))
+    evidence = Evidence.none(4).add(block, jnp.asarray(active), jnp.ones((50, 3)), 0.9)
+    ratio = active.mean(0) / active.std(0)
+    wanted = ratio.mean() / ratio.std(ddof=1) * np.sqrt(3)
+    np.testing.assert_allclose(evidence.t, wanted, rtol=1e-4)
+
+
+def test_no_evidence_of_nothing():
+    assert Evidence.none(8).t == 0
+
+
+def trained(values, seeds=1, rounds=40, **settings):
+    task = Portfolio.of(prices(values), **TASK)
+    population = Population([task] * seeds, Tilts(**SMALL, **settings), list(range(seeds)))
+    while population.steps < rounds * SMALL["rollout_length"]:
+        population.advance(SMALL["rollout_length"] * rounds - population.steps)
+    return population
+
+
+def walk(rows, assets, seed, drift=0.0):
+    return np.exp(np.cumsum(np.random.default_rng(seed).normal(0, 0.01, (rows, assets)) + drift, 0))
+
+
+def test_stays_at_the_anchor_where_prices_hold_nothing():
+    shares = [trained(walk(1500, 8, seed)).state.agent.policy.linear for seed in range(3)]
+    assert sum(bool(abs(x).max() == 0) for x in shares) >= 2
+
+
+def test_finds_momentum():
+    rng = np.random.default_rng(1)
+    drift = np.repeat(rng.normal(0, 0.004, (15, 8)), 100, axis=0)
+    state = jax.tree.map(lambda x: x[0], trained(walk(1500, 8, 2, drift)).state.agent)
+    assert state.evidence.t > 4
+    assert state.policy.linear[0] > 0.1
+
+
+def test_needs_an_anchor():
+    task = Portfolio.of(prices(walk(300, 3, 0)), **{**TASK, "anchor": ""})
+    with pytest.raises(QfolioError, match="anchor=equal-weight"):
+        Tilts(**SMALL).init(task, jax.random.key(0))
+    with pytest.raises(QfolioError, match="has none"):
+        Tilts().init(Pendulum(), jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    "settings", [{"head": 84}, {"members": 0}, {"threshold": -1.0}, {"members": 40}]
+)
+def test_settings_out_of_range(settings):
+    with pytest.raises(QfolioError, match=next(iter(settings))):
+        Tilts(**settings)
