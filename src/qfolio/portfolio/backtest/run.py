@@ -266,8 +266,11 @@ class Backtest:
                 together = self._decide(name, together=True)
                 entries[f"{name}{TOGETHER}"] = self._entry("ensemble", together)
         table, cap = self.prices, self.config.cap
+        month = max(1, round(table.periods_per_year / 12))
         for name, made in self.baselines.items():
-            decided = orders(name, made, self.folds, table.dates, table.values, cap=cap)
+            decided = orders(
+                name, made, self.folds, table.dates, table.values, cap=cap, month=month
+            )
             entries[name] = self._entry("baseline", decided.decisions[None])
             notes += decided.notes
         return entries, notes

@@ -1,16 +1,13 @@
-"""Baselines: the rules that agents are compared with.
-
-A baseline decides as an agent does: it sees the rows up to a decision and its holding, and returns
-target weights. ``orders.py`` runs it over the folds of a test; skfolio fits the optimisers.
-"""
+"""What a baseline is, and what baselines share."""
 
 import warnings
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qfolio.core.errors import QfolioError
 from qfolio.core.registry import imported
 
 Floats = NDArray[np.float64]
@@ -25,12 +22,26 @@ class History(NamedTuple):
     train: slice  # rows of the fold's training window, which ends at its first decision or earlier
     tradable: Bools  # (N,), assets that may be held; they have prices in the whole training window
     cap: float  # largest weight of one asset when it is ordered
+    month: int = 21  # rows in a month
 
-    @property
-    def returns(self) -> Floats:
-        """Simple returns of the tradable assets over the training window, (rows − 1, assets)."""
-        window = self.prices[self.train][:, self.tradable]
-        return np.asarray(window[1:] / window[:-1] - 1)
+    def window(self, months: int | None = None) -> Floats:
+        """Prices of the tradable assets from the start of the training window to the decision.
+
+        Args:
+            months: Only the returns of this many latest months, if there are so many.
+
+        Returns:
+            Prices of shape (rows, assets), without gaps; one row more than there are returns.
+        """
+        start = self.train.start or 0
+        if months is not None:
+            start = max(start, len(self.prices) - 1 - months * self.month)
+        return np.asarray(self.prices[start:][:, self.tradable])
+
+    def returns(self, months: int | None = None) -> Floats:
+        """Simple returns over ``window``, of shape (rows, assets)."""
+        prices = self.window(months)
+        return np.asarray(prices[1:] / prices[:-1] - 1)
 
 
 class Baseline(ABC):
@@ -40,11 +51,12 @@ class Baseline(ABC):
 
     Attributes:
         calendar: When ``decide`` is called. "fold": at the first decision of each fold; its result
-            is the target of every row of the fold, so that drift is traded back daily.
-            "row": at every row; None then lets the holding drift.
+            is the target of every row of the fold, so that drift is traded back at every row.
+            "month": every ``History.month`` rows from the first decision of the test on; between,
+            the holding drifts. "row": at every row; None then lets the holding drift.
     """
 
-    calendar: ClassVar[Literal["fold", "row"]] = "fold"
+    calendar: ClassVar[Literal["fold", "month", "row"]] = "fold"
 
     @abstractmethod
     def decide(self, history: History, held: Floats) -> Floats | None:
@@ -60,95 +72,44 @@ class Baseline(ABC):
         """
 
 
-class EqualWeight(Baseline):
-    """The same weight in every asset, rebalanced daily."""
-
-    def decide(self, history: History, held: Floats) -> Floats:
-        return with_cash(equal_weights(history), history)
-
-
-class BuyAndHold(Baseline):
-    """Equal weights bought once and never traded again."""
-
-    calendar = "row"
-
-    def decide(self, history: History, held: Floats) -> Floats | None:
-        return None if held[1:].any() else with_cash(equal_weights(history), history)
-
-
 class Fitted(Baseline):
-    """An optimiser of skfolio, fitted to the training window of each fold.
+    """Weights that are estimated from past returns, anew every month.
 
-    If it finds no solution, weights are equal, with a warning. If it does not support a cap, the
-    excess goes to the assets below the cap, in proportion to their weights. If the cap is too low
-    for the assets to hold everything, all are at the cap and the rest is cash.
+    If there is no solution, weights are equal, with a warning. The excess of a weight over the cap
+    goes to the assets below the cap, in proportion to their weights. If the cap is too low for the
+    assets to hold everything, all are at the cap and the rest is cash.
+
+    Attributes:
+        months: The window of the estimate (default: the training window and all rows since).
     """
 
+    calendar = "month"
+    months: ClassVar[int | None] = None
+
     @abstractmethod
-    def optimizer(self, cap: float) -> Any:
-        """Make the estimator of skfolio."""
+    def fit(self, returns: Floats, cap: float) -> Floats:
+        """Return weights of shape (assets,) up to a factor; a ValueError says there are none.
+
+        Args:
+            returns: Simple returns of shape (rows, assets), each asset with some variance.
+            cap: Largest weight of one asset; it may be ignored.
+        """
 
     def decide(self, history: History, held: Floats) -> Floats:
         equal = equal_weights(history)
         if history.cap * equal.size <= 1 + 1e-9:
             return with_cash(equal, history)
-
-        from skfolio.exceptions import SkfolioError
-
+        returns = history.returns(self.months)
         try:
-            # skfolio raises ValueError if no portfolio has a positive return or returns are few.
-            found = np.maximum(self.optimizer(history.cap).fit(history.returns).weights_, 0)
+            if len(returns) < 3 or not np.ptp(returns, axis=0).all():
+                raise ValueError("the returns of an asset are too few or have no variance")
+            found = np.maximum(self.fit(returns, history.cap), 0)
             if not 0 < found.sum() < np.inf:
-                raise ValueError("the weights found are not numbers")
-        except (SkfolioError, ValueError) as error:
+                raise ValueError("no asset is worth holding")
+        except (QfolioError, ValueError) as error:
             warnings.warn(f"no solution, so weights are equal: {error}", stacklevel=1)
             return with_cash(equal, history)
         return with_cash(_capped(found, history.cap), history)
-
-
-class InverseVolatility(Fitted):
-    """Weights in inverse proportion to volatility."""
-
-    def optimizer(self, cap: float) -> Any:
-        from skfolio.optimization import InverseVolatility
-
-        return InverseVolatility()
-
-
-class MinimumVariance(Fitted):
-    """The long-only portfolio of least variance."""
-
-    def optimizer(self, cap: float) -> Any:
-        from skfolio.optimization import MeanRisk
-
-        return MeanRisk(max_weights=cap)
-
-
-class MaximumRatio(Fitted):
-    """The long-only portfolio of the highest Sharpe ratio."""
-
-    def optimizer(self, cap: float) -> Any:
-        from skfolio.optimization import MeanRisk, ObjectiveFunction
-
-        return MeanRisk(objective_function=ObjectiveFunction.MAXIMIZE_RATIO, max_weights=cap)
-
-
-class RiskBudgeting(Fitted):
-    """Equal contributions to the variance (risk parity)."""
-
-    def optimizer(self, cap: float) -> Any:
-        from skfolio.optimization import RiskBudgeting
-
-        return RiskBudgeting(max_weights=cap)
-
-
-class HierarchicalRiskParity(Fitted):
-    """Risk parity over a hierarchy of clusters (López de Prado, 2016)."""
-
-    def optimizer(self, cap: float) -> Any:
-        from skfolio.optimization import HierarchicalRiskParity
-
-        return HierarchicalRiskParity(max_weights=cap)
 
 
 def baseline(name: str) -> Baseline:
@@ -174,6 +135,21 @@ def with_cash(weights: ArrayLike, history: History) -> Floats:
     target[1:][history.tradable] = wanted
     target[0] = max(0.0, 1 - wanted.sum())
     return target
+
+
+def nearest(wanted: Floats, low: ArrayLike, high: ArrayLike) -> Floats:
+    """The weights between bounds and of sum 1 that are nearest to those wanted.
+
+    They are clip(wanted − τ, low, high) for the one τ that makes the sum 1, which falls piecewise
+    linearly in τ. If the upper bounds add up to less than 1, all are at them.
+
+    Args:
+        wanted: Numbers of shape (assets,).
+        low, high: Bounds, numbers or of the same shape; the lower ones add up to 1 or less.
+    """
+    kinks = np.sort(np.concatenate([wanted - high, wanted - low]))
+    sums = np.clip(wanted - kinks[:, None], low, high).sum(axis=1)
+    return np.clip(wanted - np.interp(-1.0, -sums, kinks), low, high)
 
 
 def _capped(proposed: Floats, cap: float) -> Floats:
