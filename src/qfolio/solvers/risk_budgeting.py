@@ -32,7 +32,11 @@ def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> NDArray[np.float64]
     require(bool((deviations > 0).all()), "every asset needs some variance to contribute to risk")
     # In units of each asset's deviation the problem is one in correlations.
     correlations, count = sigma / np.outer(deviations, deviations), len(sigma)
-    y = np.full(count, 1 / np.sqrt(correlations.sum())) if correlations.sum() > 0 else np.ones(count)
+    y = (
+        np.full(count, 1 / np.sqrt(correlations.sum()))
+        if correlations.sum() > 0
+        else np.ones(count)
+    )
     for _ in range(200):
         slope = correlations @ y - 1 / (count * y)
         if np.max(np.abs(slope * y)) * count <= tol:

@@ -106,6 +106,7 @@ class Assessment:
     reference: str
     best_baseline: str  # by growth over the same days
     strategies: dict[str, StrategyAssessment]
+    bound: float | None = None  # annual growth that no constant weights exceed, even without costs
 
     def to_json(self) -> dict[str, Any]:
         """Return dictionaries, lists, texts and finite numbers; other numbers become None."""

@@ -6,6 +6,7 @@ float64, beside classical allocators under the same rules.
 """
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from qfolio.portfolio.backtest import assessment
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
 from qfolio.portfolio.backtest.folds import Fold, latest, spell, walk_forward
+from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.replay import Entry, Stretch, decide
 from qfolio.portfolio.backtest.simulation import simulate
@@ -286,7 +288,8 @@ class Backtest:
         """The statistics of all strategies, over the whole test or from a date on."""
         first = 0 if since is None else int(np.searchsorted(self.dates, np.datetime64(since)))
         days = slice(first, None)
-        return assessment.assess(
+        table = self.prices
+        assessed = assessment.assess(
             {
                 name: assessment.Strategy(
                     entry.kind,
@@ -297,10 +300,13 @@ class Backtest:
                 for name, entry in entries.items()
             },
             self.dates[days],
-            periods_per_year=self.prices.periods_per_year,
+            periods_per_year=table.periods_per_year,
             reference=EQUAL_WEIGHT,
-            earlier_trials=self.config.trials + trials_on(self.prices.source),
+            earlier_trials=self.config.trials + trials_on(table.source),
         )
+        begin = self.folds[0].decisions.start + self.config.lag + 1 + first
+        bound = constant_bound(table.values, begin, table.periods_per_year)
+        return dataclasses.replace(assessed, bound=bound)
 
     def write_tables(self, entries: dict[str, Entry], assessed: assessment.Assessment) -> None:
         """returns.csv (a column per strategy and seed), weights.csv (means) and summary.json."""

@@ -137,7 +137,7 @@ def with_cash(weights: ArrayLike, history: History) -> Floats:
     return target
 
 
-def nearest(wanted: Floats, low: ArrayLike, high: ArrayLike) -> Floats:
+def nearest(wanted: Floats, low: Floats | float, high: Floats | float) -> Floats:
     """The weights between bounds and of sum 1 that are nearest to those wanted.
 
     They are clip(wanted − τ, low, high) for the one τ that makes the sum 1, which falls piecewise
