@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from qfolio.report import palette
-from qfolio.report.backtest.data import BacktestData, shown_order
+from qfolio.report.backtest.data import BacktestData, faint_names, shown_order
 from qfolio.report.backtest.looks import looks_of
 from qfolio.report.backtest.paths import across_seeds, median_drawdown, wealth_paths
 from qfolio.report.figures.style import new_figure
@@ -22,7 +22,7 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
     axes = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
     days = data.dates.astype("datetime64[s]")
     names = shown_order(data)
-    looks = looks_of(names, data)
+    looks, faint = looks_of(names, data), faint_names(data)
     handles = []
     for name in reversed(names):
         look, series = looks[name], data.strategies[name]
@@ -33,7 +33,7 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
             "linewidth": 0.75 * look.width,
             # Lengths are in units of the line's width.
             "linestyle": (0, tuple(float(part) / look.width for part in look.dash.split()))
-            if look.dash
+            if look.dash and name not in faint
             else "solid",
         }
         if look.symbol is not None:
@@ -48,7 +48,12 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
                 axes[0].fill_between(days, low, high, color=colour, alpha=0.15, linewidth=0)
         else:
             marker = {}
-        handles += axes[0].plot(days, middle, **style, **marker, label=name)
+        line = axes[0].plot(days, middle, **style, **marker, label=name)
+        if name not in faint:
+            handles += line
+        elif name == faint[-1]:  # the first that is drawn
+            line[0].set_label(f"{len(faint)} other baselines")
+            handles += line
         axes[1].plot(days, -median_drawdown(series), **{**style, "linewidth": 0.5 * look.width})
     axes[0].set_yscale("log")
     axes[0].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -1,4 +1,4 @@
-"""Equal weights: rebalanced at every row, every month, within a band, or never."""
+"""Equal weights: rebalanced at every row, every month, slowly, within a band, or never."""
 
 from typing import ClassVar
 
@@ -13,6 +13,9 @@ from qfolio.portfolio.backtest.baselines.base import (
     with_cash,
 )
 
+SPEEDS = (0.3, 0.1, 0.03, 0.01, 0.0)
+"""Speeds of rebalancing, beside 1, from which a backtest chooses the best in hindsight."""
+
 
 class EqualWeight(Baseline):
     """The same weight in every asset, rebalanced at every row."""
@@ -25,6 +28,29 @@ class EqualWeightMonthly(EqualWeight):
     """The same weight in every asset, rebalanced every month."""
 
     calendar = "month"
+
+
+class EqualWeightAt(Baseline):
+    """Equal weights bought once, then a share of the way back to them at every row.
+
+    Agents are compared with the best of several speeds, because rebalancing at every row pays
+    costs that any slower trading saves.
+    """
+
+    calendar = "row"
+
+    def __init__(self, speed: float) -> None:
+        self.speed = speed  # share of the way, from 0 (never) to 1
+
+    def decide(self, history: History, held: Floats) -> Floats | None:
+        target, weights = equal_weights(history), held[1:][history.tradable]
+        if not weights.any():
+            return with_cash(target, history)
+        if self.speed == 0:
+            return None
+        wanted = weights + self.speed * (target - weights)
+        # An order may not exceed the cap, though a holding may have drifted above it.
+        return with_cash(nearest(wanted, 0, history.cap), history)
 
 
 class EqualWeightBand(Baseline):
