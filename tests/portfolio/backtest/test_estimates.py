@@ -133,7 +133,8 @@ def test_p_values_are_right_as_often_as_they_say(count: int, clustered: bool) ->
     worlds = 1500
     p_values = np.empty((worlds, len(MEASURED)))
     for world in range(worlds):
-        found = estimate(*pair(rng, count, clustered=clustered), 252)
+        one, other = pair(rng, count, clustered=clustered)
+        found = estimate(one, other, 252)
         p_values[world] = [2 * min(found[key].tails()) for key in MEASURED]
     for level, tolerance in ((0.05, 0.018), (0.01, 0.009)):  # three standard errors
         rates = (p_values <= level).mean(axis=0)

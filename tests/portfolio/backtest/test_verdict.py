@@ -90,10 +90,10 @@ def test_claims_are_plain(assessment: Assessment) -> None:
         "dqn falls short of the best rebalancing of equal weight in growth after costs, and beats "
         "it in nothing"
     ]
-    mixed = about(volatility=better, growth=worse)
+    mixed = about(sharpe=better, growth=worse, volatility=better)
     assert claims_of(assessment, mixed, none) == [
-        "dqn beats equal weight, however it is rebalanced, in volatility and falls short of the "
-        "best rebalancing of equal weight in growth after costs"
+        "dqn beats equal weight, however it is rebalanced, in Sharpe ratio and falls short of the "
+        "best rebalancing of equal weight in growth after costs, and fluctuates less"
     ]
     untested = Contrast(0.1, (0.0, 0.2))
     best = about(growth=better, sharpe=untested, volatility=untested)
@@ -104,6 +104,23 @@ def test_claims_are_plain(assessment: Assessment) -> None:
     )
 
 
+def test_less_volatility_alone_is_no_victory(assessment: Assessment) -> None:
+    calmer, wilder = contrast("better", -0.1), contrast("worse", 0.1)
+    one = about(volatility=calmer)
+    assert claims_of(assessment, one, one) == [
+        "No evidence that dqn beats equal weight in growth or Sharpe ratio after costs, but it "
+        "fluctuates less"
+    ]
+    assert claims_of(assessment, about(volatility=wilder), about())[0].endswith(
+        "in growth or Sharpe ratio after costs, and it fluctuates more"
+    )
+    bold = about(growth=contrast("better"), volatility=wilder)
+    assert claims_of(assessment, bold, about())[0] == (
+        "dqn beats equal weight, however it is rebalanced, in growth after costs, and fluctuates "
+        "more"
+    )
+
+
 def test_growing_less_is_said_first(assessment: Assessment) -> None:
     """``allocate`` repeats the first sentence when it refuses."""
     lost = about(growth=contrast("worse", -0.01))
@@ -111,7 +128,7 @@ def test_growing_less_is_said_first(assessment: Assessment) -> None:
         claims_of(assessment, about(), lost)[0]
         == "dqn falls short of equal weight in growth after costs"
     )
-    calmer = about(volatility=contrast("better", -0.1))
+    calmer = about(sharpe=contrast("better"))
     assert claims_of(assessment, calmer, lost)[0].startswith("dqn falls short of equal weight in")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from qfolio.portfolio.backtest.assessment import JUDGED, Assessment, StrategyAssessment
 from qfolio.portfolio.backtest.bootstrap import LEVEL
-from qfolio.portfolio.backtest.differences import Contrast, Difference
+from qfolio.portfolio.backtest.differences import Contrast, Difference, Finding
 from qfolio.portfolio.backtest.estimates import Measured
 
 _THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
@@ -16,6 +16,9 @@ _MEASURES: dict[Measured, str] = {
     "sharpe": "Sharpe ratio",
     "volatility": "volatility",
 }
+
+_MOVES = {"better": "less", "worse": "more"}
+"""Volatility in words, by finding."""
 
 
 def verdicts(assessment: Assessment) -> dict[str, list[str]]:
@@ -48,15 +51,12 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
     else:
         main, at_any = rebalanced, f"{reference}, however it is rebalanced,"
         at_best = f"the best rebalancing of {reference}"
-    said = [(_claim(name, main, at_any, at_best), main)]
+    claim = _claim(name, main, at_any, at_best)
+    if claim and not main.found("better"):
+        claim += ", and beats it in nothing"
+    said = [(claim or _nothing(name, main, at_any if _gains(alone) else reference), main)]
     if rebalanced is not None:
         said.append((_claim(name, alone, reference, reference), alone))
-    if not said[0][0]:
-        tested = _joined(list(_MEASURES.values()), "or")
-        other = at_any if alone.found("better") else reference
-        said[0] = (f"No evidence that {name} beats {other} in {tested} after costs", main)
-    elif not main.found("better"):
-        said[0] = (f"{said[0][0]}, and beats it in nothing", main)
     said.sort(key=lambda each: each[1].growth.finding != "worse")
     if entry.to_best_baseline is not None:
         said.append((_claim(name, entry.to_best_baseline, best, best), entry.to_best_baseline))
@@ -64,16 +64,38 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
 
 
 def _claim(name: str, difference: Difference, better: str, worse: str) -> str:
-    """What a difference shows; empty if nothing."""
+    """What a difference shows in growth or Sharpe ratio, and then in volatility; may be empty.
+
+    Less volatility alone is no victory: cash has none.
+    """
     parts = [
         f"{verb} {other} in {_joined([_MEASURES[key] for key in found], 'and')}"
         for verb, other, found in (
-            ("beats", better, difference.found("better")),
-            ("falls short of", worse, difference.found("worse")),
+            ("beats", better, _gains(difference)),
+            ("falls short of", worse, _gains(difference, "worse")),
         )
         if found
     ]
-    return f"{name} {' and '.join(parts)} after costs" if parts else ""
+    moves = (
+        f", and fluctuates {move}"
+        if (move := _MOVES.get(difference.volatility.finding or ""))
+        else ""
+    )
+    return f"{name} {' and '.join(parts)} after costs{moves}" if parts else ""
+
+
+def _nothing(name: str, difference: Difference, other: str) -> str:
+    """That nothing was found; volatility is added if it differs."""
+    move = _MOVES.get(difference.volatility.finding or "")
+    measures = "growth or Sharpe ratio" if move else _joined(list(_MEASURES.values()), "or")
+    word = "but" if move == "less" else "and"
+    moves = f", {word} it fluctuates {move}" if move else ""
+    return f"No evidence that {name} beats {other} in {measures} after costs{moves}"
+
+
+def _gains(difference: Difference, finding: Finding = "better") -> list[Measured]:
+    """The measures other than volatility with this finding."""
+    return [measure for measure in difference.found(finding) if measure != "volatility"]
 
 
 def evidence(difference: Difference, assessment: Assessment) -> str:

@@ -101,7 +101,7 @@ def shown_order(data: BacktestData) -> list[str]:
 
 
 def faint_names(data: BacktestData) -> list[str]:
-    """The other baselines, if they are too many to be told apart in a chart."""
+    """The other baselines, if they are too many to be told apart; charts hide them at first."""
     main = main_names(data)
     others = [name for name in shown_order(data) if name not in main]
     return others if len(others) > DISTINCT else []

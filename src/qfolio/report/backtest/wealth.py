@@ -15,14 +15,18 @@ if TYPE_CHECKING:
 
 
 def draw_wealth(data: BacktestData, width: float) -> Figure:
-    """Draw wealth on a log axis and the drawdown below it, in the light scheme."""
+    """Draw wealth on a log axis and the drawdown below it, in the light scheme.
+
+    Without the other baselines if they are too many to be told apart.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentFormatter
 
     figure = new_figure(width, 5.4)
     axes = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
     days = data.dates.astype("datetime64[s]")
-    names = shown_order(data)
-    looks, faint = looks_of(names, data), faint_names(data)
+    faint = faint_names(data)
+    names = [name for name in shown_order(data) if name not in faint]
+    looks = looks_of(names, data)
     handles = []
     for name in reversed(names):
         look, series = looks[name], data.strategies[name]
@@ -33,7 +37,7 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
             "linewidth": 0.75 * look.width,
             # Lengths are in units of the line's width.
             "linestyle": (0, tuple(float(part) / look.width for part in look.dash.split()))
-            if look.dash and name not in faint
+            if look.dash
             else "solid",
         }
         if look.symbol is not None:
@@ -48,12 +52,7 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
                 axes[0].fill_between(days, low, high, color=colour, alpha=0.15, linewidth=0)
         else:
             marker = {}
-        line = axes[0].plot(days, middle, **style, **marker, label=name)
-        if name not in faint:
-            handles += line
-        elif name == faint[-1]:  # the first that is drawn
-            line[0].set_label(f"{len(faint)} other baselines")
-            handles += line
+        handles += axes[0].plot(days, middle, **style, **marker, label=name)
         axes[1].plot(days, -median_drawdown(series), **{**style, "linewidth": 0.5 * look.width})
     axes[0].set_yscale("log")
     axes[0].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -147,9 +147,12 @@ def nearest(wanted: Floats, low: Floats | float, high: Floats | float) -> Floats
         wanted: Numbers of shape (assets,).
         low, high: Bounds, numbers or of the same shape; the lower ones add up to 1 or less.
     """
-    kinks = np.sort(np.concatenate([wanted - high, wanted - low]))
-    sums = np.clip(wanted - kinks[:, None], low, high).sum(axis=1)
-    return np.clip(wanted - np.interp(-1.0, -sums, kinks), low, high)
+    kinks = np.concatenate([wanted - high, wanted - low])  # where a weight begins and ends to fall
+    order = np.argsort(kinks)
+    kinks, falling = kinks[order], np.cumsum(np.where(order < wanted.size, 1, -1))
+    fallen = np.concatenate([[0.0], np.cumsum(falling[:-1] * np.diff(kinks))])
+    excess = np.broadcast_to(high, wanted.shape).sum() - 1
+    return np.clip(wanted - np.interp(excess, fallen, kinks), low, high)
 
 
 def _capped(proposed: Floats, cap: float) -> Floats:

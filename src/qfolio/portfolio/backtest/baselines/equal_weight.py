@@ -49,8 +49,9 @@ class EqualWeightAt(Baseline):
         if self.speed == 0:
             return None
         wanted = weights + self.speed * (target - weights)
-        # An order may not exceed the cap, though a holding may have drifted above it.
-        return with_cash(nearest(wanted, 0, history.cap), history)
+        if wanted.max() > history.cap:  # a holding may have drifted above it, an order may not be
+            wanted = nearest(wanted, 0, history.cap)
+        return with_cash(wanted, history)
 
 
 class EqualWeightBand(Baseline):
