@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import skfolio.optimization
 
 from qfolio.portfolio.backtest.baselines import Baseline, History, baseline
 from qfolio.portfolio.backtest.baselines.base import nearest
 from qfolio.portfolio.backtest.baselines.online import Olmar, Pamr
+from qfolio.portfolio.backtest.baselines.optimisers import HierarchicalRiskParity
 
 
 def history(prices: np.ndarray, month: int = 21, cap: float = 1.0) -> History:
@@ -58,6 +60,19 @@ def test_nearest_weights_between_bounds() -> None:
             assert (wanted - found >= shift.mean() - 1e-9)[found >= high - 1e-9].all()
             assert (wanted - found <= shift.mean() + 1e-9)[found <= low + 1e-9].all()
     np.testing.assert_array_equal(nearest(np.zeros(3), 0, 0.2), [0.2] * 3)  # cash is left
+
+
+# ------------------------------------------------------------------------------------ Risk parity
+
+
+@pytest.mark.parametrize("assets", [1, 2, 3, 12])
+def test_hierarchical_risk_parity_is_that_of_skfolio(assets: int) -> None:
+    rng = np.random.default_rng(0)
+    common = rng.normal(size=(200, 1)) * rng.normal(size=assets)
+    returns = 0.01 * (common + rng.normal(size=(200, assets)) * rng.uniform(0.5, 2, assets))
+    found = HierarchicalRiskParity().fit(returns, 1.0)
+    expected = skfolio.optimization.HierarchicalRiskParity().fit(returns).weights_
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 # ---------------------------------------------------------------------------------- Timing, trend
