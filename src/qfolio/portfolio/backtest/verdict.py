@@ -103,7 +103,7 @@ def evidence(difference: Difference, assessment: Assessment) -> str:
 
     Holm's correction over all comparisons of the backtest decides on a claim.
     """
-    lead = "the difference in annual growth is"
+    lead = f"the difference in annual growth to {difference.reference} is"
     tested = {key: each for key, each in difference.contrasts().items() if each.p is not None}
     p = "corrected p" if assessment.comparisons > 1 else "p"
     texts = [
