@@ -85,6 +85,8 @@ def usual(days: int = 300, seeds: int = 3, **more: Any) -> BacktestData:
         "equal weight": make_series(rng, "baseline", 1, days, 4, 0.0003),
         "best of all": make_series(rng, "baseline", 1, days, 4, 0.003),
         "third": make_series(rng, "baseline", 1, days, 4, -0.001),
+        "slow": make_series(rng, "rebalancing", 1, days, 4, 0.0004),
+        "never": make_series(rng, "rebalancing", 1, days, 4, 0.0002),
         "DQN": make_series(rng, "agent", seeds, days, 4, 0.0005),
         "DQN-together": make_series(rng, "ensemble", 1, days, 4, 0.0005),
         "pathwise": make_series(rng, "agent", seeds, days, 4, 0.02),

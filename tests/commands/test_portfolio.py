@@ -118,13 +118,14 @@ def copy(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "copy")
 
 
-def judge(folder, finding, verdict):
+def judge(folder, finding, verdict, against="to_reference"):
     """Has the backtest find this of its agent, beside equal weights."""
     path = folder / "summary.json"
     summary = json.loads(path.read_text())
-    difference = summary["strategies"]["pathwise-together"]["to_reference"]
-    assert difference["finding"] in ("better", "worse", "none")
-    difference["finding"] = finding
+    for key in ("to_reference", "to_rebalanced"):
+        growth = summary["strategies"]["pathwise-together"][key]["growth"]
+        assert growth["finding"] in ("better", "worse", "none")
+        growth["finding"] = finding if key == against else "none"
     summary["verdicts"]["pathwise-together"][0] = verdict
     path.write_text(json.dumps(summary))
 
@@ -142,8 +143,9 @@ def test_an_allocation_names_agent_date_and_verdict(folder, copy, monkeypatch, c
     assert "In its backtest: No evidence of \\x1b[2Jskill." in printed
 
 
-def test_a_policy_that_was_found_worse_is_traded_on_demand_only(copy, monkeypatch, capsys):
-    judge(copy, "worse", "pathwise-together falls short of equal-weight.")
+@pytest.mark.parametrize("against", ["to_reference", "to_rebalanced"])
+def test_a_policy_that_was_found_worse_is_traded_on_demand_only(copy, monkeypatch, capsys, against):
+    judge(copy, "worse", "pathwise-together falls short of equal-weight.", against)
     assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 2
     assert capsys.readouterr().err == (
         "qfolio: In its own backtest, pathwise-together falls short of equal-weight; to trade "

@@ -175,15 +175,18 @@ def describe_backtest(backtest: "Backtest") -> str:
 
 def print_assessment(assessment: "Assessment") -> None:
     """A row for each strategy, and the verdicts."""
-    from qfolio.portfolio.backtest.verdict import verdicts
+    from qfolio.portfolio.backtest.assessment import JUDGED
+    from qfolio.portfolio.backtest.verdict import bound_sentence, verdicts
 
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("a year, net")
     for name in ("growth", "vol.", "Sharpe", "drawdown", "turnover", "cost drag"):
         table.add_column(name, justify="right", no_wrap=True)
     for name, strategy in assessment.strategies.items():
+        if strategy.kind == "rebalancing" and name != assessment.rebalanced:
+            continue
         value = {key: measure.mean for key, measure in strategy.measures.items()}
-        style = None if strategy.kind == "baseline" else "bold"
+        style = "bold" if strategy.kind in JUDGED else None
         table.add_row(
             name,
             f"{value['growth']:.2%}",
@@ -195,6 +198,8 @@ def print_assessment(assessment: "Assessment") -> None:
             style=style,
         )
     console.print(table)
+    if bound := bound_sentence(assessment):
+        say(bound)
     for sentences in verdicts(assessment).values():
         for sentence in sentences:
             say(sentence)

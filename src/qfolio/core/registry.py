@@ -53,14 +53,26 @@ AGENTS = {
     "a2c": "qfolio.agents.a2c:A2C",
     "ppo": "qfolio.agents.ppo:PPO",
 }
+_CLASSICS = "qfolio.portfolio.backtest.baselines"
 BASELINES = {
-    "equal-weight": "qfolio.portfolio.backtest.baselines:EqualWeight",
-    "buy-and-hold": "qfolio.portfolio.backtest.baselines:BuyAndHold",
-    "inverse-volatility": "qfolio.portfolio.backtest.baselines:InverseVolatility",
-    "minimum-variance": "qfolio.portfolio.backtest.baselines:MinimumVariance",
-    "maximum-ratio": "qfolio.portfolio.backtest.baselines:MaximumRatio",
-    "risk-budgeting": "qfolio.portfolio.backtest.baselines:RiskBudgeting",
-    "hierarchical-risk-parity": "qfolio.portfolio.backtest.baselines:HierarchicalRiskParity",
+    "equal-weight": f"{_CLASSICS}.equal_weight:EqualWeight",
+    "equal-weight-monthly": f"{_CLASSICS}.equal_weight:EqualWeightMonthly",
+    "equal-weight-band": f"{_CLASSICS}.equal_weight:EqualWeightBand",
+    "buy-and-hold": f"{_CLASSICS}.equal_weight:BuyAndHold",
+    "inverse-volatility": f"{_CLASSICS}.timing:InverseVolatility",
+    "volatility-timing": f"{_CLASSICS}.timing:VolatilityTiming",
+    "reward-to-risk-timing": f"{_CLASSICS}.timing:RewardToRiskTiming",
+    "momentum": f"{_CLASSICS}.trend:Momentum",
+    "trend": f"{_CLASSICS}.trend:Trend",
+    "minimum-variance": f"{_CLASSICS}.minimum_variance:MinimumVariance",
+    "minimum-variance-ledoit-wolf": f"{_CLASSICS}.minimum_variance:MinimumVarianceLedoitWolf",
+    "minimum-variance-nonlinear": f"{_CLASSICS}.minimum_variance:MinimumVarianceNonlinear",
+    "minimum-variance-ewma": f"{_CLASSICS}.minimum_variance:MinimumVarianceEwma",
+    "maximum-ratio": f"{_CLASSICS}.optimisers:MaximumRatio",
+    "risk-budgeting": f"{_CLASSICS}.optimisers:RiskBudgeting",
+    "hierarchical-risk-parity": f"{_CLASSICS}.optimisers:HierarchicalRiskParity",
+    "pamr": f"{_CLASSICS}.online:Pamr",
+    "olmar": f"{_CLASSICS}.online:Olmar",
 }
 REWARDS = {
     "log": "qfolio.portfolio.rewards:Log",
@@ -102,7 +114,7 @@ class Entries(NamedTuple):
 ENTRIES: dict[Kind, Entries] = {
     "task": Entries(TASKS, "qfolio.core.mdp:Task"),
     "agent": Entries(AGENTS, "qfolio.core.mdp:Agent"),
-    "baseline": Entries(BASELINES, "qfolio.portfolio.backtest.baselines:Baseline"),
+    "baseline": Entries(BASELINES, f"{_CLASSICS}:Baseline"),
     "reward": Entries(REWARDS, "qfolio.portfolio.rewards:Reward"),
     "cost": Entries(COSTS, "qfolio.portfolio.costs:CostModel"),
     "signal": Entries(SIGNALS, "qfolio.portfolio.signals:Signal"),

@@ -43,15 +43,19 @@ def test_assess_by_hand_on_one_block() -> None:
     baseline = measures(weak.returns, weak.turnover, weak.cost, 252)
     difference = dqn.to_reference
     assert difference is not None
-    assert difference.growth == pytest.approx(
+    assert difference.growth.value == pytest.approx(
         np.log1p(table["growth"]).mean() - np.log1p(baseline["growth"][0])
     )
-    assert difference.sharpe == pytest.approx(table["sharpe"].mean() - baseline["sharpe"][0])
-    assert difference.growth_interval[0] < difference.growth < difference.growth_interval[1]
-    assert difference.finding == "none"
+    assert difference.sharpe.value == pytest.approx(table["sharpe"].mean() - baseline["sharpe"][0])
+    assert difference.volatility.value == pytest.approx(
+        np.log(table["volatility"]).mean() - np.log(baseline["volatility"][0])
+    )
+    for contrast in difference.contrasts().values():
+        assert contrast.interval[0] < contrast.value < contrast.interval[1]
+        assert contrast.finding == "none"
     best = dqn.to_best_baseline
     assert best is not None
-    assert best.finding == "worse"
+    assert best.growth.finding == "worse"
     assert result.strategies["strong"].to_best_baseline is None
     assert result.strategies["equal weight"].to_reference is None
 
@@ -157,12 +161,13 @@ def test_json_of_the_worst() -> None:
     assert content["strategies"]["mixed"]["measures"]["sharpe"]["mean"] is None
     assert content["strategies"]["cash"]["measures"]["sharpe"]["over_time"] == [0, 0]
     assert content["best_baseline"] == "cash"
-    assert ruined["to_best_baseline"]["growth"] is None  # −∞
+    assert ruined["to_best_baseline"]["growth"]["value"] is None  # −∞
     assert result.strategies["ruin"].to_best_baseline is not None
     assert result.strategies["ruin"].to_reference is not None
-    assert ruined["to_reference"]["growth"] == 0  # both lost everything
-    assert ruined["to_reference"]["growth_interval"] == [0, 0]  # on whichever days, together
-    assert ruined["to_best_baseline"]["growth_interval"][0] is None
+    assert ruined["to_reference"]["growth"]["value"] == 0  # both lost everything
+    assert ruined["to_reference"]["growth"]["interval"] == [0, 0]  # on whichever days, together
+    assert ruined["to_best_baseline"]["growth"]["interval"] == [None, None]
+    assert ruined["to_best_baseline"]["growth"]["finding"] == "none"
 
 
 def test_assess_is_repeatable_and_its_seed_counts() -> None:
@@ -200,7 +205,7 @@ def refusals() -> list[tuple[dict[str, object], dict[str, object], str]]:
         (
             {"equal weight": good, "dqn": ("robot", *good[1:])},
             {},
-            "dqn is of kind 'robot'; it must be agent or ensemble or baseline",
+            "dqn is of kind 'robot'; it must be agent or ensemble or baseline or rebalancing",
         ),
         ({"equal weight": good, "dqn": flat}, {}, r"dqn have the shape \(4,\)"),
         ({"equal weight": good, "dqn": long}, {}, "same periods.*equal weight 4, dqn 5"),

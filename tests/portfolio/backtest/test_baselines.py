@@ -43,11 +43,16 @@ def days(rows: int) -> np.ndarray:
     return np.datetime64("2020-01-01") + np.arange(rows)
 
 
+MONTH = 5
+"""Rows, so that short tables have months."""
+
+
 def ask(
     one: str | Baseline, folds: Sequence[Fold], values: np.ndarray, **options: object
 ) -> Orders:
     name, made = (one, baseline(one)) if isinstance(one, str) else ("own", one)
-    return orders(name, made, folds, days(len(values)), values, **options)  # type: ignore[arg-type]
+    chosen = {"month": MONTH} | options
+    return orders(name, made, folds, days(len(values)), values, **chosen)  # type: ignore[arg-type]
 
 
 def decisions(
@@ -80,15 +85,36 @@ def decided(name: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", FITTED)
-def test_fits_each_fold_to_its_own_training(name: str) -> None:
+def test_fits_every_month_to_all_rows_since_its_training_began(name: str) -> None:
     rows = decided(name)
     assert rows.shape == (45, 5)
-    assert (rows >= 0).all()
-    np.testing.assert_allclose(rows.sum(1), 1, rtol=1e-12)
-    assert (rows[:, 0] == 0).all()
-    assert (rows.reshape(3, 15, 5) == rows[::15][:, None]).all()
-    assert (rows[0] != rows[15]).any()
-    np.testing.assert_array_equal(rows[15, 1:], fitted(name, prices()[15:56]))
+    asked = ~np.isnan(rows[:, 0])
+    np.testing.assert_array_equal(asked, np.arange(45) % MONTH == 0)
+    assert (rows[asked] >= 0).all()
+    np.testing.assert_allclose(rows[asked].sum(1), 1, rtol=1e-12)
+    np.testing.assert_allclose(rows[asked, 0], 0, atol=1e-12)
+    assert (rows[0] != rows[5]).any()
+    for place, start in ((0, 0), (10, 0), (15, 15), (40, 30)):  # folds train from 0, 15 and 30 on
+        expected = fitted(name, prices()[start : 41 + place])
+        np.testing.assert_array_equal(rows[place, 1:], expected)
+
+
+def test_months_count_from_the_first_decision_of_the_test() -> None:
+    """Not from each fold's, or a fold that is not whole months long would trade twice."""
+    rows = decisions("equal-weight-monthly", FOLDS, prices(), month=10)
+    np.testing.assert_array_equal(~np.isnan(rows[:, 0]), np.arange(45) % 10 == 0)
+    rows = decisions("equal-weight-monthly", FOLDS, prices(), month=40)  # longer than a fold
+    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(rows[:, 0])), [0, 40])
+    assert not np.isnan(decisions("equal-weight-monthly", FOLDS, prices(), month=1)).any()
+
+
+def test_windows_end_with_the_decision() -> None:
+    tradable = np.array([True, False, True, True])
+    history = History(days(50), prices()[:50], slice(10, 41), tradable, 1.0, month=3)
+    np.testing.assert_array_equal(history.window(), prices()[10:50, [0, 2, 3]])
+    np.testing.assert_array_equal(history.window(4), prices()[37:50, [0, 2, 3]])
+    np.testing.assert_array_equal(history.window(20), history.window())  # there is no more
+    assert history.returns(4).shape == (12, 3)
 
 
 def test_what_allocators_mean() -> None:
@@ -96,11 +122,14 @@ def test_what_allocators_mean() -> None:
     noise = generator.normal(size=(200, 3))
     noise = np.linalg.qr(noise - noise.mean(0))[0] * np.sqrt(199)  # of variance 1, uncorrelated
     returns = np.array([0.001, 0.004, 0.004]) + noise * np.array([0.01, 0.02, 0.04])
-    # Without correlation weights go as 1/σ, as 1/σ², and for the ratio as mean/σ².
+    # Without correlation weights go as 1/σ, as 1/σ², and for the ratio as mean/σ²; those of timing
+    # as the squares of the latter two.
     for name, expected in {
         "equal-weight": [1, 1, 1],
         "buy-and-hold": [1, 1, 1],
         "inverse-volatility": [4, 2, 1],
+        "volatility-timing": [256, 16, 1],
+        "reward-to-risk-timing": [16, 16, 1],
         "risk-budgeting": [4, 2, 1],
         "minimum-variance": [16, 4, 1],
         "maximum-ratio": [16, 16, 4],
@@ -125,9 +154,8 @@ def test_no_later_price_changes_a_decision(name: str, row: int, seed: int) -> No
     changed = prices()
     later = changed[row + 1 :]
     later *= np.random.default_rng(seed).lognormal(size=later.shape)
-    # Whatever is decided at or before the row sees prices up to the row.
-    found = decisions(name, [f for f in FOLDS if f.decisions.start <= row], changed)
-    np.testing.assert_array_equal(found, decided(name)[: len(found)])
+    known = slice(0, min(row, 84) - 40 + 1)  # decisions at or before the row
+    np.testing.assert_array_equal(decisions(name, FOLDS, changed)[known], decided(name)[known])
 
 
 @pytest.mark.parametrize("name", FITTED)
@@ -139,14 +167,18 @@ def test_fits_see_their_training(name: str) -> None:
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_cap(name: str) -> None:
-    found = decisions(name, FOLDS[:1], prices(), cap=0.3)[0]
-    assert (found[1:] <= 0.3 + 1e-12).all()
-    assert found.sum() == pytest.approx(1)
-    assert found[0] == 0
+    found = decisions(name, FOLDS, prices(), cap=0.3)
+    found = found[~np.isnan(found[:, 0])]
+    assert (found[:, 1:] <= 0.3 + 1e-12).all()
+    np.testing.assert_allclose(found.sum(1), 1, rtol=1e-12)
+    assert name == "trend" or (found[:, 0] < 1e-12).all()
     if name in ("inverse-volatility", "minimum-variance"):
-        assert found[1] == pytest.approx(0.3)  # would like more: the calmest
+        assert found[0, 1] == pytest.approx(0.3)  # would like more: the calmest
     tight = decisions(name, FOLDS[:1], prices(), cap=0.2)[0]
-    np.testing.assert_allclose(tight, 0.2)  # in cash, too
+    held = tight[1:] > 0
+    assert name == "trend" or held.all()
+    np.testing.assert_allclose(tight[1:][held], 0.2)
+    assert tight[0] == pytest.approx(1 - 0.2 * held.sum())
 
 
 def test_cap_keeps_proportions() -> None:
@@ -169,11 +201,14 @@ def test_cap_keeps_proportions() -> None:
 @pytest.mark.parametrize("name", BASELINES)
 def test_assets_that_join_late(name: str) -> None:
     values = prices()
-    values[:50, 1] = np.nan  # in the training of the second fold from its middle on
+    values[:30, 1] = np.nan  # the third fold is the first whose training it covers
     found = decisions(name, FOLDS, values)
-    assert (found[:30, 2] == 0).sum() == (1 if name == "buy-and-hold" else 30)
+    assert np.nansum(found[:30, 2]) == 0
+    if name.startswith("equal-weight") or name in ("inverse-volatility", "risk-budgeting"):
+        first = np.flatnonzero(~np.isnan(found[30:, 0]))[0]
+        assert found[30 + first, 2] > 0.1
     without = decisions(name, FOLDS[:2], np.delete(values, 1, axis=1))
-    np.testing.assert_array_equal(np.delete(found[:30], 2, axis=1), without)
+    np.testing.assert_allclose(np.delete(found[:30], 2, axis=1), without, atol=1e-12)
     chosen = decisions(name, FOLDS, prices(), tradable=[[True, False, True, True]] * 3)
     np.testing.assert_array_equal(chosen[:30], found[:30])
     with pytest.raises(QfolioError, match="Fold 0 has no asset to hold, or one without a price"):
@@ -185,7 +220,7 @@ def test_failures_leave_a_note_and_equal_weights() -> None:
     values[:60, 2] = 7.0  # no variance
     found, notes = ask("minimum-variance", FOLDS, values)
     np.testing.assert_array_equal(found[0], [0, *[0.25] * 4])
-    assert (found[-1] != found[0]).any()
+    assert (found[40] != found[0]).any()
     assert notes[0].startswith("minimum-variance, fold 0: no solution, so weights are equal: ")
     assert "variance" in notes[0].split("equal:")[1]
     falling = -np.abs(np.random.default_rng(0).normal(0, 0.1, size=(50, 3)))
@@ -195,8 +230,8 @@ def test_failures_leave_a_note_and_equal_weights() -> None:
 
 def test_warnings_of_skfolio_are_notes() -> None:
     twins = prices()[:, :1].repeat(2, axis=1)
-    (note,) = ask("minimum-variance", FOLDS[:1], twins).notes
-    assert note.startswith("minimum-variance, fold 0: ")
+    (note,) = ask("maximum-ratio", FOLDS[:1], twins).notes
+    assert note.startswith("maximum-ratio, fold 0: ")
 
 
 class LastWinner(Baseline):
@@ -306,9 +341,11 @@ def test_errors_say_what_and_where() -> None:
     ],
 )
 def test_sharpe_ratios_of_skfolio_on_its_own_prices(name: str, sharpe: float) -> None:
+    """Fitted once a fold, as there."""
     values = real_prices()
     folds = walk(len(values), train=1260, test=252)
-    found, notes = ask(name, folds, values)
+    made = type("OnceAFold", (type(baseline(name)),), {"calendar": "fold"})()
+    found, notes = ask(made, folds, values)
     assert notes == ()
     returns = simulate(values, found, first=1260, cost=0.0, lag=0).returns
     assert returns.mean() / returns.std(ddof=1) * np.sqrt(252) == pytest.approx(sharpe, abs=5e-4)

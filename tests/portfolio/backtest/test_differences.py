@@ -1,79 +1,82 @@
 """Comparisons of strategies: paired, two-sided, and corrected for how many there are."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 
 from qfolio.core.statistics import holm
-from qfolio.portfolio.backtest.assessment import Strategy, assess
-from qfolio.portfolio.backtest.differences import (
-    MARGIN,
-    Sampled,
-    tails_to,
-    tails_to_best,
-)
+from qfolio.portfolio.backtest.assessment import Assessment, Strategy, assess
+from qfolio.portfolio.backtest.differences import Contrast, Difference, tails_to
+from qfolio.portfolio.backtest.estimates import Estimate, Tails
 
 from records import days, strategy
 
-
-def sampled(observed: float, drawn: list[float]) -> Sampled:
-    """Of one seed, given log growth as drawn."""
-    growth = np.expm1(np.array(drawn))[:, None]
-    return Sampled(
-        {"growth": np.expm1([observed])}, {"growth": growth}, np.zeros((len(drawn), 1), int)
-    )
+NU = 400
 
 
-NOTHING = sampled(0.0, [0.0] * 39)
+def estimate(value: float, error: float, seed: int = 0) -> Estimate:
+    """Of one seed; those of different seeds are uncorrelated."""
+    loads = np.random.default_rng(seed).standard_normal(NU)
+    return Estimate(value, error * loads / math.sqrt((loads**2).mean()), 0.0, 1)
 
 
-def test_p_values_by_hand() -> None:
-    ours = sampled(0.1, [-0.1] * 3 + [MARGIN / 2] * 2 + [0.2] * 34)
-    better, worse = tails_to(ours, NOTHING)
-    assert better == (1 + 5) / 40  # what is within the margin of rounding speaks for neither
-    assert worse == (1 + 36) / 40
-    assert tails_to(NOTHING, NOTHING) == (1, 1)
-    unknown = sampled(math.nan, [math.nan] * 39)
-    assert tails_to(unknown, NOTHING) == (1, 1)
+def to_best(*among: Estimate, more: bool = True) -> Tails:
+    """Against the one that does best, as a backtest chooses it."""
+    shown = min(among, key=lambda each: each.value if more else -each.value)
+    return tails_to(shown, among, more, np.random.default_rng(0))
 
 
 def test_the_best_is_chosen_in_hindsight() -> None:
     """Two rivals alike but for luck: the luckier one is ahead by less than luck explains."""
-    rng = np.random.default_rng(0)
-    ours = sampled(0.0, [0.0] * 1999)
-    noise = rng.normal(0, 0.01, (2, 1999))
-    rivals = [sampled(0.021, list(0.021 + noise[0])), sampled(0.0, list(noise[1]))]
-    alone = tails_to(ours, rivals[0]).worse
-    either = tails_to_best(ours, rivals)
-    assert alone == pytest.approx(0.018, abs=0.006)  # Φ(−2.1)
-    assert either.worse == pytest.approx(2 * 0.018, abs=0.01)  # one of two was to be that lucky
+    lucky, other = estimate(-0.021, 0.01, 1), estimate(0.0, 0.01, 2)
+    alone, either = to_best(lucky), to_best(lucky, other)
+    assert alone.worse == pytest.approx(0.018, abs=0.001)  # Φ(−2.1)
+    assert either.worse == pytest.approx(2 * 0.018, abs=0.006)  # one of two was to be that lucky
     assert either.better > 0.95
+    # Copies of one rival are no choice.
+    assert to_best(lucky, lucky, lucky).worse == pytest.approx(alone.worse, abs=0.004)
 
 
-def test_beating_the_best_is_beating_every_baseline() -> None:
+def test_beating_the_best_is_beating_every_one() -> None:
     """The rival that grew less, but may as well have grown more than ours, counts."""
-    rng = np.random.default_rng(1)
-    ours = sampled(0.02, [0.02] * 1999)
-    calm = sampled(0.01, list(0.01 + rng.normal(0, 0.001, 1999)))
-    wild = sampled(0.005, list(0.005 + rng.normal(0, 0.01, 1999)))
-    assert tails_to_best(ours, [calm]).better < 0.001
-    assert tails_to_best(ours, [calm, wild]).better == tails_to(ours, wild).better > 0.05
+    calm, wild = estimate(0.01, 0.001, 1), estimate(0.015, 0.01, 2)
+    assert to_best(calm).better < 0.001
+    assert to_best(calm, wild).better == wild.tails().better > 0.05
 
 
-def both(result: Any, name: str) -> list[Any]:
+def test_less_volatility_is_better() -> None:
+    calmer = estimate(-0.03, 0.01)
+    assert to_best(calmer, more=False) == to_best(calmer.negated())
+    assert to_best(calmer, more=False).better < 0.01 < 0.9 < to_best(calmer, more=True).better
+
+
+def test_unknown_differences_are_no_evidence() -> None:
+    unknown = Estimate(math.inf, np.full(1, np.nan), 0.0, 1)
+    assert to_best(unknown) == (1, 1)
+    assert to_best(estimate(0.1, 0.01), unknown).better == 1
+    assert to_best(estimate(-0.1, 0.01), unknown).worse < 0.01
+
+
+def both(result: Assessment, name: str) -> list[Difference]:
     entry = result.strategies[name]
     return [each for each in (entry.to_reference, entry.to_best_baseline) if each is not None]
 
 
+def in_tests(result: Assessment, *names: str) -> list[Contrast]:
+    fields = ("to_reference", "to_rebalanced", "to_best_baseline")
+    found = [getattr(result.strategies[name], field) for name in names for field in fields]
+    contrasts = [c for each in found if each is not None for c in each.contrasts().values()]
+    return [each for each in contrasts if each.p is not None]
+
+
 def test_holm_takes_away_what_many_comparisons_found_by_luck() -> None:
-    """The same edge is evidence when it is compared once, and none among six comparisons."""
+    """The same edge is evidence when it is compared once, and none among six agents."""
     rng = np.random.default_rng(12)
     base = strategy(rng, "baseline", 1)
-    # A mean excess of 2.2 standard errors over 300 days: p is about 0.03.
+    # A mean excess of 3 standard errors over 300 days: p is about 0.008.
     excess = rng.standard_normal(300)
-    excess = 0.002 * ((excess - excess.mean()) / excess.std() + 2.2 / math.sqrt(300))
+    excess = 0.002 * ((excess - excess.mean()) / excess.std() + 3.0 / math.sqrt(300))
     edge = Strategy("agent", np.asarray(base.returns) + excess, base.turnover, base.cost)
     noise = {
         f"noise {i}": base._replace(
@@ -86,15 +89,19 @@ def test_holm_takes_away_what_many_comparisons_found_by_luck() -> None:
         for more in ({}, noise)
     )
     (single,), (one,) = both(alone, "edge"), both(among, "edge")
-    assert single.p == single.p_holm < 0.05
-    assert single.finding == "better"
-    assert single.growth_interval[0] > 0
-    assert among.comparisons == 6
-    assert one.growth_interval[0] > 0  # of this difference alone
-    assert one.p < 0.05 < one.p_holm
-    assert one.finding == "none"
-    tested = [each for name in ("edge", *noise) for each in both(among, name)]
-    np.testing.assert_allclose([each.p_holm for each in tested], holm([x.p for x in tested]))
+    assert alone.comparisons == 3  # measures
+    assert single.growth.finding == "better"
+    assert among.comparisons == 18
+    assert one.growth.interval[0] > 0  # of this difference alone
+    assert one.growth.p is not None
+    assert one.growth.p_holm is not None
+    assert one.growth.p == single.growth.p
+    assert one.growth.p < 0.05 < one.growth.p_holm
+    assert one.growth.finding == "none"
+    every = in_tests(among, "edge", *noise)
+    p_values = [(each.p or 0.0, each.p_holm or 0.0) for each in every]
+    alone_p, corrected = np.array(p_values).T
+    np.testing.assert_allclose(corrected, holm(alone_p))
 
 
 def test_the_best_baseline_is_the_one_that_grew_most() -> None:
@@ -111,11 +118,13 @@ def test_the_best_baseline_is_the_one_that_grew_most() -> None:
     sharpes = {name: entry.measures["sharpe"].mean for name, entry in result.strategies.items()}
     assert sharpes["calm"] > sharpes["bold"]
     assert result.best_baseline == "bold"
-    assert result.comparisons == 2
+    assert result.comparisons == 3 + 1  # with the best baseline in growth alone
     best = result.strategies["dqn"].to_best_baseline
     assert best is not None
     assert best.reference == "bold"
-    assert result.strategies["calm"].to_reference.finding is None  # type: ignore[union-attr]
+    assert best.sharpe.finding is None
+    assert best.growth.finding is not None
+    assert in_tests(result, "calm", "bold") == []
 
 
 def test_the_reference_as_the_best_is_one_comparison() -> None:
@@ -125,7 +134,7 @@ def test_the_reference_as_the_best_is_one_comparison() -> None:
     entries = {"equal weight": base, "weak": weak, "dqn": strategy(rng)}
     result = assess(entries, days(300), periods_per_year=252, resamples=100)
     assert result.best_baseline == "equal weight"
-    assert result.comparisons == 1
+    assert result.comparisons == 3
     assert result.strategies["dqn"].to_best_baseline is None
 
 
@@ -133,11 +142,12 @@ def test_a_strategy_does_not_differ_from_itself() -> None:
     rng = np.random.default_rng(11)
     base = strategy(rng, "baseline", 1)
     copies = {"equal weight": base, "dqn": base._replace(kind="agent"), "noise": strategy(rng)}
-    difference = both(assess(copies, days(300), periods_per_year=252), "dqn")[0]
-    assert difference.growth == difference.sharpe == 0
-    assert difference.growth_interval == difference.sharpe_interval == (0, 0)
-    assert difference.p == 1
-    assert difference.finding == "none"
+    (difference,) = both(assess(copies, days(300), periods_per_year=252), "dqn")
+    for contrast in difference.contrasts().values():
+        assert contrast.value == 0
+        assert contrast.interval == (0, 0)
+        assert contrast.p == 1
+        assert contrast.finding == "none"
 
 
 def test_differences_are_paired() -> None:
@@ -148,15 +158,16 @@ def test_differences_are_paired() -> None:
     agent = Strategy("agent", (1 + returns) * math.exp(1e-4) - 1, base.turnover, base.cost)
     result = assess({"equal weight": base, "dqn": agent}, days(300), periods_per_year=252)
     (difference,) = both(result, "dqn")
-    np.testing.assert_allclose(difference.growth_interval, 0.0252, rtol=1e-9)
-    assert difference.p == pytest.approx(2 / 2001)
-    assert difference.finding == "better"
+    np.testing.assert_allclose(difference.growth.interval, 0.0252, rtol=1e-9)
+    assert difference.growth.p is not None
+    assert difference.growth.p < 1e-9
+    assert difference.growth.finding == "better"
     assert np.ptp(result.strategies["dqn"].measures["growth"].over_time) > 0.1
 
 
 def test_differences_carry_the_doubt_about_seeds() -> None:
     # Every seed is equal weight times its own constant, so that all doubt is about seeds: the
-    # interval is normal with the variance of the mean, s² / 6.
+    # interval is Student's with the variance of the mean, s² / 6, and 5 degrees of freedom.
     rng = np.random.default_rng(13)
     base = strategy(rng, "baseline", 1)
     extra = np.array([-0.08, -0.03, 0.0, 0.02, 0.04, 0.05])
@@ -164,6 +175,60 @@ def test_differences_carry_the_doubt_about_seeds() -> None:
     agent = Strategy("agent", returns, np.zeros((6, 300)), np.zeros((6, 300)))
     result = assess({"equal weight": base, "dqn": agent}, days(300), periods_per_year=252)
     (difference,) = both(result, "dqn")
-    assert difference.growth == pytest.approx(0, abs=1e-12)
-    width = 2 * 1.96 * extra.std(ddof=1) / math.sqrt(6)
-    assert np.diff(difference.growth_interval).item() == pytest.approx(width, rel=0.08)
+    assert difference.growth.value == pytest.approx(0, abs=1e-12)
+    width = 2 * 2.570582 * extra.std(ddof=1) / math.sqrt(6)
+    assert np.diff(difference.growth.interval).item() == pytest.approx(width, rel=1e-6)
+
+
+def test_the_best_rebalancing_is_the_one_that_grew_most() -> None:
+    """And to beat it is to beat every speed, in each measure."""
+    rng = np.random.default_rng(5)
+    base = strategy(rng, "baseline", 1)
+    market = np.asarray(base.returns)
+    slow = base._replace(kind="rebalancing", returns=market + 2e-4)
+    wave = rng.normal(size=(1, 300))
+    wave -= wave.mean()
+    never = base._replace(kind="rebalancing", returns=market + 1e-4 + 0.004 * wave)
+    ours = base._replace(kind="agent", returns=market + 4e-4)
+    entries = {"equal weight": base, "slow": slow, "never": never, "dqn": ours}
+    result = assess(entries, days(300), periods_per_year=252, resamples=100)
+    assert result.rebalanced == "slow"
+    assert result.best_baseline == "equal weight"  # a rebalancing is no baseline
+    assert result.comparisons == 6
+    assert result.trials == 1
+    entry = result.strategies["dqn"]
+    assert entry.to_rebalanced is not None
+    assert entry.to_reference is not None
+    assert entry.to_rebalanced.reference == "slow"
+    assert entry.to_reference.growth.finding == "better"
+    assert entry.to_rebalanced.growth.interval[0] > 0  # ahead of the best for sure
+    assert entry.to_rebalanced.growth.finding == "none"  # but not of each
+    del entries["never"]
+    alone = assess(entries, days(300), periods_per_year=252, resamples=100).strategies["dqn"]
+    assert alone.to_rebalanced is not None
+    assert alone.to_rebalanced.growth.finding == "better"
+
+
+def test_costs_that_slower_rebalancing_saves_are_no_edge() -> None:
+    """Noise that trades less than the reference beats it, but not its best rebalancing."""
+    rng = np.random.default_rng(6)
+    market = 0.01 * rng.standard_normal((1, 2000))
+    zeros = np.zeros_like(market)
+    entries = {
+        "equal weight": Strategy("baseline", market - 1e-4, zeros, zeros),
+        "slow": Strategy("rebalancing", market - 1e-5, zeros, zeros),
+        "noise": Strategy("agent", market + 1e-4 * rng.standard_normal(market.shape), zeros, zeros),
+    }
+    noise = assess(entries, days(2000), periods_per_year=252, resamples=50).strategies["noise"]
+    assert noise.to_reference is not None
+    assert noise.to_rebalanced is not None
+    assert noise.to_reference.growth.finding == "better"
+    assert noise.to_rebalanced.growth.finding == "better"  # by the last basis point
+    entries["noise"] = entries["noise"]._replace(
+        returns=np.asarray(entries["noise"].returns) - 1e-5
+    )
+    noise = assess(entries, days(2000), periods_per_year=252, resamples=50).strategies["noise"]
+    assert noise.to_reference is not None
+    assert noise.to_rebalanced is not None
+    assert noise.to_reference.growth.finding == "better"
+    assert noise.to_rebalanced.growth.finding == "none"

@@ -64,7 +64,8 @@ def finished(tmp_path_factory):
 def test_all_strategies_are_replayed_on_the_same_days(finished):
     entries, _ = finished.entries()
     agents = ["dqn", "dqn-together", "pathwise", "pathwise-together"]
-    assert list(entries) == [*agents, *BASELINES]
+    slower = [f"equal-weight at {speed}" for speed in ("0.3", "0.1", "0.03", "0.01", "0")]
+    assert list(entries) == [*agents, *BASELINES, *slower]
     assert len(finished.folds) == 4
     assert len(finished.dates) == 260 - 100
     for name, entry in entries.items():
@@ -138,6 +139,17 @@ def test_what_is_learned_does_not_depend_on_the_group(finished, tmp_path):
             np.testing.assert_array_equal(x, y)
 
 
+def test_rebalancing_at_speeds(finished):
+    """At 0 it is buy and hold; the slower, the less it trades; each pays the backtest's costs."""
+    entries, _ = finished.entries()
+    never = entries["equal-weight at 0"].simulation.returns
+    np.testing.assert_array_equal(never, entries["buy-and-hold"].simulation.returns)
+    names = ["equal-weight", *(f"equal-weight at {speed}" for speed in ("0.3", "0.1", "0.03", "0"))]
+    turnover = [entries[name].simulation.turnover.sum() for name in names]
+    assert turnover == sorted(turnover, reverse=True)
+    assert len(set(turnover)) == 5
+
+
 def test_seeds_differ_and_opening_gives_the_same(finished):
     entries, _ = finished.entries()
     again, _ = Backtest.open(finished.folder).entries()
@@ -199,7 +211,12 @@ def test_no_strategy_looks_ahead():
     for name, before in decisions[0].items():
         after = decisions[1][name]
         np.testing.assert_array_equal(after[:, :known], before[:, :known], err_msg=name)
-        if name not in ("equal-weight", "buy-and-hold"):
+        if name not in (
+            "equal-weight",
+            "equal-weight-monthly",
+            "buy-and-hold",
+            "equal-weight at 0",
+        ):
             assert not np.array_equal(after[:, known:], before[:, known:]), name
 
 
@@ -214,7 +231,13 @@ def test_tables_say_what_was_replayed(finished):
     summary = json.loads((finished.folder / "summary.json").read_text())
     assert summary["strategies"]["pathwise"]["kind"] == "agent"
     assert list(summary["verdicts"]) == ["dqn", "dqn-together", "pathwise", "pathwise-together"]
-    assert summary["strategies"]["dqn"]["to_reference"]["finding"] in ("better", "worse", "none")
+    growth = summary["strategies"]["dqn"]["to_reference"]["growth"]
+    assert growth["finding"] in ("better", "worse", "none")
+    assert summary["rebalanced"].startswith("equal-weight")
+    best = max(x["measures"]["growth"]["mean"] for n, x in summary["strategies"].items()
+               if n == "equal-weight" or x["kind"] == "rebalancing")  # fmt: skip
+    assert summary["strategies"][summary["rebalanced"]]["measures"]["growth"]["mean"] == best
+    assert summary["bound"] > summary["strategies"]["buy-and-hold"]["measures"]["growth"]["mean"]
 
 
 def test_looks_at_the_default_table_count_as_trials(finished):

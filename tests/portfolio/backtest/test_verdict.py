@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from qfolio.portfolio.backtest.assessment import Assessment, assess
-from qfolio.portfolio.backtest.differences import Difference
-from qfolio.portfolio.backtest.verdict import luck, p_value, verdict, verdicts
+from qfolio.portfolio.backtest.differences import Contrast, Difference
+from qfolio.portfolio.backtest.verdict import bound_sentence, luck, p_value, verdicts
 
 from records import days, strategy
 
@@ -25,29 +25,126 @@ def assessment() -> Assessment:
     return assess({**baselines, "dqn": strategy(rng)}, days(300), periods_per_year=252)
 
 
-def difference(finding: Any, growth: float, low: float, high: float, p: float) -> Difference:
-    return Difference("it", growth, (low, high), 0.0, (0.0, 0.0), p / 2, p, finding)
+NOTHING = Contrast(0.0, (-0.1, 0.1), 0.5, 1.0, "none")
+
+
+def about(reference: str = "it", **contrasts: Contrast) -> Difference:
+    given: dict[str, Any] = dict.fromkeys(("growth", "sharpe", "volatility"), NOTHING)
+    return Difference(reference, **{**given, **contrasts})
+
+
+def contrast(finding: Any, value: float = 0.01, p: float = 0.02) -> Contrast:
+    return Contrast(value, (value - 0.005, value + 0.005), p / 2, p, finding)
+
+
+def said(
+    assessment: Assessment,
+    rebalanced: Difference | None,
+    reference: Difference,
+    best: Difference | None = None,
+) -> list[str]:
+    entry = dataclasses.replace(
+        assessment.strategies["dqn"],
+        to_reference=reference,
+        to_rebalanced=rebalanced,
+        to_best_baseline=best,
+    )
+    strategies = {**assessment.strategies, "dqn": entry}
+    changed = dataclasses.replace(assessment, strategies=strategies, best_baseline="other")
+    return [text(sentence) for sentence in verdicts(changed)["dqn"]]
+
+
+def claims_of(*arguments: Any) -> list[str]:
+    return [sentence.partition(":")[0] for sentence in said(*arguments)]
 
 
 def test_the_corrected_p_value_decides(assessment: Assessment) -> None:
-    taken_away = difference("none", 0.008, 0.001, 0.034, 0.0502)
-    assert text(verdict("dqn", taken_away, assessment)) == (
-        "No evidence that dqn beats it after costs: the difference in annual growth is +0.8 % "
-        "(95 % interval +0.1 % to +3.4 %; p = 0.051 after Holm’s correction)."
-    )
-    better = difference("better", 0.008, 0.001, 0.034, 0.02)
-    assert verdict("dqn", better, assessment).startswith("dqn beats it after costs: ")
-    worse = difference("worse", -0.008, -0.034, -0.001, 0.02)
-    assert verdict("dqn", worse, assessment).startswith("dqn falls short of it after costs: ")
+    taken_away = about(growth=Contrast(0.008, (0.001, 0.034), 0.02, 0.0502, "none"))
+    assert said(assessment, None, taken_away) == [
+        "No evidence that dqn beats equal weight in growth, Sharpe ratio or volatility after "
+        "costs: the difference in annual growth to it is +0.8 % (95 % interval +0.1 % to +3.4 %; "
+        "corrected p = 0.051), in Sharpe ratio 0.00 (95 % interval -0.10 to +0.10; corrected "
+        "p = 1.00) and in volatility 0.0 % (95 % interval -9.5 % to +10.5 %; corrected p = 1.00)."
+    ]
     single = dataclasses.replace(assessment, comparisons=1)
-    assert text(verdict("dqn", better, single)).endswith("to +3.4 %; p = 0.020).")
+    assert "to +3.4 %; p = 0.051)" in said(single, None, taken_away)[0]
+
+
+def test_claims_are_plain(assessment: Assessment) -> None:
+    better, worse, none = contrast("better"), contrast("worse", -0.01), about()
+    both = about(growth=better, sharpe=better)
+    assert claims_of(assessment, both, both) == [
+        "dqn beats equal weight, however it is rebalanced, in growth and Sharpe ratio after costs",
+        "dqn beats equal weight in growth and Sharpe ratio after costs",
+    ]
+    assert claims_of(assessment, none, about(growth=better)) == [
+        "No evidence that dqn beats equal weight, however it is rebalanced, in growth, Sharpe "
+        "ratio or volatility after costs",
+        "dqn beats equal weight in growth after costs",
+    ]
+    assert claims_of(assessment, none, none) == [
+        "No evidence that dqn beats equal weight in growth, Sharpe ratio or volatility after costs"
+    ]
+    lost = about(growth=worse)
+    assert claims_of(assessment, lost, none) == [
+        "dqn falls short of the best rebalancing of equal weight in growth after costs, and beats "
+        "it in nothing"
+    ]
+    mixed = about(sharpe=better, growth=worse, volatility=better)
+    assert claims_of(assessment, mixed, none) == [
+        "dqn beats equal weight, however it is rebalanced, in Sharpe ratio and falls short of the "
+        "best rebalancing of equal weight in growth after costs, and fluctuates less"
+    ]
+    untested = Contrast(0.1, (0.0, 0.2))
+    best = about(growth=better, sharpe=untested, volatility=untested)
+    *_, last = said(assessment, none, none, best)
+    assert last == (
+        "dqn beats other in growth after costs: the difference in annual growth to it is +1.0 % "
+        "(95 % interval +0.5 % to +1.5 %; corrected p = 0.020)."
+    )
+
+
+def test_less_volatility_alone_is_no_victory(assessment: Assessment) -> None:
+    calmer, wilder = contrast("better", -0.1), contrast("worse", 0.1)
+    one = about(volatility=calmer)
+    assert claims_of(assessment, one, one) == [
+        "No evidence that dqn beats equal weight in growth or Sharpe ratio after costs, but it "
+        "fluctuates less"
+    ]
+    assert claims_of(assessment, about(volatility=wilder), about())[0].endswith(
+        "in growth or Sharpe ratio after costs, and it fluctuates more"
+    )
+    bold = about(growth=contrast("better"), volatility=wilder)
+    assert claims_of(assessment, bold, about())[0] == (
+        "dqn beats equal weight, however it is rebalanced, in growth after costs, and fluctuates "
+        "more"
+    )
+
+
+def test_growing_less_is_said_first(assessment: Assessment) -> None:
+    """``allocate`` repeats the first sentence when it refuses."""
+    lost = about(growth=contrast("worse", -0.01))
+    assert (
+        claims_of(assessment, about(), lost)[0]
+        == "dqn falls short of equal weight in growth after costs"
+    )
+    calmer = about(sharpe=contrast("better"))
+    assert claims_of(assessment, calmer, lost)[0].startswith("dqn falls short of equal weight in")
 
 
 def test_digits_tell_an_end_from_zero(assessment: Assessment) -> None:
-    sentence = text(verdict("dqn", difference("better", 0.008, 0.00004, 0.02, 0.01), assessment))
-    assert "+0.800 % (95 % interval +0.004 % to +2.000 %;" in sentence
-    ruin = difference("none", -math.inf, -math.inf, 0.02, 1.0)
-    assert "-∞ % (95 % interval -∞ % to +2.0 %;" in text(verdict("dqn", ruin, assessment))
+    near = about(growth=Contrast(0.008, (0.00004, 0.02), 0.01, 0.01, "better"))
+    assert "+0.800 % (95 % interval +0.004 % to +2.000 %;" in said(assessment, None, near)[0]
+    ruin = about(growth=Contrast(-math.inf, (-math.inf, math.inf), 1.0, 1.0, "none"))
+    assert "-∞ % (95 % interval -∞ % to +∞ %;" in said(assessment, None, ruin)[0]
+
+
+def test_the_bound_is_said_as_a_bound(assessment: Assessment) -> None:
+    assert bound_sentence(assessment) == ""
+    known = dataclasses.replace(assessment, bound=0.2603)
+    assert text(bound_sentence(known)).startswith(
+        "A bound: even without costs, no constant weights grew by more than 26.0 % a year."
+    )
 
 
 @pytest.mark.parametrize(
@@ -59,9 +156,8 @@ def test_p_values_are_rounded_up(p: float, said: str) -> None:
 
 
 def test_verdicts_are_on_agents_alone(assessment: Assessment) -> None:
-    said = verdicts(assessment)
-    assert list(said) == ["dqn"]
-    assert len(said["dqn"]) == assessment.comparisons == 1 + (assessment.best_baseline == "other")
+    assert list(verdicts(assessment)) == ["dqn"]
+    assert assessment.comparisons == 3 + (assessment.best_baseline == "other")
 
 
 def test_luck_in_words(assessment: Assessment) -> None:

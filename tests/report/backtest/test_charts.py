@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qfolio.report.backtest.charts import AREAS, NAMED, POINTS
-from qfolio.report.backtest.data import BacktestData
+from qfolio.report.backtest.data import DISTINCT, BacktestData
 from qfolio.report.backtest.page import render_backtest, write_backtest_report
 
 from backtests import Page, make_data, make_series, usual, weekdays
@@ -86,3 +86,29 @@ def test_page_of_a_long_backtest_stays_small(tmp_path: Path) -> None:
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert size < 8e6
     assert len(page.scripts[0]) < 1e6
+
+
+def test_many_baselines_are_hidden_at_first() -> None:
+    """But in the tables and in the lists they stand, one select away."""
+    rng = np.random.default_rng(2)
+    kinds = {"agent": "agent", "equal weight": "baseline", "slow": "rebalancing"}
+    kinds |= {f"other {i}": "baseline" for i in range(DISTINCT + 2)}
+    series = {
+        name: make_series(rng, kind, 1, 40, 2, 0.01 if name == "other 0" else 0.0)
+        for name, kind in kinds.items()
+    }
+    data = make_data(series, weekdays("2020-01-01", 40), ("A", "B"))
+    page = Page(render_backtest(data))
+    main = 2 + (data.assessment.rebalanced == "slow") + 1  # other 0 is the best baseline
+    assert data.assessment.best_baseline == "other 0"
+    assert page.data["hidden"] == list(range(main, main + DISTINCT + 1))
+    assert len(page.data["strategies"]) == main + DISTINCT + 1
+    pressed = [
+        attributes["aria-pressed"] for tag, attributes in page.tags if "aria-pressed" in attributes
+    ]
+    assert pressed[: main + 1] == ["true"] * main + ["false"]
+    assert "7 other baselines" in page.text
+    assert "The other baselines are hidden at first" in page.text
+    del series["other 1"]
+    fewer = Page(render_backtest(make_data(series, data.dates, data.assets)))
+    assert fewer.data["hidden"] == []

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.differences import Contrast
 from qfolio.portfolio.backtest.verdict import verdicts
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.backtest.page import render_backtest
@@ -28,10 +29,10 @@ def test_leads_with_the_verdicts_and_says_no_more(data: BacktestData, page: Page
     places = [page.text.index(plain(each)) for name in said for each in said[name]]
     assert places == sorted(places)
     assert places[-1] < page.text.index("Mind the data") < page.text.index("Cumulative wealth")
-    # Each claim is made once, and only the one that the interval allows.
-    assert page.text.count("after costs:") == 6
-    assert "No evidence that DQN beats equal weight after costs" in page.text
-    assert "pathwise beats best of all after costs" in page.text
+    # Each claim is made once, and only the one that the corrected p-value allows.
+    assert page.text.count("after costs:") == sum(map(len, said.values()))
+    assert "No evidence that DQN beats equal weight in growth, Sharpe ratio or" in page.text
+    assert "pathwise beats best of all in growth after costs" in page.text
 
 
 def test_says_what_the_test_is(page: Page) -> None:
@@ -43,7 +44,7 @@ def test_says_what_the_test_is(page: Page) -> None:
         "is carried out at the close of the next day",
         "1, walk-forward: training on a rolling window of 2y, then a test of 6m",
         "12: 2 agents × 3 seeds, 1 ensemble, and 5 earlier trials on these prices.",
-        "after Holm’s correction for 6 comparisons",
+        "after Holm’s correction for 21 comparisons",
         "no order gives an asset more than 30.0 %",
         "Market impact",
         "Taxes.",
@@ -66,9 +67,16 @@ def test_table_has_every_figure_with_its_intervals(data: BacktestData) -> None:
         ("agent", "DQN-together"),
         ("agent", "pathwise"),
         ("baseline", "equal weight"),
+        ("baseline", "never"),
         ("baseline", "best of all"),
-        ("baseline", "third"),
     ]
+    others = page.split("Table of statistics of the other baselines")[1].split("</table>")[0]
+    assert re.findall(r"<th scope=\"row\">(.*?)</th>", others) == ["third"]
+    before, speeds = page.split("Table of speeds of rebalancing")
+    assert ">slow<" not in before  # nor in any other place
+    assert re.findall(r"<th scope=\"row\">(.*?)</th>", speeds.split("</table>")[0]) == [
+        "equal weight", "slow", "never (best)"
+    ]  # fmt: skip
     sharpe = data.assessment.strategies["DQN"].measures["sharpe"]
     assert sharpe.over_seeds is None  # of three
     cell = rows[0][2].split("<td>")[3].replace("\N{MINUS SIGN}", "-").replace("\u202f", "")
@@ -95,10 +103,9 @@ def test_only_the_corrected_verdict_is_marked() -> None:
     data = usual()
     entry = data.assessment.strategies["DQN"]
     assert entry.to_reference is not None
-    near = replace(
-        entry.to_reference, growth=0.01, growth_interval=(0.00004, 0.02), finding="better"
-    )
-    none = replace(near, finding="none")
+    growth = Contrast(0.01, (0.00004, 0.02), 0.01, 0.02, "better")
+    near = replace(entry.to_reference, growth=growth)
+    none = replace(near, growth=replace(growth, finding="none"))
 
     def first_cell(difference: Any) -> str:
         strategies = {**data.assessment.strategies, "DQN": replace(entry, to_reference=difference)}
@@ -106,7 +113,7 @@ def test_only_the_corrected_verdict_is_marked() -> None:
         table = render_backtest(changed).split('aria-label="Table of differences"')[1]
         return table.split("<td", 2)[1]
 
-    assert first_cell(near).startswith(' class="higher">▲ +1.0')
+    assert first_cell(near).startswith(' class="better">▲ +1.0')
     assert "+0.004\u202f% … +2.0\u202f%" in first_cell(near)
     assert first_cell(none).startswith(' class="">+1.0')
 
@@ -134,7 +141,7 @@ def test_total_loss_one_seed_and_the_shortest_test() -> None:
     dqn = page.data["strategies"][0]
     assert dqn["wealth"] == [1, 1.1, None]
     assert dqn["band"] is None
-    assert "nan" not in "".join(page.words).lower()
+    assert not re.search(r"\bnan\b", "".join(page.words).lower())
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -1,7 +1,7 @@
 """The statistics of a whole backtest: measures, intervals and tests.
 
-``measures.py``, ``bootstrap.py`` and ``sharpe.py`` define each number, ``verdict.py`` states the
-conclusions in words. In JSON, infinite and undefined numbers are null.
+``measures.py``, ``bootstrap.py``, ``estimates.py`` and ``sharpe.py`` define each number,
+``verdict.py`` states the conclusions in words. In JSON, infinite and undefined numbers are null.
 """
 
 import dataclasses
@@ -14,14 +14,13 @@ from numpy.typing import ArrayLike
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.statistics import mean_interval
-from qfolio.portfolio.backtest.bootstrap import LEVEL, block_length, bootstrap_measures
-from qfolio.portfolio.backtest.differences import (
-    Difference,
-    Sampled,
-    as_range,
-    compare,
-    mean_over_seeds,
+from qfolio.portfolio.backtest.bootstrap import (
+    LEVEL,
+    block_length,
+    bootstrap_measures,
+    percentile_interval,
 )
+from qfolio.portfolio.backtest.differences import Difference, Rival, compare
 from qfolio.portfolio.backtest.measures import (
     MEASURES,
     Floats,
@@ -38,8 +37,12 @@ from qfolio.portfolio.backtest.sharpe import (
     skewness_and_kurtosis,
 )
 
-KINDS = ("agent", "ensemble", "baseline")
-"""An ensemble is all seeds of an agent, traded as one."""
+KINDS = ("agent", "ensemble", "baseline", "rebalancing")
+"""An ensemble is all seeds of an agent, traded as one. A rebalancing is the reference at another
+speed of rebalancing."""
+
+JUDGED = ("agent", "ensemble")
+"""The kinds that are tested."""
 
 
 class Strategy(NamedTuple):
@@ -85,6 +88,7 @@ class StrategyAssessment:
     seeds: int
     measures: dict[str, Measure]  # by the names in MEASURES
     to_reference: Difference | None  # none for the reference itself
+    to_rebalanced: Difference | None  # none for it, and if only one speed was replayed
     to_best_baseline: Difference | None  # none for it, and if the reference is the best
     sharpe_test: SharpeTest
 
@@ -104,8 +108,10 @@ class Assessment:
     earlier_trials: int
     comparisons: int  # that Holm's correction counts
     reference: str
+    rebalanced: str  # the reference or its rebalancing, whichever grew most over the same days
     best_baseline: str  # by growth over the same days
     strategies: dict[str, StrategyAssessment]
+    bound: float | None = None  # annual growth that no constant weights exceed, even without costs
 
     def to_json(self) -> dict[str, Any]:
         """Return dictionaries, lists, texts and finite numbers; other numbers become None."""
@@ -126,8 +132,8 @@ def assess(
 ) -> Assessment:
     """Compute every statistic of a backtest.
 
-    Agents and ensembles are compared in growth with a reference and with the best baseline, the
-    one that grew most over the days of the test; see ``differences.py``.
+    Agents and ensembles are compared with a reference, with the rebalancing of the reference that
+    grew most over the days of the test, and with the baseline that did; see ``differences.py``.
 
     All strategies share the resampled days and so one block length: the longest that their returns
     (mean over seeds) or squared returns require. Squared returns are autocorrelated for months, and
@@ -175,18 +181,27 @@ def assess(
     for name, track in tracks.items():
         seeds = track.shape[1]
         start, end = end, end + seeds
-        sampled[name] = Sampled(
+        sampled[name] = _Sampled(
             measures(track[0], track[1], track[2], periods_per_year),
             {key: values[:, start:end] for key, values in drawn.items()},
-            rng.integers(seeds, size=(resamples, max(seeds - 1, 1))),
         )
 
-    best = max(baselines, key=lambda name: mean_over_seeds(sampled[name].observed["growth"]))
-    judged = [name for name in tracks if name not in baselines]
+    def growth(name: str) -> float:
+        return _mean_over_seeds(sampled[name].observed["growth"])
+
+    family = [reference, *(name for name, entry in strategies.items() if entry[0] == "rebalancing")]
+    rebalanced, best = max(family, key=growth), max(baselines, key=growth)
+    judged = [name for name, entry in strategies.items() if entry[0] in JUDGED]
     trials = earlier_trials + sum(tracks[name].shape[1] for name in judged)
     known = [sharpe for name in judged for sharpe in sampled[name].observed["sharpe"]]
     variance = _trial_variance(known, periods, periods_per_year)
-    differences = compare(sampled, baselines, reference, best)
+    rivals = {"reference": Rival(reference, (reference,))}
+    if len(family) > 1:
+        rivals["rebalanced"] = Rival(rebalanced, tuple(family))
+    if best != reference:
+        rivals["best"] = Rival(best, tuple(baselines), tested=("growth",))
+    returns = {name: _canonical(track)[0] for name, track in tracks.items()}
+    differences = compare(returns, rivals, judged, periods_per_year, seed)
 
     return Assessment(
         first_date=str(days[0].astype("datetime64[D]")),
@@ -198,19 +213,26 @@ def assess(
         block_length=block,
         trials=trials,
         earlier_trials=earlier_trials,
-        comparisons=sum(each.p is not None for each in differences.values()),
+        comparisons=sum(
+            contrast.p is not None
+            for named in differences.values()
+            for difference in named.values()
+            for contrast in difference.contrasts().values()
+        ),
         reference=reference,
+        rebalanced=rebalanced,
         best_baseline=best,
         strategies={
             name: StrategyAssessment(
                 kind=strategies[name][0],
                 seeds=track.shape[1],
                 measures={key: _measure(sampled[name], key) for key in MEASURES},
-                to_reference=differences.get((name, reference)),
-                to_best_baseline=None if best == reference else differences.get((name, best)),
+                to_reference=differences["reference"].get(name),
+                to_rebalanced=differences.get("rebalanced", {}).get(name),
+                to_best_baseline=differences.get("best", {}).get(name),
                 sharpe_test=_sharpe_test(
-                    _canonical(track)[0],
-                    mean_over_seeds(sampled[name].observed["sharpe"]),
+                    returns[name],
+                    _mean_over_seeds(sampled[name].observed["sharpe"]),
                     trials if name in judged else 1,  # baselines were not selected among trials
                     variance,
                     periods_per_year,
@@ -221,12 +243,20 @@ def assess(
     )
 
 
-def _measure(strategy: Sampled, key: str) -> Measure:
+class _Sampled(NamedTuple):
+    """The measures of one strategy by seed, observed and resampled."""
+
+    observed: dict[str, Floats]  # (seeds,)
+    drawn: dict[str, Floats]  # (resamples, seeds): the same days for all
+
+
+def _measure(strategy: _Sampled, key: str) -> Measure:
     values = strategy.observed[key]
+    low, high = percentile_interval(strategy.drawn[key].mean(axis=1))
     return Measure(
-        mean=mean_over_seeds(values),
+        mean=_mean_over_seeds(values),
         per_seed=tuple(values.tolist()),
-        over_time=as_range(strategy.drawn[key].mean(axis=1)),
+        over_time=(float(low), float(high)),
         over_seeds=mean_interval(np.sort(values), LEVEL) if np.isfinite(values).all() else None,
     )
 
@@ -246,6 +276,12 @@ def _sharpe_test(
         deflated=deflated_sharpe(sharpe / year, periods, *moments, trials, variance),
         trials=trials,
     )
+
+
+def _mean_over_seeds(values: Floats) -> float:
+    return float(
+        np.sort(values).mean()
+    )  # so that the order of the seeds cannot move the last digit
 
 
 def _trial_variance(annual: list[float], periods: int, periods_per_year: float) -> float:

@@ -8,13 +8,14 @@ and, at the end, returns.csv, weights.csv, summary.json and the report.
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import msgspec
 import numpy as np
 
+from qfolio.core import settings
 from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import (
@@ -25,10 +26,12 @@ from qfolio.core.files import (
     write_json,
     write_tree,
 )
-from qfolio.core.registry import BASELINES
+from qfolio.core.mdp import Agent
+from qfolio.core.registry import BASELINES, name_of
 from qfolio.core.text import csv_cell
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Row
+from qfolio.experiments.presets import Preset
 from qfolio.portfolio.prices.table import Prices
 
 # Names become folders.
@@ -42,6 +45,30 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
     settings: dict[str, Any]
     task: dict[str, Any]
     episodes: int
+
+    @staticmethod
+    def of(
+        name: str, agent: Preset | Agent, episodes: int | None, task: Mapping[str, Any]
+    ) -> "AgentConfig":
+        """The configuration of an agent; episodes and task are those of one without a preset."""
+        if isinstance(agent, Preset):
+            described = settings.describe(agent.build())
+            return AgentConfig(
+                agent=agent.agent,
+                settings=described,
+                task=dict(agent.task),
+                episodes=agent.episodes,
+            )
+        if episodes is None:
+            raise QfolioError(
+                f"{name} has no preset; give episodes, the length of its training in a fold."
+            )
+        return AgentConfig(
+            agent=name_of(agent),
+            settings=settings.describe(agent),
+            task=dict(task),
+            episodes=episodes,
+        )
 
 
 class BacktestConfig(Config, frozen=True):

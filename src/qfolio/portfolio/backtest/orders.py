@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.baselines import Baseline, Bools, Floats, History
+from qfolio.portfolio.backtest.baselines.base import Baseline, Bools, Floats, History
 
 TOLERANCE = 1e-6
 """How far weights may be off the simplex or above the cap."""
@@ -46,6 +46,7 @@ def orders(
     *,
     tradable: ArrayLike | None = None,
     cap: float = 1.0,
+    month: int = 21,
 ) -> Orders:
     """Ask a baseline for its decisions on every row of the folds.
 
@@ -59,6 +60,7 @@ def orders(
         tradable: Which assets a fold may hold, of shape (folds, N) (default: those with prices in
             all of its training rows).
         cap: Largest weight of one asset when it is ordered.
+        month: Rows in a month.
 
     Returns:
         Decisions for all rows of the folds, and notes that name the fold.
@@ -80,14 +82,14 @@ def orders(
         part = np.full((len(rows), len(ordered)), np.nan)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            for place, row in enumerate(rows[:1] if baseline.calendar == "fold" else rows):
+            for row in _asked(baseline, rows, folds[0].decisions.start, month):
                 known = slice(0, row + 1)
-                history = History(dates[known], prices[known], fold.train, allowed, cap)
+                history = History(dates[known], prices[known], fold.train, allowed, cap, month)
                 held = _drifted(ordered, prices[row_ordered], prices[row])
                 wanted = baseline.decide(history, held)
                 if wanted is not None:
                     ordered, row_ordered = _checked(name, wanted, history), row
-                    part[place] = ordered
+                    part[row - rows[0]] = ordered
         if baseline.calendar == "fold":
             part[:] = part[0]
             row_ordered = row_ordered if np.isnan(part[0]).any() else rows[-1]
@@ -95,6 +97,13 @@ def orders(
         notes += [f"{name}, fold {fold.name}: {note}" for note in said]
         parts.append(part)
     return Orders(np.concatenate(parts), tuple(notes))
+
+
+def _asked(baseline: Baseline, rows: range, first: int, month: int) -> range:
+    """The rows of a fold at which a baseline decides; months count from the first of the test."""
+    if baseline.calendar == "fold":
+        return rows[:1]
+    return rows[(first - rows[0]) % month :: month] if baseline.calendar == "month" else rows
 
 
 def _tradable(fold: Fold, prices: Floats, chosen: Bools | None) -> Bools:

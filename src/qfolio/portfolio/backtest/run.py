@@ -6,6 +6,7 @@ float64, beside classical allocators under the same rules.
 """
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from qfolio.core import devices, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
-from qfolio.core.registry import BASELINES, name_of, short
+from qfolio.core.registry import BASELINES, short
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.executor import Executor, Here, Job
@@ -26,8 +27,10 @@ from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest import assessment
 from qfolio.portfolio.backtest.baselines import baseline
+from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
 from qfolio.portfolio.backtest.folds import Fold, latest, spell, walk_forward
+from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.replay import Entry, Stretch, decide
 from qfolio.portfolio.backtest.simulation import simulate
@@ -151,7 +154,7 @@ class Backtest:
             trials=int(trials),
             command=command,
             agents={
-                name: _described(name, agent, episodes, task or {})
+                name: AgentConfig.of(name, agent, episodes, task or {})
                 for name, agent in agents.items()
             },
             **devices.circumstances("python", "jax", "equinox", "numpy", "skfolio"),
@@ -266,9 +269,14 @@ class Backtest:
                 together = self._decide(name, together=True)
                 entries[f"{name}{TOGETHER}"] = self._entry("ensemble", together)
         table, cap = self.prices, self.config.cap
-        for name, made in self.baselines.items():
-            decided = orders(name, made, self.folds, table.dates, table.values, cap=cap)
-            entries[name] = self._entry("baseline", decided.decisions[None])
+        month = max(1, round(table.periods_per_year / 12))
+        slower = {f"{EQUAL_WEIGHT} at {speed:g}": EqualWeightAt(speed) for speed in SPEEDS}
+        for name, made in {**self.baselines, **slower}.items():
+            decided = orders(
+                name, made, self.folds, table.dates, table.values, cap=cap, month=month
+            )
+            kind = "rebalancing" if name in slower else "baseline"
+            entries[name] = self._entry(kind, decided.decisions[None])
             notes += decided.notes
         return entries, notes
 
@@ -283,7 +291,8 @@ class Backtest:
         """The statistics of all strategies, over the whole test or from a date on."""
         first = 0 if since is None else int(np.searchsorted(self.dates, np.datetime64(since)))
         days = slice(first, None)
-        return assessment.assess(
+        table = self.prices
+        assessed = assessment.assess(
             {
                 name: assessment.Strategy(
                     entry.kind,
@@ -294,10 +303,13 @@ class Backtest:
                 for name, entry in entries.items()
             },
             self.dates[days],
-            periods_per_year=self.prices.periods_per_year,
+            periods_per_year=table.periods_per_year,
             reference=EQUAL_WEIGHT,
-            earlier_trials=self.config.trials + trials_on(self.prices.source),
+            earlier_trials=self.config.trials + trials_on(table.source),
         )
+        begin = self.folds[0].decisions.start + self.config.lag + 1 + first
+        bound = constant_bound(table.values, begin, table.periods_per_year)
+        return dataclasses.replace(assessed, bound=bound)
 
     def write_tables(self, entries: dict[str, Entry], assessed: assessment.Assessment) -> None:
         """returns.csv (a column per strategy and seed), weights.csv (means) and summary.json."""
@@ -309,7 +321,11 @@ class Backtest:
             for i, series in enumerate(entry.simulation.returns)
         }
         self._folder.write_returns(days, columns)
-        weights = {name: entry.simulation.weights.mean(0) for name, entry in entries.items()}
+        weights = {
+            name: entry.simulation.weights.mean(0)
+            for name, entry in entries.items()
+            if entry.kind != "rebalancing"
+        }
         self._folder.write_weights(days, self.prices.assets, weights)
         self._folder.write_summary({**assessed.to_json(), "verdicts": verdicts(assessed)})
 
@@ -423,24 +439,3 @@ def _learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, A
     """The policy for tomorrow as one tree, so that its file is always consistent."""
     seconds = np.array(learned, "datetime64[s]").astype(np.int64)
     return {"learner": learner, "updates": np.array(updates), "learned": seconds}
-
-
-def _described(
-    name: str, agent: Preset | Agent, episodes: int | None, task: Mapping[str, Any]
-) -> AgentConfig:
-    """An agent's configuration."""
-    if isinstance(agent, Preset):
-        described = settings.describe(agent.build())
-        return AgentConfig(
-            agent=agent.agent, settings=described, task=dict(agent.task), episodes=agent.episodes
-        )
-    if episodes is None:
-        raise QfolioError(
-            f"{name} has no preset; give episodes, the length of its training in a fold."
-        )
-    return AgentConfig(
-        agent=name_of(agent),
-        settings=settings.describe(agent),
-        task=dict(task),
-        episodes=episodes,
-    )

@@ -14,7 +14,8 @@ class Standing:
 
     agent: its name.
     verdict: the sentence of the report; empty if the backtest is not finished.
-    worse: whether it falls short of equal weights.
+    worse: whether it falls short of equal weights in growth, rebalanced at every row or at the best
+    speed.
     """
 
     agent: str
@@ -40,7 +41,11 @@ class Standing:
                     f"The backtest has no agent {agent!r}; choose from {', '.join(agents)}."
                 )
             name = f"{agent}{TOGETHER}" if f"{agent}{TOGETHER}" in strategies else agent
-            worse = strategies[name]["to_reference"]["finding"] == "worse"
+            worse = any(
+                strategies[name][key] is not None
+                and strategies[name][key]["growth"]["finding"] == "worse"
+                for key in ("to_rebalanced", "to_reference")
+            )
             return Standing(agent, str(summary["verdicts"][name][0]), worse)
         except (AttributeError, IndexError, KeyError, TypeError, ValueError):
             raise QfolioError(

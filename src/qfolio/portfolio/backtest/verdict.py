@@ -1,67 +1,138 @@
-"""Verdicts of a backtest in sentences: which baselines an agent beats, and whether by luck."""
+"""Verdicts of a backtest in sentences: which references an agent beats, and whether by luck."""
 
 import math
 
 import numpy as np
 
-from qfolio.portfolio.backtest.assessment import Assessment, StrategyAssessment
+from qfolio.portfolio.backtest.assessment import JUDGED, Assessment, StrategyAssessment
 from qfolio.portfolio.backtest.bootstrap import LEVEL
-from qfolio.portfolio.backtest.differences import Difference
+from qfolio.portfolio.backtest.differences import Contrast, Difference, Finding
+from qfolio.portfolio.backtest.estimates import Measured
 
 _THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
 
-_FINDINGS = {
-    "better": "{} beats {} after costs",
-    "worse": "{} falls short of {} after costs",
-    "none": "No evidence that {} beats {} after costs",
+_MEASURES: dict[Measured, str] = {
+    "growth": "growth",
+    "sharpe": "Sharpe ratio",
+    "volatility": "volatility",
 }
+
+_MOVES = {"better": "less", "worse": "more"}
+"""Volatility in words, by finding."""
 
 
 def verdicts(assessment: Assessment) -> dict[str, list[str]]:
-    """The verdicts on every agent and ensemble, by name."""
+    """The verdicts on every agent and ensemble, by name; the first is against the reference."""
     return {
-        name: [verdict(name, each, assessment) for each in tested(strategy)]
+        name: [
+            f"{claim}: {evidence(difference, assessment)}."
+            for claim, difference in claims(name, assessment)
+        ]
         for name, strategy in assessment.strategies.items()
-        if strategy.kind != "baseline"
+        if strategy.kind in JUDGED
     }
 
 
-def tested(strategy: StrategyAssessment) -> list[Difference]:
-    """The differences to the reference, and to the best baseline if that is another."""
-    pair = (strategy.to_reference, strategy.to_best_baseline)
-    return [each for each in pair if each is not None and each.finding is not None]
+def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
+    """What was found of an agent, without numbers, and the difference that each claim is about.
 
-
-def verdict(name: str, difference: Difference, assessment: Assessment) -> str:
-    """The verdict of a comparison in growth.
-
-    Holm's correction over all comparisons of the backtest decides on the claim.
+    Claims against the reference come first, one that says the agent grew less before all others. If
+    the agent does not beat the reference at every speed of rebalancing, a claim says so.
     """
-    found, numbers = finding(name, difference), evidence(difference, assessment)
-    return f"{found}: the difference in annual growth is {numbers}."
+    entry, reference, best = (
+        assessment.strategies[name],
+        assessment.reference,
+        assessment.best_baseline,
+    )
+    alone, rebalanced = entry.to_reference, entry.to_rebalanced
+    assert alone is not None  # only the reference itself has none
+    if rebalanced is None:
+        main, at_any, at_best = alone, reference, reference
+    else:
+        main, at_any = rebalanced, f"{reference}, however it is rebalanced,"
+        at_best = f"the best rebalancing of {reference}"
+    claim = _claim(name, main, at_any, at_best)
+    if claim and not main.found("better"):
+        claim += ", and beats it in nothing"
+    said = [(claim or _nothing(name, main, at_any if _gains(alone) else reference), main)]
+    if rebalanced is not None:
+        said.append((_claim(name, alone, reference, reference), alone))
+    said.sort(key=lambda each: each[1].growth.finding != "worse")
+    if entry.to_best_baseline is not None:
+        said.append((_claim(name, entry.to_best_baseline, best, best), entry.to_best_baseline))
+    return [(claim, difference) for claim, difference in said if claim]
 
 
-def finding(name: str, difference: Difference) -> str:
-    """The claim of a verdict, without its numbers."""
-    return _FINDINGS[difference.finding or "none"].format(name, difference.reference)
+def _claim(name: str, difference: Difference, better: str, worse: str) -> str:
+    """What a difference shows in growth or Sharpe ratio, and then in volatility; may be empty.
+
+    Less volatility alone is no victory: cash has none.
+    """
+    parts = [
+        f"{verb} {other} in {_joined([_MEASURES[key] for key in found], 'and')}"
+        for verb, other, found in (
+            ("beats", better, _gains(difference)),
+            ("falls short of", worse, _gains(difference, "worse")),
+        )
+        if found
+    ]
+    moves = (
+        f", and fluctuates {move}"
+        if (move := _MOVES.get(difference.volatility.finding or ""))
+        else ""
+    )
+    return f"{name} {' and '.join(parts)} after costs{moves}" if parts else ""
+
+
+def _nothing(name: str, difference: Difference, other: str) -> str:
+    """That nothing was found; volatility is added if it differs."""
+    move = _MOVES.get(difference.volatility.finding or "")
+    measures = "growth or Sharpe ratio" if move else _joined(list(_MEASURES.values()), "or")
+    word = "but" if move == "less" else "and"
+    moves = f", {word} it fluctuates {move}" if move else ""
+    return f"No evidence that {name} beats {other} in {measures} after costs{moves}"
+
+
+def _gains(difference: Difference, finding: Finding = "better") -> list[Measured]:
+    """The measures other than volatility with this finding."""
+    return [measure for measure in difference.found(finding) if measure != "volatility"]
 
 
 def evidence(difference: Difference, assessment: Assessment) -> str:
-    """The numbers of a verdict: the difference, its interval and the p-value that decides."""
-    low, high = difference.growth_interval
+    """The numbers of a verdict: each tested difference, its interval and the p-value that decides.
+
+    Holm's correction over all comparisons of the backtest decides on a claim.
+    """
+    lead = f"the difference in annual growth to {difference.reference} is"
+    tested = {key: each for key, each in difference.contrasts().items() if each.p is not None}
+    p = "corrected p" if assessment.comparisons > 1 else "p"
+    texts = [
+        f"{lead if key == 'growth' else 'in ' + _MEASURES[key]} {_numbers(key, each, p)}"
+        for key, each in (tested or {"growth": difference.growth}).items()
+    ]
+    return _joined(texts, "and")
+
+
+def shown(key: Measured, contrast: Contrast) -> tuple[float, float, float]:
+    """A difference and its interval as readers see them: that in volatility is a ratio less 1."""
+    values = (contrast.value, *contrast.interval)
+    if key != "volatility":
+        return values
+    low, middle, high = (math.expm1(min(value, 700.0)) for value in values)
+    return low, middle, high
+
+
+def _numbers(key: Measured, contrast: Contrast, p: str) -> str:
+    """A difference with its interval and p-value in words."""
+    percent, unit = key != "sharpe", f"{_THIN_SPACE}%" if key != "sharpe" else ""
+    least = 1 if percent else 2
+    scaled = [100 * value if percent else value for value in shown(key, contrast)]
     # Enough digits to tell an end from zero.
-    ends = [abs(100 * end) for end in (low, high) if end and math.isfinite(end)]
-    digits = next((d for d in range(1, 7) if all(round(end, d) for end in ends)), 7)
-    middle, left, right = (
-        f"{_number(100 * value, digits, sign=True)}{_THIN_SPACE}%"
-        for value in (difference.growth, low, high)
-    )
+    ends = [abs(end) for end in scaled[1:] if end and math.isfinite(end)]
+    digits = next((d for d in range(least, 7) if all(round(end, d) for end in ends)), 7)
+    middle, left, right = (f"{_number(value, digits, sign=True)}{unit}" for value in scaled)
     text = f"{middle} (95{_THIN_SPACE}% interval {left} to {right}"
-    if difference.p_holm is not None:
-        text += f"; p {p_value(difference.p_holm)}"
-        if assessment.comparisons > 1:
-            text += " after Holm’s correction"
-    return text + ")"
+    return text + (")" if contrast.p_holm is None else f"; {p} {p_value(contrast.p_holm)})")
 
 
 def p_value(p: float) -> str:
@@ -76,7 +147,7 @@ def luck(name: str, strategy: StrategyAssessment) -> str:
     """The verdict of a deflated Sharpe ratio.
 
     It tests whether there is a return for the risk at all, given the selection among trials.
-    ``verdict`` tests whether an agent is better than a baseline.
+    ``verdicts`` tests whether an agent is better than a baseline.
     """
     test, sharpe = strategy.sharpe_test, strategy.measures["sharpe"].mean
     bar = "zero"
@@ -91,6 +162,23 @@ def luck(name: str, strategy: StrategyAssessment) -> str:
         f"The annual Sharpe ratio of {name}, {_number(sharpe, 2)}, {claim}: the probability that "
         f"the true one exceeds {bar} is {_number(chance, 1)}{_THIN_SPACE}%{shortfall}."
     )
+
+
+def bound_sentence(assessment: Assessment) -> str:
+    """What no constant weights could have exceeded; empty if it is not known."""
+    if assessment.bound is None:
+        return ""
+    growth = f"{_number(100 * assessment.bound, 1)}{_THIN_SPACE}%"
+    return (
+        f"A bound: even without costs, no constant weights grew by more than {growth} a year. "
+        "They are known only in hindsight, so nobody could have followed them."
+    )
+
+
+def _joined(texts: list[str], word: str) -> str:
+    """The texts with commas, and a word before the last."""
+    *first, last = texts
+    return f"{', '.join(first)} {word} {last}" if first else last
 
 
 def _number(value: float, digits: int, sign: bool = False) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.report import palette
-from qfolio.report.backtest.data import BacktestData, StrategySeries
+from qfolio.report.backtest.data import BacktestData, StrategySeries, faint_names
 from qfolio.report.backtest.looks import SYMBOLS, Look
 from qfolio.report.backtest.paths import across_seeds, cost_share, median_drawdown, wealth_paths
 from qfolio.report.data import Floats
@@ -36,6 +36,7 @@ def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> 
     return {
         "themes": {"light": palette.LIGHT, "dark": palette.DARK},
         "dates": _texts(np.concatenate([start, data.dates[ends]])),
+        "hidden": [place for place, name in enumerate(names) if name in faint_names(data)],
         "months": _texts(months.astype("datetime64[D]")),
         "strategies": [
             {

@@ -9,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.assessment import Assessment
+from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
 from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.data import Floats
+
+DISTINCT = 6
+"""Most baselines, beside those that agents are compared with, that a chart tells apart."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +22,7 @@ class StrategySeries:
     """The results of one strategy on D days, with S seeds (1 for a baseline) and N assets.
 
     Attributes:
-        kind: 'agent', 'ensemble' or 'baseline'.
+        kind: 'agent', 'ensemble', 'baseline' or 'rebalancing'.
         returns: Simple returns net of costs, shape (S, D).
         turnover: Value bought plus value sold as a share of the wealth, shape (S, D).
         cost: Cost of each day's trade as a share of the wealth, shape (S, D).
@@ -83,8 +86,22 @@ def require_fit(data: BacktestData) -> None:
             )
 
 
-def shown_order(data: BacktestData) -> list[str]:
-    """Agents and ensembles first, then the baselines they are compared with, then the others."""
+def main_names(data: BacktestData) -> list[str]:
+    """Agents and ensembles, and what they are compared with."""
     test = data.assessment
-    agents = [name for name, series in data.strategies.items() if series.kind != "baseline"]
-    return list(dict.fromkeys([*agents, test.reference, test.best_baseline, *data.strategies]))
+    agents = [name for name, series in data.strategies.items() if series.kind in JUDGED]
+    return list(dict.fromkeys([*agents, test.reference, test.rebalanced, test.best_baseline]))
+
+
+def shown_order(data: BacktestData) -> list[str]:
+    """The main names, then the other baselines."""
+    kinds = {name: series.kind for name, series in data.strategies.items()}
+    others = [name for name, kind in kinds.items() if kind == "baseline"]
+    return list(dict.fromkeys([*main_names(data), *others]))
+
+
+def faint_names(data: BacktestData) -> list[str]:
+    """The other baselines, if they are too many to be told apart; charts hide them at first."""
+    main = main_names(data)
+    others = [name for name in shown_order(data) if name not in main]
+    return others if len(others) > DISTINCT else []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from qfolio.portfolio.backtest.assessment import JUDGED
 from qfolio.report import palette
 from qfolio.report.backtest.data import BacktestData
 
@@ -24,9 +25,9 @@ class Look:
 
 def looks_of(names: list[str], data: BacktestData) -> dict[str, Look]:
     """The look of each strategy."""
-    looks, agents, others = {}, 0, 0
+    looks, agents, others = {}, 0, 1
     for name in names:
-        if data.strategies[name].kind != "baseline":
+        if data.strategies[name].kind in JUDGED:
             dash = "" if agents < palette.AGENTS else "8 3"
             colour = f"agent-{agents % palette.AGENTS + 1}"
             looks[name] = Look(colour, 2.2, dash, agents % len(SYMBOLS))
@@ -35,6 +36,8 @@ def looks_of(names: list[str], data: BacktestData) -> dict[str, Look]:
             looks[name] = Look("muted", 1.5, "", None)
         elif name == data.assessment.best_baseline:
             looks[name] = Look("muted", 1.5, _DASHES[0], None)
+        elif name == data.assessment.rebalanced:
+            looks[name] = Look("muted", 1.5, _DASHES[1], None)
         else:
             others += 1
             looks[name] = Look("faint", 1.1, _DASHES[others % len(_DASHES)], None)

@@ -16,18 +16,22 @@ from pathlib import Path
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
+from qfolio.portfolio.backtest.assessment import JUDGED
+from qfolio.portfolio.backtest.verdict import bound_sentence
 from qfolio.report import palette
 from qfolio.report.backtest.charts import AREAS, chart_data, days_per_point, latest_values
 from qfolio.report.backtest.convergence import convergence_sentences, draw_convergence
-from qfolio.report.backtest.data import BacktestData, require_fit, shown_order
+from qfolio.report.backtest.data import BacktestData, main_names, require_fit, shown_order
 from qfolio.report.backtest.facts import account, few_seeds, key_facts, unit_of
 from qfolio.report.backtest.looks import looks_of
 from qfolio.report.backtest.tables import (
     HEADINGS,
+    difference_headings,
     difference_rows,
     fold_rows,
     luck_rows,
     month_tables,
+    rebalancing_rows,
     statistics_rows,
 )
 from qfolio.report.backtest.verdicts import verdict_rows
@@ -59,7 +63,7 @@ def render_backtest(data: BacktestData) -> str:
     from plotly.offline import get_plotlyjs
 
     require_fit(data)
-    names = shown_order(data)
+    names, lead = shown_order(data), main_names(data)
     looks = looks_of(names, data)
     payload = chart_data(names, looks, data)
     scripts = [get_plotlyjs().replace("\r\n", "\n"), source("backtest.js").replace("\r\n", "\n")]
@@ -71,9 +75,10 @@ def render_backtest(data: BacktestData) -> str:
         hashes=[_hash(script) for script in scripts],
         payload=htmlsafe_json_dumps(payload, separators=(",", ":"), allow_nan=False),
         strategies=[
-            (name, "baseline" if data.strategies[name].kind == "baseline" else "agent", looks[name])
+            (name, "agent" if data.strategies[name].kind in JUDGED else "baseline", looks[name])
             for name in names
         ],
+        hidden=payload["hidden"],
         markers=palette.MARKER_PATHS,
         verdicts=verdict_rows(names, data),
         facts=key_facts(data),
@@ -82,9 +87,13 @@ def render_backtest(data: BacktestData) -> str:
             for name, lines in zip(names, payload["strategies"], strict=True)
         },
         headings=HEADINGS,
+        lead=len(lead),
+        bound=bound_sentence(data.assessment),
         statistics=[(name, statistics_rows(name, data)) for name in names],
+        difference_headings=difference_headings(data),
         differences=[(name, difference_rows(name, data)) for name in names],
-        luck=luck_rows(names, data),
+        rebalancings=rebalancing_rows(data),
+        luck=luck_rows(lead, data),
         months=month_tables(names, data),
         folds=fold_rows(data.folds),
         fold_names=any(fold["name"] != fold["test_first"] for fold in data.folds),

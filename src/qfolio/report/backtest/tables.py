@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.statistics import FEWEST_SEEDS
-from qfolio.portfolio.backtest.assessment import Measure
+from qfolio.portfolio.backtest.assessment import JUDGED, Assessment, Measure
+from qfolio.portfolio.backtest.differences import Difference
+from qfolio.portfolio.backtest.estimates import MEASURED, Measured
 from qfolio.portfolio.backtest.measures import monthly
-from qfolio.portfolio.backtest.verdict import luck
+from qfolio.portfolio.backtest.verdict import luck, shown
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import number, percent
 
@@ -23,6 +25,12 @@ HEADINGS = {
     "calmar": "Calmar",
     "turnover": "Turnover",
     "cost_drag": "Cost drag",
+}
+
+_MEASURED: dict[Measured, str] = {
+    "growth": "Growth",
+    "sharpe": "Sharpe",
+    "volatility": "Volatility",
 }
 
 _PERCENT = ("growth", "volatility", "drawdown", "cost_drag")
@@ -54,27 +62,73 @@ def _over_seeds(measure: Measure) -> tuple[float, ...]:
     return (min(values), max(values)) if 1 < len(values) < FEWEST_SEEDS else ()
 
 
+def difference_headings(data: BacktestData) -> list[str]:
+    """What the columns of ``difference_rows`` show."""
+    test = data.assessment
+    return [
+        f"{_MEASURED[key]} less {name}{remark}"
+        for _, name, remark, keys in _comparisons(test)
+        for key in keys
+    ]
+
+
 def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None]:
-    """Growth and Sharpe ratio minus those of the reference, and of the best baseline."""
+    """Differences to the reference, to its best rebalancing, and to the best baseline."""
     entry = data.assessment.strategies[name]
     cells: list[dict[str, str] | None] = []
-    for each in (entry.to_reference, entry.to_best_baseline):
-        if each is None:
-            cells += [None, None]
-            continue
-        for value, (low, high), write, scale, digits, found in (
-            (each.growth, each.growth_interval, percent, 100, 1, each.finding),
-            (each.sharpe, each.sharpe_interval, number, 1, 2, None),
-        ):
-            ends = (write(end, _telling(scale * end, digits), sign=True) for end in (low, high))
+    for field, _, _, keys in _comparisons(data.assessment):
+        difference: Difference | None = getattr(entry, field)
+        for key in keys:
+            if difference is None:
+                cells.append(None)
+                continue
+            contrast = difference.contrasts()[key]
+            write, scale, digits = (number, 1, 2) if key == "sharpe" else (percent, 100, 1)
+            value, *interval = shown(key, contrast)
+            ends = (write(end, _telling(scale * end, digits), sign=True) for end in interval)
             cells.append(
                 {
                     "value": write(value, digits, sign=True),
                     "interval": " … ".join(ends),
-                    "side": {"better": "higher", "worse": "lower"}.get(found or "", ""),
+                    "side": {"better": "better", "worse": "worse"}.get(contrast.finding or "", ""),
+                    "mark": ""
+                    if contrast.finding in (None, "none")
+                    else "▲ "
+                    if value > 0
+                    else "▼ ",
                 }
             )
     return cells
+
+
+def _comparisons(test: Assessment) -> list[tuple[str, str, str, tuple[Measured, ...]]]:
+    """The field of each comparison, with whom, a remark, and the measures shown."""
+    found = [("to_reference", test.reference, "", MEASURED)]
+    if any(entry.to_rebalanced is not None for entry in test.strategies.values()):
+        found.append(("to_rebalanced", test.rebalanced, " (best rebalancing)", MEASURED))
+    if test.best_baseline != test.reference:
+        found.append(("to_best_baseline", test.best_baseline, " (best baseline)", ("growth",)))
+    return found
+
+
+def rebalancing_rows(data: BacktestData) -> list[dict[str, Any]]:
+    """The reference at each speed of rebalancing, if others than its own were replayed."""
+    test = data.assessment
+    names = [name for name, entry in test.strategies.items() if entry.kind == "rebalancing"]
+    keys = ("growth", "volatility", "sharpe", "turnover", "cost_drag")
+    return [
+        {
+            "name": name,
+            "best": name == test.rebalanced,
+            "cells": [
+                percent(value) if key in _PERCENT else number(value, 1 if key == "turnover" else 2)
+                for key in keys
+                for value in (test.strategies[name].measures[key].mean,)
+            ],
+        }
+        for name in (test.reference, *names)
+        if names
+    ]
 
 
 def _telling(value: float, digits: int) -> int:
@@ -97,7 +151,7 @@ def luck_rows(names: list[str], data: BacktestData) -> list[dict[str, Any]]:
         rows.append(
             {
                 "name": name,
-                "sentence": None if entry.kind == "baseline" else luck(name, entry),
+                "sentence": luck(name, entry) if entry.kind in JUDGED else None,
                 "sharpe": number(entry.measures["sharpe"].mean, 2),
                 "certain": certain,
                 "threshold": number(test.threshold, 2),

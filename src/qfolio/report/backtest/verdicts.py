@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from qfolio.portfolio.backtest.assessment import JUDGED
 from qfolio.portfolio.backtest.differences import Difference
-from qfolio.portfolio.backtest.verdict import evidence, finding, tested
+from qfolio.portfolio.backtest.verdict import claims, evidence
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import percent
 
@@ -14,16 +15,12 @@ from qfolio.report.rendering import percent
 def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
     """Return each agent's verdicts, and their intervals' positions on a common axis (in %)."""
     test = data.assessment
-    agents = [
-        (name, tested(test.strategies[name]))
-        for name in names
-        if test.strategies[name].kind != "baseline"
-    ]
+    agents = [(name, claims(name, test)) for name in names if test.strategies[name].kind in JUDGED]
     ends = [
         end
-        for _, differences in agents
-        for each in differences
-        for end in (each.growth, *each.growth_interval)
+        for _, claimed in agents
+        for _, each in claimed
+        for end in (each.growth.value, *each.growth.interval)
         if math.isfinite(end)
     ]
     low, high = min(ends, default=0.0), max(ends, default=0.0)
@@ -35,20 +32,21 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
         share = (value - low + margin) / (high - low + 2 * margin)
         return round(100 * min(max(share, 0.0), 1.0), 2)
 
-    def row(name: str, each: Difference) -> dict[str, Any]:
-        left, right = (place(end) for end in each.growth_interval)
-        known = not any(map(math.isnan, (each.growth, *each.growth_interval)))
+    def row(claim: str, each: Difference) -> dict[str, Any]:
+        growth, interval = each.growth.value, each.growth.interval
+        left, right = (place(end) for end in interval)
+        known = all(map(math.isfinite, (growth, *interval)))
         return {
-            "finding": finding(name, each),
-            "numbers": f"the difference in annual growth is {evidence(each, test)}.",
-            "span": (left, round(right - left, 2), place(each.growth)) if known else None,
-            "label": f"{percent(each.growth, sign=True)}, 95 % interval "
-            + " to ".join(percent(end, sign=True) for end in each.growth_interval),
+            "finding": claim,
+            "numbers": f"{evidence(each, test)}.",
+            "span": (left, round(right - left, 2), place(growth)) if known else None,
+            "label": f"{percent(growth, sign=True)}, 95 % interval "
+            + " to ".join(percent(end, sign=True) for end in interval),
         }
 
     return {
         "agents": [
-            (name, [row(name, each) for each in differences]) for name, differences in agents
+            (name, [row(claim, each) for claim, each in claimed]) for name, claimed in agents
         ],
         "ticks": [(percent(tick, _digits(ticks), sign=True), place(tick)) for tick in ticks],
         "zero": place(0),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from qfolio.report import palette
-from qfolio.report.backtest.data import BacktestData, shown_order
+from qfolio.report.backtest.data import BacktestData, faint_names, shown_order
 from qfolio.report.backtest.looks import looks_of
 from qfolio.report.backtest.paths import across_seeds, median_drawdown, wealth_paths
 from qfolio.report.figures.style import new_figure
@@ -15,13 +15,17 @@ if TYPE_CHECKING:
 
 
 def draw_wealth(data: BacktestData, width: float) -> Figure:
-    """Draw wealth on a log axis and the drawdown below it, in the light scheme."""
+    """Draw wealth on a log axis and the drawdown below it, in the light scheme.
+
+    Without the other baselines if they are too many to be told apart.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentFormatter
 
     figure = new_figure(width, 5.4)
     axes = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
     days = data.dates.astype("datetime64[s]")
-    names = shown_order(data)
+    faint = faint_names(data)
+    names = [name for name in shown_order(data) if name not in faint]
     looks = looks_of(names, data)
     handles = []
     for name in reversed(names):

@@ -6,7 +6,7 @@
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const narrow = matchMedia("(max-width: 40rem)");
   const coarse = matchMedia("(pointer: coarse)");
-  const hidden = new Set();
+  const hidden = new Set(data.hidden);
   let printing = false;
   let chosen = 0;
 

@@ -1,0 +1,65 @@
+"""Estimates of a covariance matrix from returns of shape (rows, assets)."""
+
+import numpy as np
+
+from qfolio.portfolio.backtest.baselines.base import Floats
+
+
+def ledoit_wolf(returns: Floats) -> Floats:
+    """Linear shrinkage towards a multiple of the identity matrix.
+
+    O. Ledoit and M. Wolf, "A Well-Conditioned Estimator for Large-Dimensional Covariance Matrices"
+    (2004): (1 − δ) S + δ m I, where m is the mean variance, d² = ‖S − m I‖²/N, and δ =
+    min(Σ‖xₜxₜ' − S‖² / (N T²), d²) / d².
+    """
+    rows, assets = returns.shape
+    centred = returns - returns.mean(axis=0)
+    sample = centred.T @ centred / rows
+    mean = np.trace(sample) / assets
+    spread = ((sample - mean * np.eye(assets)) ** 2).sum()
+    # Σ‖xx' − S‖² = Σ‖x‖⁴ − T‖S‖²
+    noise = (((centred**2).sum(axis=1) ** 2).sum() - rows * (sample**2).sum()) / rows**2
+    intensity = min(noise / spread, 1.0) if spread > 0 else 1.0
+    return np.asarray((1 - intensity) * sample + intensity * mean * np.eye(assets))
+
+
+def nonlinear(returns: Floats) -> Floats:
+    """Analytical nonlinear shrinkage: each eigenvalue is corrected by those around it.
+
+    O. Ledoit and M. Wolf, "Analytical Nonlinear Shrinkage of Large-Dimensional Covariance Matrices"
+    (2020), section 4.7, for N ≤ T and for N > T: the density f of the eigenvalues and its Hilbert
+    transform H are estimated with Epanechnikov's kernel of bandwidth T^(−1/3) λ.
+    """
+    rows, assets = len(returns) - 1, returns.shape[1]  # a row less, for the mean
+    centred = returns - returns.mean(axis=0)
+    eigenvalues, vectors = np.linalg.eigh(centred.T @ centred / rows)
+    kept = np.maximum(eigenvalues[max(0, assets - rows) :], 1e-12 * eigenvalues[-1])
+    width = rows ** (-1 / 3)
+    scale = width * kept  # of each eigenvalue's kernel
+    x = (kept[:, None] - kept) / scale
+    root = np.sqrt(5)
+    density = (3 / (4 * root) * np.maximum(1 - x**2 / 5, 0) / scale).mean(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curve = (1 - x**2 / 5) * np.log(np.abs((root - x) / (root + x)))
+    curve = np.where(np.isclose(np.abs(x), root, rtol=1e-12), 0, curve)
+    hilbert = ((-3 / 10 * x + 3 / (4 * root) * curve) / np.pi / scale).mean(axis=1)
+    ratio = assets / rows
+    if assets <= rows:
+        real = 1 - ratio - np.pi * ratio * kept * hilbert
+        shrunk = kept / ((np.pi * ratio * kept * density) ** 2 + real**2)
+    else:
+        edge = np.log((1 + root * width) / abs(1 - root * width))
+        level = 3 / 10 / width**2 + 3 / (4 * root) / width * (1 - 1 / (5 * width**2)) * edge
+        none = np.pi * (assets - rows) / rows * level / np.pi * (1 / kept).mean()
+        positive = 1 / (np.pi**2 * kept * (density**2 + hilbert**2))
+        shrunk = np.concatenate([np.full(assets - rows, 1 / none), positive])
+    return np.asarray((vectors * shrunk) @ vectors.T)
+
+
+def exponential(returns: Floats, decay: float = 0.97) -> Floats:
+    """Second moments, in which each row counts ``decay`` times as much as the one after it.
+
+    J.P. Morgan, "RiskMetrics: Technical Document" (1996), whose decay for a month is 0.97.
+    """
+    weights = decay ** np.arange(len(returns))[::-1]
+    return np.asarray((returns.T * (weights / weights.sum())) @ returns)

@@ -1,0 +1,81 @@
+"""Equal weights: rebalanced at every row, every month, slowly, within a band, or never."""
+
+from typing import ClassVar
+
+import numpy as np
+
+from qfolio.portfolio.backtest.baselines.base import (
+    Baseline,
+    Floats,
+    History,
+    equal_weights,
+    nearest,
+    with_cash,
+)
+
+SPEEDS = (0.3, 0.1, 0.03, 0.01, 0.0)
+"""Speeds of rebalancing, beside 1, from which a backtest chooses the best in hindsight."""
+
+
+class EqualWeight(Baseline):
+    """The same weight in every asset, rebalanced at every row."""
+
+    def decide(self, history: History, held: Floats) -> Floats:
+        return with_cash(equal_weights(history), history)
+
+
+class EqualWeightMonthly(EqualWeight):
+    """The same weight in every asset, rebalanced every month."""
+
+    calendar = "month"
+
+
+class EqualWeightAt(Baseline):
+    """Equal weights bought once, then a share of the way back to them at every row.
+
+    Agents are compared with the best of several speeds, because rebalancing at every row pays
+    costs that any slower trading saves.
+    """
+
+    calendar = "row"
+
+    def __init__(self, speed: float) -> None:
+        self.speed = speed  # share of the way, from 0 (never) to 1
+
+    def decide(self, history: History, held: Floats) -> Floats | None:
+        target, weights = equal_weights(history), held[1:][history.tradable]
+        if not weights.any():
+            return with_cash(target, history)
+        if self.speed == 0:
+            return None
+        wanted = weights + self.speed * (target - weights)
+        if wanted.max() > history.cap:  # a holding may have drifted above it, an order may not be
+            wanted = nearest(wanted, 0, history.cap)
+        return with_cash(wanted, history)
+
+
+class EqualWeightBand(Baseline):
+    """Equal weights with a no-trade band: a weight that leaves it is traded back to its edge.
+
+    The band reaches a fifth of the target to either side (Daryanani 2008). Under proportional costs
+    it is best to trade to the edge and no further (Davis & Norman 1990).
+    """
+
+    calendar = "row"
+    width: ClassVar[float] = 0.2
+
+    def decide(self, history: History, held: Floats) -> Floats | None:
+        target, weights = equal_weights(history), held[1:][history.tradable]
+        low, high = (1 - self.width) * target, (1 + self.width) * target
+        if ((low <= weights) & (weights <= high)).all():
+            return None
+        return with_cash(nearest(weights, low, np.minimum(high, history.cap)), history)
+
+
+class BuyAndHold(Baseline):
+    """Equal weights bought once and never traded again."""
+
+    calendar = "row"
+
+    def decide(self, history: History, held: Floats) -> Floats | None:
+        return None if held[1:].any() else with_cash(equal_weights(history), history)

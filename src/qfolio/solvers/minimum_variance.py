@@ -1,0 +1,65 @@
+"""The long-only portfolio of least variance with a cap on each weight."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qfolio.solvers.shared import require
+
+
+def minimum_variance(
+    covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-12
+) -> NDArray[np.float64]:
+    """The weights w that minimise w'Σw with Σw = 1 and 0 ≤ w ≤ cap.
+
+    A primal-dual interior-point method (Wright 1997, chapter 5) from equal weights, with
+    multipliers z of w ≥ 0 and v of w ≤ cap: Σw − y − z + v = 0 holds after a full step, and the
+    products w z and (cap − w) v go to zero together. An iteration solves one system.
+
+    Args:
+        covariance: Σ, shape (asset, asset), positive semidefinite.
+        cap: Largest weight, at least 1/assets.
+        tol: Largest mean product that is accepted, in units of the mean variance.
+
+    Returns:
+        Weights of shape (asset,); those that are zero or at the cap are so exactly.
+
+    Raises:
+        QfolioError: The covariance is invalid, the cap is too low, or there is no convergence.
+    """
+    sigma = np.asarray(covariance, dtype=float)
+    require(
+        sigma.ndim == 2 and sigma.shape[0] == sigma.shape[1] and bool(np.isfinite(sigma).all()),
+        f"a covariance must be a square table of finite numbers; this one has shape {sigma.shape}",
+    )
+    count, scale = len(sigma), float(np.trace(sigma)) / len(sigma)
+    require(scale > 0, "a covariance needs some variance, else every portfolio has the least")
+    require(cap * count >= 1 - 1e-12, f"a cap of {cap:g} is too low for {count} assets")
+    if cap * count <= 1 + 1e-9 or count == 1:
+        return np.full(count, 1 / count)
+    sigma = sigma / scale
+    w = np.full(count, 1 / count)
+    z = v = np.full(count, 1.0)
+    for _ in range(100):
+        room = cap - w
+        gap = float(w @ z + room @ v) / (2 * count)
+        if gap <= tol:
+            break
+        target = 0.1 * gap
+        system = sigma + np.diag(z / w + v / room)
+        push = target / w - target / room - sigma @ w
+        moved, level = np.linalg.solve(system, np.stack([push, np.ones(count)], axis=1)).T
+        step = moved - moved.sum() / level.sum() * level  # of sum 0
+        step_z = target / w - z - z / w * step
+        step_v = target / room - v + v / room * step
+        length = 1.0
+        for value, change in ((w, step), (room, -step), (z, step_z), (v, step_v)):
+            falling = change < 0
+            length = min(length, 0.99 * float(np.min(-value[falling] / change[falling], initial=2)))
+        w, z, v = w + length * step, z + length * step_z, v + length * step_v
+    else:
+        require(False, "the weights of least variance were not found; is the covariance positive?")
+    full, empty = cap - w < v, w < z  # at most one of each pair is not almost zero
+    w = np.where(full, cap, np.where(empty, 0, w))
+    inside = ~full & ~empty
+    w[inside] *= (1 - w[~inside].sum()) / w[inside].sum() if inside.any() else 1
+    return w

@@ -1,0 +1,39 @@
+"""The bound on constant weights: it is reached, and it is not exceeded."""
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+
+from qfolio.portfolio.backtest import hindsight
+from qfolio.portfolio.backtest.hindsight import constant_bound
+from qfolio.portfolio.backtest.simulation import simulate
+
+
+def test_the_bound_of_covers_example() -> None:
+    # Cash and a stock that doubles and halves in turn: half in each grows by √(9/8) a row.
+    prices = np.array([[3.0], [1.0], [2.0], [1.0], [2.0], [1.0]])
+    assert constant_bound(prices, 2, 12) == pytest.approx((9 / 8) ** 6 - 1)
+
+
+def test_no_constant_weights_grow_more() -> None:
+    rng = np.random.default_rng(0)
+    prices = np.exp(rng.normal(5e-4, 0.02, (301, 4)).cumsum(0))
+    prices[:100, 2] = np.nan
+    bound = constant_bound(prices, 1, 252)
+    assert bound is not None
+    tried = rng.dirichlet(np.full(5, 0.5), 500)[:, None].repeat(300, axis=1)
+    tried[:, :100, 0] += tried[:, :100, 3]  # cash instead of what has no price yet
+    tried[:, :100, 3] = 0
+    for cost in (0.0, 0.001):
+        found = simulate(prices, tried, first=0, cost=cost, lag=0)
+        growth = np.expm1(252 * found.growth.mean(-1))
+        assert growth.max() <= bound
+    assert bound < math.inf
+
+
+def test_without_a_certificate_there_is_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    strict = partial(hindsight.growth_optimal, tol=-1.0)
+    monkeypatch.setattr(hindsight, "growth_optimal", strict)
+    assert constant_bound(np.ones((5, 2)), 1, 252) is None

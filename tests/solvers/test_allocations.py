@@ -1,0 +1,68 @@
+"""Weights of least variance and of equal risk: optimality conditions, and skfolio's answers."""
+
+import numpy as np
+import pytest
+from skfolio.optimization import MeanRisk, RiskBudgeting
+
+from qfolio.core.errors import QfolioError
+from qfolio.solvers.minimum_variance import minimum_variance
+from qfolio.solvers.risk_budgeting import equal_risk
+
+
+def returns(rows: int = 300, assets: int = 12) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    scales = rng.uniform(0.005, 0.03, assets)
+    common = rng.normal(size=(rows, 1)) * rng.uniform(0.5, 1.5, assets)
+    return (rng.normal(size=(rows, assets)) + common) * scales
+
+
+@pytest.mark.parametrize("cap", [1.0, 0.4, 0.2, 0.1, 1 / 12])
+@pytest.mark.parametrize("rows", [5, 20, 300])  # of rank 4 at first
+def test_least_variance_meets_its_conditions(cap: float, rows: int) -> None:
+    sigma = np.cov(returns(rows).T)
+    w = minimum_variance(sigma, cap)
+    assert w.sum() == pytest.approx(1, abs=1e-12)
+    assert w.min() >= 0
+    assert w.max() <= cap + 1e-15
+    # No shift of weight from an asset to another lowers the variance.
+    slope = sigma @ w / sigma.trace()
+    takes, gives = slope[w < cap - 1e-12], slope[w > 0]
+    if takes.size:
+        assert gives.max() <= takes.min() + 1e-8
+
+
+@pytest.mark.parametrize("cap", [1.0, 0.2])
+def test_least_variance_is_that_of_skfolio(cap: float) -> None:
+    found = minimum_variance(np.cov(returns().T), cap)
+    np.testing.assert_allclose(found, MeanRisk(max_weights=cap).fit(returns()).weights_, atol=1e-4)
+
+
+def test_least_variance_of_uncorrelated_assets() -> None:
+    found = minimum_variance(np.diag([1.0, 2.0, 4.0]) * 1e-4)
+    np.testing.assert_allclose(found, np.array([4, 2, 1]) / 7, rtol=1e-9)
+    np.testing.assert_allclose(minimum_variance(np.ones((2, 2))), 0.5)  # twins
+    np.testing.assert_array_equal(minimum_variance([[3.0]]), [1.0])
+
+
+def test_equal_risk_is_equal_and_that_of_skfolio() -> None:
+    sigma = np.cov(returns().T)
+    w = equal_risk(sigma)
+    np.testing.assert_allclose(w * (sigma @ w), w @ sigma @ w / len(w), rtol=1e-8)
+    np.testing.assert_allclose(w, RiskBudgeting().fit(returns()).weights_, atol=1e-4)
+    few = np.cov(returns(5).T)  # of rank 4
+    w = equal_risk(few)
+    np.testing.assert_allclose(w * (few @ w), w @ few @ w / len(w), rtol=1e-6)
+    np.testing.assert_allclose(equal_risk(np.diag([1.0, 4.0])), [2 / 3, 1 / 3])
+
+
+def test_covariances_that_cannot_be() -> None:
+    with pytest.raises(QfolioError, match=r"square table of finite numbers; this one has shape"):
+        minimum_variance(np.ones((2, 3)))
+    with pytest.raises(QfolioError, match=r"cap of 0\.2 is too low for 3 assets"):
+        minimum_variance(np.eye(3), 0.2)
+    with pytest.raises(QfolioError, match="needs some variance"):
+        minimum_variance(np.zeros((2, 2)))
+    with pytest.raises(QfolioError, match="every asset needs some variance"):
+        equal_risk(np.diag([1.0, 0.0]))
+    with pytest.raises(QfolioError, match="square table"):
+        equal_risk(np.array([[np.nan]]))
