@@ -327,13 +327,18 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
 
 def _report(run: "Backtest", folder: Path) -> None:
     from qfolio.commands import console
+    from qfolio.portfolio.backtest.attribution.explain import explain
     from qfolio.report.backtest.page import write_backtest_report
     from qfolio.report.collect import backtest_data
 
     with console.console.status("Replaying all strategies, drawing histories, writing the report"):
         entries, notes = run.entries()
         assessment = run.assess(entries)
-        run.write_tables(entries, assessment)
-        write_backtest_report(folder, backtest_data(run, entries, assessment, notes))
+        why = explain(run, entries)
+        run.write_tables(entries, assessment, why)
+        write_backtest_report(folder, backtest_data(run, entries, assessment, notes, why))
     console.print_assessment(assessment)
+    for sentences in why.diagnosis.values():
+        for sentence in sentences:
+            console.say(f"Diagnosis: {sentence}")
     console.say(f"Report: {folder / 'report.html'}")

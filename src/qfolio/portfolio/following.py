@@ -64,17 +64,20 @@ def follow(
     """
     portfolios = jax.tree.map(lambda x: x[None] if together else x[:, None], members)
     start = jnp.array(first, jnp.int32), jnp.asarray(held, jnp.float32)
-    results = _follow(task, agent, portfolios, *start, count)
+    results = paths(task, agent, portfolios, *start, count)
     targets, after = (np.asarray(result) for result in results)
     _require_feasible(task, agent, targets, first)
     return targets, after
 
 
 @eqx.filter_jit(donate="none")
-def _follow(
+def paths(
     task: Portfolio, agent: Agent, members: PyTree, first: Array, held: Array, count: int
 ) -> tuple[Float[Array, "portfolio time entry"], Float[Array, "portfolio time entry"]]:
-    """members: with leading axes (portfolio, member); a portfolio follows the mean of its own."""
+    """Targets, and weights held one row later, without the checks of ``follow``.
+
+    members: with leading axes (portfolio, member); a portfolio follows the mean of its own.
+    """
 
     def step(members: PyTree, held: Array, row: Array) -> tuple[Array, tuple[Array, Array]]:
         view = jax.tree.map(lambda x: x[None], task.view(row, held))

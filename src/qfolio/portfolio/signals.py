@@ -191,6 +191,11 @@ def names(text: str) -> list[str]:
     return [_split(part)[0] for part in _parts(text)]
 
 
+def labels(text: str) -> list[str]:
+    """The signals in such a text as they are written there, in order."""
+    return _parts(text)
+
+
 def lookback(signals: Sequence[Signal]) -> int:
     """Rows before one at which all signals are known."""
     return max((signal.rows for signal in signals), default=0)

@@ -15,6 +15,7 @@ from qfolio.core.mdp import Agent, Policy, Position
 from qfolio.core.training import episode_steps
 from qfolio.experiments.run import Run
 from qfolio.portfolio.backtest.assessment import Assessment
+from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.market import Market
@@ -73,6 +74,7 @@ def backtest_data(
     entries: dict[str, Entry],
     assessment: Assessment,
     notes: Sequence[str],
+    why: Why | None = None,
 ) -> BacktestData:
     """Collects everything ``write_backtest_report`` needs."""
     config, dates = backtest.config, backtest.prices.dates
@@ -112,6 +114,7 @@ def backtest_data(
         ],
         notes=list(notes),
         training={name: folds for name in backtest.agents if (folds := _training(backtest, name))},
+        why=why,
     )
 
 

@@ -3,7 +3,8 @@
 It holds config.json (settings, written once), prices.safetensors (the table),
 policies/AGENT/FOLD.safetensors (weights, written as soon as a group of folds is trained; for the
 latest policy, the whole learning state), training/AGENT/FOLD.csv (a row for each training episode)
-and, at the end, returns.csv, weights.csv, summary.json and the report.
+and, at the end, returns.csv, weights.csv, summary.json, why.json (what explains the agents) and the
+report.
 """
 
 import csv
@@ -20,6 +21,7 @@ from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import (
     read_arrays,
+    read_json,
     read_tree,
     write_arrays,
     write_bytes,
@@ -192,6 +194,13 @@ class BacktestFolder:
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         write_json(self.path / "summary.json", summary)
+
+    def write_why(self, content: dict[str, Any]) -> None:
+        write_json(self.path / "why.json", content)
+
+    def read_why(self) -> dict[str, Any]:
+        """Raises QfolioError if the file is missing or holds no JSON object."""
+        return read_json(self.path / "why.json")
 
     def _policy(self, agent: str, fold: str) -> Path:
         return self.path / "policies" / agent / f"{fold}.safetensors"

@@ -26,6 +26,7 @@ from qfolio.experiments.fit import Listener, Row
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest import assessment
+from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
@@ -249,6 +250,13 @@ class Backtest:
         learning = _learning(policy.learner, policy.updates, policy.learned)
         self._keep_policy(self._name(agent), LATEST, learning)
 
+    def stretches(self, agent: str) -> list[Stretch]:
+        """The folds with an agent's policies."""
+        return [
+            Stretch(self._part(self.tasks[agent], fold), self._members(agent, fold.name), fold)
+            for fold in self.folds
+        ]
+
     def records(self, agent: str, fold: str) -> list[Row]:
         """Every training episode of an agent in a fold, all seeds, in order of time."""
         if self._folder is None:
@@ -311,8 +319,13 @@ class Backtest:
         bound = constant_bound(table.values, begin, table.periods_per_year)
         return dataclasses.replace(assessed, bound=bound)
 
-    def write_tables(self, entries: dict[str, Entry], assessed: assessment.Assessment) -> None:
-        """returns.csv (a column per strategy and seed), weights.csv (means) and summary.json."""
+    def write_tables(
+        self, entries: dict[str, Entry], assessed: assessment.Assessment, why: Why | None = None
+    ) -> None:
+        """returns.csv (a column per strategy and seed), weights.csv (means) and summary.json.
+
+        With attributions, why.json as well, and the diagnosis in summary.json.
+        """
         assert self._folder is not None
         days = [spell(date, self.prices.dates) for date in self.dates]
         columns = {
@@ -327,7 +340,11 @@ class Backtest:
             if entry.kind != "rebalancing"
         }
         self._folder.write_weights(days, self.prices.assets, weights)
-        self._folder.write_summary({**assessed.to_json(), "verdicts": verdicts(assessed)})
+        summary = {**assessed.to_json(), "verdicts": verdicts(assessed)}
+        if why is not None:
+            self._folder.write_why(why.to_json())
+            summary["diagnosis"] = why.diagnosis
+        self._folder.write_summary(summary)
 
     def _name(self, agent: str | None) -> str:
         """An agent's name (default: the first); raises QfolioError if it is unknown."""
@@ -417,12 +434,8 @@ class Backtest:
 
     def _decide(self, name: str, together: bool = False) -> np.ndarray:
         """Decisions over all folds, (seed, day, entry); see ``decide``."""
-        stretches = [
-            Stretch(self._part(self.tasks[name], fold), self._members(name, fold.name), fold)
-            for fold in self.folds
-        ]
         seeds = 1 if together else self.config.seeds
-        return decide(self.agents[name], stretches, seeds, together=together)
+        return decide(self.agents[name], self.stretches(name), seeds, together=together)
 
     def _entry(self, kind: str, decisions: np.ndarray) -> Entry:
         simulation = simulate(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
+from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.data import Floats
 
@@ -55,6 +56,7 @@ class BacktestData:
         folds: For each fold name, train_first, train_last, test_first and test_last (ISO dates).
         notes: Problems of the backtest, in sentences.
         training: The training of each fold, by agent; none if records are missing.
+        why: What explains the agents' returns; without it, the page has no such section.
     """
 
     title: str
@@ -68,6 +70,7 @@ class BacktestData:
     folds: list[dict[str, Any]]
     notes: list[str]
     training: dict[str, list[FoldTraining]] = field(default_factory=dict)
+    why: Why | None = None
 
 
 def require_fit(data: BacktestData) -> None:

@@ -36,6 +36,7 @@ from qfolio.report.backtest.tables import (
 )
 from qfolio.report.backtest.verdicts import verdict_rows
 from qfolio.report.backtest.wealth import draw_wealth
+from qfolio.report.backtest.why import diagnoses, why_sections
 from qfolio.report.figures.style import LEAD, save_png, svgs
 from qfolio.report.rendering import render, setting_groups, source
 
@@ -82,6 +83,9 @@ def render_backtest(data: BacktestData) -> str:
         markers=palette.MARKER_PATHS,
         verdicts=verdict_rows(names, data),
         facts=key_facts(data),
+        why=why_sections(data),
+        diagnoses=diagnoses(data),
+        looks=looks,
         latest={
             name: latest_values(lines)
             for name, lines in zip(names, payload["strategies"], strict=True)

@@ -1,0 +1,108 @@
+"""Where a return came from: weights that were held all the time, their timing, and costs.
+
+A day's net return is R = Σᵢ wᵢrᵢ − c, with weights w after the trade, returns r of cash and assets
+while they were held, and the day's cost c. Over all days the mean of Σᵢ wᵢrᵢ is Σᵢ w̄ᵢr̄ᵢ, what
+constant weights would have earned, plus Σᵢ cov(wᵢ, rᵢ), what was earned by holding more of an asset
+on its better days (Lo 2008, "Where do alphas come from?"). All parts are arithmetic and add up
+exactly.
+"""
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from qfolio.portfolio.backtest.attribution.hac import Floats, mean_t
+
+
+class AssetPart(msgspec.Struct, frozen=True):
+    """The contribution of cash or an asset, a year."""
+
+    name: str
+    weight: float  # the mean
+    static: float  # mean weight times mean return
+    timing: float  # covariance of weight and return
+
+
+class FoldPart(msgspec.Struct, frozen=True):
+    """A fold's parts, a year of its own days: static + timing − cost = net.
+
+    static: of the mean weights of the whole test. timing: of the departures from them.
+    """
+
+    name: str
+    static: float
+    timing: float
+    cost: float
+    net: float
+
+
+class Decomposition(msgspec.Struct, frozen=True):
+    """The parts of the arithmetic mean return, a year: equal + tilts + timing − cost = net."""
+
+    net: float
+    equal: float  # of equal weights of all assets, without costs
+    tilts: float  # what the mean weights earned beyond it
+    timing: float
+    timing_t: float  # HAC, given the mean weights
+    between: float  # of the timing: mean weights that differ from fold to fold
+    cost: float
+    assets: list[AssetPart]  # cash first
+    folds: list[FoldPart]
+
+    @property
+    def static(self) -> float:
+        return self.equal + self.tilts
+
+
+def decompose(
+    net: Floats,
+    weights: Floats,
+    returns: Floats,
+    folds: dict[str, slice],
+    assets: Sequence[str],
+    periods_per_year: float,
+    known: Floats | None = None,
+) -> Decomposition:
+    """Decompose a strategy's mean net return.
+
+    Args:
+        net: Net returns, shape (D,).
+        weights: After each day's trade, cash first, shape (D, N + 1).
+        returns: Of cash and assets while these weights were held, likewise.
+        folds: The days of each, by name.
+        assets: Names of the N assets.
+        periods_per_year: For example 252 for days of trading.
+        known: 1 for each asset that had a price on a day, else 0, shape (D, N) (default: all had).
+    """
+    year = periods_per_year
+    mean, there = weights.mean(0), np.ones_like(weights[:, 1:]) if known is None else known
+    equal = (there * returns[:, 1:]).sum(1) / np.maximum(there.sum(1), 1)
+    static, timed = returns @ mean, ((weights - mean) * returns).sum(1)
+    cost = (weights * returns).sum(1) - net
+    by_asset = ((weights - mean) * returns).mean(0)
+    steps = [
+        len(net[days]) * float((weights[days].mean(0) - mean) @ returns[days].mean(0))
+        for days in folds.values()
+    ]
+    return Decomposition(
+        net=year * float(net.mean()),
+        equal=year * float(equal.mean()),
+        tilts=year * float((static - equal).mean()),
+        timing=year * float(timed.mean()),
+        timing_t=mean_t(timed),
+        between=year * sum(steps) / len(net),
+        cost=year * float(cost.mean()),
+        assets=[
+            AssetPart(name, float(weight), year * float(own), year * float(moved))
+            for name, weight, own, moved in zip(
+                ("cash", *assets), mean, mean * returns.mean(0), by_asset, strict=True
+            )
+        ],
+        folds=[
+            FoldPart(
+                name, *(year * float(part[days].mean()) for part in (static, timed, cost, net))
+            )
+            for name, days in folds.items()
+        ],
+    )

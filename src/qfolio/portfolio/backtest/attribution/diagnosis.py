@@ -1,0 +1,62 @@
+"""Dead agents, in one plain sentence: those that never trade, hold one asset, or see nothing."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from qfolio.portfolio.backtest.replay import Entry
+
+STILL = 1e-6
+"""Turnover of a row below which nothing is traded; the agents compute in float32."""
+
+SAME = 1e-4
+"""Target weights that differ less are the same."""
+
+ALONE = 0.99
+"""Weight of an asset that is held alone, on this share of the days as well."""
+
+
+def diagnose(
+    name: str, entry: Entry, folds: Sequence[slice], assets: Sequence[str], ignored: bool
+) -> list[str]:
+    """Sentences about a strategy that does nothing with what it observes; usually none.
+
+    Args:
+        name: Of the strategy.
+        entry: Its decisions and their replay.
+        folds: The days of each fold.
+        assets: Names of the assets.
+        ignored: Whether its targets stay the same when all that it observes is shuffled.
+    """
+    seeds = len(entry.decisions)
+    found = [_dead(entry, seed, folds, assets) for seed in range(seeds)]
+    sentences = []
+    for what in dict.fromkeys(each for each in found if each):
+        count = found.count(what)
+        who = name if count == seeds else f"{count} of {seeds} seeds of {name}"
+        sentences.append(f"{who} {what}.")
+    if ignored:
+        sentences.append(
+            f"{name} ignored what it observed: its targets did not change when all of it was "
+            "shuffled."
+        )
+    return sentences
+
+
+def _dead(entry: Entry, seed: int, folds: Sequence[slice], assets: Sequence[str]) -> str:
+    """What one seed did all the time; empty if it did different things."""
+    moved = np.flatnonzero(entry.simulation.turnover[seed] > STILL)
+    weights, targets = entry.simulation.weights[seed], entry.decisions[seed]
+    if not len(moved):
+        return "never traded and stayed in cash"
+    if len(moved) == 1:
+        return "traded once and never again"
+    alone = (weights > ALONE).mean(0)
+    if alone.max() >= ALONE:
+        return f"always held {('cash', *assets)[alone.argmax()]} alone"
+    if all(np.ptp(targets[days], axis=0).max() < SAME for days in folds):
+        whole = np.ptp(targets, axis=0).max() < SAME
+        return "ordered the same weights at every row" + (
+            "" if whole else " of a fold, in each of the folds"
+        )
+    return ""

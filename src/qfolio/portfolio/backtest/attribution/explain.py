@@ -1,0 +1,93 @@
+"""Why an agent earned what it earned: all attributions of a backtest.
+
+Each agent is explained by the policy that ``allocate`` follows, the mean of all its seeds.
+docs/why.md lists formulas and sources.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from qfolio.core.mdp import Discrete
+from qfolio.portfolio.backtest.attribution.decomposition import decompose
+from qfolio.portfolio.backtest.attribution.diagnosis import diagnose
+from qfolio.portfolio.backtest.attribution.distillation import Rule, distil
+from qfolio.portfolio.backtest.attribution.factors import exposures, factor_returns
+from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
+from qfolio.portfolio.backtest.attribution.hac import Floats
+from qfolio.portfolio.backtest.attribution.importance import importance, of_seeds
+from qfolio.portfolio.backtest.attribution.replays import channel_names, channels
+from qfolio.portfolio.backtest.attribution.slices import slices
+from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
+from qfolio.portfolio.backtest.replay import Entry, Stretch
+from qfolio.portfolio.backtest.run import EQUAL_WEIGHT, TOGETHER, Backtest
+from qfolio.portfolio.costs import Context
+
+
+def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
+    """Explain every agent of a finished backtest, from the replays of ``Backtest.entries``."""
+    prices, config = backtest.prices, backtest.config
+    begin = backtest.folds[0].decisions.start
+    folds = {
+        fold.name: slice(fold.decisions.start - begin, fold.decisions.stop - begin)
+        for fold in backtest.folds
+    }
+    year = prices.periods_per_year
+    factors = factor_returns(prices.values, backtest.folds, config.lag, year)
+    reference = entries[EQUAL_WEIGHT].simulation.returns[0]
+    agents, diagnosis = {}, {}
+    for name, agent in backtest.agents.items():
+        followed = f"{name}{TOGETHER}" if config.seeds > 1 else name
+        entry, stretches = entries[followed], backtest.stretches(name)
+        net = entry.simulation.returns[0]
+        names = channel_names(backtest.tasks[name], prices.feature_names)
+        worth, replays = importance(agent, stretches, names, prices.values, year)
+        held, few = replays.held[0], of_seeds(stretches, worth.seeds)
+        shared = [each.shared for each in worth.signals] or [False] * len(names)
+        agents[followed] = AgentWhy(
+            decomposition=decompose(
+                net,
+                entry.simulation.weights[0],
+                held_returns(backtest, stretches[0], len(net)),
+                folds,
+                prices.assets,
+                year,
+                ~np.isnan(prices.values[begin + config.lag :][: len(net)]),
+            ),
+            exposures=exposures(net - reference, factors, year),
+            importance=worth,
+            slices=slices(agent, few, names, prices.assets, held, shared),
+            gradients=integrated_gradients(agent, few, names, held),
+            rule=_rule(entry.decisions[0], stretches, names),
+            menu=isinstance(stretches[0].task.actions, Discrete),
+        )
+        for each in dict.fromkeys((name, followed)):
+            ignored = worth.ignored and each == followed
+            said = diagnose(each, entries[each], list(folds.values()), prices.assets, ignored)
+            if said:
+                diagnosis[each] = said
+    return Why(EQUAL_WEIGHT, agents, diagnosis)
+
+
+def held_returns(backtest: Backtest, stretch: Stretch, days: int) -> Floats:
+    """Returns of cash and assets from each day's trade to the next, shape (days, N + 1)."""
+    begin = stretch.fold.decisions.start + backtest.config.lag
+    values = backtest.prices.values[begin : begin + days + 1]
+    relatives = np.nan_to_num(values[1:] / values[:-1], nan=1.0)
+    return np.asarray(stretch.task.costs.carry(relatives, Context())) - 1
+
+
+def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> Rule:
+    """The linear rule of an agent's decisions, fitted on every other fold."""
+    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
+    task, days = stretches[0].task, end - begin
+    tradable, fitted = np.zeros((days, task.limits.shape[0])), np.zeros(days)
+    for i, (part, _, fold) in enumerate(stretches):
+        rows = slice(fold.decisions.start - begin, fold.decisions.stop - begin)
+        tradable[rows] = np.asarray(part.limits) > 0
+        fitted[rows] = i % 2 == 0
+    if len(stretches) == 1:
+        fitted[days // 2 :] = 0
+    anchor = np.asarray(task.anchors)[begin:end] if task.anchor else np.zeros_like(tradable)
+    seen = np.asarray(channels(task))[begin:end].astype(float)
+    return distil(decisions[:, 1:], anchor, seen, names, tradable, fitted)

@@ -1,0 +1,144 @@
+"""Factors made from the price table itself, and a strategy's exposures to them.
+
+Each factor but the market is long one unit and short one unit of the assets, by weights that are
+known at the close before the return; none pays costs. Momentum, reversal and low volatility weigh
+assets by the rank of a signal. The components are the largest ones of training returns less the
+market's, fitted on the rows that the fold's agents were trained on (Connor & Korajczyk 1988).
+"""
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from qfolio.portfolio import signals
+from qfolio.portfolio.backtest.attribution.hac import Floats, regress
+from qfolio.portfolio.backtest.folds import Fold
+
+COMPONENTS = 2
+
+_DISTINCT = 1e-6
+"""Share of its variance that a factor must have for itself, beside those before it."""
+
+
+class Exposure(msgspec.Struct, frozen=True):
+    """The slope on a factor, with its t-statistic."""
+
+    name: str
+    beta: float
+    t: float
+
+
+class Exposures(msgspec.Struct, frozen=True):
+    """A regression of active returns on factors."""
+
+    alpha: float  # the intercept, a year
+    alpha_t: float
+    r2: float
+    lags: int  # of Newey & West
+    factors: list[Exposure]
+
+
+def exposures(
+    active: Floats, factors: dict[str, Floats], periods_per_year: float
+) -> Exposures | None:
+    """Regress a strategy's active returns on factors; None if there are too few days.
+
+    A factor that others before it span is left out.
+
+    Args:
+        active: Net returns less those of the reference, shape (D,).
+        factors: By name, of the same days.
+        periods_per_year: For example 252 for days of trading.
+    """
+    chosen: dict[str, Floats] = {}
+    for name, series in factors.items():
+        before = np.stack([np.ones(len(series)), *chosen.values()], axis=1)
+        own = series - before @ np.linalg.lstsq(before, series, rcond=None)[0]
+        if own.var() > max(_DISTINCT * series.var(), 1e-18):
+            chosen[name] = series
+    if len(active) < 2 * len(chosen) + 10:
+        return None
+    table = np.stack(list(chosen.values()), 1) if chosen else np.empty((len(active), 0))
+    found = regress(active, table)
+    slopes = zip(chosen, found.coefficients[1:].tolist(), found.t[1:].tolist(), strict=True)
+    return Exposures(
+        alpha=periods_per_year * float(found.coefficients[0]),
+        alpha_t=float(found.t[0]),
+        r2=found.r2,
+        lags=found.lags,
+        factors=[Exposure(*each) for each in slopes],
+    )
+
+
+def factor_returns(
+    values: Floats, folds: Sequence[Fold], lag: int, periods_per_year: float
+) -> dict[str, Floats]:
+    """The returns of every factor on the days of a test.
+
+    Args:
+        values: Prices of shape (rows, N), NaN before an asset's first.
+        folds: In order, without gaps.
+        lag: Rows from a decision to its execution.
+        periods_per_year: It sets the factors' lengths: a year, a month, a week.
+
+    Returns:
+        By name, series of shape (D,).
+    """
+    moves = np.zeros(values.shape)
+    moves[1:] = np.nan_to_num(values[1:] / values[:-1] - 1)
+    known = np.zeros(values.shape)
+    known[1:] = ~np.isnan(values[:-1])
+    shift = lag + 1
+    days = slice(folds[0].decisions.start + shift, folds[-1].decisions.stop + shift)
+    market = moves.sum(1) / np.maximum(known.sum(1), 1)
+    found = {"market": market[days]}
+    for name, signal in _signals(periods_per_year).items():
+        ranks = signals.compute([signal], values)[..., 0]
+        weights = _long_short(-ranks if name == "low volatility" else ranks)
+        found[name] = (weights[:-1] * moves[1:]).sum(1)[days.start - 1 : days.stop - 1]
+    return found | _components(values, moves - market[:, None], folds, shift)
+
+
+def _signals(periods_per_year: float) -> dict[str, signals.Signal]:
+    """Signals by name, with lengths in rows, as far as the table is fine enough for them."""
+    year, month, week = (max(0, round(periods_per_year / part)) for part in (1, 12, 52))
+    found: dict[str, signals.Signal] = {}
+    if year > month > 0:
+        found[f"momentum {year}\N{MINUS SIGN}{month}"] = signals.Momentum(year, month)
+    for rows in sorted({month, week} - {0}, reverse=True):
+        found[f"reversal {rows}"] = signals.Reversal(rows)
+    if year >= 3:
+        found["low volatility"] = signals.Volatility(year)
+    return found
+
+
+def _long_short(scores: Floats) -> Floats:
+    """Weights in proportion to scores, long one and short one; 0 where no score is known."""
+    gross = abs(scores).sum(-1, keepdims=True) / 2
+    return scores / np.where(gross > 0, gross, 1.0)
+
+
+def _components(
+    values: Floats, active: Floats, folds: Sequence[Fold], shift: int
+) -> dict[str, Floats]:
+    """The components' returns, each fold's weights from its training rows alone."""
+    series: list[Floats] = []
+    last: Floats | None = None
+    for fold in folds:
+        tradable = fold.tradable(values)
+        seen = active[fold.train.start + 1 : fold.train.stop] * tradable
+        seen = seen - np.where(tradable, seen.sum(1, keepdims=True) / max(1, tradable.sum()), 0.0)
+        vectors = np.linalg.eigh(seen.T @ seen)[1][:, ::-1][:, :COMPONENTS].T
+        vectors = _long_short(np.where(tradable, vectors, 0.0))
+        if last is None:
+            largest = np.take_along_axis(vectors, abs(vectors).argmax(1)[:, None], 1)
+            signs = np.sign(largest[:, 0])
+        else:  # as in the fold before
+            signs = np.where((vectors * last).sum(1) < 0, -1.0, 1.0)
+        last = vectors * signs[:, None]
+        days = slice(fold.decisions.start + shift, fold.decisions.stop + shift)
+        series.append(active[days] @ last.T)
+    count = min(COMPONENTS, max(0, values.shape[1] - 2))
+    names = [f"component {i + 1}" for i in range(count)]
+    return dict(zip(names, np.concatenate(series).T[:count], strict=True))

@@ -1,0 +1,117 @@
+"""Integrated gradients of target weights: how far each signal moves them (Sundararajan, Taly & Yan
+2017, "Axiomatic attribution for deep networks").
+
+For target weights f of what is observed, x, against a typical observation x₀ (0, the mean in
+training), channel c moves the weights by ∫₀¹ ∂f/∂x_c (x₀ + α(x − x₀)) · (x − x₀)_c dα. Over all
+channels this adds up to f(x) − f(x₀), with holding and anchor as they were. The integral is a mean
+over midpoints, and each directional derivative one forward pass.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+from qfolio.core.mdp import Agent, Discrete
+from qfolio.portfolio.backtest.attribution.slices import answer
+from qfolio.portfolio.backtest.replay import Stretch
+from qfolio.portfolio.task import Portfolio
+
+DAYS = 24
+"""Days of the test, evenly spread; at least one in each fold."""
+
+STEPS = 16
+
+
+class Pull(msgspec.Struct, frozen=True):
+    """How far a channel moves target weights."""
+
+    name: str
+    size: float  # mean absolute change of an asset's weight
+    direction: float  # correlation of that change with the asset's latest value, from −1 to 1
+
+
+class Gradients(msgspec.Struct, frozen=True):
+    """Integrated gradients, averaged over days and assets."""
+
+    pulls: list[Pull]
+    days: int
+    whole: float  # mean absolute change by all channels together
+    gap: float  # mean absolute error of their sum, from the midpoints
+
+
+def integrated_gradients(
+    agent: Agent, stretches: Sequence[Stretch], names: Sequence[str], held: np.ndarray
+) -> Gradients | None:
+    """Attribute an agent's target weights, the mean of all seeds; None if it has a menu.
+
+    Args:
+        stretches: The folds with its policies.
+        names: Of the channels that it observes.
+        held: Weights held when deciding, shape (D, entry).
+    """
+    if isinstance(stretches[0].task.actions, Discrete):
+        return None
+    each = -(-DAYS // len(stretches))
+    begin = stretches[0].fold.decisions.start
+    parts, seen, whole, gaps = [], [], [], []
+    for task, members, fold in stretches:
+        rows = np.linspace(fold.decisions.start, fold.decisions.stop - 1, each + 2)[1:-1].astype(
+            int
+        )
+        holding = jnp.asarray(held[rows - begin], jnp.float32)
+        given = jnp.asarray(rows, jnp.int32), holding
+        moved, latest, change = (np.asarray(x) for x in _integrated(task, agent, members, *given))
+        open_to = np.asarray(task.limits) > 0
+        parts.append(moved[..., open_to].swapaxes(1, 2).reshape(-1, len(names)))
+        seen.append(latest[:, open_to].reshape(-1, len(names)))
+        whole.append(abs(change[:, open_to]).mean())
+        gaps.append(abs(moved.sum(1) - change)[:, open_to].mean())
+    pulled, shown = np.concatenate(parts), np.concatenate(seen)
+    return Gradients(
+        pulls=[
+            Pull(name, float(abs(pulled[:, c]).mean()), _correlation(pulled[:, c], shown[:, c]))
+            for c, name in enumerate(names)
+        ],
+        days=each * len(stretches),
+        whole=float(np.mean(whole)),
+        gap=float(np.mean(gaps)),
+    )
+
+
+@eqx.filter_jit(donate="none")
+def _integrated(
+    task: Portfolio, agent: Agent, members: PyTree, rows: Array, held: Array
+) -> tuple[
+    Float[Array, "day channel asset"], Float[Array, "day asset channel"], Float[Array, "day asset"]
+]:
+    places = (jnp.arange(STEPS) + 0.5) / STEPS
+
+    def day(given: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        row, held = given
+        features, anchor = task.features(row), task.anchor_weights(row)
+
+        def targets(features: Array) -> Array:
+            return answer(task, agent, members, features, held, anchor)[1:]
+
+        def pull(channel: Array) -> Array:
+            along = features * (jnp.arange(features.shape[-1]) == channel)
+            slope = lambda share: jax.jvp(targets, (share * features,), (along,))[1]  # noqa: E731
+            return jax.vmap(slope)(places).mean(0)
+
+        pulls = lax.map(pull, jnp.arange(features.shape[-1]))
+        return pulls, features[:, -1], targets(features) - targets(0 * features)
+
+    found: tuple[Array, Array, Array] = lax.map(day, (rows, held))
+    return found
+
+
+def _correlation(x: np.ndarray, y: np.ndarray) -> float:
+    if x.std() < 1e-9 or y.std() < 1e-9:
+        return 0.0
+    return float(np.corrcoef(x, y)[0, 1])

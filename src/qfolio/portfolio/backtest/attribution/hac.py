@@ -1,0 +1,80 @@
+"""Least squares with errors that allow for heteroskedasticity and autocorrelation.
+
+Newey & West (1987), "A simple, positive semi-definite, heteroskedasticity and autocorrelation
+consistent covariance matrix"; the number of lags is chosen from the data as Newey & West (1994),
+"Automatic lag selection in covariance matrix estimation", do for Bartlett's kernel.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Regression(NamedTuple):
+    """Coefficients of an intercept and K regressors, in this order."""
+
+    coefficients: Floats  # (K + 1,)
+    errors: Floats  # (K + 1,)
+    r2: float  # 0 if there is nothing to explain
+    lags: int
+
+    @property
+    def t(self) -> Floats:
+        """Coefficients over their errors; 0 where there is no error."""
+        known = self.errors > 0
+        return np.where(known, self.coefficients / np.where(known, self.errors, 1.0), 0.0)
+
+
+def regress(values: Floats, regressors: Floats) -> Regression:
+    """Regress a series on an intercept and others.
+
+    Args:
+        values: Shape (T,).
+        regressors: Shape (T, K), not collinear, K + 1 < T; K may be 0.
+
+    Returns:
+        Estimates whose variances are those of Newey & West, times T / (T − K − 1).
+    """
+    count = len(values)
+    design = np.concatenate([np.ones((count, 1)), regressors], axis=1)
+    coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
+    residuals = values - design @ coefficients
+    scores = design * residuals[:, None]
+    # As in the paper, the intercept has no say in the choice of lags, unless it is alone.
+    lags = newey_west_lags(scores[:, 1:].sum(1) if regressors.shape[1] else scores[:, 0])
+    middle = scores.T @ scores
+    for lag in range(1, lags + 1):
+        crossed = scores[lag:].T @ scores[:-lag]
+        middle += (1 - lag / (lags + 1)) * (crossed + crossed.T)
+    bread = np.linalg.inv(design.T @ design)
+    variance = np.diag(bread @ middle @ bread) * count / (count - design.shape[1])
+    total = float(((values - values.mean()) ** 2).sum())
+    r2 = 1 - float((residuals**2).sum()) / total if total > 0 else 0.0
+    return Regression(coefficients, np.sqrt(np.maximum(variance, 0.0)), r2, lags)
+
+
+def newey_west_lags(scores: Floats) -> int:
+    """The number of lags for a mean of T scores, shape (T,).
+
+    m = ⌊1.1447 ((s₁/s₀)² T)^⅓⌋, where s₀ and s₁ sum σⱼ and |j| σⱼ over the autocovariances up to
+    ⌊4 (T/100)^(2/9)⌋ lags in both directions.
+    """
+    count = len(scores)
+    longest = min(int(4 * (count / 100) ** (2 / 9)), count - 1)
+    covariances = [
+        float(scores[lag:] @ scores[: count - lag]) / count for lag in range(longest + 1)
+    ]
+    level = covariances[0] + 2 * sum(covariances[1:])
+    slope = 2 * sum(lag * each for lag, each in enumerate(covariances))
+    if level == 0:
+        return 0
+    return min(math.floor(1.1447 * ((slope / level) ** 2 * count) ** (1 / 3)), count - 1)
+
+
+def mean_t(values: Floats) -> float:
+    """The mean of a series over its error; 0 if it does not vary."""
+    return float(regress(values, np.empty((len(values), 0))).t[0])

@@ -1,0 +1,141 @@
+"""What a signal is worth: the growth a year that is lost without it.
+
+The policy is replayed on the same days, at the same costs, while it sees one signal shuffled
+(permutation importance, Breiman 2001; measured in net growth after Jensen, Kelly, Malamud &
+Pedersen). Signals that differ between assets are shuffled among the assets, those that all assets
+share in blocks of time.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import msgspec
+import numpy as np
+
+from qfolio.core.mdp import Agent
+from qfolio.portfolio.backtest.attribution.hac import Floats, mean_t
+from qfolio.portfolio.backtest.attribution.replays import (
+    Replays,
+    Shuffle,
+    Shuffles,
+    channels,
+    replay,
+)
+from qfolio.portfolio.backtest.replay import Stretch
+from qfolio.portfolio.backtest.simulation import simulate
+
+DRAWS = 3
+"""Shuffles of each signal."""
+
+WORK = 4e9
+"""Most observed numbers that the replays of an agent read: seconds on two cores. Beyond it, each
+signal is shuffled once; then only the first seed is followed; then only everything is shuffled."""
+
+SEED = 0
+
+UNMOVED = 1e-5
+"""Targets that move less do not depend on what was shuffled; they are computed in float32."""
+
+EVERYTHING = "all together"
+
+
+class Worth(msgspec.Struct, frozen=True):
+    """The growth a year that is lost without a signal; negative if the policy does better so."""
+
+    name: str
+    lost: float  # the mean over the draws
+    low: float  # the least and the most
+    high: float
+    t: float  # of the mean over the days, HAC
+    shared: bool  # shuffled in time; else among the assets
+
+
+class Importance(msgspec.Struct, frozen=True):
+    """The worth of each signal, and of all at once."""
+
+    signals: list[Worth]  # none if the replays would take too long
+    everything: Worth
+    ignored: bool  # no shuffle of everything moves any target
+    draws: int
+    seeds: int  # that the policy is the mean of
+    replays: int
+
+
+def importance(
+    agent: Agent,
+    stretches: Sequence[Stretch],
+    names: Sequence[str],
+    values: Floats,
+    periods_per_year: float,
+) -> tuple[Importance, Replays]:
+    """Replay an agent's policy, the mean of its seeds, without each of its signals.
+
+    Args:
+        stretches: The folds with its policies.
+        names: Of the channels that it observes.
+        values: Prices, shape (rows, N).
+        periods_per_year: It sets the length of blocks, a quarter of a year.
+
+    Returns:
+        The worth of each channel, and the replays; the first of these is not shuffled.
+    """
+    signals, draws, seeds = _affordable(stretches, len(names))
+    stretches = of_seeds(stretches, seeds)
+    count = len(names) if signals else 0
+    shared = _shared(stretches)[:count]
+    block = max(1, round(periods_per_year / 4))
+    shuffles = Shuffles.drawn(stretches, draws, block, SEED)
+    each_draw = range(1, draws + 1)
+    wanted = [Shuffle(np.zeros(len(names), int), 0, 0)]
+    for mask, in_time in zip(np.eye(len(names), dtype=int)[:count], shared, strict=True):
+        wanted += [Shuffle(mask, draw * in_time, draw * (1 - in_time)) for draw in each_draw]
+    wanted += [Shuffle(np.ones(len(names), int), draw, draw) for draw in each_draw]
+    found = replay(agent, stretches, shuffles, wanted)
+
+    task, first = stretches[0].task, stretches[0].fold.decisions.start
+    weights = found.targets.astype(float)
+    weights /= weights.sum(-1, keepdims=True)
+    logs = simulate(values, weights, first=first, cost=task.costs, lag=task.lag).growth
+    lost = (logs[0] - logs[1:]).reshape(count + 1, draws, -1)
+    each = periods_per_year * lost.mean(2)
+    worth = [
+        Worth(
+            name,
+            float(each[i].mean()),
+            float(each[i].min()),
+            float(each[i].max()),
+            mean_t(lost[i].mean(0)),
+            bool(i < count and shared[i]),
+        )
+        for i, name in enumerate([*names[:count], EVERYTHING])
+    ]
+    moved = abs(found.targets[-draws:] - found.targets[0]).max()
+    ignored = bool(moved < UNMOVED)
+    return Importance(worth[:-1], worth[-1], ignored, draws, seeds, len(wanted)), found
+
+
+def of_seeds(stretches: Sequence[Stretch], count: int) -> list[Stretch]:
+    """The folds with the policies of the first seeds alone."""
+    few = lambda tree: jax.tree.map(lambda x: x[:count], tree)  # noqa: E731
+    return [each._replace(members=few(each.members)) for each in stretches]
+
+
+def _affordable(stretches: Sequence[Stretch], count: int) -> tuple[bool, int, int]:
+    """Whether to shuffle signals one by one, the number of draws, and of seeds to follow."""
+    task = stretches[0].task
+    seeds = int(jax.tree.leaves(stretches[0].members)[0].shape[0])
+    days = sum(fold.decisions.stop - fold.decisions.start for *_, fold in stretches)
+    read = days * task.limits.shape[0] * task.window * count
+    for draws, followed in ((DRAWS, seeds), (1, seeds), (1, 1)):
+        if read * followed * (1 + draws * (count + 1)) <= WORK:
+            return True, draws, followed
+    return False, 1, 1
+
+
+def _shared(stretches: Sequence[Stretch]) -> list[int]:
+    """For each channel, 1 if it is the same for all assets on the days of the test, else 0."""
+    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
+    shown = np.asarray(channels(stretches[0].task))[begin:end]
+    open_to = np.any([np.asarray(task.limits) > 0 for task, *_ in stretches], axis=0)
+    shown = shown[:, open_to]
+    return np.all(shown == shown[:, :1], axis=(0, 1)).astype(int).tolist()

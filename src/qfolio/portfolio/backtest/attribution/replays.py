@@ -1,0 +1,157 @@
+"""Replays of a policy that sees some of its channels shuffled.
+
+Two shuffles take a channel's information away and leave its distribution: the assets swap what is
+seen of them, or blocks of rows swap places. Assets are relabelled anew every quarter of a year, not
+every row: else a slow signal would become noise that a policy pays costs to follow, and its value
+would be confused with that of trading less. All else is as it was: prices, holdings, costs.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, PyTree
+
+from qfolio.core.mdp import Agent
+from qfolio.portfolio import signals
+from qfolio.portfolio.backtest.replay import Stretch
+from qfolio.portfolio.following import paths
+from qfolio.portfolio.task import Portfolio
+
+AT_ONCE = 16
+"""Replays in one vectorised loop; their inputs are in memory together."""
+
+
+class Observed(Portfolio):
+    """A portfolio whose observed channels are given, with those of row ``begin`` first."""
+
+    observed: Float[Array, "row asset channel"] = eqx.field(kw_only=True)
+    begin: Int[Array, ""] = eqx.field(kw_only=True)
+
+    @staticmethod
+    def given(task: Portfolio, observed: Array, begin: Array) -> "Observed":
+        own = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
+        return Observed(**own, observed=observed, begin=begin)
+
+    def features(self, market: Int[Array, ""]) -> Float[Array, "asset time channel"]:
+        start = market - self.window + 1 - self.begin
+        return jnp.swapaxes(lax.dynamic_slice_in_dim(self.observed, start, self.window), 0, 1)
+
+
+class Shuffle(NamedTuple):
+    """What a replay takes away.
+
+    mask: 1 for each shuffled channel. rows, assets: number of the draw of each kind; 0: none.
+    """
+
+    mask: np.ndarray  # (channel,)
+    rows: int
+    assets: int
+
+
+class Shuffles(NamedTuple):
+    """Draws of both kinds over the rows that a test observes; draw 0 leaves all in place."""
+
+    begin: int  # first of these rows
+    rows: np.ndarray  # (draw, row): the row that is seen instead
+    assets: np.ndarray  # (draw, row, asset): the asset that is seen instead
+
+    @staticmethod
+    def drawn(stretches: Sequence[Stretch], count: int, block: int, seed: int) -> "Shuffles":
+        """Draws with a fixed seed, in blocks of rows; only tradable assets are relabelled."""
+        task, folds = stretches[0].task, [fold for *_, fold in stretches]
+        longest = max(fold.decisions.stop - fold.decisions.start for fold in folds)
+        begin, end = folds[0].decisions.start - task.window + 1, folds[-1].decisions.stop
+        length, assets = end - begin, task.limits.shape[0]
+        block = max(1, min(block, length // 4))
+        rng = np.random.default_rng(seed)
+        rows = np.tile(np.arange(begin, end), (count + 1, 1))
+        shown = np.tile(np.arange(assets), (count + 1, length, 1))
+        pieces = np.array_split(np.arange(begin, end), max(1, length // block))
+        starts = np.array([fold.decisions.start for fold in folds])
+        for draw in range(1, count + 1):
+            rows[draw] = np.concatenate([pieces[i] for i in rng.permutation(len(pieces))])
+            for piece in pieces:
+                # Tradable in the fold that decides in these rows.
+                fold = max(0, int(np.searchsorted(starts, piece[0], side="right")) - 1)
+                open_to = np.flatnonzero(np.asarray(stretches[fold].task.limits) > 0)
+                shown[draw, piece - begin, open_to[:, None]] = rng.permutation(open_to)[:, None]
+        # The last fold is followed beyond its end, as long as the longest.
+        pad = ((0, 0), (0, longest))
+        return Shuffles(begin, np.pad(rows, pad, "edge"), np.pad(shown, (*pad, (0, 0)), "edge"))
+
+
+class Replays(NamedTuple):
+    """The decisions of R replays over D days."""
+
+    targets: np.ndarray  # (R, D, entry)
+    held: np.ndarray  # (R, D, entry): weights held when deciding
+
+
+def channel_names(task: Portfolio, feature_names: Sequence[str]) -> list[str]:
+    """The names of the channels that agents observe, in order."""
+    return ["log return", *feature_names, *signals.labels(task.signals)]
+
+
+def channels(task: Portfolio) -> Float[Array, "row asset channel"]:
+    """All channels on all rows of the table, before scaling."""
+    return jnp.concatenate([task.log_relatives[..., None], task.extra], -1)
+
+
+def replay(
+    agent: Agent, stretches: Sequence[Stretch], shuffles: Shuffles, wanted: Sequence[Shuffle]
+) -> Replays:
+    """Follow the mean of all seeds over all folds, once for each of some shuffles."""
+    raw = channels(stretches[0].task)
+    masks, rows, assets = (jnp.asarray(np.array(x)) for x in zip(*wanted, strict=True))
+    counts = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
+    held = np.zeros((len(wanted), raw.shape[1] + 1), np.float32)
+    held[:, 0] = 1.0
+    targets, before = [], []
+    for (task, members, fold), count in zip(stretches, counts, strict=True):
+        start, longest = fold.decisions.start, max(counts)
+        here = slice(start - task.window + 1 - shuffles.begin, None)
+        seen = slice(here.start, here.start + task.window - 1 + longest)
+        drawn = [jnp.asarray(x[:, seen]) for x in (shuffles.rows, shuffles.assets)]
+        together = jax.tree.map(lambda x: x[None], members)
+        first = jnp.array(start, jnp.int32)
+        ends = _paths(
+            task,
+            raw,
+            agent,
+            together,
+            first,
+            jnp.asarray(held),
+            (*drawn, masks, rows, assets),
+            longest,
+        )
+        ordered, after = (np.asarray(x) for x in ends)
+        targets.append(ordered[:, :count])
+        before.append(np.concatenate([held[:, None], after[:, : count - 1]], 1))
+        held = after[:, count - 1]
+    return Replays(np.concatenate(targets, 1), np.concatenate(before, 1))
+
+
+@eqx.filter_jit(donate="none")
+def _paths(
+    task: Portfolio, raw: Array, agent: Agent, members: PyTree, first: Array, held: Array,
+    shuffled: tuple[Array, ...], count: int,
+) -> tuple[Float[Array, "replay time entry"], Float[Array, "replay time entry"]]:  # fmt: skip
+    rows, assets, masks, *draws = shuffled
+
+    def one(given: tuple[Array, ...]) -> tuple[Array, Array]:
+        held, mask, row_draw, asset_draw = given
+        seen = jnp.take_along_axis(raw[rows[row_draw]], assets[asset_draw][..., None], 1)
+        mixed = jnp.where(mask > 0, seen, raw[rows[0]])
+        observed = (mixed - task.center) / task.scale
+        blind = Observed.given(task, observed, first - task.window + 1)
+        targets, after = paths(blind, agent, members, first, held[None], count)
+        return targets[0], after[0]
+
+    found: tuple[Array, Array] = lax.map(one, (held, masks, *draws), batch_size=AT_ONCE)
+    return found

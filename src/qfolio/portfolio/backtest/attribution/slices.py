@@ -1,0 +1,165 @@
+"""A policy by pictures: the weight of one asset, against one thing that it depends on.
+
+Against the weight held, it is the target of one decision: on the diagonal nothing is traded.
+Against a signal, it is the weight at which the policy comes to rest if it decides again and again
+while prices stand still: from nothing of the asset, and from twice its typical weight. A policy
+with a no-trade band rests at the band's two edges, others at one weight.
+
+All else is typical: other channels are at their mean in training (returns at 0), the holding is the
+mean over the test. A signal or feature has its value in the whole window, a return only in its
+latest row.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+from qfolio.core.market import View
+from qfolio.core.mdp import Agent
+from qfolio.portfolio.backtest.attribution.replays import channels
+from qfolio.portfolio.backtest.replay import Stretch
+from qfolio.portfolio.task import Portfolio
+
+POINTS = 17
+
+SHOWN = 8
+"""Most folds whose policies are drawn, evenly spread."""
+
+DECISIONS = 24
+"""Decisions in a row until a policy rests; one that trades a tenth of the way has come 92 %."""
+
+TAIL = 0.01
+"""Share of the signal's values that lies beyond each end of a slice."""
+
+
+class Slice(msgspec.Struct, frozen=True):
+    """Weights against one quantity, a line for each fold's policy."""
+
+    name: str
+    x: list[float]
+    lines: list[list[float]]  # (fold, point); against a signal, those reached from below
+    above: list[list[float]]  # those reached from above; none against the holding
+    shared: bool  # the quantity is changed for all assets at once
+
+
+class Slices(msgspec.Struct, frozen=True):
+    """The slices of one asset's weight."""
+
+    asset: str
+    holding: Slice  # against the weight held; the others keep their proportions
+    signals: list[Slice]
+
+
+def slices(
+    agent: Agent,
+    stretches: Sequence[Stretch],
+    names: Sequence[str],
+    assets: Sequence[str],
+    held: np.ndarray,
+    shared: Sequence[bool],
+) -> Slices:
+    """Draw an agent's policy, the mean of all seeds.
+
+    Args:
+        stretches: The folds with its policies.
+        names: Of the channels that it observes.
+        assets: Their names; the one that is held most is shown.
+        held: Weights held when deciding, shape (D, entry).
+        shared: Whether a channel is the same for all assets.
+    """
+    tradable = np.all([np.asarray(task.limits) > 0 for task, *_ in stretches], axis=0)
+    typical = held.mean(0)
+    asset = int(np.where(tradable, typical[1:], -1.0).argmax())
+    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
+    seen = np.asarray(channels(stretches[0].task))[begin:end]
+    grids = []
+    for channel, everywhere in enumerate(shared):
+        shown = seen[..., asset if everywhere else tradable, channel]
+        low, high = (float(end) for end in np.quantile(shown, (TAIL, 1 - TAIL)))
+        grids.append(np.linspace(low, high, POINTS))
+    who = np.array([tradable if every else np.arange(len(assets)) == asset for every in shared])
+    highest = min(1.0, max(1.5 * held[:, 1 + asset].max(), 2 / len(typical)))
+    kept = np.linspace(0, highest, POINTS)
+    with_asset = lambda weights: _with(typical, 1 + asset, np.asarray(weights))  # noqa: E731
+    starts = with_asset([0.0, min(1.0, 2 * typical[1 + asset])])
+    given = [jnp.asarray(x, jnp.float32) for x in (grids, who, starts, with_asset(kept))]
+    places = np.unique(np.linspace(0, len(stretches) - 1, SHOWN).round().astype(int))
+    lines = []
+    for task, members, fold in (stretches[place] for place in places):
+        row = jnp.array(fold.decisions.start, jnp.int32)
+        lines.append([np.asarray(x) for x in _answers(task, agent, members, row, asset, *given)])
+    rests, ordered = (np.stack(each) for each in zip(*lines, strict=True))
+    return Slices(
+        asset=assets[asset],
+        holding=Slice("weight held", _short(kept), [_short(y) for y in ordered], [], False),
+        signals=[
+            Slice(
+                name,
+                _short(grids[i]),
+                [_short(y) for y in rests[:, i, 0]],
+                [_short(y) for y in rests[:, i, 1]],
+                bool(same),
+            )
+            for i, (name, same) in enumerate(zip(names, shared, strict=True))
+        ],
+    )
+
+
+def _with(typical: np.ndarray, entry: int, weights: np.ndarray) -> np.ndarray:
+    """Weights with another one for an entry; the others keep their proportions."""
+    others = typical * (np.arange(len(typical)) != entry)
+    others = others / others.sum() if others.sum() > 0 else np.eye(len(typical))[0]
+    result = others * (1 - weights[:, None])
+    result[:, entry] = weights
+    return result
+
+
+def answer(
+    task: Portfolio, agent: Agent, members: PyTree, features: Array, held: Array, anchor: PyTree
+) -> Float[Array, " entry"]:
+    """The target weights of a view, the mean of all members."""
+    view = View(*jax.tree.map(lambda x: x[None], (features, held[1:], anchor)))
+
+    def one(weights: PyTree) -> Array:
+        return task.target(held, agent.policy(weights, view)[0])
+
+    mean: Array = jax.vmap(one)(members).mean(0)
+    return mean
+
+
+@eqx.filter_jit(donate="none")
+def _answers(
+    task: Portfolio, agent: Agent, members: PyTree, row: Array, asset: int,
+    grids: Array, who: Array, starts: Array, holdings: Array,
+) -> tuple[Float[Array, "channel start point"], Float[Array, " point"]]:  # fmt: skip
+    count = grids.shape[0]
+    blank = jnp.zeros((task.limits.shape[0], task.window, count))
+    latest = jnp.arange(task.window) == task.window - 1
+    anchor = task.anchor_weights(row)
+
+    def order(features: Array, held: Array) -> Array:
+        return answer(task, agent, members, features, held, anchor)
+
+    def rest(features: Array, held: Array) -> Array:
+        decide = lambda _, held: order(features, held)  # noqa: E731
+        return lax.fori_loop(0, DECISIONS, decide, held)[1 + asset]
+
+    def along(channel: Array) -> Array:
+        rows = jnp.where(channel == 0, latest, True)
+        place = who[channel][:, None, None] * rows[:, None] * (jnp.arange(count) == channel)
+        scaled = (grids[channel] - task.center[channel]) / task.scale[channel]
+        each = jax.vmap(lambda value, start: rest(blank + value * place, start), (0, None))
+        return jax.vmap(each, (None, 0))(scaled, starts)
+
+    ordered = jax.vmap(lambda held: order(blank, held)[1 + asset])(holdings)
+    return lax.map(along, jnp.arange(count)), ordered
+
+
+def _short(values: np.ndarray) -> list[float]:
+    return [float(f"{value:.6g}") for value in values]

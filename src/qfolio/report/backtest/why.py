@@ -1,0 +1,278 @@
+"""The page's section about why agents earned what they earned: sentences, and places of its marks.
+
+Bars and lines are plain HTML and SVG: places are in percent of their track or panel, and names
+stand beside them as text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from qfolio.portfolio.backtest.attribution.decomposition import Decomposition
+from qfolio.portfolio.backtest.attribution.factors import Exposures
+from qfolio.portfolio.backtest.attribution.importance import Worth
+from qfolio.portfolio.backtest.attribution.slices import Slice, Slices
+from qfolio.portfolio.backtest.attribution.why import AgentWhy
+from qfolio.report.backtest.data import BacktestData
+from qfolio.report.rendering import number, percent
+
+SIGNIFICANT = 1.96
+"""The t-statistic beyond which a figure is in bold: 5 % of those without any meaning."""
+
+
+def why_sections(data: BacktestData) -> list[dict[str, Any]]:
+    """What the page shows of each agent that is explained."""
+    if data.why is None:
+        return []
+    return [
+        {
+            "name": name,
+            "headline": headline(name, why.decomposition),
+            "parts": _parts(why.decomposition),
+            "folds": _folds(why.decomposition),
+            "assets": _assets(why.decomposition),
+            "exposures": _exposures(why.exposures, data.why.reference),
+            "signals": _signals(why),
+            "told": _told(why),
+            "slices": _panels(why.slices),
+            "asset": why.slices.asset,
+        }
+        for name, why in data.why.agents.items()
+    ]
+
+
+def diagnoses(data: BacktestData) -> list[str]:
+    """All sentences about dead agents."""
+    found = {} if data.why is None else data.why.diagnosis
+    return [sentence for sentences in found.values() for sentence in sentences]
+
+
+def headline(name: str, parts: Decomposition) -> str:
+    """Where the return came from, in words that add up."""
+    digits = _digits([parts.tilts, parts.timing, parts.cost])
+    said = {
+        key: percent(value, digits, sign=key in ("tilts", "timing"))
+        for key, value in (
+            ("net", parts.net), ("equal", parts.equal), ("tilts", parts.tilts),
+            ("timing", parts.timing), ("cost", parts.cost),
+        )
+    }  # fmt: skip
+    return (
+        f"Of the {said['net']} a year that {name} earned, {said['equal']} come from holding all "
+        f"assets in equal parts, {said['tilts']} from weights that were constantly different, "
+        f"{said['timing']} from their timing (t = {number(parts.timing_t)}), and costs took "
+        f"{said['cost']}."
+    )
+
+
+def _digits(values: Sequence[float]) -> int:
+    """Decimals of a percentage that keep the parts apart: one, or two for small ones."""
+    return 2 if max(map(abs, values)) < 0.01 else 1
+
+
+def _parts(parts: Decomposition) -> list[dict[str, Any]]:
+    """Bars of what the agent earned beyond equal weights."""
+    digits = _digits([parts.tilts, parts.timing, parts.cost])
+    between = percent(parts.between, digits, sign=True)
+    rows = [
+        ("Constant tilts", parts.tilts, "mean weights, less equal weights"),
+        ("Timing", parts.timing, f"{between} from fold to fold; t = {number(parts.timing_t)}"),
+        ("Costs", -parts.cost, "of all trades"),
+        ("Net of equal weights", parts.net - parts.equal, "the sum"),
+    ]
+    bars = _bars([value for _, value, _ in rows])
+    return [
+        {"name": name, "note": note, "value": percent(value, digits, sign=True), "bar": bar}
+        for (name, value, note), bar in zip(rows, bars, strict=True)
+    ]
+
+
+def _folds(parts: Decomposition) -> list[dict[str, Any]]:
+    highest = max((abs(fold.timing) for fold in parts.folds), default=0.0) or 1.0
+    return [
+        {
+            "name": fold.name,
+            "height": round(50 * abs(fold.timing) / highest, 2),
+            "side": "gain" if fold.timing >= 0 else "loss",
+            "cells": [
+                percent(value, 2, sign=True)
+                for value in (fold.static, fold.timing, -fold.cost, fold.net)
+            ],
+        }
+        for fold in parts.folds
+    ]
+
+
+def _assets(parts: Decomposition) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": asset.name,
+            "cells": [
+                percent(asset.weight),
+                percent(asset.static, 2, sign=True),
+                percent(asset.timing, 2, sign=True),
+            ],
+        }
+        for asset in parts.assets
+    ]
+
+
+def _exposures(found: Exposures | None, reference: str) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    rows = [("Alpha, a year", percent(found.alpha, 2, sign=True), found.alpha_t)]
+    rows += [(each.name, number(each.beta, 3, sign=True), each.t) for each in found.factors]
+    return {
+        "rows": [
+            {"name": name, "value": value, "t": number(t), "sure": abs(t) > SIGNIFICANT}
+            for name, value, t in rows
+        ],
+        "about": f"Returns less those of {reference}, regressed on factors made from the table. "
+        f"R² {percent(found.r2, 0)}; {found.lags} lags.",
+    }
+
+
+def _signals(why: AgentWhy) -> list[dict[str, Any]]:
+    """A row for each channel: its worth, how far it moves weights, and its place in the rule."""
+    worth = [*why.importance.signals, why.importance.everything]
+    order = [*sorted(worth[:-1], key=lambda each: -each.lost), worth[-1]]
+    bars = _bars([each.lost for each in order], [(each.low, each.high) for each in order])
+    pulls = {each.name: each for each in why.gradients.pulls} if why.gradients else {}
+    terms = {each.name: each for each in why.rule.terms}
+    longest = max((each.size for each in pulls.values()), default=0.0) or 1.0
+    digits = _digits([each.lost for each in order])
+    rows = []
+    for each, bar in zip(order, bars, strict=True):
+        pull, term = pulls.get(each.name), terms.get(each.name)
+        rows.append(
+            {
+                "name": each.name,
+                "shared": each.shared,
+                "bar": bar,
+                "lost": percent(each.lost, digits, sign=True),
+                "t": number(each.t),
+                "sure": abs(each.t) > SIGNIFICANT,
+                "label": _label(each),
+                "pull": None
+                if pull is None
+                else {
+                    "width": round(100 * pull.size / longest, 2),
+                    "size": percent(pull.size, 2 if longest > 1e-3 else 3),
+                    "sign": "" if abs(pull.direction) < 0.2 else "▲" if pull.direction > 0 else "▼",
+                },
+                "term": None if term is None else percent(term.per_deviation, 3, sign=True),
+            }
+        )
+    return rows
+
+
+def _label(worth: Worth) -> str:
+    return (
+        f"{percent(worth.lost, 2, sign=True)} a year, from {percent(worth.low, 2, sign=True)} to "
+        f"{percent(worth.high, 2, sign=True)} over the shuffles"
+    )
+
+
+def _told(why: AgentWhy) -> list[str]:
+    """Remarks below the table of signals."""
+    found, rule = why.importance, why.rule
+    followed = "the mean of all seeds" if found.seeds > 1 else "one seed"
+    shuffles = "one shuffle" if found.draws == 1 else f"{found.draws} shuffles"
+    sentences = [f"Worth: {shuffles} of each signal, {followed}, {found.replays} replays in all."]
+    if not found.signals:
+        sentences.append(
+            "There is too much to replay for each signal by itself, so only all together were "
+            "shuffled."
+        )
+    if why.menu:
+        sentences.append(
+            "This agent chooses from a menu; its weights jump, so they have no gradients."
+        )
+    if rule.r2 is None:
+        sentences.append("Its weights did not differ between assets, so no rule can describe them.")
+    elif rule.terms:
+        sentences.append(
+            f"The linear rule explains {percent(max(rule.r2, 0.0), 0)} of the active weights in "
+            "the folds that it was not fitted on (R²)."
+        )
+    return sentences
+
+
+def _panels(slices: Slices) -> dict[str, Any]:
+    """The small multiples; the signals' panels share one scale of weights."""
+    values = [y for each in slices.signals for line in (*each.lines, *each.above) for y in line]
+    ends = _range(values)
+    return {
+        "holding": _panel(slices.holding, (0.0, slices.holding.x[-1]), identity=True),
+        "signals": [_panel(each, ends) for each in slices.signals],
+    }
+
+
+def _range(values: Sequence[float]) -> tuple[float, float]:
+    """The ends of an axis, which is at least a thousandth of a percent wide."""
+    low, high = min(values, default=0.0), max(values, default=1.0)
+    margin = max(0.06 * (high - low), 5e-6)
+    return max(0.0, low - margin), min(1.0, high + margin)
+
+
+def _panel(each: Slice, ends: tuple[float, float], identity: bool = False) -> dict[str, Any]:
+    x, (low, high) = np.array(each.x), ends
+    across = 100 * (x - x[0]) / (np.ptp(x) or 1.0)
+
+    def points(line: Any) -> str:
+        up = 100 * (1 - (np.asarray(line) - low) / ((high - low) or 1.0))
+        return " ".join(f"{a:.4g},{b:.4g}" for a, b in zip(across, up.clip(-5, 105), strict=True))
+
+    digits = next((d for d in range(5) if (high - low) * 10 ** (d + 2) >= 4), 5)
+    means = [np.mean(lines, axis=0) for lines in (each.lines, each.above) if lines]
+    edges = points(means[0]) + " " + " ".join(reversed(points(means[-1]).split()))
+    return {
+        "name": each.name,
+        "shared": each.shared,
+        "lines": [points(line) for line in (*each.lines, *each.above)]
+        if len(each.lines) > 1
+        else [],
+        "means": [points(mean) for mean in means],
+        "band": edges if len(means) > 1 else "",
+        "identity": points(x) if identity else "",
+        "y": (percent(low, digits), percent(high, digits)),
+        "x": tuple(
+            percent(end, 0) if identity else _tick(end, float(np.ptp(x))) for end in (x[0], x[-1])
+        ),
+    }
+
+
+def _tick(value: float, width: float) -> str:
+    digits = next((d for d in range(5) if width * 10**d >= 10), 5)
+    return number(value, digits)
+
+
+def _bars(
+    values: Sequence[float], whiskers: Sequence[tuple[float, float]] = ()
+) -> list[dict[str, Any]]:
+    """Places of bars from a common zero, in percent of their track."""
+    ends = [*values, *(end for pair in whiskers for end in pair), 0.0]
+    low, high = min(ends), max(ends)
+    width = (high - low) or 1.0
+
+    def place(value: float) -> float:
+        return round(100 * (value - low) / width, 2)
+
+    bars = []
+    for i, value in enumerate(values):
+        left, right = sorted((place(0), place(value)))
+        bar: dict[str, Any] = {
+            "left": left,
+            "width": round(right - left, 2),
+            "zero": place(0),
+            "side": "gain" if value >= 0 else "loss",
+            "whisker": None,
+        }
+        if whiskers:
+            ends_of = [place(end) for end in whiskers[i]]
+            bar["whisker"] = (ends_of[0], round(ends_of[1] - ends_of[0], 2))
+        bars.append(bar)
+    return bars
