@@ -5,6 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.attribution.why import Why
+
 from shell import qfolio
 
 TINY = ["--set", "window=10", "horizon=20", "hidden=8,8", "num_envs=4", "rollout_length=10"]
@@ -39,7 +42,7 @@ def folder(tmp_path_factory):
 def test_backtest_writes_the_whole_folder(folder):
     assert {path.name for path in folder.iterdir()} == {
         "config.json", "prices.safetensors", "policies", "returns.csv", "weights.csv",
-        "summary.json", "training", "wealth.png", "report.html",
+        "summary.json", "why.json", "training", "wealth.png", "report.html",
     }  # fmt: skip
     config = json.loads((folder / "config.json").read_text())
     assert config["cost"] == pytest.approx(0.001)
@@ -54,6 +57,22 @@ def test_resuming_a_finished_backtest_reports_again(folder, monkeypatch, capsys)
     assert qfolio(monkeypatch, "backtest", "--resume", folder) == 0
     assert (folder / "returns.csv").read_text() == before
     assert "equal-weight" in capsys.readouterr().out
+
+
+def test_backtest_explains_its_agents(folder):
+    why = Why.read(json.loads((folder / "why.json").read_text()))
+    assert list(why.agents) == ["pathwise-together"]
+    with (folder / "returns.csv").open() as file:
+        returns = [float(row["pathwise-together"]) for row in csv.DictReader(file)]
+    parts = why.agents["pathwise-together"].decomposition
+    assert parts.net == pytest.approx(365 * np.mean(returns), abs=1e-12)
+    assert parts.static + parts.timing - parts.cost == pytest.approx(parts.net, abs=1e-12)
+    assert json.loads((folder / "summary.json").read_text())["diagnosis"] == why.diagnosis
+    page = (folder / "report.html").read_text()
+    assert "that pathwise-together earned" in page
+    assert all(sentence in page for said in why.diagnosis.values() for sentence in said)
+    with pytest.raises(QfolioError, match="damaged"):
+        Why.read({"agents": {}})
 
 
 def allocation(folder, monkeypatch, capsys, *options):

@@ -33,7 +33,7 @@ class Portfolio(Market):
 
     log_relatives: Float[Array, "row asset"]  # log of price over the row before; 0 if unknown
     extra: Float[Array, "row asset feature"]
-    anchors: Float[Array, "row asset"]  # weights of the anchor; no rows without one
+    anchors: Float[Array, "anchored asset"]  # weights of the anchor; no rows without one
     limits: Float[Array, " asset"]  # largest weight of each asset; 0 where it cannot be traded
     center: Float[Array, " channel"]  # of the observed channels, from the rows of the part
     scale: Float[Array, " channel"]

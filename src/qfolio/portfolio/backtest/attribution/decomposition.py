@@ -62,7 +62,7 @@ def decompose(
     folds: dict[str, slice],
     assets: Sequence[str],
     periods_per_year: float,
-    known: Floats | None = None,
+    known: np.ndarray | None = None,
 ) -> Decomposition:
     """Decompose a strategy's mean net return.
 
@@ -73,7 +73,7 @@ def decompose(
         folds: The days of each, by name.
         assets: Names of the N assets.
         periods_per_year: For example 252 for days of trading.
-        known: 1 for each asset that had a price on a day, else 0, shape (D, N) (default: all had).
+        known: Whether an asset had a price on a day, shape (D, N) (default: all had).
     """
     year = periods_per_year
     mean, there = weights.mean(0), np.ones_like(weights[:, 1:]) if known is None else known

@@ -33,12 +33,12 @@ class Rule(msgspec.Struct, frozen=True):
 
 
 def distil(
-    targets: Floats,
-    anchor: Floats,
-    signals: Floats,
+    targets: np.ndarray,
+    anchor: np.ndarray,
+    signals: np.ndarray,
     names: Sequence[str],
-    tradable: Floats,
-    fitted: Floats,
+    tradable: np.ndarray,
+    fitted: np.ndarray,
 ) -> Rule:
     """Fit the rule by least squares.
 
@@ -52,23 +52,24 @@ def distil(
     """
     count = np.maximum(tradable.sum(1, keepdims=True), 1)
 
-    def centred(values: Floats) -> Floats:
+    def centred(values: np.ndarray) -> Floats:
         mean = (values * tradable).sum(1, keepdims=True) / count
         return (values - mean) * tradable
 
-    y = centred(targets - anchor)
+    y = centred(targets.astype(float) - anchor)
     x = np.stack([centred(signals[..., c]) for c in range(len(names))], -1)
     spread = np.sqrt((x**2).sum((0, 1)) / max(1.0, float(tradable.sum())))
     used = spread > 1e-9
     scaled = x[..., used] / spread[used]
-    rows = fitted.astype(bool)
-    solved = np.linalg.lstsq(scaled[rows].reshape(-1, used.sum()), y[rows].ravel(), rcond=None)[0]
-    total = float((y[~rows] ** 2).sum())
-    left = float(((y[~rows] - scaled[~rows] @ solved) ** 2).sum())
+    solved = np.linalg.lstsq(scaled[fitted].reshape(-1, used.sum()), y[fitted].ravel(), rcond=None)[
+        0
+    ]
+    total = float((y[~fitted] ** 2).sum())
+    left = float(((y[~fitted] - scaled[~fitted] @ solved) ** 2).sum())
     known = [name for name, yes in zip(names, used, strict=True) if yes]
     terms = zip(known, (solved / spread[used]).tolist(), solved.tolist(), strict=True)
     return Rule(
         terms=[Term(*each) for each in terms],
-        r2=1 - left / total if total > _LEAST**2 * y[~rows].size else None,
+        r2=1 - left / total if total > _LEAST**2 * y[~fitted].size else None,
         shared=[name for name, yes in zip(names, used, strict=True) if not yes],
     )

@@ -81,13 +81,13 @@ def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> 
     """The linear rule of an agent's decisions, fitted on every other fold."""
     begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
     task, days = stretches[0].task, end - begin
-    tradable, fitted = np.zeros((days, task.limits.shape[0])), np.zeros(days)
+    tradable, fitted = np.zeros((days, task.limits.shape[0])), np.zeros(days, bool)
     for i, (part, _, fold) in enumerate(stretches):
         rows = slice(fold.decisions.start - begin, fold.decisions.stop - begin)
         tradable[rows] = np.asarray(part.limits) > 0
         fitted[rows] = i % 2 == 0
     if len(stretches) == 1:
-        fitted[days // 2 :] = 0
+        fitted[days // 2 :] = False
     anchor = np.asarray(task.anchors)[begin:end] if task.anchor else np.zeros_like(tradable)
     seen = np.asarray(channels(task))[begin:end].astype(float)
     return distil(decisions[:, 1:], anchor, seen, names, tradable, fitted)

@@ -76,5 +76,7 @@ def newey_west_lags(scores: Floats) -> int:
 
 
 def mean_t(values: Floats) -> float:
-    """The mean of a series over its error; 0 if it does not vary."""
+    """The mean of a series over its error; 0 for rounding errors."""
+    if abs(values).max() < 1e-12:
+        return 0.0
     return float(regress(values, np.empty((len(values), 0))).t[0])

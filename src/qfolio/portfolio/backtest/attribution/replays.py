@@ -30,7 +30,7 @@ AT_ONCE = 16
 class Observed(Portfolio):
     """A portfolio whose observed channels are given, with those of row ``begin`` first."""
 
-    observed: Float[Array, "row asset channel"] = eqx.field(kw_only=True)
+    observed: Float[Array, "seen asset channel"] = eqx.field(kw_only=True)
     begin: Int[Array, ""] = eqx.field(kw_only=True)
 
     @staticmethod

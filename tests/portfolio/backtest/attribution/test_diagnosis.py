@@ -1,0 +1,49 @@
+"""Agents that do nothing are told from those that do something."""
+
+import numpy as np
+import pytest
+
+from qfolio.portfolio.backtest.attribution.diagnosis import diagnose
+from qfolio.portfolio.backtest.replay import Entry
+from qfolio.portfolio.backtest.simulation import simulate
+
+DAYS = 200
+FOLDS = [slice(0, 100), slice(100, DAYS)]
+
+
+def entry(*seeds):
+    prices = 50 * np.exp(np.cumsum(np.random.default_rng(0).normal(0, 0.01, (DAYS + 2, 3)), 0))
+    decisions = np.array(seeds, float)
+    return Entry("agent", decisions, simulate(prices, decisions, first=0, cost=0.001))
+
+
+def always(*weights):
+    return np.tile(weights, (DAYS, 1))
+
+
+LIVELY = np.random.default_rng(1).dirichlet(np.ones(4), DAYS)
+BY_FOLD = np.repeat([[0, 0.6, 0.4, 0], [0, 0.2, 0.2, 0.6]], 100, 0)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "expected"),
+    [
+        ([LIVELY, LIVELY[::-1]], []),
+        ([always(1, 0, 0, 0)], ["dqn never traded and stayed in cash."]),
+        ([always(0, 0, 1, 0)], ["dqn traded once and never again."]),
+        ([always(0, 0.001, 0.999, 0)], ["dqn always held B alone."]),
+        ([always(0, 0.3, 0.3, 0.4)], ["dqn ordered the same weights at every row."]),
+        ([BY_FOLD], ["dqn ordered the same weights at every row of a fold, in each of the folds."]),
+        (
+            [always(1, 0, 0, 0), LIVELY, always(1, 0, 0, 0)],
+            ["2 of 3 seeds of dqn never traded and stayed in cash."],
+        ),
+    ],
+)
+def test_the_sentence(seeds, expected):
+    assert diagnose("dqn", entry(*seeds), FOLDS, "ABC", ignored=False) == expected
+
+
+def test_an_agent_that_ignores_what_it_observes():
+    (sentence,) = diagnose("dqn", entry(LIVELY), FOLDS, "ABC", ignored=True)
+    assert sentence.startswith("dqn ignored what it observed")

@@ -1,0 +1,72 @@
+"""What a signal is worth, where it is known what the policy follows."""
+
+import numpy as np
+import pytest
+
+from qfolio.portfolio.backtest.attribution import importance as module
+from qfolio.portfolio.backtest.attribution.importance import importance
+from qfolio.portfolio.backtest.attribution.replays import Shuffles
+from qfolio.portfolio.backtest.replay import decide
+
+from planted import NAMES, Known
+
+
+def found(rule, stretches, prices):
+    return importance(Known(rule), stretches, NAMES, prices.values, 252)
+
+
+def test_a_planted_signal_is_found_and_nothing_else(stretches, prices):
+    worth, replays = found("momentum", stretches, prices)
+    by_name = {each.name: each for each in worth.signals}
+    momentum = by_name.pop("momentum:20")
+    assert momentum.lost > 0.05
+    assert momentum.t > 2
+    assert momentum.low <= momentum.lost <= momentum.high
+    assert all(each.lost == each.low == each.high == 0 for each in by_name.values())
+    assert worth.everything.lost == pytest.approx(momentum.lost, rel=0.5)
+    assert not worth.ignored
+    assert (worth.draws, worth.seeds, worth.replays) == (3, 2, 1 + 3 * 5)
+    # The first replay is the policy itself.
+    decided = decide(Known("momentum"), stretches, 1, together=True)
+    np.testing.assert_allclose(replays.targets[:1], decided, atol=1e-6)
+
+
+def test_a_shared_signal_is_shuffled_in_time(stretches, prices):
+    worth, replays = found("market", stretches, prices)
+    assert [each.shared for each in worth.signals] == [False, False, False, True]
+    moved = abs(replays.targets[1:-3] - replays.targets[0]).max((1, 2))
+    assert (moved > 0).tolist() == 9 * [False] + 3 * [True]
+
+
+def test_an_agent_that_sees_nothing_is_told(stretches, prices):
+    worth, _ = found("constant", stretches, prices)
+    assert worth.ignored
+    assert worth.everything.lost == 0
+
+
+def test_equal_draws_give_equal_results(stretches, prices):
+    assert found("momentum", stretches, prices)[0] == found("momentum", stretches, prices)[0]
+
+
+def test_shuffles_keep_what_they_do_not_touch(stretches):
+    drawn = Shuffles.drawn(stretches, 2, 63, 0)
+    begin, end = stretches[0].fold.decisions.start - 1, stretches[-1].fold.decisions.stop
+    count = end - begin
+    assert drawn.begin == begin
+    assert (drawn.rows[0, :count] == np.arange(begin, end)).all()
+    assert (drawn.assets[0] == np.arange(6)).all()
+    for draw in (1, 2):
+        assert sorted(drawn.rows[draw, :count]) == list(range(begin, end))
+        assert (np.sort(drawn.assets[draw]) == np.arange(6)).all()
+        changes = (np.diff(drawn.assets[draw], axis=0) != 0).any(1).sum()
+        assert 0 < changes <= count // 63
+
+
+def test_replays_are_bounded(stretches, prices, monkeypatch):
+    """With less room: one draw, then one seed, then everything at once only."""
+    days, each = 600, 6 * 2 * 4
+    for room, expected in ((6, (4, 1, 2)), (3, (4, 1, 1)), (1, (0, 1, 1))):
+        monkeypatch.setattr(module, "WORK", days * each * 2 * room)
+        worth, _ = found("momentum", stretches, prices)
+        assert (len(worth.signals), worth.draws, worth.seeds) == expected
+        assert worth.everything.lost > 0

@@ -1,0 +1,76 @@
+"""Slices, gradients and rules of policies that are known."""
+
+import numpy as np
+import pytest
+
+from qfolio.portfolio.backtest.attribution.distillation import distil
+from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
+from qfolio.portfolio.backtest.attribution.replays import channels
+from qfolio.portfolio.backtest.attribution.slices import slices
+from qfolio.portfolio.backtest.replay import decide
+
+from planted import ASSETS, NAMES, Known
+
+SHARED = [False, False, False, True]
+
+
+def held(days=600):
+    return np.full((days, ASSETS + 1), 1 / (ASSETS + 1))
+
+
+def test_the_rule_is_recovered(stretches):
+    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
+    targets = decide(Known("momentum"), stretches, 1, together=True)[0, :, 1:]
+    seen = np.asarray(channels(stretches[0].task))[begin:end].astype(float)
+    open_to = np.ones_like(targets)
+    fitted = np.repeat([True, False, True, False], 150)
+    rule = distil(targets, 0 * targets, seen, NAMES, open_to, fitted)
+    terms = {term.name: term for term in rule.terms}
+    assert terms["momentum:20"].coefficient == pytest.approx(0.5 / ASSETS, rel=1e-4)
+    spread = np.std(np.linspace(-1, 1, ASSETS))
+    assert terms["momentum:20"].per_deviation == pytest.approx(0.5 / ASSETS * spread, rel=1e-4)
+    assert abs(terms["reversal:3"].per_deviation) < 1e-6
+    assert rule.shared == ["market-volatility:20"]
+    assert rule.r2 == pytest.approx(1, abs=1e-6)
+    noise = targets + np.random.default_rng(0).normal(0, 0.1, targets.shape)
+    assert distil(noise, 0 * targets, seen, NAMES, open_to, fitted).r2 == pytest.approx(
+        0.2, abs=0.1
+    )
+    same = distil(0 * targets, 0 * targets, seen, NAMES, open_to, fitted)
+    assert same.r2 is None
+
+
+def test_gradients_add_up_and_name_the_driver(stretches):
+    found = integrated_gradients(Known("momentum"), stretches, NAMES, held())
+    pulls = {pull.name: pull for pull in found.pulls}
+    momentum = pulls.pop("momentum:20")
+    assert found.gap < 1e-6
+    assert momentum.size == pytest.approx(found.whole, rel=1e-3)
+    assert momentum.size == pytest.approx(0.5 / ASSETS * abs(np.linspace(-1, 1, ASSETS)).mean(),
+                                          rel=1e-3)  # fmt: skip
+    assert momentum.direction == pytest.approx(1, abs=1e-3)
+    assert all(pull.size == 0 for pull in pulls.values())
+
+
+def test_slices_draw_the_rule(stretches):
+    found = slices(Known("momentum"), stretches, NAMES, list("ABCDEF"), held(), SHARED)
+    assert found.asset == "A"
+    drawn = {each.name: each for each in found.signals}
+    x = np.array(drawn["momentum:20"].x)
+    for lines in (drawn["momentum:20"].lines, drawn["momentum:20"].above):
+        assert np.shape(lines) == (4, 17)
+        np.testing.assert_allclose(lines[0], (1 + 0.5 * x) / ASSETS, rtol=1e-4)
+    assert np.ptp(drawn["reversal:3"].lines) == 0
+    assert [each.shared for each in found.signals] == SHARED
+    np.testing.assert_allclose(found.holding.lines, 1 / ASSETS, rtol=1e-5)
+
+
+def test_slices_draw_the_edges_of_a_band(stretches):
+    found = slices(Known("band"), stretches, NAMES, list("ABCDEF"), held(), SHARED)
+    momentum = found.signals[1]
+    x = np.array(momentum.x)
+    edge = 0.1 * (1 + np.maximum(0.4 * x, 0.6 * x))  # of the seed that wants more
+    np.testing.assert_allclose(momentum.lines[0], edge, rtol=1e-4)
+    np.testing.assert_allclose(momentum.above[0], 0.16, rtol=1e-4)
+    x = np.array(found.holding.x)
+    np.testing.assert_allclose(found.holding.lines[0], np.clip(x, 0.1, 0.16), rtol=1e-4)
