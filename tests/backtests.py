@@ -8,6 +8,13 @@ from typing import Any
 import numpy as np
 
 from qfolio.portfolio.backtest.assessment import Strategy, assess
+from qfolio.portfolio.backtest.attribution.decomposition import AssetPart, Decomposition, FoldPart
+from qfolio.portfolio.backtest.attribution.distillation import Rule, Term
+from qfolio.portfolio.backtest.attribution.factors import Exposure, Exposures
+from qfolio.portfolio.backtest.attribution.gradients import Gradients, Pull
+from qfolio.portfolio.backtest.attribution.importance import Importance, Worth
+from qfolio.portfolio.backtest.attribution.slices import Slice, Slices
+from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 
 ATTACK = "</script><script>hacked = 1</script><img src=x onerror='hacked = 1'>"
@@ -109,7 +116,42 @@ def hostile() -> BacktestData:
         prices={**data.prices, "source": ATTACK, "note": ATTACK, "digest": ATTACK},
         config={**data.config, "train": ATTACK, ATTACK: {ATTACK: [ATTACK]}},
         folds=[{**data.folds[0], "name": ATTACK}],
+        why=made_up_why(
+            names["DQN"], (ATTACK, LINK), (ATTACK, LINK, "C", "\u2028</SCRIPT>"), ATTACK
+        ),
     )
+
+
+def made_up_why(
+    name: str = "DQN-together",
+    signals: tuple[str, ...] = ("momentum:20", "volatility:21"),
+    assets: tuple[str, ...] = ("A", "B", "C", "D"),
+    fold: str = "2001-01-02",
+) -> Why:
+    """Attributions of one agent, with any names."""
+    x, up, down = [-1.0, 0.0, 1.0], [0.1, 0.15, 0.2], [0.2, 0.2, 0.2]
+    worth = [Worth(signals[0], 0.012, 0.01, 0.02, 2.3, False),
+             Worth(signals[1], -0.001, -0.002, 0.001, -0.4, True)]  # fmt: skip
+    agent = AgentWhy(
+        decomposition=Decomposition(
+            0.142, 0.131, 0.004, 0.011, 1.7, 0.002, 0.004,
+            [AssetPart(each, 0.2, 0.03, 0.002) for each in ("cash", *assets)],
+            [FoldPart(fold, 0.135, 0.02, 0.004, 0.151), FoldPart("next", 0.1, -0.01, 0.004, 0.086)],
+        ),
+        exposures=Exposures(0.021, 2.4, 0.31, 7, [Exposure("market", -0.02, -1.2)]),
+        importance=Importance(worth, Worth("all together", 0.01, 0.0, 0.02, 1.2, False),
+                              False, 3, 5, 10),
+        slices=Slices(
+            assets[0], Slice("weight held", [0.0, 0.1, 0.2], [up, down], [], False),
+            [Slice(each, x, [up, down], [down, down], False) for each in signals],
+        ),
+        gradients=Gradients(
+            [Pull(signals[0], 0.02, 0.9), Pull(signals[1], 0.0, 0.0)], 24, 0.02, 0.0
+        ),
+        rule=Rule([Term(signals[0], 0.05, 0.03)], 0.64, [signals[1]]),
+        menu=False,
+    )  # fmt: skip
+    return Why("equal weight", {name: agent}, {name: [f"{name} traded once and never again."]})
 
 
 class Page(HTMLParser):

@@ -75,7 +75,8 @@ class BacktestData:
 
 def require_fit(data: BacktestData) -> None:
     """Raise QfolioError if strategies, assessment, dates and assets do not fit together."""
-    if set(data.strategies) != set(data.assessment.strategies):
+    explained = set() if data.why is None else set(data.why.agents)
+    if set(data.strategies) != set(data.assessment.strategies) or explained - set(data.strategies):
         raise QfolioError(
             "The series and the statistics are of different strategies; report one backtest."
         )

@@ -66,6 +66,7 @@ def test_exposures_are_recovered():
     factors = {"market": market, "tilt": tilt, "same": 2 * market, "none": np.zeros(2000)}
     active = 0.0002 - 0.3 * market + 0.1 * tilt + rng.normal(0, 1e-3, 2000)
     found = exposures(active, factors, 252)
+    assert found is not None
     assert [each.name for each in found.factors] == ["market", "tilt"]
     assert [each.beta for each in found.factors] == pytest.approx([-0.3, 0.1], abs=0.01)
     assert found.alpha == pytest.approx(0.0504, abs=0.03)

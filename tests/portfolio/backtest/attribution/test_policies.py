@@ -42,6 +42,7 @@ def test_the_rule_is_recovered(stretches):
 
 def test_gradients_add_up_and_name_the_driver(stretches):
     found = integrated_gradients(Known("momentum"), stretches, NAMES, held())
+    assert found is not None
     pulls = {pull.name: pull for pull in found.pulls}
     momentum = pulls.pop("momentum:20")
     assert found.gap < 1e-6

@@ -1,0 +1,71 @@
+"""What the page says about why an agent earned what it earned."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.attribution.why import Why
+from qfolio.report.backtest.page import render_backtest
+from qfolio.report.backtest.why import headline, why_sections
+
+from backtests import Page, made_up_why, usual
+
+
+@pytest.fixture(scope="module")
+def explained():
+    return usual(60, why=made_up_why())
+
+
+def test_the_page_says_where_the_return_came_from(explained):
+    text = Page(render_backtest(explained)).text
+    for sentence in (
+        "Of the 14.2 % a year that DQN-together earned, 13.1 % come from holding all assets in "
+        "equal parts, +0.4 % from weights that were constantly different, +1.1 % from their timing "
+        "(t = 1.7), and costs took 0.4 %.",
+        "Diagnosis: DQN-together traded once and never again.",
+        "+0.2 % from fold to fold; t = 1.7",
+        "Returns less those of equal weight, regressed on factors made from the table. R² 31 %",
+        "Worth: 3 shuffles of each signal, the mean of all seeds, 10 replays in all.",
+        "The linear rule explains 64 % of the active weights",
+        "volatility:21 shared by all assets",
+    ):
+        assert sentence in text, sentence
+
+
+def test_without_attributions_there_is_no_such_section():
+    page = render_backtest(usual(60))
+    assert 'id="why"' not in page
+    assert "Diagnosis" not in page
+    assert ".multiples" not in page
+
+
+def test_the_section_is_made_again_from_its_file(explained):
+    again = Why.read(json.loads(json.dumps(explained.why.to_json())))
+    assert why_sections(replace(explained, why=again)) == why_sections(explained)
+
+
+def test_signals_are_ordered_by_their_worth(explained):
+    (section,) = why_sections(explained)
+    names = [row["name"] for row in section["signals"]]
+    assert names == ["momentum:20", "volatility:21", "all together"]
+    first, second, _ = (row["bar"] for row in section["signals"])
+    assert (first["side"], second["side"]) == ("gain", "loss")
+    assert first["left"] == first["zero"] == second["left"] + second["width"]
+    assert first["whisker"][0] + first["whisker"][1] == 100  # the longest
+    assert section["signals"][0]["pull"]["sign"] == "▲"
+    assert section["signals"][1]["term"] is None
+
+
+def test_small_parts_have_more_digits(explained):
+    parts = made_up_why().agents["DQN-together"].decomposition
+    small = type(parts)(0.1315, 0.131, 0.001, 0.0001, 0.1, 0.0, 0.0006, [], [])
+    assert "+0.10\u202f% from weights" in headline("x", small)
+    assert "costs took 0.06\u202f%" in headline("x", small)
+    assert "costs took 0.4\u202f%" in headline("x", parts)
+
+
+def test_attributions_of_another_backtest_are_refused(explained):
+    with pytest.raises(QfolioError, match="one backtest"):
+        render_backtest(replace(explained, why=made_up_why("another")))
