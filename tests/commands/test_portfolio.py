@@ -7,6 +7,7 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.attribution.why import Why
+from qfolio.portfolio.backtest.folder import BacktestFolder
 
 from shell import qfolio
 
@@ -60,7 +61,7 @@ def test_resuming_a_finished_backtest_reports_again(folder, monkeypatch, capsys)
 
 
 def test_backtest_explains_its_agents(folder):
-    why = Why.read(json.loads((folder / "why.json").read_text()))
+    why = Why.read(BacktestFolder(folder).read_why())
     assert list(why.agents) == ["pathwise-together"]
     with (folder / "returns.csv").open() as file:
         returns = [float(row["pathwise-together"]) for row in csv.DictReader(file)]

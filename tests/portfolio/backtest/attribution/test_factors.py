@@ -73,3 +73,14 @@ def test_exposures_are_recovered():
     assert found.alpha_t > 3
     assert found.r2 == pytest.approx(0.9, abs=0.03)
     assert exposures(active[:8], {"market": market[:8]}, 252) is None
+
+
+@pytest.mark.parametrize(("assets", "components"), [(1, 0), (2, 0), (3, 1), (4, 2)])
+def test_few_assets_have_few_components(prices, stretches, assets, components):
+    folds = [fold for *_, fold in stretches]
+    found = factor_returns(prices.values[:, :assets], folds, 1, 252)
+    assert sum("component" in name for name in found) == components
+    assert all(np.isfinite(series).all() for series in found.values())
+    left = exposures(found["market"] + 1e-3, found, 252)
+    assert left is not None
+    assert left.factors[0].beta == pytest.approx(1)

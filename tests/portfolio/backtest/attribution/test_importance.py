@@ -8,7 +8,7 @@ from qfolio.portfolio.backtest.attribution.importance import importance
 from qfolio.portfolio.backtest.attribution.replays import Shuffles
 from qfolio.portfolio.backtest.replay import decide
 
-from planted import NAMES, Known
+from planted import NAMES, Known, four_folds, planted
 
 
 def found(rule, stretches, prices):
@@ -70,3 +70,12 @@ def test_replays_are_bounded(stretches, prices, monkeypatch):
         worth, _ = found("momentum", stretches, prices)
         assert (len(worth.signals), worth.draws, worth.seeds) == expected
         assert worth.everything.lost > 0
+
+
+def test_the_signals_of_a_single_asset_are_shuffled_in_time():
+    prices = planted(400)
+    prices = prices.select(prices.assets[:1])
+    stretches = four_folds(prices)
+    worth, _ = found("market", stretches, prices)
+    assert [each.shared for each in worth.signals] == [True] * 4
+    assert not worth.ignored

@@ -75,3 +75,9 @@ def test_slices_draw_the_edges_of_a_band(stretches):
     np.testing.assert_allclose(momentum.above[0], 0.16, rtol=1e-4)
     x = np.array(found.holding.x)
     np.testing.assert_allclose(found.holding.lines[0], np.clip(x, 0.1, 0.16), rtol=1e-4)
+
+
+def test_a_single_asset_has_no_rule():
+    one = np.random.default_rng(0).uniform(size=(40, 1))
+    rule = distil(one, 0 * one, one[..., None], ["x"], np.ones_like(one), np.arange(40) < 20)
+    assert (rule.terms, rule.r2, rule.shared) == ([], None, ["x"])

@@ -61,7 +61,7 @@ def distil(
     spread = np.sqrt((x**2).sum((0, 1)) / max(1.0, float(tradable.sum())))
     used = spread > 1e-9
     scaled = x[..., used] / spread[used]
-    solved = np.linalg.lstsq(scaled[fitted].reshape(-1, used.sum()), y[fitted].ravel(), rcond=None)[
+    solved = np.linalg.lstsq(scaled[fitted].reshape(y[fitted].size, int(used.sum())), y[fitted].ravel(), rcond=None)[
         0
     ]
     total = float((y[~fitted] ** 2).sum())

@@ -70,8 +70,8 @@ class Shuffles(NamedTuple):
         length, assets = end - begin, task.limits.shape[0]
         block = max(1, min(block, length // 4))
         rng = np.random.default_rng(seed)
-        rows = np.tile(np.arange(begin, end), (count + 1, 1))
-        shown = np.tile(np.arange(assets), (count + 1, length, 1))
+        rows = np.tile(np.arange(begin, end, dtype=np.int32), (count + 1, 1))
+        shown = np.tile(np.arange(assets, dtype=np.int32), (count + 1, length, 1))
         pieces = np.array_split(np.arange(begin, end), max(1, length // block))
         starts = np.array([fold.decisions.start for fold in folds])
         for draw in range(1, count + 1):
