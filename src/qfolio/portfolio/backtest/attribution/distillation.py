@@ -61,9 +61,8 @@ def distil(
     spread = np.sqrt((x**2).sum((0, 1)) / max(1.0, float(tradable.sum())))
     used = spread > 1e-9
     scaled = x[..., used] / spread[used]
-    solved = np.linalg.lstsq(scaled[fitted].reshape(y[fitted].size, int(used.sum())), y[fitted].ravel(), rcond=None)[
-        0
-    ]
+    seen = scaled[fitted].reshape(y[fitted].size, int(used.sum()))
+    solved = np.linalg.lstsq(seen, y[fitted].ravel(), rcond=None)[0]
     total = float((y[~fitted] ** 2).sum())
     left = float(((y[~fitted] - scaled[~fitted] @ solved) ** 2).sum())
     known = [name for name, yes in zip(names, used, strict=True) if yes]
