@@ -142,7 +142,7 @@ def made_up_why(
         importance=Importance(worth, Worth("all together", 0.01, 0.0, 0.02, 1.2, False),
                               False, 3, 5, 10),
         slices=Slices(
-            assets[0], Slice("weight held", [0.0, 0.1, 0.2], [up, down], [], False),
+            assets[0], assets[1], Slice("weight held", [0.0, 0.1, 0.2], [up, down], [], False),
             [Slice(each, x, [up, down], [down, down], False) for each in signals],
         ),
         gradients=Gradients(

@@ -39,6 +39,7 @@ def why_sections(data: BacktestData) -> list[dict[str, Any]]:
             "told": _told(why),
             "slices": _panels(why.slices),
             "asset": why.slices.asset,
+            "partner": why.slices.partner,
         }
         for name, why in data.why.agents.items()
     ]
@@ -205,8 +206,10 @@ def _panels(slices: Slices) -> dict[str, Any]:
     """The small multiples; the signals' panels share one scale of weights."""
     values = [y for each in slices.signals for line in (*each.lines, *each.above) for y in line]
     ends = _range(values)
+    held = slices.holding
+    highest = max(held.x[-1], *(max(line) for line in held.lines))
     return {
-        "holding": _panel(slices.holding, (0.0, slices.holding.x[-1]), identity=True),
+        "holding": _panel(held, (0.0, highest), identity=True),
         "signals": [_panel(each, ends) for each in slices.signals],
     }
 

@@ -55,7 +55,7 @@ def test_gradients_add_up_and_name_the_driver(stretches):
 
 def test_slices_draw_the_rule(stretches):
     found = slices(Known("momentum"), stretches, NAMES, list("ABCDEF"), held(), SHARED)
-    assert found.asset == "A"
+    assert (found.asset, found.partner) == ("A", "B")
     drawn = {each.name: each for each in found.signals}
     x = np.array(drawn["momentum:20"].x)
     for lines in (drawn["momentum:20"].lines, drawn["momentum:20"].above):

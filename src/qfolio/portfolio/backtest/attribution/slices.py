@@ -1,9 +1,13 @@
 """A policy by pictures: the weight of one asset, against one thing that it depends on.
 
-Against the weight held, it is the target of one decision: on the diagonal nothing is traded.
-Against a signal, it is the weight at which the policy comes to rest if it decides again and again
-while prices stand still: from nothing of the asset, and from twice its typical weight. A policy
-with a no-trade band rests at the band's two edges, others at one weight.
+The asset is the one that is held most. What it gains, a partner gives, the one held second most
+(or cash if there is no other): while the asset's signal goes up, the partner's goes down. Many
+policies buy only what others sell, and alone an asset would not move.
+
+Against the weight held, the picture is the target of one decision: on the diagonal nothing is
+traded. Against a signal, it is the weight at which the policy comes to rest if it decides again and
+again while prices stand still: from all that the two hold in the partner, and from all of it in the
+asset. A policy with a no-trade band rests at the band's two edges, others at one weight.
 
 All else is typical: other channels are at their mean in training (returns at 0), the holding is the
 mean over the test. A signal or feature has its value in the whole window, a return only in its
@@ -52,7 +56,8 @@ class Slices(msgspec.Struct, frozen=True):
     """The slices of one asset's weight."""
 
     asset: str
-    holding: Slice  # against the weight held; the others keep their proportions
+    partner: str
+    holding: Slice  # against the weight held
     signals: list[Slice]
 
 
@@ -69,26 +74,34 @@ def slices(
     Args:
         stretches: The folds with its policies.
         names: Of the channels that it observes.
-        assets: Their names; the one that is held most is shown.
+        assets: Their names.
         held: Weights held when deciding, shape (D, entry).
         shared: Whether a channel is the same for all assets.
     """
     tradable = np.all([np.asarray(task.limits) > 0 for task, *_ in stretches], axis=0)
     typical = held.mean(0)
-    asset = int(np.where(tradable, typical[1:], -1.0).argmax())
+    order = np.argsort(-np.where(tradable, typical[1:], -1.0), kind="stable") + 1
+    asset = int(order[0])
+    partner = int(order[1]) if tradable.sum() > 1 else 0
     begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
     seen = np.asarray(channels(stretches[0].task))[begin:end]
     grids = []
     for channel, everywhere in enumerate(shared):
-        shown = seen[..., asset if everywhere else tradable, channel]
+        shown = seen[..., asset - 1 if everywhere else tradable, channel]
         low, high = (float(end) for end in np.quantile(shown, (TAIL, 1 - TAIL)))
         grids.append(np.linspace(low, high, POINTS))
-    who = np.array([tradable if every else np.arange(len(assets)) == asset for every in shared])
-    highest = min(1.0, max(1.5 * held[:, 1 + asset].max(), 2 / len(typical)))
-    kept = np.linspace(0, highest, POINTS)
-    with_asset = lambda weights: _with(typical, 1 + asset, np.asarray(weights))  # noqa: E731
-    starts = with_asset([0.0, min(1.0, 2 * typical[1 + asset])])
-    given = [jnp.asarray(x, jnp.float32) for x in (grids, who, starts, with_asset(kept))]
+    entries = np.arange(1, len(typical))
+    opposite = 1.0 * (entries == asset) - (entries == partner)
+    who = np.array([tradable if everywhere else opposite for everywhere in shared])
+    total = max(typical[asset] + typical[partner], 1 / len(typical))
+    kept = np.linspace(0, total, POINTS)
+    holdings = np.tile(typical, (POINTS, 1))
+    holdings[:, [asset, partner]] = 0
+    rest = holdings.sum(1, keepdims=True)
+    holdings *= (1 - total) / np.where(rest > 0, rest, 1)
+    holdings[:, asset], holdings[:, partner] = kept, total - kept
+    holdings[:, 0] += 1 - holdings.sum(1)  # if the two are all that was held
+    given = [jnp.asarray(x, jnp.float32) for x in (grids, who, holdings[[0, -1]], holdings)]
     places = np.unique(np.linspace(0, len(stretches) - 1, SHOWN).round().astype(int))
     lines = []
     for task, members, fold in (stretches[place] for place in places):
@@ -96,7 +109,8 @@ def slices(
         lines.append([np.asarray(x) for x in _answers(task, agent, members, row, asset, *given)])
     rests, ordered = (np.stack(each) for each in zip(*lines, strict=True))
     return Slices(
-        asset=assets[asset],
+        asset=assets[asset - 1],
+        partner=("cash", *assets)[partner],
         holding=Slice("weight held", _short(kept), [_short(y) for y in ordered], [], False),
         signals=[
             Slice(
@@ -109,15 +123,6 @@ def slices(
             for i, (name, same) in enumerate(zip(names, shared, strict=True))
         ],
     )
-
-
-def _with(typical: np.ndarray, entry: int, weights: np.ndarray) -> np.ndarray:
-    """Weights with another one for an entry; the others keep their proportions."""
-    others = typical * (np.arange(len(typical)) != entry)
-    others = others / others.sum() if others.sum() > 0 else np.eye(len(typical))[0]
-    result = others * (1 - weights[:, None])
-    result[:, entry] = weights
-    return result
 
 
 def answer(
@@ -148,7 +153,7 @@ def _answers(
 
     def rest(features: Array, held: Array) -> Array:
         decide = lambda _, held: order(features, held)  # noqa: E731
-        return lax.fori_loop(0, DECISIONS, decide, held)[1 + asset]
+        return lax.fori_loop(0, DECISIONS, decide, held)[asset]
 
     def along(channel: Array) -> Array:
         rows = jnp.where(channel == 0, latest, True)
@@ -157,7 +162,7 @@ def _answers(
         each = jax.vmap(lambda value, start: rest(blank + value * place, start), (0, None))
         return jax.vmap(each, (None, 0))(scaled, starts)
 
-    ordered = jax.vmap(lambda held: order(blank, held)[1 + asset])(holdings)
+    ordered = jax.vmap(lambda held: order(blank, held)[asset])(holdings)
     return lax.map(along, jnp.arange(count)), ordered
 
 
