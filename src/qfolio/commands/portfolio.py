@@ -274,8 +274,7 @@ def _known(kind: registry.Kind, name: str) -> str:
 
 def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
     """The parts that a setting of the task names."""
-    from qfolio.portfolio.anchors import COLUMN
-    from qfolio.portfolio.signals import names
+    from qfolio.portfolio.signals import COLUMN, names
 
     if setting == "signals":
         return [("signal", name) for name in names(value)]

@@ -13,8 +13,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines import Baseline, History, baseline
 from qfolio.portfolio.costs import drift
 from qfolio.portfolio.prices.table import Prices
-
-COLUMN = "feature:"
+from qfolio.portfolio.signals import COLUMN
 
 MONTHS = 60
 """Months before a decision that a baseline estimates from."""

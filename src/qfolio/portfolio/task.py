@@ -87,7 +87,8 @@ class Portfolio(Market):
         chosen = signals.parse(self.signals)
         logs = np.zeros(prices.values.shape)
         logs[1:] = np.nan_to_num(np.diff(np.log(prices.values), axis=0))
-        computed = signals.compute(chosen, prices.values, self.signal_scale)
+        columns = dict(zip(prices.feature_names, np.moveaxis(prices.features, -1, 0), strict=True))
+        computed = signals.compute(chosen, prices.values, self.signal_scale, columns)
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
         followed = anchors.path(self.anchor, prices) if self.anchor else logs[:0]
         where = lambda t: (t.log_relatives, t.extra, t.anchors)  # noqa: E731
