@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.portfolio.backtest.standing import Standing
     from qfolio.portfolio.prices.findings import Finding
+    from qfolio.portfolio.study.folder import Result, Variant
+    from qfolio.portfolio.study.run import Study
 
 console = Console(highlight=False)
 
@@ -203,6 +205,67 @@ def print_assessment(assessment: "Assessment") -> None:
     for sentences in verdicts(assessment).values():
         for sentence in sentences:
             say(sentence)
+
+
+def describe_study(study: "Study") -> str:
+    """Tables, variants and agents of a study, and why tables are left out."""
+    config = study.config
+    variants = f"{len(config.variants)} variant" + "s" * (len(config.variants) > 1)
+    tables = f"{len(config.tables)} table" + "s" * (len(config.tables) > 1)
+    left_out = (f"{name} is left out: {why}" for name, why in config.left_out.items())
+    about = f"{tables} · {variants} · {' and '.join(config.agents)} · {config.device}"
+    return "\n".join([about, *left_out])
+
+
+def spell(variant: "Variant") -> str:
+    return f"lag {variant.lag}, {variant.bps:g} bp"
+
+
+def print_study(result: "Result") -> None:
+    """A row for each table and pooled, for each agent; the variants; and the verdicts."""
+    from qfolio.portfolio.study.verdict import decimal, looks_sentence, percent
+
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("active growth a year, net")
+    for name in (
+        "years",
+        "growth",
+        "95 % interval",
+        "TE",
+        "IR",
+        "t",
+        "rebal.",
+        "t",
+        "ΔSharpe",
+        "t",
+    ):
+        table.add_column(name, justify="right", no_wrap=True)
+    main, *_ = result.variants
+    for agent, pools in main.agents.items():
+        for name, known in pools.evidence.items():
+            active, other = known.anchor, known.rebalanced
+            spread = "–" if active.tracking_error is None else f"{active.tracking_error:.1%}"
+            table.add_row(
+                f"{agent} on {name}", f"{known.years:.1f}", percent(active.growth),
+                f"{percent(active.low)} … {percent(active.high)}", spread,
+                decimal(active.information_ratio), decimal(active.t), percent(other.growth),
+                decimal(other.t), decimal(known.sharpe), decimal(known.sharpe_t),
+            )  # fmt: skip
+        for entry in result.variants:
+            pooled = entry.agents[agent].anchor
+            rest = entry.agents[agent].rebalanced
+            name = "pooled" if entry is main else f"pooled at {spell(entry.variant)}"
+            table.add_row(
+                f"{agent}, {name}", f"{sum(e.years for e in pools.evidence.values()):.1f}",
+                percent(pooled.growth), f"{percent(pooled.low)} … {percent(pooled.high)}", "", "",
+                f"z {decimal(pooled.z)}", percent(rest.growth), f"z {decimal(rest.z)}",
+                style="bold" if entry is main else None,
+            )  # fmt: skip
+    console.print(table)
+    for sentences in result.verdicts.values():
+        for sentence in sentences:
+            say(sentence)
+    say(looks_sentence(result))
 
 
 def print_allocation(allocation: "Allocation", standing: "Standing", trained: str) -> None:
