@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from qfolio.portfolio.backtest.standing import Standing
     from qfolio.portfolio.prices.findings import Finding
     from qfolio.portfolio.study.folder import Result, Variant
+    from qfolio.portfolio.study.pooling import Active, Pooled
     from qfolio.portfolio.study.run import Study
 
 console = Console(highlight=False)
@@ -222,50 +223,41 @@ def spell(variant: "Variant") -> str:
 
 
 def print_study(result: "Result") -> None:
-    """A row for each table and pooled, for each agent; the variants; and the verdicts."""
-    from qfolio.portfolio.study.verdict import decimal, looks_sentence, percent
+    """A row for each table and each variant pooled, by agent, and the verdicts."""
+    from qfolio.portfolio.study.verdict import decimal, looks_sentence
 
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column("active growth a year, net")
-    for name in (
-        "years",
-        "growth",
-        "95 % interval",
-        "TE",
-        "IR",
-        "t",
-        "rebal.",
-        "t",
-        "ΔSharpe",
-        "t",
-    ):
-        table.add_column(name, justify="right", no_wrap=True)
     main, *_ = result.variants
     for agent, pools in main.agents.items():
+        table = Table(box=None, header_style="bold", pad_edge=False)
+        table.add_column(agent, no_wrap=True)
+        for name in ("a year", "95 % interval", "IR", "t", "rebal.", "Sharpe"):
+            table.add_column(name, justify="right", no_wrap=True)
         for name, known in pools.evidence.items():
-            active, other = known.anchor, known.rebalanced
-            spread = "–" if active.tracking_error is None else f"{active.tracking_error:.1%}"
-            table.add_row(
-                f"{agent} on {name}", f"{known.years:.1f}", percent(active.growth),
-                f"{percent(active.low)} … {percent(active.high)}", spread,
-                decimal(active.information_ratio), decimal(active.t), percent(other.growth),
-                decimal(other.t), decimal(known.sharpe), decimal(known.sharpe_t),
-            )  # fmt: skip
+            active = known.anchor
+            ratios = (active.information_ratio, active.t, known.rebalanced.t, known.sharpe)
+            table.add_row(name, *_growth(active), *map(decimal, ratios))
         for entry in result.variants:
-            pooled = entry.agents[agent].anchor
-            rest = entry.agents[agent].rebalanced
-            name = "pooled" if entry is main else f"pooled at {spell(entry.variant)}"
-            table.add_row(
-                f"{agent}, {name}", f"{sum(e.years for e in pools.evidence.values()):.1f}",
-                percent(pooled.growth), f"{percent(pooled.low)} … {percent(pooled.high)}", "", "",
-                f"z {decimal(pooled.z)}", percent(rest.growth), f"z {decimal(rest.z)}",
-                style="bold" if entry is main else None,
-            )  # fmt: skip
-    console.print(table)
+            pooled, rest = entry.agents[agent].anchor, entry.agents[agent].rebalanced
+            name, style = f"pooled, {spell(entry.variant)}", "bold" if entry is main else None
+            cells = (*_growth(pooled), "", decimal(pooled.z), decimal(rest.z))
+            table.add_row(name, *cells, style=style)
+        console.print(table)
+    say(
+        "Growth is what exceeds equal weights, t against them (pooled: Stouffer's z), rebal. the t "
+        "(or z) against their best rebalancing, Sharpe the ratio less that of the best baseline."
+    )
     for sentences in result.verdicts.values():
         for sentence in sentences:
             say(sentence)
     say(looks_sentence(result))
+
+
+def _growth(entry: "Active | Pooled") -> tuple[str, str]:
+    """An active growth and its interval."""
+    growth, low, high = (
+        "–" if x is None else f"{x:+.1%}" for x in (entry.growth, entry.low, entry.high)
+    )
+    return growth, f"{low.removesuffix('%')} … {high}"
 
 
 def print_allocation(allocation: "Allocation", standing: "Standing", trained: str) -> None:

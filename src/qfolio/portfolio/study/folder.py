@@ -16,7 +16,7 @@ from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json, write_csv
 from qfolio.portfolio.backtest.folder import AgentName, BacktestFolder
-from qfolio.portfolio.study.pooling import Pools, Tested
+from qfolio.portfolio.study.pooling import Pools, TableReturns
 
 FILE = "study.json"
 
@@ -128,7 +128,7 @@ class StudyFolder:
         """The folder of a backtest."""
         return self.path / "tables" / table / variant.name
 
-    def read_tested(self, table: str, variant: Variant, agents: Iterable[str]) -> Tested:
+    def read_returns(self, table: str, variant: Variant, agents: Iterable[str]) -> TableReturns:
         """The returns of a finished backtest.
 
         Raises:
@@ -141,7 +141,7 @@ class StudyFolder:
             kinds = {name: entry["kind"] for name, entry in summary["strategies"].items()}
             anchor = summary["reference"]
             baselines = _of_kind("baseline", kinds, columns)
-            return Tested(
+            return TableReturns(
                 tuple(days),
                 float(summary["periods_per_year"]),
                 {agent: _traded(agent, columns) for agent in agents},

@@ -37,7 +37,7 @@ AGAINST: tuple[Against, ...] = ("anchor", "rebalanced")
 Finding = Literal["better", "worse", "none"]
 
 
-class Tested(NamedTuple):
+class TableReturns(NamedTuple):
     """Simple daily returns on one table over the days of its test, each of shape (days,).
 
     agents: by name, each traded as ``allocate`` trades it. rebalancings: the anchor first, then the
@@ -92,7 +92,7 @@ class Pooled(msgspec.Struct, frozen=True, kw_only=True):
     worst: str  # the table with the least active growth
 
 
-def evidence(tested: Tested, agent: str) -> Evidence:
+def evidence(tested: TableReturns, agent: str) -> Evidence:
     """Compare an agent with its references on one table.
 
     The estimator is that of a backtest (``estimates.py``). The best rebalancing and the best
@@ -121,7 +121,7 @@ def evidence(tested: Tested, agent: str) -> Evidence:
     )
 
 
-def active_returns(tested: Tested, agent: str, against: Against) -> Floats:
+def active_returns(tested: TableReturns, agent: str, against: Against) -> Floats:
     """Daily differences in log return, of shape (days,)."""
     anchor = next(iter(tested.rebalancings))
     name = anchor if against == "anchor" else _best_rebalancing(tested)
@@ -129,7 +129,9 @@ def active_returns(tested: Tested, agent: str, against: Against) -> Floats:
     return paired_difference(log_growth(ours), log_growth(theirs))
 
 
-def pool(tables: Mapping[str, Tested], agents: Sequence[str], seed: int = 0) -> "dict[str, Pools]":
+def pool(
+    tables: Mapping[str, TableReturns], agents: Sequence[str], seed: int = 0
+) -> "dict[str, Pools]":
     """Pool the evidence of tables on each agent, without Holm's correction.
 
     Args:
@@ -138,9 +140,12 @@ def pool(tables: Mapping[str, Tested], agents: Sequence[str], seed: int = 0) -> 
         seed: Seed of the bootstrap; all agents share the tables and days that are drawn.
     """
     keys = [(agent, against) for agent in agents for against in AGAINST]
+    # Any number will do for a total loss, which has neither an interval nor a z.
     active = {
-        name: np.stack([active_returns(tested, *key) for key in keys])
-        for name, tested in tables.items()
+        name: np.nan_to_num(
+            np.stack([active_returns(table, *key) for key in keys]), neginf=0.0, posinf=0.0
+        )
+        for name, table in tables.items()
     }
     annual = [tested.periods_per_year * active[name] for name, tested in tables.items()]
     drawn = hierarchical_bootstrap(annual, RESAMPLES, np.random.default_rng(seed))
@@ -295,7 +300,7 @@ def _resampled_means(
     return means
 
 
-def _active(tested: Tested, agent: str, name: str, shown: Estimate, z: float) -> Active:
+def _active(tested: TableReturns, agent: str, name: str, shown: Estimate, z: float) -> Active:
     daily = paired_difference(
         log_growth(tested.agents[agent]), log_growth(tested.rebalancings[name])
     )
@@ -313,7 +318,7 @@ def _active(tested: Tested, agent: str, name: str, shown: Estimate, z: float) ->
     )
 
 
-def _best_rebalancing(tested: Tested) -> str:
+def _best_rebalancing(tested: TableReturns) -> str:
     growth = {name: float(log_growth(x).mean()) for name, x in tested.rebalancings.items()}
     return max(growth, key=lambda name: growth[name])
 

@@ -38,7 +38,7 @@ from qfolio.portfolio.study.folder import (
     Variant,
     VariantResult,
 )
-from qfolio.portfolio.study.pooling import AGAINST, Finding, Pooled, Pools, pool
+from qfolio.portfolio.study.pooling import AGAINST, Finding, Pooled, Pools, TableReturns, pool
 from qfolio.portfolio.study.verdict import verdicts
 
 Listen = Callable[[Job, float, float], Sequence[Listener]]
@@ -214,22 +214,15 @@ class Study:
             raise QfolioError(
                 f"The study is not finished; continue with qfolio study --resume {self.folder}."
             )
-        found = []
-        for variant in config.variants:
-            read = self._files.read_tested
-            tables = {name: read(name, variant, config.agents) for name in config.tables}
-            found.append(VariantResult(variant=variant, agents=pool(tables, config.agents)))
-        main = corrected(found[0].agents)
-        found[0] = VariantResult(variant=found[0].variant, agents=main)
-        before = [table.trials + trials_on(table.source) for table in config.tables.values()]
-        trials = max(before) + len(config.variants) * len(config.agents)
-        result = Result(
-            variants=found,
-            looks=sum(len(look.agents) for look in config.looks),
-            earlier=sum(before),
-            trials=trials,
-            threshold=expected_maximum_sharpe(trials, 1.0),
-            verdicts=verdicts(main),
+        result = summarise(
+            config,
+            [
+                {
+                    name: self._files.read_returns(name, each, config.agents)
+                    for name in config.tables
+                }
+                for each in config.variants
+            ],
         )
         self.config = msgspec.structs.replace(config, result=result)
         self._files.write(self.config)
@@ -252,6 +245,30 @@ class Study:
 
 def _silent(job: Job, done: float, share: float) -> Sequence[Listener]:
     return ()
+
+
+def summarise(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]]) -> Result:
+    """Pool the evidence of a study.
+
+    Args:
+        config: With the looks that were taken.
+        tested: The returns on each table, by variant.
+    """
+    pooled = [pool(tables, config.agents) for tables in tested]
+    pooled[0] = corrected(pooled[0])
+    before = [table.trials + trials_on(table.source) for table in config.tables.values()]
+    trials = max(before) + len(config.variants) * len(config.agents)
+    return Result(
+        variants=[
+            VariantResult(variant=variant, agents=agents)
+            for variant, agents in zip(config.variants, pooled, strict=True)
+        ],
+        looks=sum(len(look.agents) for look in config.looks),
+        earlier=sum(before),
+        trials=trials,
+        threshold=expected_maximum_sharpe(trials, 1.0),
+        verdicts=verdicts(pooled[0]),
+    )
 
 
 def looks_of(folder: Path | str) -> list[Look]:
