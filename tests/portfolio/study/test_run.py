@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.statistics import holm
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.folds import require_fold
@@ -118,12 +119,27 @@ def test_looks_are_counted_and_inherited(finished, tmp_path):
     assert len(later.config.earlier) == 4  # each once
 
 
+def _untested(pools):
+    """As ``pool`` returns them."""
+    return msgspec.structs.replace(
+        pools,
+        **{
+            key: msgspec.structs.replace(getattr(pools, key), p_holm=None, finding=None)
+            for key in ("anchor", "rebalanced")
+        },
+    )
+
+
 def test_the_correction_counts_all_agents_and_references():
     _, result = study(3)
     agents = result.variants[0].agents
-    ps = [getattr(agents[name], key).p for name in agents for key in ("anchor", "rebalanced")]
-    found = corrected(agents)
-    assert min(found[name].anchor.p_holm for name in found) >= 4 * min(ps) - 1e-12
+    pooled = [each for name in agents for each in (agents[name].anchor, agents[name].rebalanced)]
+    found = corrected({name: _untested(pools) for name, pools in agents.items()})
+    after = [each for name in found for each in (found[name].anchor, found[name].rebalanced)]
+    assert after == pooled
+    assert [each.p_holm for each in after] == pytest.approx(
+        holm(np.array([each.p for each in after]))
+    )
     better = [pools.anchor.finding for pools in found.values()]
     assert set(better) <= {"better", "worse", "none"}
     worse = msgspec.structs.replace(

@@ -92,6 +92,14 @@ class Pooled(msgspec.Struct, frozen=True, kw_only=True):
     worst: str  # the table with the least active growth
 
 
+class Pools(msgspec.Struct, frozen=True, kw_only=True):
+    """What all tables say about one agent; evidence: of each table, by its name."""
+
+    evidence: dict[str, Evidence]
+    anchor: Pooled
+    rebalanced: Pooled
+
+
 def evidence(tested: TableReturns, agent: str) -> Evidence:
     """Compare an agent with its references on one table.
 
@@ -131,7 +139,7 @@ def active_returns(tested: TableReturns, agent: str, against: Against) -> Floats
 
 def pool(
     tables: Mapping[str, TableReturns], agents: Sequence[str], seed: int = 0
-) -> "dict[str, Pools]":
+) -> dict[str, Pools]:
     """Pool the evidence of tables on each agent, without Holm's correction.
 
     Args:
@@ -141,54 +149,53 @@ def pool(
     """
     keys = [(agent, against) for agent in agents for against in AGAINST]
     # Any number will do for a total loss, which has neither an interval nor a z.
-    active = {
-        name: np.nan_to_num(
-            np.stack([active_returns(table, *key) for key in keys]), neginf=0.0, posinf=0.0
-        )
-        for name, table in tables.items()
-    }
-    annual = [tested.periods_per_year * active[name] for name, tested in tables.items()]
+    active = [
+        np.nan_to_num([active_returns(table, *key) for key in keys], neginf=0.0, posinf=0.0)
+        for table in tables.values()
+    ]
+    years = [table.periods_per_year for table in tables.values()]
+    annual = [year * daily for year, daily in zip(years, active, strict=True)]
     drawn = hierarchical_bootstrap(annual, RESAMPLES, np.random.default_rng(seed))
-    known = {name: {a: evidence(tested, a) for a in agents} for name, tested in tables.items()}
-    weights = [math.sqrt(len(tested.days) / tested.periods_per_year) for tested in tables.values()]
-    pools = {}
-    for place, (agent, against) in enumerate(keys):
-        entries = {name: getattr(known[name][agent], against) for name in tables}
-        growth = {name: _known(entry.growth) for name, entry in entries.items()}
-        shared = correlations(
-            [tested.days for tested in tables.values()], [active[name][place] for name in tables]
+    known = {a: {name: evidence(table, a) for name, table in tables.items()} for a in agents}
+    days = [table.days for table in tables.values()]
+    pooled = {
+        (agent, against): _pooled(
+            {name: getattr(each, against) for name, each in known[agent].items()},
+            [math.sqrt(each.years) for each in known[agent].values()],
+            correlations(days, [daily[place] for daily in active]),
+            drawn[:, place],
+            both=against == "anchor",
         )
-        z = stouffer([_known(entry.z) for entry in entries.values()], weights, shared)
-        mean = float(np.mean(list(growth.values())))
-        low, high = (
-            percentile_interval(drawn[:, place]) if math.isfinite(mean) else (-np.inf, np.inf)
-        )
-        pools[agent, against] = Pooled(
-            growth=finite(mean),
-            low=finite(float(low)),
-            high=finite(float(high)),
-            z=finite(z),
-            p=finite(p_value(z, both=against == "anchor")),
-            positive=sum(value > 0 for value in growth.values()),
-            # A growth that is not finite is that of a total loss.
-            worst=min(growth, key=lambda name: (math.isfinite(growth[name]), growth[name])),
-        )
+        for place, (agent, against) in enumerate(keys)
+    }
     return {
         agent: Pools(
-            evidence={name: known[name][agent] for name in tables},
-            anchor=pools[agent, "anchor"],
-            rebalanced=pools[agent, "rebalanced"],
+            evidence=known[agent],
+            anchor=pooled[agent, "anchor"],
+            rebalanced=pooled[agent, "rebalanced"],
         )
         for agent in agents
     }
 
 
-class Pools(msgspec.Struct, frozen=True, kw_only=True):
-    """What all tables say about one agent; evidence: of each table, by its name."""
-
-    evidence: dict[str, Evidence]
-    anchor: Pooled
-    rebalanced: Pooled
+def _pooled(
+    tables: Mapping[str, Active], weights: list[float], shared: Floats, drawn: Floats, *, both: bool
+) -> Pooled:
+    """From differences by table, their weights and correlations, and resampled means."""
+    growth = {name: _known(each.growth) for name, each in tables.items()}
+    mean = float(np.mean(list(growth.values())))
+    low, high = percentile_interval(drawn) if math.isfinite(mean) else np.full(2, math.nan)
+    z = stouffer([_known(each.z) for each in tables.values()], weights, shared)
+    return Pooled(
+        growth=finite(mean),
+        low=finite(float(low)),
+        high=finite(float(high)),
+        z=finite(z),
+        p=finite(p_value(z, both=both)),
+        positive=sum(value > 0 for value in growth.values()),
+        # A growth that is not finite is that of a total loss.
+        worst=min(growth, key=lambda name: (math.isfinite(growth[name]), growth[name])),
+    )
 
 
 def z_of(difference: Estimate) -> float:
@@ -273,10 +280,10 @@ def hierarchical_bootstrap(
 
 
 def p_value(z: float, *, both: bool) -> float:
-    """The two-sided p-value of a z; if not ``both``, only a positive z counts."""
+    """The two-sided p-value of a z; if not ``both``, that of a negative z is 1."""
     from scipy.special import ndtr
 
-    return min(1.0, 2 * float(ndtr(-abs(z) if both else -z)))
+    return float(np.minimum(1.0, 2 * ndtr(-abs(z) if both else -z)))
 
 
 def finite(value: float) -> float | None:
@@ -304,6 +311,7 @@ def _active(tested: TableReturns, agent: str, name: str, shown: Estimate, z: flo
     daily = paired_difference(
         log_growth(tested.agents[agent]), log_growth(tested.rebalancings[name])
     )
+    daily = daily if shown.known else np.full(2, math.nan)  # a total loss has no spread
     spread = math.sqrt(tested.periods_per_year) * float(daily.std(ddof=1))
     low, high = shown.interval()
     return Active(

@@ -96,12 +96,12 @@ class Study:
         """
         variants = [Variant(int(lag), float(cost)) for lag, cost in itertools.product(lags, costs)]
         _require_different(tables, variants)
+        earlier = list(dict.fromkeys(look for folder in after for look in looks_of(folder)))
         left_out = _too_short(tables, train, test, max(lags, default=1))
         kept = {name: table for name, table in tables.items() if name not in left_out}
         if not kept:
             reasons = " ".join(f"{name} is too short: {why}" for name, why in left_out.items())
             raise QfolioError(reasons or "A study needs at least one table; name its file.")
-        earlier = list(dict.fromkeys(look for folder in after for look in looks_of(folder)))
         config = StudyConfig(
             tables={
                 name: _table_config(table, trials + _count(earlier, table.digest))
