@@ -50,6 +50,7 @@ def study(
     from qfolio.report.study import write_study_report
 
     if options.resume is None:
+        basis_points("--cost-bps", options.cost_bps)  # refuses a wrong one by its own name
         costs = _numbers("--costs-bps", costs_bps, options.cost_bps)
         run = Study.create(
             _tables(sets, options.load),

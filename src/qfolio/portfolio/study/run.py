@@ -202,7 +202,7 @@ class Study:
                     if report is not None:
                         report(backtest, entries, assessment, notes)
                 self._note(name, variant)
-            self.interrupted = stop.is_set()
+            self.interrupted = stop.is_set() and not self._complete
 
     def result(self) -> Result:
         """The pooled evidence; writes it into study.json and study.csv.
@@ -210,7 +210,7 @@ class Study:
         Raises QfolioError if a backtest is not finished.
         """
         config = self.config
-        if not all(self.finished(*place) for place in self.places):
+        if not self._complete:
             raise QfolioError(
                 f"The study is not finished; continue with qfolio study --resume {self.folder}."
             )
@@ -228,6 +228,10 @@ class Study:
         self._files.write(self.config)
         self._files.write_table(result)
         return result
+
+    @property
+    def _complete(self) -> bool:
+        return all(self.finished(*place) for place in self.places)
 
     def _note(self, table: str, variant: Variant) -> None:
         """Records a look, which marks the backtest as finished."""
