@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from qfolio.portfolio.prices.table import Prices
     from qfolio.portfolio.study.folder import Variant
 
-Sets = Annotated[tuple[str, ...], arg(metavar="[NAME=]FILE", help_behavior_hint="")]
-Numbers = Annotated[str | None, arg(metavar="N,N …", help_behavior_hint="")]
+Sets = Annotated[tuple[str, ...], arg(metavar="[NAME=]FILE …", help_behavior_hint="")]
+Numbers = Annotated[str | None, arg(metavar="N,N", help_behavior_hint="")]
 Folders = Annotated[tuple[Path, ...], arg(metavar="DIR …", help_behavior_hint="")]
 
 

@@ -13,6 +13,7 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.study.folder import Variant
 from qfolio.portfolio.study.run import Study, corrected
 
+from listeners import Interrupt
 from studies import study
 
 AGENTS = {
@@ -79,6 +80,16 @@ def test_a_study_killed_and_resumed_equals_an_undisturbed_one(finished, tmp_path
     assert trained == left  # finished tables are not run again
     assert again.result() == finished.config.result
     assert (tmp_path / "study/study.csv").read_text() == (finished.folder / "study.csv").read_text()
+
+
+def test_ctrl_c_stops_after_the_current_chunk(tmp_path):
+    made = create(tmp_path / "study")
+    made.run(lambda *place: lambda job, done, share: [Interrupt()])
+    assert made.interrupted
+    assert not made.config.looks
+    made.run()
+    assert not made.interrupted
+    assert len(made.config.looks) == 2
 
 
 def test_a_study_writes_typed_finite_numbers(finished):
@@ -172,6 +183,8 @@ def test_a_fold_may_end_on_a_holiday():
     ("options", "message"),
     [
         ({"tables": {}}, "needs at least one table"),
+        ({"costs": ()}, "needs at least one lag and one cost"),
+        ({"tables": {"../a": TABLES["one"]}}, "A table is called '../a'"),
         ({"tables": {"a": TABLES["one"], "b": TABLES["one"]}}, "a and b are the same table"),
         ({"lags": (1, 1)}, "lag of 1 with a cost of 10 bp is given twice"),
         ({"baselines": ["equl-weight"]}, "one: .*equl-weight"),

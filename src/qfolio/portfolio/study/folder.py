@@ -20,8 +20,10 @@ from qfolio.portfolio.study.pooling import Pools, TableReturns
 
 FILE = "study.json"
 
-# Names become folders.
-TableName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")]
+NAME = r"^[A-Za-z0-9_-]+$"
+"""The names of tables, which become folders."""
+
+TableName = Annotated[str, msgspec.Meta(pattern=NAME)]
 
 
 class Variant(msgspec.Struct, frozen=True):

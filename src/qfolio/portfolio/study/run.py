@@ -7,6 +7,7 @@ trained, so that nothing is chosen after a result is known.
 
 import contextlib
 import itertools
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.study.folder import (
+    NAME,
     Look,
     Result,
     StudyConfig,
@@ -95,13 +97,13 @@ class Study:
                 refuses its arguments.
         """
         variants = [Variant(int(lag), float(cost)) for lag, cost in itertools.product(lags, costs)]
-        _require_different(tables, variants)
+        _require_plan(tables, variants)
         earlier = list(dict.fromkeys(look for folder in after for look in looks_of(folder)))
         left_out = _too_short(tables, train, test, max(lags, default=1))
         kept = {name: table for name, table in tables.items() if name not in left_out}
         if not kept:
             reasons = " ".join(f"{name} is too short: {why}" for name, why in left_out.items())
-            raise QfolioError(reasons or "A study needs at least one table; name its file.")
+            raise QfolioError(reasons)
         config = StudyConfig(
             tables={
                 name: _table_config(table, trials + _count(earlier, table.digest))
@@ -320,10 +322,16 @@ def _count(looks: Sequence[Look], digest: str) -> int:
     return sum(len(look.agents) for look in looks if look.digest == digest)
 
 
-def _require_different(tables: Mapping[str, Prices], variants: Sequence[Variant]) -> None:
-    """Raises QfolioError if something is given twice, which would count twice."""
+def _require_plan(tables: Mapping[str, Prices], variants: Sequence[Variant]) -> None:
+    """Raises QfolioError if there is nothing to do, something counts twice, or a name is no
+    folder's."""
+    if not (tables and variants):
+        what = "table; name its file" if variants else "lag and one cost"
+        raise QfolioError(f"A study needs at least one {what}.")
     names: dict[str, str] = {}
     for name, table in tables.items():
+        if not re.fullmatch(NAME, name):
+            raise QfolioError(f"A table is called {name!r}; use letters, digits, - and _.")
         if (twin := names.setdefault(table.digest, name)) != name:
             raise QfolioError(f"{twin} and {name} are the same table; give it once.")
     for variant in variants:
