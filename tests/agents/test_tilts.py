@@ -1,5 +1,7 @@
 """Anchored tilts: they trade as defined, find what is there, and stay where nothing is."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +16,13 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
-SMALL = {"num_envs": 16, "rollout_length": 42, "head": 10, "learning_rate_steps": 40.0}
-TASK = {
+SMALL: dict[str, Any] = {
+    "num_envs": 16,
+    "rollout_length": 42,
+    "head": 10,
+    "learning_rate_steps": 40.0,
+}
+TASK: dict[str, Any] = {
     "window": 1,
     "horizon": 42,
     "signals": "momentum:21,volatility:21",
@@ -45,13 +52,14 @@ def view(held, features=((0.0,), (0.0,), (0.0,)), anchor=(0.25, 0.25, 0.5)):
     return View(channels[:, None], jnp.asarray(held, float), jnp.asarray(anchor, float))
 
 
-def test_target_is_the_anchor_times_exponential_scores():
+def test_target_is_the_anchor_plus_softmax_less_equal_weights():
     found = tilt([1.0]).target(view([0, 0, 0], [[np.log(2.0)], [0.0], [0.0]]))
-    np.testing.assert_allclose(found, [0, 0.4, 0.2, 0.4], atol=1e-6)
+    np.testing.assert_allclose(found, [0, 5 / 12, 2 / 12, 5 / 12], atol=1e-6)
 
 
 def test_interaction_multiplies_inputs_with_their_mean_over_the_assets():
-    policy = Tilt(jnp.zeros(2), jnp.array([[0.0, 1.0], [0.0, 0.0]]), *jnp.zeros(2), Simplex(3))
+    square, zero = jnp.array([[0.0, 1.0], [0.0, 0.0]]), jnp.array(0.0)
+    policy = Tilt(jnp.zeros(2), square, zero, zero, Simplex(3))
     features = jnp.array([[[0.0, 1.0, 0.5]], [[0.0, 0.0, 0.5]], [[0.0, -1.0, 0.5]]])
     np.testing.assert_allclose(policy.scores(features), [0.5, 0.0, -0.5], atol=1e-6)
 
@@ -67,16 +75,16 @@ def test_without_tilts_and_at_the_anchor_nothing_is_traded():
 
 def test_part_of_the_way_is_traded_beyond_the_band():
     policy = tilt([0.0], rate=0.0, band=np.log(0.2))  # half of it
-    seen = view([0.40, 0.10, 0.50])  # off by 0.15 and -0.15, beyond the band by 0.1 each
+    seen = view([0.40, 0.10, 0.50])  # off by 0.15 and -0.15, with a band of 0.2/3
     found = policy.traded(seen.holding, policy.target(seen), seen.anchor)
-    np.testing.assert_allclose(found, [0, 0.35, 0.15, 0.5], atol=1e-6)
+    np.testing.assert_allclose(found, [0, 0.4 - 0.25 / 6, 0.1 + 0.25 / 6, 0.5], atol=1e-6)
 
 
 def test_purchases_are_scaled_to_sales():
     policy = tilt([0.0], rate=20.0, band=np.log(0.2))
-    seen = view([0.35, 0.20, 0.45])  # off by 0.1, -0.05, -0.05: one asset beyond its band
+    seen = view([0.34, 0.20, 0.46])  # off by 0.09, -0.05, -0.04: one asset beyond its band
     found = policy.traded(seen.holding, policy.target(seen), seen.anchor)
-    np.testing.assert_allclose(found, [0, 0.35, 0.20, 0.45], atol=1e-6)
+    np.testing.assert_allclose(found, [0, 0.34, 0.20, 0.46], atol=1e-6)
 
 
 def test_cash_is_invested_at_once_in_proportion_to_the_target():
@@ -84,6 +92,11 @@ def test_cash_is_invested_at_once_in_proportion_to_the_target():
     seen = view([0.0, 0.0, 0.0])
     found = policy.traded(seen.holding, policy.target(seen), seen.anchor)
     np.testing.assert_allclose(found, [0, 0.25, 0.25, 0.5], atol=1e-6)
+
+
+def test_a_weight_of_zero_can_grow():
+    seen = view([0, 0, 0], [[3.0], [0.0], [0.0]], anchor=(1e-6, 0.5, 0.5 - 1e-6))
+    assert tilt([1.0]).target(seen)[1] > 0.3
 
 
 def test_target_keeps_the_cap():
@@ -147,6 +160,6 @@ def test_needs_an_anchor():
 @pytest.mark.parametrize(
     "settings", [{"head": 84}, {"members": 0}, {"threshold": -1.0}, {"members": 40}]
 )
-def test_settings_out_of_range(settings):
+def test_settings_out_of_range(settings: dict[str, Any]):
     with pytest.raises(QfolioError, match=next(iter(settings))):
         Tilts(**settings)

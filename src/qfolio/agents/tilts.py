@@ -37,19 +37,20 @@ class Tilt(eqx.Module):
 
     The scores of assets are s = x·(θ + Θc) with an asset's inputs x, the latest of its features but
     the first (its return), and their mean over the assets c, the state of the market: features that
-    rank assets have mean 0 and do not enter it. The target is the anchor times exp(s), rescaled to
-    the anchor's sum.
+    rank assets have mean 0 and do not enter it. The target is the anchor plus softmax(s) less equal
+    weights, so that a weight of 0 can grow; negative weights are set to 0, and the sum is kept
+    (Brandt, Santa-Clara & Valkanov 2009, eq. 3 and 16, with a softmax).
     """
 
     linear: Float[Array, " channel"]  # θ
     interaction: Float[Array, "channel channel"]  # Θ
     rate: Float[Array, ""]  # logit of the share of the way to the target that is traded
-    band: Float[Array, ""]  # log of the deviation that is not traded, relative to the anchor
+    band: Float[Array, ""]  # log of the deviation that is not traded, in equal weights
     actions: Simplex
 
     @staticmethod
     def start(channels: int, actions: Simplex) -> "Tilt":
-        """The anchor, 30 % of the way at each step, outside a band of 5 % of each weight."""
+        """The anchor, 30 % of the way at each step, outside a band of 5 % of an equal weight."""
         square = jnp.zeros((channels, channels))
         rate, band = jnp.array(math.log(0.3 / 0.7)), jnp.array(math.log(0.05))
         return Tilt(jnp.zeros(channels), square, rate, band, actions)
@@ -65,8 +66,9 @@ class Tilt(eqx.Module):
         """The tilted anchor, cash first, each asset's weight at most the cap."""
         assert view.anchor is not None
         total, open_to = view.anchor.sum(-1, keepdims=True), view.anchor > 0
-        scores = self.scores(view.features) + jnp.log(jnp.where(open_to, view.anchor, 1.0))
-        tilted = total * jax.nn.softmax(scores, where=open_to)
+        tilted = jax.nn.softmax(self.scores(view.features), where=open_to)
+        tilted = jnp.maximum(view.anchor + total * tilted - _equal(view.anchor), 0.0)
+        tilted = total * tilted / tilted.sum(-1, keepdims=True)
         target = jnp.concatenate([1 - total, tilted], -1)
         if self.actions.cap == 1:
             return target
@@ -84,7 +86,7 @@ class Tilt(eqx.Module):
         and sales pay for each other. Cash beyond the target's is invested at once.
         """
         gap = target[..., 1:] - held
-        band = jnp.exp(self.band) * anchor
+        band = jnp.exp(self.band) * _equal(anchor)
         bought, sold = jnp.maximum(gap - band, 0.0), jnp.maximum(-gap - band, 0.0)
         buying, selling = bought.sum(-1, keepdims=True), sold.sum(-1, keepdims=True)
         matched = jnp.where(buying < selling, buying, selling)
@@ -306,6 +308,13 @@ class Tilts(Agent):
         moves = (market, next_market, first, view.anchor, (target, anchor))
         _, (rewards, anchored) = lax.scan(jax.checkpoint(step), (start, start), moves)
         return rewards, anchored
+
+
+def _equal(anchor: Float[Array, "*batch asset"]) -> Float[Array, "*batch asset"]:
+    """The anchor's sum, in equal parts over the assets that can be traded."""
+    open_to = anchor > 0
+    share = anchor.sum(-1, keepdims=True) / open_to.sum(-1, keepdims=True)
+    return jnp.where(open_to, share, 0.0)
 
 
 def _ratio(part: Array | float, whole: Array) -> Array:

@@ -172,10 +172,12 @@ def _known(kind: registry.Kind, name: str) -> str:
 
 def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
     """The parts that a setting of the task names."""
-    from qfolio.portfolio.signals import names
+    from qfolio.portfolio.signals import COLUMN, names
 
     if setting == "signals":
         return [("signal", name) for name in names(value)]
+    if setting == "anchor" and value and not value.startswith(COLUMN):
+        return [("baseline", value)]
     return [("reward", value)] if setting == "reward" else []
 
 
