@@ -233,11 +233,11 @@ def print_study(result: "Result") -> None:
         for name in ("a year", "95 % interval", "IR", "t", "rebal.", "Sharpe"):
             table.add_column(name, justify="right", no_wrap=True)
         for name, known in pools.evidence.items():
-            active = known.anchor
-            ratios = (active.information_ratio, active.t, known.rebalanced.t, known.sharpe)
+            active = known.to_reference
+            ratios = (active.information_ratio, active.t, known.to_rebalanced.t, known.sharpe)
             table.add_row(name, *_growth(active), *map(decimal, ratios))
         for entry in result.variants:
-            pooled, rest = entry.agents[agent].anchor, entry.agents[agent].rebalanced
+            pooled, rest = entry.agents[agent].to_reference, entry.agents[agent].to_rebalanced
             name, style = f"pooled, {spell(entry.variant)}", "bold" if entry is main else None
             cells = (*_growth(pooled), "", decimal(pooled.z), decimal(rest.z))
             table.add_row(name, *cells, style=style)

@@ -98,7 +98,7 @@ def render_study(
             {
                 "name": name,
                 "verdicts": result.verdicts[name],
-                "anchor": next(iter(pools.evidence.values())).anchor.reference,
+                "to_reference": next(iter(pools.evidence.values())).to_reference.reference,
                 **_forest(pools, links),
                 "variants": _variants(result, name),
             }
@@ -129,8 +129,8 @@ def _facts(config: StudyConfig, result: Result) -> list[tuple[str, str, str]]:
 
 def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
     """The rows of the forest plot, the best first, the pooled row, and the axis."""
-    actives = {name: known.anchor for name, known in pools.evidence.items()}
-    pooled = pools.anchor
+    actives = {name: known.to_reference for name, known in pools.evidence.items()}
+    pooled = pools.to_reference
     points = [x for one in actives.values() if (x := one.growth) is not None]
     points += [x for x in (pooled.low, pooled.growth, pooled.high, 0.0) if x is not None]
     ends = [x for one in actives.values() for x in (one.low, one.high) if x is not None]
@@ -167,7 +167,7 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
         for name in order
         for one in [actives[name]]
     ]
-    rest = pools.rebalanced
+    rest = pools.to_rebalanced
     return {
         "rows": rows,
         "pooled": {
@@ -191,7 +191,7 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
 
 
 def _cells(known: Evidence) -> list[tuple[str, ...]]:
-    active, rest = known.anchor, known.rebalanced
+    active, rest = known.to_reference, known.to_rebalanced
     return [
         (percent(active.growth), _interval(active.low, active.high)),
         (decimal(active.information_ratio), f"TE {_spread(active)}"),
@@ -218,12 +218,12 @@ def _variants(result: Result, agent: str) -> dict[str, Any] | None:
 
 
 def _cell(pools: Pools, main: bool) -> dict[str, Any]:
-    pooled = pools.anchor
+    pooled = pools.to_reference
     return {
         "growth": percent(pooled.growth),
         "interval": _interval(pooled.low, pooled.high),
         "z": decimal(pooled.z),
-        "rest": decimal(pools.rebalanced.z),
+        "rest": decimal(pools.to_rebalanced.z),
         "shade": _shade(pooled.z),
         "main": main,
     }

@@ -56,7 +56,7 @@ def test_a_z_is_as_likely_as_its_t():
 
 
 def test_the_information_ratio_by_hand():
-    found = evidence(constant([0.002, -0.001]), "a").anchor
+    found = evidence(constant([0.002, -0.001]), "a").to_reference
     spread = math.sqrt(252) * 0.0015 * math.sqrt(40 / 39)
     assert found.growth == pytest.approx(252 * 0.0005)
     assert found.tracking_error == pytest.approx(spread)
@@ -75,10 +75,10 @@ def test_to_beat_the_best_rebalancing_is_to_beat_them_all():
         for name, theirs in tested.rebalancings.items()
     }
     found = evidence(tested, "tilts")
-    assert found.anchor.z == pytest.approx(each["equal-weight"])
-    assert found.rebalanced.z == pytest.approx(min(each.values()))
+    assert found.to_reference.z == pytest.approx(each["equal-weight"])
+    assert found.to_rebalanced.z == pytest.approx(min(each.values()))
     growth = {name: np.log1p(x).mean() for name, x in tested.rebalancings.items()}
-    assert found.rebalanced.reference == max(growth, key=lambda name: growth[name])
+    assert found.to_rebalanced.reference == max(growth, key=lambda name: growth[name])
 
 
 def test_correlations_come_from_common_days():
@@ -122,8 +122,8 @@ def test_intervals_cover_the_mean_of_all_tables(between):
 
 def test_tables_are_pooled():
     tables = {f"t{i}": constant([0.002 * (i + 1), 0.0], 40 + 10 * i) for i in range(3)}
-    pooled = pool(tables, ["a"])["a"].anchor
-    each = [evidence(tested, "a").anchor for tested in tables.values()]
+    pooled = pool(tables, ["a"])["a"].to_reference
+    each = [evidence(tested, "a").to_reference for tested in tables.values()]
     growths = [active.growth or math.nan for active in each]
     assert pooled.growth == pytest.approx(np.mean(growths))
     assert pooled.low is not None
@@ -137,7 +137,7 @@ def test_tables_are_pooled():
 def test_a_total_loss_is_the_worst_and_has_no_numbers():
     lost = constant([0.001])
     lost.agents["a"][7] = -1.0
-    pooled = pool({"good": constant([0.002, 0.0]), "lost": lost}, ["a"])["a"].anchor
+    pooled = pool({"good": constant([0.002, 0.0]), "lost": lost}, ["a"])["a"].to_reference
     assert pooled.worst == "lost"
     assert (pooled.growth, pooled.low, pooled.z, pooled.p) == (None, None, None, None)
     assert pooled.positive == 1

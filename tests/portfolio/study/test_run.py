@@ -100,8 +100,8 @@ def test_a_study_writes_typed_finite_numbers(finished):
     assert len(lines) == 1 + 2 * 2
     assert lines[0].startswith("table,lag,cost_bps,agent,")
     main = content["result"]["variants"][0]["agents"]["pathwise"]
-    assert main["anchor"]["p_holm"] is not None
-    assert content["result"]["variants"][1]["agents"]["pathwise"]["anchor"]["p_holm"] is None
+    assert main["to_reference"]["p_holm"] is not None
+    assert content["result"]["variants"][1]["agents"]["pathwise"]["to_reference"]["p_holm"] is None
     assert "4 of 4 backtests finished" in repr(finished)
 
 
@@ -112,7 +112,7 @@ def test_each_table_is_an_ordinary_backtest(finished):
     contrast = summary["strategies"]["pathwise-together"]["to_reference"]["growth"]
     assert finished.config.result is not None
     pools = finished.config.result.variants[1].agents["pathwise"]
-    active = pools.evidence["two"].anchor
+    active = pools.evidence["two"].to_reference
     assert active.growth == pytest.approx(contrast["value"])
     assert (active.low, active.high) == pytest.approx(tuple(contrast["interval"]))
     with pytest.raises(QfolioError, match="no table 'three'; choose from one, two"):
@@ -136,7 +136,7 @@ def _untested(pools):
         pools,
         **{
             key: msgspec.structs.replace(getattr(pools, key), p_holm=None, finding=None)
-            for key in ("anchor", "rebalanced")
+            for key in ("to_reference", "to_rebalanced")
         },
     )
 
@@ -144,19 +144,24 @@ def _untested(pools):
 def test_the_correction_counts_all_agents_and_references():
     _, result = study(3)
     agents = result.variants[0].agents
-    pooled = [each for name in agents for each in (agents[name].anchor, agents[name].rebalanced)]
+    pooled = [
+        each for name in agents for each in (agents[name].to_reference, agents[name].to_rebalanced)
+    ]
     found = corrected({name: _untested(pools) for name, pools in agents.items()})
-    after = [each for name in found for each in (found[name].anchor, found[name].rebalanced)]
+    after = [
+        each for name in found for each in (found[name].to_reference, found[name].to_rebalanced)
+    ]
     assert after == pooled
     assert [each.p_holm for each in after] == pytest.approx(
         holm(np.array([each.p for each in after]))
     )
-    better = [pools.anchor.finding for pools in found.values()]
+    better = [pools.to_reference.finding for pools in found.values()]
     assert set(better) <= {"better", "worse", "none"}
     worse = msgspec.structs.replace(
-        agents["tilts"], anchor=msgspec.structs.replace(agents["tilts"].anchor, z=-9.0, p=1e-9)
+        agents["tilts"],
+        to_reference=msgspec.structs.replace(agents["tilts"].to_reference, z=-9.0, p=1e-9),
     )
-    assert corrected({"tilts": worse})["tilts"].anchor.finding == "worse"
+    assert corrected({"tilts": worse})["tilts"].to_reference.finding == "worse"
 
 
 def test_short_tables_are_left_out_with_a_reason(tmp_path):

@@ -141,13 +141,13 @@ class StudyFolder:
         summary = read_json(files.path / "summary.json")
         try:
             kinds = {name: entry["kind"] for name, entry in summary["strategies"].items()}
-            anchor = summary["reference"]
+            reference = summary["reference"]
             baselines = _of_kind("baseline", kinds, columns)
             return TableReturns(
                 tuple(days),
                 float(summary["periods_per_year"]),
                 {agent: _traded(agent, columns) for agent in agents},
-                {anchor: columns[anchor], **_of_kind("rebalancing", kinds, columns)},
+                {reference: columns[reference], **_of_kind("rebalancing", kinds, columns)},
                 baselines,
             )
         except (AttributeError, KeyError, StopIteration, TypeError, ValueError):
@@ -173,7 +173,7 @@ def _rows(result: Result) -> Iterator[dict[str, Any]]:
                     "agent": agent,
                     **msgspec.to_builtins(known),
                 }
-                for against in ("anchor", "rebalanced"):
+                for against in ("to_reference", "to_rebalanced"):
                     row |= {f"{against}_{key}": x for key, x in row.pop(against).items()}
                 yield row
 

@@ -1,7 +1,7 @@
 """Evidence on one table, and the evidence of several tables pooled.
 
-``evidence`` compares an agent with its anchor, with the best rebalancing of the anchor and with the
-best baseline on one table; ``pool`` combines what several tables say about one agent.
+``evidence`` compares an agent on one table with the reference, with the reference at its best speed
+of rebalancing and with the best baseline; ``pool`` combines what several tables say about an agent.
 """
 
 import math
@@ -30,9 +30,9 @@ RESAMPLES = 2000
 
 _CHUNK = 2_000_000  # resampled days held at a time
 
-Against = Literal["anchor", "rebalanced"]
-AGAINST: tuple[Against, ...] = ("anchor", "rebalanced")
-"""What an agent is compared with: its anchor, and the best rebalancing of the anchor."""
+Against = Literal["to_reference", "to_rebalanced"]
+AGAINST: tuple[Against, ...] = ("to_reference", "to_rebalanced")
+"""What an agent is compared with: the reference, and its best rebalancing."""
 
 Finding = Literal["better", "worse", "none"]
 
@@ -40,8 +40,8 @@ Finding = Literal["better", "worse", "none"]
 class TableReturns(NamedTuple):
     """Simple daily returns on one table over the days of its test, each of shape (days,).
 
-    agents: by name, each traded as ``allocate`` trades it. rebalancings: the anchor first, then the
-    anchor at other speeds. baselines: all of them, the anchor included.
+    agents: by name, each traded as ``allocate`` trades it. rebalancings: the reference first, then
+    the reference at other speeds. baselines: all of them, the reference included.
     """
 
     days: Sequence[str]
@@ -71,8 +71,8 @@ class Evidence(msgspec.Struct, frozen=True, kw_only=True):
     last: str
     days: int
     years: float
-    anchor: Active
-    rebalanced: Active  # less the best rebalancing; z is of the claim that it beats them all
+    to_reference: Active
+    to_rebalanced: Active  # less the best rebalancing; z is of the claim that it beats them all
     baseline: str  # that with the highest Sharpe ratio over the same days
     sharpe: float | None  # annual Sharpe ratio less that of this baseline
     sharpe_t: float | None
@@ -96,8 +96,8 @@ class Pools(msgspec.Struct, frozen=True, kw_only=True):
     """What all tables say about one agent; evidence: of each table, by its name."""
 
     evidence: dict[str, Evidence]
-    anchor: Pooled
-    rebalanced: Pooled
+    to_reference: Pooled
+    to_rebalanced: Pooled
 
 
 def evidence(tested: TableReturns, agent: str) -> Evidence:
@@ -112,7 +112,7 @@ def evidence(tested: TableReturns, agent: str) -> Evidence:
         name: estimate(ours[None], theirs[None], year)["growth"]
         for name, theirs in tested.rebalancings.items()
     }
-    anchor, best = next(iter(to)), _best_rebalancing(tested)
+    reference, best = next(iter(to)), _best_rebalancing(tested)
     sharpes = {name: _sharpe(returns) for name, returns in tested.baselines.items()}
     baseline = max(sharpes, key=lambda name: sharpes[name])
     sharpe = estimate(ours[None], tested.baselines[baseline][None], year)["sharpe"]
@@ -121,8 +121,8 @@ def evidence(tested: TableReturns, agent: str) -> Evidence:
         last=tested.days[-1],
         days=len(tested.days),
         years=len(tested.days) / year,
-        anchor=_active(tested, agent, anchor, to[anchor], z_of(to[anchor])),
-        rebalanced=_active(tested, agent, best, to[best], min(map(z_of, to.values()))),
+        to_reference=_active(tested, agent, reference, to[reference], z_of(to[reference])),
+        to_rebalanced=_active(tested, agent, best, to[best], min(map(z_of, to.values()))),
         baseline=baseline,
         sharpe=finite(sharpe.value),
         sharpe_t=finite(_t(sharpe)),
@@ -131,8 +131,8 @@ def evidence(tested: TableReturns, agent: str) -> Evidence:
 
 def active_returns(tested: TableReturns, agent: str, against: Against) -> Floats:
     """Daily differences in log return, of shape (days,)."""
-    anchor = next(iter(tested.rebalancings))
-    name = anchor if against == "anchor" else _best_rebalancing(tested)
+    reference = next(iter(tested.rebalancings))
+    name = reference if against == "to_reference" else _best_rebalancing(tested)
     ours, theirs = tested.agents[agent], tested.rebalancings[name]
     return paired_difference(log_growth(ours), log_growth(theirs))
 
@@ -164,15 +164,15 @@ def pool(
             [math.sqrt(each.years) for each in known[agent].values()],
             correlations(days, [daily[place] for daily in active]),
             drawn[:, place],
-            both=against == "anchor",
+            both=against == "to_reference",
         )
         for place, (agent, against) in enumerate(keys)
     }
     return {
         agent: Pools(
             evidence=known[agent],
-            anchor=pooled[agent, "anchor"],
-            rebalanced=pooled[agent, "rebalanced"],
+            to_reference=pooled[agent, "to_reference"],
+            to_rebalanced=pooled[agent, "to_rebalanced"],
         )
         for agent in agents
     }

@@ -289,7 +289,7 @@ def corrected(agents: Mapping[str, Pools]) -> dict[str, Pools]:
     p_holm = holm([1.0 if each.p is None else each.p for each in pooled]).tolist()
     found = iter([_found(each, p) for each, p in zip(pooled, p_holm, strict=True)])
     return {
-        name: msgspec.structs.replace(pools, anchor=next(found), rebalanced=next(found))
+        name: msgspec.structs.replace(pools, to_reference=next(found), to_rebalanced=next(found))
         for name, pools in agents.items()
     }
 

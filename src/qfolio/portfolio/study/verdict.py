@@ -10,28 +10,34 @@ _SPACE = "\N{NARROW NO-BREAK SPACE}"
 
 
 def verdicts(agents: Mapping[str, Pools]) -> dict[str, list[str]]:
-    """The sentences on each agent of the main variant: against its anchor, its best rebalancing,
-    and where it did worst."""
-    return {name: [*_claims(name, pools), _tables(pools)] for name, pools in agents.items()}
+    """Three sentences on each agent: against the reference, its best rebalancing, and by table."""
+    return {
+        name: [
+            f"{_claim(name, pools)}: {_numbers(pools.to_reference)}.",
+            f"{_claim_at_best(name, pools)}: {_numbers(pools.to_rebalanced)}.",
+            _tables(pools),
+        ]
+        for name, pools in agents.items()
+    }
 
 
-def _claims(name: str, pools: Pools) -> list[str]:
-    anchor = next(iter(pools.evidence.values())).anchor.reference
-    said = [f"{_claim(name, anchor, pools.anchor, pools)}: {_numbers(pools.anchor)}."]
-    if pools.rebalanced.finding == "better":
-        claim = f"{name} beats {anchor}, however it is rebalanced, in growth after costs"
-    else:
-        claim = f"No evidence that {name} beats the best rebalancing of {anchor}"
-    return [*said, f"{claim}: {_numbers(pools.rebalanced)}."]
+def _claim(name: str, pools: Pools) -> str:
+    where = f"{_reference(pools)} in growth after costs over {counted(len(pools.evidence))}"
+    if pools.to_reference.finding == "better":
+        return f"{name} beats {where}"
+    if pools.to_reference.finding == "worse":
+        return f"{name} falls short of {where}"
+    return f"No evidence that {name} beats {where}"
 
 
-def _claim(name: str, anchor: str, pooled: Pooled, pools: Pools) -> str:
-    over = f"over {counted(len(pools.evidence))}"
-    if pooled.finding == "better":
-        return f"{name} beats {anchor} in growth after costs {over}"
-    if pooled.finding == "worse":
-        return f"{name} falls short of {anchor} in growth after costs {over}"
-    return f"No evidence that {name} beats {anchor} in growth after costs {over}"
+def _claim_at_best(name: str, pools: Pools) -> str:
+    if pools.to_rebalanced.finding == "better":
+        return f"{name} beats {_reference(pools)}, however it is rebalanced, in growth after costs"
+    return f"No evidence that {name} beats the best rebalancing of {_reference(pools)}"
+
+
+def _reference(pools: Pools) -> str:
+    return next(iter(pools.evidence.values())).to_reference.reference
 
 
 def _numbers(pooled: Pooled) -> str:
@@ -44,10 +50,10 @@ def _numbers(pooled: Pooled) -> str:
 
 
 def _tables(pools: Pools) -> str:
-    worst = pools.evidence[pools.anchor.worst].anchor
-    count, total = pools.anchor.positive, len(pools.evidence)
+    worst = pools.evidence[pools.to_reference.worst].to_reference
+    count, total = pools.to_reference.positive, len(pools.evidence)
     grew = f"It grew more than {worst.reference} on {count} of {counted(total)}"
-    return f"{grew}; its worst is {pools.anchor.worst}, {percent(worst.growth)} a year."
+    return f"{grew}; its worst is {pools.to_reference.worst}, {percent(worst.growth)} a year."
 
 
 def looks_sentence(result: Result) -> str:
