@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from qfolio.portfolio.backtest.run import Backtest as Backtest
     from qfolio.portfolio.policy import Policy as Policy
     from qfolio.portfolio.prices.table import load as load_prices  # noqa: F401
+    from qfolio.portfolio.study.run import Study as Study
     from qfolio.portfolio.task import Portfolio as Portfolio
     from qfolio.tasks.finite import FiniteMDP as FiniteMDP
     from qfolio.tasks.pendulum import Pendulum as Pendulum
@@ -57,6 +58,7 @@ _HOMES = {
     "QfolioError": "qfolio.core.errors:QfolioError",
     "Run": "qfolio.experiments.run:Run",
     "SAC": "qfolio.agents.sac:SAC",
+    "Study": "qfolio.portfolio.study.run:Study",
     "TD3": "qfolio.agents.td3:TD3",
     "load_prices": "qfolio.portfolio.prices.table:load",
     "preset": "qfolio.experiments.presets:preset",
