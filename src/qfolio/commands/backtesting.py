@@ -31,8 +31,8 @@ class Options:
     """How agents are trained and tested on a table.
 
     Args:
-        agents: Agents, separated by commas: dqn, pathwise, ppo, a2c, reinforce, sac, ddpg, td3, or
-            your own as module:Name.
+        agents: Agents, separated by commas: tilts, dqn, pathwise, ppo, a2c, reinforce, sac, ddpg,
+            td3, or your own as module:Name.
         preset: Preset of the agents.
         cost_bps: Cost of buying or selling, in basis points of the value traded.
         lag: Rows between the close that a decision sees and the close at which it trades.
@@ -43,7 +43,7 @@ class Options:
         cost_model: Cost of trading and holding: proportional, or your own as module:Name.
         signals: Signals that agents observe beside returns, separated by commas, each with the rows
             that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
-            own as module:Name (default: none).
+            own as module:Name (default: the preset's).
         baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight
             is always among them (default: all of qfolio's).
         seeds: Agents of each kind (default: the preset's number).
@@ -62,7 +62,7 @@ class Options:
         date: Column of dates (default: found by its name).
     """
 
-    agents: str = "dqn,pathwise"
+    agents: str = "tilts,dqn"
     preset: str = "fast"
     cost_bps: float = 10.0
     lag: int = 1
