@@ -71,12 +71,13 @@ def planted(rows=800, seed=2):
     return Prices(dates, tuple("ABCDEF"), np.exp(logs))
 
 
-def four_folds(prices):
+def four_folds(prices, **changed):
     """Four folds with two seeds, whose rules have coefficients 0.4 and 0.6."""
-    task = Portfolio.of(prices, signals=SIGNALS, window=2, horizon=20, cost=0.0005)
+    settings = {"signals": SIGNALS, "window": 2, "horizon": 20, "cost": 0.0005, **changed}
+    task = Portfolio.of(prices, **settings)
     folds = walk_forward(prices.dates, "200d", "150d", 1)
     where = lambda t: (t.center, t.scale)  # noqa: E731
-    plain = jnp.zeros(len(NAMES)), jnp.ones(len(NAMES))
+    plain = jnp.zeros_like(task.center), jnp.ones_like(task.scale)
     parts = (task.part(fold.train.start, fold.train.stop - 1) for fold in folds)
     return [
         Stretch(eqx.tree_at(where, part, plain), jnp.array([0.4, 0.6]), fold)

@@ -2,7 +2,7 @@
 
 >>> import qfolio
 >>> prices = qfolio.load_prices("prices.csv")
->>> agents = {"pathwise": qfolio.preset("fast", "portfolio", "pathwise")}
+>>> agents = {"tilts": qfolio.preset("fast", "portfolio", "tilts")}
 >>> backtest = qfolio.Backtest.create(prices, agents, out="runs/mine")
 >>> backtest.run()
 >>> backtest.policy().weights(prices)
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from qfolio.agents.reinforce import REINFORCE as REINFORCE
     from qfolio.agents.sac import SAC as SAC
     from qfolio.agents.td3 import TD3 as TD3
+    from qfolio.agents.tilts import Tilts as Tilts
     from qfolio.core.errors import QfolioError as QfolioError
     from qfolio.experiments.budget import Budget as Budget
     from qfolio.experiments.fit import Listener as Listener
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from qfolio.portfolio.backtest.run import Backtest as Backtest
     from qfolio.portfolio.policy import Policy as Policy
     from qfolio.portfolio.prices.table import load as load_prices  # noqa: F401
+    from qfolio.portfolio.study.run import Study as Study
     from qfolio.portfolio.task import Portfolio as Portfolio
     from qfolio.tasks.finite import FiniteMDP as FiniteMDP
     from qfolio.tasks.pendulum import Pendulum as Pendulum
@@ -57,7 +59,9 @@ _HOMES = {
     "QfolioError": "qfolio.core.errors:QfolioError",
     "Run": "qfolio.experiments.run:Run",
     "SAC": "qfolio.agents.sac:SAC",
+    "Study": "qfolio.portfolio.study.run:Study",
     "TD3": "qfolio.agents.td3:TD3",
+    "Tilts": "qfolio.agents.tilts:Tilts",
     "load_prices": "qfolio.portfolio.prices.table:load",
     "preset": "qfolio.experiments.presets:preset",
     "train": "qfolio.experiments.run:train",

@@ -24,12 +24,13 @@ def run() -> NoReturn:
     from qfolio.commands.comparison import compare
     from qfolio.commands.continual import continual
     from qfolio.commands.portfolio import allocate, backtest, prices
+    from qfolio.commands.study import study
     from qfolio.commands.training import evaluate, train, watch
     from qfolio.commands.tuning import tune
     from qfolio.core.errors import QfolioError
 
     commands: dict[str, Callable[..., Any]] = {
-        "backtest": backtest, "allocate": allocate, "prices": prices,
+        "backtest": backtest, "allocate": allocate, "prices": prices, "study": study,
         "train": train, "compare": compare, "evaluate": evaluate, "watch": watch, "tune": tune,
         "continual": continual,
     }  # fmt: skip

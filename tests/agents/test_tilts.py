@@ -1,11 +1,19 @@
 """Anchored tilts: they trade as defined, find what is there, and stay where nothing is."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.agents.tilts import Evidence, Tilt, Tilts
+from qfolio.agents.tilts import (
+    Evidence,
+    Tilt,
+    TiltPolicy,
+    Tilts,
+    Trading,
+)
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
 from qfolio.core.mdp import Simplex
@@ -14,8 +22,13 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
-SMALL = {"num_envs": 16, "rollout_length": 42, "head": 10, "learning_rate_steps": 40.0}
-TASK = {
+SMALL: dict[str, Any] = {
+    "num_envs": 16,
+    "rollout_length": 42,
+    "head": 10,
+    "learning_rate_steps": 40.0,
+}
+TASK: dict[str, Any] = {
     "window": 1,
     "horizon": 42,
     "signals": "momentum:21,volatility:21",
@@ -28,15 +41,12 @@ def prices(values):
     return Prices(dates, tuple(f"a{i}" for i in range(values.shape[1])), values)
 
 
-def tilt(linear, rate=0.0, band=-20.0, cap=1.0):
+def tilt(linear, interaction=None, rate=0.0, band=-20.0, cap=1.0, network=None):
     count = len(linear)
-    return Tilt(
-        jnp.asarray(linear, float),
-        jnp.zeros((count, count)),
-        jnp.asarray(rate, float),
-        jnp.asarray(band, float),
-        Simplex(3, cap),
-    )
+    square = np.zeros((count, count)) if interaction is None else interaction
+    trading = Trading(jnp.asarray(rate, float), jnp.asarray(band, float))
+    one = Tilt(jnp.asarray(linear, float), jnp.asarray(square, float), network, trading)
+    return TiltPolicy(jax.tree.map(lambda x: x[None], one), jnp.array(1.0), Simplex(3, cap))
 
 
 def view(held, features=((0.0,), (0.0,), (0.0,)), anchor=(0.25, 0.25, 0.5)):
@@ -45,45 +55,48 @@ def view(held, features=((0.0,), (0.0,), (0.0,)), anchor=(0.25, 0.25, 0.5)):
     return View(channels[:, None], jnp.asarray(held, float), jnp.asarray(anchor, float))
 
 
-def test_target_is_the_anchor_times_exponential_scores():
+def test_target_is_the_anchor_plus_softmax_less_equal_weights():
     found = tilt([1.0]).target(view([0, 0, 0], [[np.log(2.0)], [0.0], [0.0]]))
-    np.testing.assert_allclose(found, [0, 0.4, 0.2, 0.4], atol=1e-6)
+    np.testing.assert_allclose(found, [0, 5 / 12, 2 / 12, 5 / 12], atol=1e-6)
 
 
 def test_interaction_multiplies_inputs_with_their_mean_over_the_assets():
-    policy = Tilt(jnp.zeros(2), jnp.array([[0.0, 1.0], [0.0, 0.0]]), *jnp.zeros(2), Simplex(3))
+    one = jax.tree.map(lambda x: x[0], tilt([0.0, 0.0], [[0.0, 1.0], [0.0, 0.0]]).members)
     features = jnp.array([[[0.0, 1.0, 0.5]], [[0.0, 0.0, 0.5]], [[0.0, -1.0, 0.5]]])
-    np.testing.assert_allclose(policy.scores(features), [0.5, 0.0, -0.5], atol=1e-6)
+    np.testing.assert_allclose(one.scores(features), [0.5, 0.0, -0.5], atol=1e-6)
 
 
 def test_without_tilts_and_at_the_anchor_nothing_is_traded():
     policy = tilt([0.0], band=np.log(0.1))
     seen = view([0.26, 0.24, 0.5])
     held = np.array([0, 0.26, 0.24, 0.5], np.float32)
-    np.testing.assert_array_equal(
-        policy.traded(seen.holding, policy.target(seen), seen.anchor), held
-    )
+    np.testing.assert_array_equal(policy(seen), held)
 
 
 def test_part_of_the_way_is_traded_beyond_the_band():
     policy = tilt([0.0], rate=0.0, band=np.log(0.2))  # half of it
-    seen = view([0.40, 0.10, 0.50])  # off by 0.15 and -0.15, beyond the band by 0.1 each
-    found = policy.traded(seen.holding, policy.target(seen), seen.anchor)
-    np.testing.assert_allclose(found, [0, 0.35, 0.15, 0.5], atol=1e-6)
+    seen = view([0.40, 0.10, 0.50])  # off by 0.15 and -0.15, with a band of 0.2/3
+    found = policy(seen)
+    np.testing.assert_allclose(found, [0, 0.4 - 0.25 / 6, 0.1 + 0.25 / 6, 0.5], atol=1e-6)
 
 
 def test_purchases_are_scaled_to_sales():
     policy = tilt([0.0], rate=20.0, band=np.log(0.2))
-    seen = view([0.35, 0.20, 0.45])  # off by 0.1, -0.05, -0.05: one asset beyond its band
-    found = policy.traded(seen.holding, policy.target(seen), seen.anchor)
-    np.testing.assert_allclose(found, [0, 0.35, 0.20, 0.45], atol=1e-6)
+    seen = view([0.34, 0.20, 0.46])  # off by 0.09, -0.05, -0.04: one asset beyond its band
+    found = policy(seen)
+    np.testing.assert_allclose(found, [0, 0.34, 0.20, 0.46], atol=1e-6)
 
 
 def test_cash_is_invested_at_once_in_proportion_to_the_target():
     policy = tilt([0.0], rate=-20.0)
     seen = view([0.0, 0.0, 0.0])
-    found = policy.traded(seen.holding, policy.target(seen), seen.anchor)
+    found = policy(seen)
     np.testing.assert_allclose(found, [0, 0.25, 0.25, 0.5], atol=1e-6)
+
+
+def test_a_weight_of_zero_can_grow():
+    seen = view([0, 0, 0], [[3.0], [0.0], [0.0]], anchor=(1e-6, 0.5, 0.5 - 1e-6))
+    assert tilt([1.0]).target(seen)[1] > 0.3
 
 
 def test_target_keeps_the_cap():
@@ -124,8 +137,8 @@ def walk(rows, assets, seed, drift=0.0):
 
 
 def test_stays_at_the_anchor_where_prices_hold_nothing():
-    shares = [trained(walk(1500, 8, seed)).state.agent.policy.linear for seed in range(3)]
-    assert sum(bool(abs(x).max() == 0) for x in shares) >= 2
+    shares = [float(trained(walk(1500, 8, seed)).state.agent.policy.share[0]) for seed in range(3)]
+    assert shares.count(0.0) >= 2
 
 
 def test_finds_momentum():
@@ -133,7 +146,7 @@ def test_finds_momentum():
     drift = np.repeat(rng.normal(0, 0.004, (15, 8)), 100, axis=0)
     state = jax.tree.map(lambda x: x[0], trained(walk(1500, 8, 2, drift)).state.agent)
     assert state.evidence.t > 4
-    assert state.policy.linear[0] > 0.1
+    assert state.policy.members.linear[:, 0].min() > 0.1
 
 
 def test_needs_an_anchor():
@@ -147,6 +160,6 @@ def test_needs_an_anchor():
 @pytest.mark.parametrize(
     "settings", [{"head": 84}, {"members": 0}, {"threshold": -1.0}, {"members": 40}]
 )
-def test_settings_out_of_range(settings):
+def test_settings_out_of_range(settings: dict[str, Any]):
     with pytest.raises(QfolioError, match=next(iter(settings))):
         Tilts(**settings)

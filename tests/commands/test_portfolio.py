@@ -10,20 +10,10 @@ from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.folder import BacktestFolder
 
 from shell import qfolio
+from tables import write_table
 
 TINY = ["--set", "window=10", "horizon=20", "hidden=8,8", "num_envs=4", "rollout_length=10"]
 AS_OF = ["--as-of", "2020-09-16"]
-
-
-def write_table(path, rows=260, names=("A", "B", "C"), scale=1.0):
-    rng = np.random.default_rng(0)
-    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0)) * scale
-    dates = np.datetime64("2020-01-01") + np.arange(rows)
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["date", *names])
-        writer.writerows([day, *row] for day, row in zip(dates, values.tolist(), strict=True))
-    return path
 
 
 @pytest.fixture(scope="module")

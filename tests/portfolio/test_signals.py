@@ -167,3 +167,12 @@ def test_a_portfolio_observes_them():
         on_table(task, table(8))
     with pytest.raises(QfolioError, match="signal_scale is 'log'"):
         Portfolio.of(table(), window=2, horizon=10, signals=text, signal_scale="log")
+
+
+def test_a_column_of_the_table_is_ranked_like_a_signal():
+    values = prices()[:, :3]
+    column = np.random.default_rng(0).normal(size=values.shape)
+    found = signals.compute(signals.parse("feature:value"), values, columns={"value": column})
+    np.testing.assert_array_equal(found[..., 0], column.argsort(1).argsort(1) - 1.0)
+    with pytest.raises(QfolioError, match="feature:value names no column"):
+        signals.compute(signals.parse("feature:value"), values)

@@ -186,7 +186,7 @@ def test_limits():
     values[:30, 1] = np.nan
     task = portfolio(Prices(table().dates, ("a", "b", "c"), values), max_weight=0.4)
     np.testing.assert_allclose(task.limits, [0.4, 0, 0.4])
-    target = task.target(jnp.array([1.0, 0, 0, 0]), jnp.array([0.1, 0.5, 0.3, 0.1]))
+    target = task.target(jnp.array(0), jnp.array([1.0, 0, 0, 0]), jnp.array([0.1, 0.5, 0.3, 0.1]))
     np.testing.assert_allclose(target, [0.5, 0.4, 0, 0.1], atol=1e-6)
     assert task.part(30, 59).limits.min() == pytest.approx(0.4)
 

@@ -135,7 +135,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         if self._steps >= self.task.horizon:
             raise QfolioError("The episode is over; call reset() first.")
         row, lag = self._row, self.task.lag
-        self._target = _programs().target(self.task, self._held, self._checked(action))
+        self._target = _programs().target(self.task, row, self._held, self._checked(action))
         values = self.prices.values[row : row + lag + 2]
         costs = self.task.costs
         traded = simulate(
@@ -213,10 +213,10 @@ class _Programs:
         devices.configure()
 
         @jax.jit
-        def target(task: Any, held: Any, action: Any) -> Any:
+        def target(task: Any, row: Any, held: Any, action: Any) -> Any:
             if not task.menu:
                 action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
-            return task.intent(Position(task.first_decision, task.hold(held)), action)
+            return task.intent(Position(row, task.hold(held)), action)
 
         self._target = target
 
@@ -231,9 +231,9 @@ class _Programs:
         where = lambda task: (task.center, task.scale)  # noqa: E731
         self.scaled = lambda task, by: eqx.tree_at(where, task, where(by))
 
-    def target(self, task: Any, held: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def target(self, task: Any, row: int, held: np.ndarray, action: np.ndarray) -> np.ndarray:
         with self._double():
-            weights = np.asarray(self._target(task, held, action), float)
+            weights = np.asarray(self._target(task, np.int32(row), held, action), float)
         return np.asarray(weights / weights.sum())
 
     def memory(self, task: Any) -> Any:

@@ -27,52 +27,24 @@ from qfolio.core.market import View
 from qfolio.core.mdp import Agent, ExogenousTask, Metrics, Position, Simplex, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.scores import NETWORKS, Attention, Hidden
 
 LARGEST = 3.0
 """Inputs are clipped to ± this many standard deviations of the training data."""
 
 
-class Tilt(eqx.Module):
-    """Maps a view of the market to target weights, cash first.
+class Trading(eqx.Module):
+    """How to trade towards a target."""
 
-    The scores of assets are s = x·(θ + Θc) with an asset's inputs x, the latest of its features but
-    the first (its return), and their mean over the assets c, the state of the market: features that
-    rank assets have mean 0 and do not enter it. The target is the anchor times exp(s), rescaled to
-    the anchor's sum.
-    """
-
-    linear: Float[Array, " channel"]  # θ
-    interaction: Float[Array, "channel channel"]  # Θ
-    rate: Float[Array, ""]  # logit of the share of the way to the target that is traded
-    band: Float[Array, ""]  # log of the deviation that is not traded, relative to the anchor
-    actions: Simplex
+    rate: Float[Array, ""]  # logit of the share of the way that is traded at a step
+    band: Float[Array, ""]  # log of the deviation that is not traded, in equal weights
 
     @staticmethod
-    def start(channels: int, actions: Simplex) -> "Tilt":
-        """The anchor, 30 % of the way at each step, outside a band of 5 % of each weight."""
-        square = jnp.zeros((channels, channels))
-        rate, band = jnp.array(math.log(0.3 / 0.7)), jnp.array(math.log(0.05))
-        return Tilt(jnp.zeros(channels), square, rate, band, actions)
+    def start() -> "Trading":
+        """30 % of the way at each step, outside a band of 5 % of an equal weight."""
+        return Trading(jnp.array(math.log(0.3 / 0.7)), jnp.array(math.log(0.05)))
 
-    def scores(
-        self, features: Float[Array, "*batch asset time channel"]
-    ) -> Float[Array, "*batch asset"]:
-        inputs = jnp.clip(features[..., -1, 1:], -LARGEST, LARGEST)
-        weights = self.linear + inputs.mean(-2) @ self.interaction.T
-        return jnp.einsum("...ac,...c->...a", inputs, weights)
-
-    def target(self, view: View) -> Float[Array, "*batch entry"]:
-        """The tilted anchor, cash first, each asset's weight at most the cap."""
-        assert view.anchor is not None
-        total, open_to = view.anchor.sum(-1, keepdims=True), view.anchor > 0
-        scores = self.scores(view.features) + jnp.log(jnp.where(open_to, view.anchor, 1.0))
-        tilted = total * jax.nn.softmax(scores, where=open_to)
-        target = jnp.concatenate([1 - total, tilted], -1)
-        if self.actions.cap == 1:
-            return target
-        return simplex.project(target, jnp.asarray(self.actions.caps))
-
-    def traded(
+    def __call__(
         self,
         held: Float[Array, "*batch asset"],
         target: Float[Array, "*batch entry"],
@@ -84,17 +56,82 @@ class Tilt(eqx.Module):
         and sales pay for each other. Cash beyond the target's is invested at once.
         """
         gap = target[..., 1:] - held
-        band = jnp.exp(self.band) * anchor
+        band = jnp.exp(self.band) * _equal(anchor)
         bought, sold = jnp.maximum(gap - band, 0.0), jnp.maximum(-gap - band, 0.0)
         buying, selling = bought.sum(-1, keepdims=True), sold.sum(-1, keepdims=True)
         matched = jnp.where(buying < selling, buying, selling)
         trade = bought * _ratio(matched, buying) - sold * _ratio(matched, selling)
         idle = 1 - held.sum(-1, keepdims=True) - target[..., :1]
-        assets = target[..., 1:]
-        source = jnp.where(idle > 0, assets, held)
+        source = jnp.where(idle > 0, target[..., 1:], held)
         invested = idle * source * _ratio(1.0, source.sum(-1, keepdims=True))
         assets = held + jax.nn.sigmoid(self.rate) * trade + invested
         return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
+
+
+class Tilt(eqx.Module):
+    """What a member learns: scores of assets, and how to trade.
+
+    The scores are s = x·(θ + Θc) with an asset's inputs x, the latest of its features but the first
+    (its return), and their mean over the assets c, the state of the market: features that rank
+    assets have mean 0 and do not enter it.
+    """
+
+    linear: Float[Array, " channel"]  # θ
+    interaction: Float[Array, "channel channel"]  # Θ
+    network: Hidden | Attention | None  # added to the linear scores
+    trading: Trading
+
+    def scores(
+        self, features: Float[Array, "*batch asset time channel"]
+    ) -> Float[Array, "*batch asset"]:
+        inputs = jnp.clip(features[..., -1, 1:], -LARGEST, LARGEST)
+        weights = self.linear + inputs.mean(-2) @ self.interaction.T
+        found = jnp.einsum("...ac,...c->...a", inputs, weights)
+        return found if self.network is None else found + self.network(inputs)
+
+    @property
+    def squares(self) -> Float[Array, ""]:
+        """The sum of squared coefficients."""
+        leaves = jax.tree.leaves((self.linear, self.interaction, self.network))
+        return sum((jnp.sum(leaf**2) for leaf in leaves), jnp.array(0.0))
+
+
+class TiltPolicy(eqx.Module):
+    """Maps a view of the market to an order, by the mean scores of the members."""
+
+    members: Tilt  # with a leading member axis
+    share: Float[Array, ""]  # of the scores that the evidence leaves
+    actions: Simplex
+
+    def __call__(self, view: View) -> Float[Array, "*batch entry"]:
+        assert view.anchor is not None
+        target = self.target(view)
+        return self.trading(view.holding, target, view.anchor)
+
+    def target(self, view: View) -> Float[Array, "*batch entry"]:
+        assert view.anchor is not None
+        scores = jax.vmap(lambda member: member.scores(view.features))(self.members).mean(0)
+        return tilted(view.anchor, self.share * scores, self.actions)
+
+    @property
+    def trading(self) -> Trading:
+        return jax.tree.map(lambda x: x.mean(0), self.members.trading)
+
+
+def tilted(
+    anchor: Float[Array, "*batch asset"], scores: Float[Array, "*batch asset"], actions: Simplex
+) -> Float[Array, "*batch entry"]:
+    """The anchor plus softmax(scores) less equal weights, cash first.
+
+    A weight of 0 can grow; negative weights are set to 0, and the sum is kept (Brandt, Santa-Clara
+    & Valkanov 2009, section 1.3). Weights that are exactly 0 in the anchor cannot be traded.
+    """
+    total = anchor.sum(-1, keepdims=True)
+    wanted = anchor + total * jax.nn.softmax(scores, where=anchor > 0) - _equal(anchor)
+    wanted = jnp.maximum(wanted, 0.0)
+    wanted = total * wanted / wanted.sum(-1, keepdims=True)
+    target = jnp.concatenate([1 - total, wanted], -1)
+    return target if actions.cap == 1 else simplex.project(target, jnp.asarray(actions.caps))
 
 
 class Evidence(NamedTuple):
@@ -137,8 +174,7 @@ class Evidence(NamedTuple):
 class TiltsState(eqx.Module):
     """The state of a Tilts agent."""
 
-    members: Tilt  # with a leading member axis
-    policy: Tilt  # their mean, shrunk to the anchor by the evidence
+    policy: TiltPolicy
     optimizer: optimizer.Optimizer
     evidence: Evidence
 
@@ -146,6 +182,8 @@ class TiltsState(eqx.Module):
 class Tilts(Agent):
     """Gradient ascent on net utility, with a penalty on tracking error and on tilts."""
 
+    network: str = static("linear")  # or hidden or attention, which are added to linear scores
+    units: int = static(8)  # of such a network
     members: int = static(4)  # each learns without every so-many-th block of the data
     blocks: int = static(32)  # of the data, of equal length
     num_envs: int = static(32)  # paths in a batch
@@ -161,7 +199,9 @@ class Tilts(Agent):
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 
     def __check_init__(self) -> None:
-        require(self, "members blocks num_envs", lambda x: 1 <= x < 2**31, "at least 1")
+        kinds = ", ".join(("linear", *NETWORKS))
+        require(self, "network", lambda x: x in ("linear", *NETWORKS), f"one of {kinds}")
+        require(self, "members blocks num_envs units", lambda x: 1 <= x < 2**31, "at least 1")
         require(self, "rollout_length", lambda x: x >= 2, "at least 2")
         require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
@@ -199,22 +239,31 @@ class Tilts(Agent):
             )
         if not isinstance(task.actions, Simplex):
             raise QfolioError("tilts gives weights; leave menu empty.")
-        one = Tilt.start(view.features.shape[-1] - 1, task.actions)
-        members = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.members, *x.shape)), one)
-        return TiltsState(members, one, optimizer.begin(members), Evidence.none(self.blocks))
+        channels, actions = view.features.shape[-1] - 1, task.actions
+
+        def member(key: PRNGKeyArray) -> Tilt:
+            kind = NETWORKS.get(self.network)
+            network = None if kind is None else kind(channels, self.units, key)
+            square = jnp.zeros((channels, channels))
+            return Tilt(jnp.zeros(channels), square, network, Trading.start())
+
+        members = jax.vmap(member)(jax.random.split(key, self.members))
+        policy = TiltPolicy(members, jnp.array(0.0), actions)
+        return TiltsState(policy, optimizer.begin(members), Evidence.none(self.blocks))
 
     def warm_up(self) -> int:
         return 0
 
     def monitor(self, state: TiltsState) -> Metrics:
+        trading = state.policy.trading
         return {
             "evidence": state.evidence.t,
-            "share": self._share(state.evidence),
-            "rate": jax.nn.sigmoid(state.policy.rate),
-            "band": jnp.exp(state.policy.band),
+            "share": state.policy.share,
+            "rate": jax.nn.sigmoid(trading.rate),
+            "band": jnp.exp(trading.band),
         }
 
-    def weights(self, state: TiltsState) -> Tilt:
+    def weights(self, state: TiltsState) -> TiltPolicy:
         return state.policy
 
     def _share(self, evidence: Evidence) -> Float[Array, ""]:
@@ -222,15 +271,13 @@ class Tilts(Agent):
         t = jnp.maximum(evidence.t, 1e-9)
         return jnp.maximum(1 - (self.threshold / t) ** 2, 0.0)
 
-    def policy(self, weights: Tilt, observation: View) -> Float[Array, "batch entry"]:
-        assert observation.anchor is not None
-        target = weights.target(observation)
-        return weights.traded(observation.holding, target, observation.anchor)
+    def policy(self, weights: TiltPolicy, observation: View) -> Float[Array, "batch entry"]:
+        return weights(observation)
 
     def act(
         self, state: TiltsState, observation: View, key: PRNGKeyArray
     ) -> Float[Array, "batch entry"]:
-        return self.policy(state.policy, observation)
+        return state.policy(observation)
 
     def observe(self, state: TiltsState, rollout: Transition) -> TiltsState:
         return state
@@ -244,28 +291,25 @@ class Tilts(Agent):
         left_out = block % self.members == jnp.arange(self.members)[:, None, None]
 
         def loss(members: Tilt) -> tuple[Array, tuple[Array, Array]]:
-            rewards, anchored = jax.vmap(lambda policy: self._paths(policy, task, rollout))(members)
+            rewards, anchored = jax.vmap(lambda one: self._paths(one, task, rollout))(members)
             active = rewards - anchored
             seen = counted & ~left_out
             steps = jnp.maximum(seen.sum((1, 2)), 1)
             mean = lambda x: (seen * x).sum((1, 2)) / steps  # noqa: E731
             variance = mean(active**2) - mean(active) ** 2
-            squares = (members.linear**2).sum(1) + (members.interaction**2).sum((1, 2))
+            squares = jax.vmap(lambda one: one.squares)(members)
             utility = mean(rewards) - self.tracking_aversion / 2 * variance
             return (self.ridge / task.moves * squares - utility).sum(), (utility.mean(), active)
 
-        gradient, (utility, active) = jax.grad(loss, has_aux=True)(state.members)
+        gradient, (utility, active) = jax.grad(loss, has_aux=True)(state.policy.members)
         rate = self._schedule(state.optimizer.count + 1)
-        members, adam = optimizer.descend(state.members, gradient, state.optimizer, rate)
+        members, adam = optimizer.descend(state.policy.members, gradient, state.optimizer, rate)
         unseen = counted & left_out
         evidence = state.evidence.add(
             block, (unseen * active).sum(0), 1.0 * unseen.any(0), self.memory
         )
-        mean = jax.tree.map(lambda x: x.mean(0), members)
-        tilts = lambda p: (p.linear, p.interaction)  # noqa: E731
-        share = self._share(evidence)
-        policy = eqx.tree_at(tilts, mean, replace_fn=lambda x: share * x)
-        return TiltsState(members, policy, adam, evidence), {"loss": -utility}
+        policy = TiltPolicy(members, self._share(evidence), state.policy.actions)
+        return TiltsState(policy, adam, evidence), {"loss": -utility}
 
     def _blocks(self, task: ExogenousTask, rollout: Transition) -> Int[Array, "time path"]:
         """The block of each step; where moves are drawn anew, each path is of one block."""
@@ -276,27 +320,28 @@ class Tilts(Agent):
         return jnp.where(jnp.isfinite(task.moves), found, own)
 
     def _paths(
-        self, policy: Tilt, task: ExogenousTask, rollout: Transition
+        self, member: Tilt, task: ExogenousTask, rollout: Transition
     ) -> tuple[Float[Array, "time path"], Float[Array, "time path"]]:
-        """Rewards of the policy along the rollout's market, and of the anchor.
+        """Rewards of a member along the rollout's market, and of the anchor.
 
-        Both begin at their own targets. The anchor is followed at the policy's rate and band.
+        Both begin at their own targets. The anchor is followed at the member's rate and band.
         """
         view: View = rollout.observation
         assert view.anchor is not None
-        target = policy.target(view)
+        assert isinstance(task.actions, Simplex)
+        target = tilted(view.anchor, member.scores(view.features), task.actions)
         anchor = jnp.concatenate([1 - view.anchor.sum(-1, keepdims=True), view.anchor], -1)
-        fixed = lax.stop_gradient(policy)
+        fixed = lax.stop_gradient(member.trading)
 
         def step(holdings: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
             market, next_market, first, weights, targets = moves
 
-            def settled(policy: Tilt, holding: PyTree, target: Array) -> tuple[Array, PyTree]:
+            def settled(trade: Trading, holding: PyTree, target: Array) -> tuple[Array, PyTree]:
                 held = jax.vmap(task.observe)(Position(market, holding)).holding
-                action = jnp.where(first, target, policy.traded(held, target, weights))
+                action = jnp.where(first, target, trade(held, target, weights))
                 return jax.vmap(task.settle)(market, next_market, holding, action)
 
-            followers = zip((policy, fixed), holdings, targets, strict=True)
+            followers = zip((member.trading, fixed), holdings, targets, strict=True)
             rewards, after = zip(*(settled(*each) for each in followers), strict=True)
             return after, rewards
 
@@ -306,6 +351,13 @@ class Tilts(Agent):
         moves = (market, next_market, first, view.anchor, (target, anchor))
         _, (rewards, anchored) = lax.scan(jax.checkpoint(step), (start, start), moves)
         return rewards, anchored
+
+
+def _equal(anchor: Float[Array, "*batch asset"]) -> Float[Array, "*batch asset"]:
+    """The anchor's sum, in equal parts over the assets that can be traded."""
+    open_to = anchor > 0
+    share = anchor.sum(-1, keepdims=True) / open_to.sum(-1, keepdims=True)
+    return jnp.where(open_to, share, 0.0)
 
 
 def _ratio(part: Array | float, whole: Array) -> Array:

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.portfolio.backtest.standing import Standing
     from qfolio.portfolio.prices.findings import Finding
+    from qfolio.portfolio.study.folder import Result, Variant
+    from qfolio.portfolio.study.pooling import Active, Pooled
+    from qfolio.portfolio.study.run import Study
 
 console = Console(highlight=False)
 
@@ -203,6 +206,58 @@ def print_assessment(assessment: "Assessment") -> None:
     for sentences in verdicts(assessment).values():
         for sentence in sentences:
             say(sentence)
+
+
+def describe_study(study: "Study") -> str:
+    """Tables, variants and agents of a study, and why tables are left out."""
+    config = study.config
+    variants = f"{len(config.variants)} variant" + "s" * (len(config.variants) > 1)
+    tables = f"{len(config.tables)} table" + "s" * (len(config.tables) > 1)
+    left_out = (f"{name} is left out: {why}" for name, why in config.left_out.items())
+    about = f"{tables} · {variants} · {' and '.join(config.agents)} · {config.device}"
+    return "\n".join([about, *left_out])
+
+
+def spell(variant: "Variant") -> str:
+    return f"lag {variant.lag}, {variant.bps:g} bp"
+
+
+def print_study(result: "Result") -> None:
+    """A row for each table and each variant pooled, by agent, and the verdicts."""
+    from qfolio.portfolio.study.verdict import decimal, looks_sentence
+
+    main, *_ = result.variants
+    for agent, pools in main.agents.items():
+        table = Table(box=None, header_style="bold", pad_edge=False)
+        table.add_column(agent, no_wrap=True)
+        for name in ("a year", "95 % interval", "IR", "t", "rebal.", "Sharpe"):
+            table.add_column(name, justify="right", no_wrap=True)
+        for name, known in pools.evidence.items():
+            active = known.to_reference
+            ratios = (active.information_ratio, active.t, known.to_rebalanced.t, known.sharpe)
+            table.add_row(name, *_growth(active), *map(decimal, ratios))
+        for entry in result.variants:
+            pooled, rest = entry.agents[agent].to_reference, entry.agents[agent].to_rebalanced
+            name, style = f"pooled, {spell(entry.variant)}", "bold" if entry is main else None
+            cells = (*_growth(pooled), "", decimal(pooled.z), decimal(rest.z))
+            table.add_row(name, *cells, style=style)
+        console.print(table)
+    say(
+        "Growth is what exceeds equal weights, t against them (pooled: Stouffer's z), rebal. the t "
+        "(or z) against their best rebalancing, Sharpe the ratio less that of the best baseline."
+    )
+    for sentences in result.verdicts.values():
+        for sentence in sentences:
+            say(sentence)
+    say(looks_sentence(result))
+
+
+def _growth(entry: "Active | Pooled") -> tuple[str, str]:
+    """An active growth and its interval."""
+    growth, low, high = (
+        "–" if x is None else f"{x:+.1%}" for x in (entry.growth, entry.low, entry.high)
+    )
+    return growth, f"{low.removesuffix('%')} … {high}"
 
 
 def print_allocation(allocation: "Allocation", standing: "Standing", trained: str) -> None:

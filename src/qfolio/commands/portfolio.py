@@ -1,36 +1,23 @@
 """The commands about prices: check a table, backtest agents on it, and allocate for tomorrow."""
 
-import datetime
-import inspect
 import json
-import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import (
-    Assignments,
-    Count,
-    File,
-    Folder,
-    Modules,
-    Name,
-    Names,
-    again,
+from qfolio.commands.arguments import File, Modules, Name, Names, again
+from qfolio.commands.backtesting import (
+    DEFAULTS,
+    Late,
+    Missing,
+    Shared,
+    basis_points,
+    write_report,
 )
-from qfolio.core import registry, settings
+from qfolio.core import registry
 from qfolio.core.errors import QfolioError
-
-if TYPE_CHECKING:
-    from qfolio.experiments.presets import Preset
-    from qfolio.portfolio.backtest.run import Backtest
-
-Missing = Literal["error", "drop-asset", "forward-fill"]
-Late = Literal["error", "drop-asset", "trim", "join"]
-
-BASIS_POINT = 1e-4
 
 
 def prices(
@@ -62,117 +49,52 @@ def prices(
     console.print_prices(describe(load(file, **options)))
 
 
-def backtest(
-    file: Positional[File] = None,
-    *,
-    agents: str = "dqn,pathwise",
-    preset: str = "fast",
-    cost_bps: float = 10.0,
-    lag: int = 1,
-    train: str = "5y",
-    test: str = "1y",
-    rolling: bool = False,
-    cap: float = 1.0,
-    cost_model: str = "proportional",
-    signals: Name = None,
-    baselines: Name = None,
-    seeds: Count = None,
-    seed: int = 0,
-    episodes: Count = None,
-    trials: int = 0,
-    assignments: Assignments = (),
-    out: Folder = None,
-    resume: Folder = None,
-    trust: Modules = (),
-    missing: Missing = "error",
-    late: Late = "error",
-    features: Names = (),
-    date: Name = None,
-) -> None:
+def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> None:
     """Train agents walk-forward on a price table and compare them with classical allocators.
 
     Args:
         file: CSV or Parquet with prices, which qfolio prices checks (default: 20 US stocks that
             come with skfolio).
-        agents: Agents, separated by commas: dqn, pathwise, ppo, a2c, reinforce, sac, ddpg, td3, or
-            your own as module:Name.
-        preset: Preset of the agents.
-        cost_bps: Cost of buying or selling, in basis points of the value traded.
-        lag: Rows between the close that a decision sees and the close at which it trades.
-        train: Length of the first training window: 5y, 6m, 8w or 500d (d counts rows).
-        test: Length of a fold, after which agents are retrained.
-        rolling: Train on a window of fixed length instead of all rows so far.
-        cap: Largest weight of one asset, from 0 to 1.
-        cost_model: Cost of trading and holding: proportional, or your own as module:Name.
-        signals: Signals that agents observe beside returns, separated by commas, each with the rows
-            that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
-            own as module:Name (default: none).
-        baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight
-            is always among them (default: all of qfolio's).
-        seeds: Agents of each kind (default: the preset's number).
-        seed: First seed; the others follow it.
-        episodes: Training episodes of each agent in a fold (default: the preset's number).
-        trials: Earlier trials on these prices, for the deflated Sharpe ratio; known trials on the
-            default table are added to them.
-        assignments: Hyperparameters of all agents that have them (learning_rate=1e-3) or of one
-            (dqn.discount=0.9), or of the task (window=20 reward=crra).
-        out: New folder for the backtest (default: one in runs/).
-        resume: Folder of a backtest to resume.
-        trust: Modules of your own code that the folder may name (default: none).
-        missing: How to treat missing prices.
-        late: How to treat assets that start later than the table.
-        features: Columns that hold features for agents instead of prices.
-        date: Column of dates (default: found by its name).
     """
-    options = dict(locals())
     from qfolio.core import devices
 
     devices.configure()
-    registry.trust(trust)
+    registry.trust(options.trust)
     from qfolio.commands import console
     from qfolio.commands.progress import BacktestProgress, stop
+    from qfolio.portfolio.backtest.attribution.explain import explain
     from qfolio.portfolio.backtest.run import Backtest
-    from qfolio.portfolio.prices.table import load
 
-    if not 0 <= cost_bps <= 2000:
-        raise QfolioError(f"--cost-bps is {cost_bps:g}; it must be from 0 to 2000.")
-    if resume is None:
-        table = load(file, missing=missing, late=late, features=features, date=date)
-        chosen = {name: _preset(agent, preset, episodes) for name, agent in _split(agents).items()}
-        observed = {} if signals is None else {"signals": signals}
-        chosen = _assign(chosen, observed | settings.parse(assignments))
-        folder = out or Path("runs") / f"backtest-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    if options.resume is None:
+        folder = options.folder("backtest")
         run = Backtest.create(
-            table,
-            chosen,
-            train=train,
-            test=test,
-            expanding=not rolling,
-            lag=lag,
-            cost=cost_bps * BASIS_POINT,
-            cap=cap,
-            cost_model=_known("cost", cost_model),
-            baselines=list(registry.BASELINES)
-            if baselines is None
-            else [_known("baseline", name) for name in _split(baselines).values()],
-            seeds=max((p.seeds for p in chosen.values()), default=1) if seeds is None else seeds,
-            seed=seed,
-            trials=trials,
-            command=shlex.join(["qfolio", *sys.argv[1:]]),
+            options.load(file),
+            options.presets(),
+            lag=options.lag,
+            cost=basis_points("--cost-bps", options.cost_bps),
             out=folder,
+            **options.settings(),
         )
+    elif file is None and options.only_resumes:
+        run, folder = Backtest.open(options.resume), options.resume
     else:
-        defaults = inspect.signature(backtest).parameters
-        kept = defaults.keys() - {"resume", "trust"}
-        if any(options[name] != defaults[name].default for name in kept):
-            raise QfolioError("--resume keeps the backtest's settings; add only --trust.")
-        run, folder = Backtest.open(resume), resume
+        raise QfolioError("--resume keeps the backtest's settings; add only --trust.")
     console.say(console.describe_backtest(run))
     with console.bar("compiling") as update:
         run.run(BacktestProgress(update))
     if run.interrupted:
         stop(again("qfolio backtest --resume", folder, *run.parts))
-    _report(run, folder)
+    with console.console.status("Replaying all strategies, drawing histories, writing the report"):
+        entries, notes = run.entries()
+        assessment = run.assess(entries)
+        why = explain(run, entries)
+        run.write_tables(entries, assessment, why)
+        write_report(run, entries, assessment, notes, why)
+    console.print_assessment(assessment)
+    for sentences in why.diagnosis.values():
+        for sentence in sentences:
+            console.say(f"Diagnosis: {sentence}")
+    console.say(f"Report: {folder / 'report.html'}")
 
 
 def allocate(
@@ -255,90 +177,3 @@ def allocate(
         console.print_allocation(allocation, standing, trained or "an unknown date")
     if update:
         run.keep(name, policy)
-
-
-def _split(text: str) -> dict[str, str]:
-    """The names in a comma-separated option, by their short names in the backtest."""
-    agents = [name.strip() for name in text.split(",") if name.strip()]
-    names = {registry.short(agent): agent for agent in agents}
-    if len(names) < len(agents):
-        raise QfolioError(f"{text} names one twice.")
-    return names
-
-
-def _known(kind: registry.Kind, name: str) -> str:
-    """The name of a part that a user has typed; imports its module."""
-    registry.find(kind, name)
-    return name
-
-
-def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
-    """The parts that a setting of the task names."""
-    from qfolio.portfolio.signals import names
-
-    if setting == "signals":
-        return [("signal", name) for name in names(value)]
-    return [("reward", value)] if setting == "reward" else []
-
-
-def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
-    from qfolio.experiments import presets
-
-    registry.find("agent", name)
-    chosen = presets.preset(preset, "portfolio", name)
-    return chosen if episodes is None else chosen._replace(episodes=episodes)
-
-
-def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
-    """Presets with changed settings: of one agent (dqn.discount), of all that have it, or of the
-    task. Imports the modules of parts that they name."""
-    from qfolio.portfolio.task import Portfolio
-
-    used = set()
-    changed = {}
-    own_options = {"lag", "cost", "cost_model", "max_weight"}
-    for name, preset in presets.items():
-        kind = registry.find("agent", preset.agent)
-        own, task = {}, {}
-        for key, value in chosen.items():
-            who, dot, rest = key.rpartition(".")
-            if dot and who != name:
-                continue
-            if rest in settings.names(kind):
-                own[rest] = value
-            elif rest in settings.names(Portfolio) - own_options:
-                for part, named in _named(rest, value):
-                    registry.find(part, named)
-                task[rest] = value
-            else:
-                continue
-            used.add(key)
-        changed[name] = preset._replace(
-            settings={**preset.settings, **settings.convert(kind, own)},
-            task={**preset.task, **settings.convert(Portfolio, task)},
-        )
-    for key in chosen.keys() - used:
-        raise QfolioError(
-            f"--set {key}: none of {', '.join(presets)} has this setting, nor the portfolio task "
-            "(its lag, costs and cap have options of their own)."
-        )
-    return changed
-
-
-def _report(run: "Backtest", folder: Path) -> None:
-    from qfolio.commands import console
-    from qfolio.portfolio.backtest.attribution.explain import explain
-    from qfolio.report.backtest.page import write_backtest_report
-    from qfolio.report.collect import backtest_data
-
-    with console.console.status("Replaying all strategies, drawing histories, writing the report"):
-        entries, notes = run.entries()
-        assessment = run.assess(entries)
-        why = explain(run, entries)
-        run.write_tables(entries, assessment, why)
-        write_backtest_report(folder, backtest_data(run, entries, assessment, notes, why))
-    console.print_assessment(assessment)
-    for sentences in why.diagnosis.values():
-        for sentence in sentences:
-            console.say(f"Diagnosis: {sentence}")
-    console.say(f"Report: {folder / 'report.html'}")

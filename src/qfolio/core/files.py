@@ -1,14 +1,16 @@
 """Files that are never half-written and never executed: atomic writes, safetensors, locks."""
 
 import contextlib
+import csv
 import datetime
 import hashlib
+import io
 import json
 import os
 import platform
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import csv_cell
 
 UNFINISHED = ".part"
 """Suffix of temporary files; a killed process may leave some."""
@@ -112,6 +115,13 @@ def _holder(path: Path) -> str:
 
 def write_json(path: Path, content: Any) -> None:
     write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def write_csv(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([csv_cell(cell) for cell in row] for row in (header, *rows))
+    write_bytes(path, text.getvalue().encode())
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -1,18 +1,79 @@
-"""Anchors: weights at each row of a table that a policy may depart from."""
+"""Anchors: weights at each row of a table that a policy may depart from.
+
+An anchor is a baseline, followed on the whole table, or a column of the table with a benchmark's
+weights.
+"""
+
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.baselines import Baseline, History, baseline
+from qfolio.portfolio.costs import drift
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.signals import COLUMN
+
+MONTHS = 60
+"""Months before a decision that a baseline estimates from."""
+
+Weights = NDArray[np.float64]
 
 
-def path(name: str, prices: Prices) -> NDArray[np.float64]:
-    """The weights of an anchor at each row, (row, asset); the rest is cash.
+def made(name: str) -> Baseline | None:
+    """The baseline that an anchor names; None for a column. Raises QfolioError if it is unknown."""
+    return None if name.startswith(COLUMN) else baseline(name)
 
-    Raises QfolioError if there is no such anchor.
+
+def path(name: str, prices: Prices) -> Weights:
+    """The weights of an anchor at each row, of shape (row, asset); the rest is cash.
+
+    A row depends on it and earlier ones only. A baseline decides every month, or at every row if
+    that is its calendar; between, its holding drifts, unless its target is to be held at every row
+    (the calendar "fold"). It may hold the assets that have had prices for a year, or all there are
+    until then.
+
+    Raises QfolioError if there is no such baseline or column, or if a column's weights are not at
+    least 0, with a sum of at most 1.
     """
-    if name != "equal-weight":
-        raise QfolioError(f"anchor is {name!r}; it must be equal-weight.")
-    known = ~np.isnan(prices.values)
-    return known / np.maximum(known.sum(1, keepdims=True), 1)
+    chosen = made(name)
+    if chosen is None:
+        return _column(name.removeprefix(COLUMN), prices)
+    month = max(1, round(prices.periods_per_year / 12))
+    values, known = prices.values, ~np.isnan(prices.values)
+    held = np.eye(values.shape[1] + 1)[0]
+    rows = np.empty(values.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a table's first rows are too few for any estimate
+        for row in range(len(values)):
+            if row % month == 0 or chosen.calendar == "row":
+                year = known[max(0, row - 12 * month) : row + 1].all(0)
+                first = max(0, row - MONTHS * month)
+                complete = year & known[first : row + 1].all(0)
+                train = slice(first if (complete == year).all() else row - 12 * month, row + 1)
+                history = History(
+                    prices.dates[: row + 1], values[: row + 1], slice(max(0, train.start), row + 1),
+                    year if year.any() else known[row], 1.0, month,
+                )  # fmt: skip
+                wanted = chosen.decide(history, held)
+                held = held if wanted is None else np.asarray(wanted, float)
+            rows[row] = held[1:]
+            if row + 1 < len(values) and chosen.calendar != "fold":
+                held = drift(held, np.nan_to_num(values[row + 1] / values[row], nan=1.0))
+    return rows
+
+
+def _column(name: str, prices: Prices) -> Weights:
+    if name not in prices.feature_names:
+        raise QfolioError(
+            f"anchor is {COLUMN}{name}, but the table has no column {name}; name it with "
+            "--features, with a weight for each asset and date."
+        )
+    weights = np.nan_to_num(prices.features[..., prices.feature_names.index(name)])
+    if weights.min() < 0 or weights.sum(-1).max() > 1 + 1e-6:
+        raise QfolioError(
+            f"The weights in the column {name} must be at least 0 and add up to at most 1 at each "
+            "date; write them as fractions, one for each asset."
+        )
+    return weights

@@ -83,7 +83,7 @@ def paths(
         view = jax.tree.map(lambda x: x[None], task.view(row, held))
 
         def one(weights: PyTree) -> Array:
-            return task.target(held, agent.policy(weights, view)[0])
+            return task.target(row, held, agent.policy(weights, view)[0])
 
         target = jax.vmap(one)(members).mean(0)
         after = grown(target, task.costs.carry(task.coming(row), Context()))

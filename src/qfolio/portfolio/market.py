@@ -26,6 +26,9 @@ from qfolio.portfolio.rewards import Outcome, Reward
 
 MENU_LIMIT = 2000
 
+RATES = (0.1, 0.5)
+"""Shares of the way to a target that the menu "signals" offers."""
+
 
 class Holding(NamedTuple):
     """The last target weights, drifted to now, and the state of the reward."""
@@ -42,6 +45,13 @@ class Relatives(NamedTuple):
     coming: Float[Array, " asset"]  # from the decision to the next one
 
 
+class Signalled(NamedTuple):
+    """What a menu of signals starts from."""
+
+    anchor: Float[Array, " asset"]
+    signals: Float[Array, "asset signal"]  # in ±1 if they are ranks
+
+
 class Menu(eqx.Module):
     """A menu of allocations: each mixes a share of the holding with a target.
 
@@ -49,19 +59,22 @@ class Menu(eqx.Module):
     text: "grid:10" for all weights in tenths; "tilts:0.1" for: no order, all cash, equal weights,
     all in one asset, and a tenth of the holding moved into one asset (each for every asset);
     "overweight:0.1" for: no order, all cash, equal weights, and equal weights with a tenth of the
-    wealth moved into one asset.
+    wealth moved into one asset; "signals:1" for: no order, and each of ``RATES`` of the way to the
+    anchor and to the anchor times exp(±1·signal), for every signal. signals: how many there are.
     """
 
     keep: Float[Array, " choice"]
     target: Float[Array, "choice entry"]
+    tilts: Float[Array, "choice signal"] | None  # instead of targets
     actions: Discrete
 
-    def __init__(self, text: str, limits: Float[Array, " asset"]) -> None:
+    def __init__(self, text: str, limits: Float[Array, " asset"], signals: int = 0) -> None:
         kind, _, size = text.partition(":")
         assets = limits.shape[0]
         each = jnp.eye(assets + 1)[1:]
         open_to = jnp.append(0.0, limits > 0)
         cash, equal = jnp.eye(assets + 1)[:1], (open_to / open_to.sum())[None]
+        tilts = None
         try:
             value = float(size)
         except ValueError:
@@ -82,17 +95,39 @@ class Menu(eqx.Module):
             target = jnp.concatenate([cash, cash, equal, (1 - value) * equal + value * each])
             keep = jnp.zeros(len(target)).at[0].set(1.0)
             self.actions = MenuActions(len(target), pooled=3, each=1)
+        elif kind == "signals" and 0 < value <= 10:
+            if not signals:
+                raise QfolioError(f"menu={text} tilts by signals; name some with --signals.")
+            ways = value * jnp.concatenate([jnp.zeros((1, signals)), *_sides(signals)])
+            tilts = jnp.concatenate([ways[:1], *[ways] * len(RATES)])
+            keep = 1 - jnp.concatenate([jnp.zeros(1), jnp.repeat(jnp.array(RATES), len(ways))])
+            target = jnp.zeros((len(keep), assets + 1))
+            self.actions = MenuActions(len(keep), pooled=len(keep), each=0)
         else:
             raise QfolioError(
-                f"menu is {text!r}; it must be like grid:10, tilts:0.1 or overweight:0.1."
+                f"menu is {text!r}; it must be like grid:10, tilts:0.1, overweight:0.1 or "
+                "signals:1."
             )
-        self.keep, self.target = keep, target
+        self.keep, self.target, self.tilts = keep, target, tilts
 
     def weights(
-        self, held: Float[Array, " entry"], choice: Int[Array, ""]
+        self,
+        held: Float[Array, " entry"],
+        choice: Int[Array, ""],
+        signalled: Signalled | None = None,
     ) -> Float[Array, " entry"]:
-        """The allocation of a choice, given the weights held."""
-        return self.keep[choice] * held + (1 - self.keep[choice]) * self.target[choice]
+        """The allocation of a choice, given the weights held; ``signalled`` for signals only."""
+        target = self.target[choice]
+        if self.tilts is not None:
+            assert signalled is not None
+            tilted = signalled.anchor * jnp.exp(signalled.signals @ self.tilts[choice])
+            tilted = tilted * signalled.anchor.sum() / tilted.sum()
+            target = jnp.append(1 - tilted.sum(), tilted)
+        return self.keep[choice] * held + (1 - self.keep[choice]) * target
+
+
+def _sides(signals: int) -> tuple[Float[Array, "signal signal"], Float[Array, "signal signal"]]:
+    return jnp.eye(signals), -jnp.eye(signals)
 
 
 class Market(ExogenousTask):
@@ -132,9 +167,20 @@ class Market(ExogenousTask):
 
     @property
     def actions(self) -> Actions:
-        if self.menu:
-            return Menu(self.menu, self.limits).actions
-        return Simplex(self.limits.shape[0])
+        return self._menu.actions if self.menu else Simplex(self.limits.shape[0])
+
+    @property
+    def _menu(self) -> Menu:
+        return Menu(self.menu, self.limits, self.tilting)
+
+    @property
+    def tilting(self) -> int:
+        """How many signals a menu may tilt by."""
+        return 0
+
+    def signalled(self, market: PyTree) -> Signalled | None:
+        """What a menu of signals starts from; None without signals."""
+        return None
 
     @property
     def feasible(self) -> Feasible:
@@ -153,13 +199,17 @@ class Market(ExogenousTask):
     def path_dependent(self) -> bool:
         return self.reward_function.path_dependent
 
-    def target(self, held: Float[Array, " entry"], action: Array) -> Float[Array, " entry"]:
+    def target(
+        self, market: PyTree, held: Float[Array, " entry"], action: Array
+    ) -> Float[Array, " entry"]:
         """The target weights of an action, projected onto the feasible set."""
-        weights = Menu(self.menu, self.limits).weights(held, action) if self.menu else action
+        weights = action
+        if self.menu:
+            weights = self._menu.weights(held, action, self.signalled(market))
         return self.feasible.project(weights, held)
 
     def intent(self, state: Position, action: Array) -> Float[Array, " entry"]:
-        return self.target(state.holding.weights, action)
+        return self.target(state.market, state.holding.weights, action)
 
     def anchor_weights(self, market: PyTree) -> Float[Array, " asset"] | None:
         """The weights that a policy may depart from, if the market has any."""
@@ -183,7 +233,7 @@ class Market(ExogenousTask):
         self, market: PyTree, next_market: PyTree, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
         costs, moved = self.costs, self.relatives(market, next_market)
-        target = self.target(holding.weights, action)
+        target = self.target(market, holding.weights, action)
         wait = Context(rows=self.lag)
         waiting = costs.carry(moved.waiting, wait)
         before, after = grown(holding.weights, waiting), grown(target, waiting)

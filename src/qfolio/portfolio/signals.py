@@ -2,14 +2,15 @@
 
 ``signals="momentum:252-21,volatility:21"`` of a portfolio names some, each with the rows that it
 looks back on and the latest rows that it skips; a user's own are ``module:Name``, with rows or
-without. Agents observe them after the log return and the table's own features. By default each is
-ranked across assets, from −1 to 1, and nothing has to be fitted; a number that all assets share
-stays as it is. docs/signals.md lists formulas and sources.
+without, and ``feature:NAME`` is a column of the table. Agents observe them after the log return and
+the table's own features. By default each is ranked across assets, from −1 to 1, and nothing has to
+be fitted; a number that all assets share stays as it is. docs/signals.md lists formulas and
+sources.
 """
 
 import abc
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -21,6 +22,8 @@ from qfolio.core.fields import static
 from qfolio.core.registry import SIGNALS, build
 
 Floats = NDArray[np.float64]
+
+COLUMN = "feature:"
 
 SCALES = ("rank", "z-score", "raw")
 """Across assets, row by row: ranks from −1 to 1; distances from the mean in standard deviations,
@@ -181,14 +184,24 @@ class MarketVolatility(Signal):
         return _log(_deviation(_market(_returns(prices)), rows))
 
 
+class Column(Signal):
+    """A column of the table, as it is known at each row."""
+
+    name: str = static("")
+    rows: int = static(1)
+
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        raise AssertionError("compute reads columns from the table")
+
+
 def parse(text: str) -> list[Signal]:
     """The signals that a text names; raises QfolioError if there is no such signal."""
     return [_named(part) for part in _parts(text)]
 
 
 def names(text: str) -> list[str]:
-    """The names in such a text, without rows."""
-    return [_split(part)[0] for part in _parts(text)]
+    """The names in such a text, without rows and without columns of the table."""
+    return [_split(part)[0] for part in _parts(text) if not part.startswith(COLUMN)]
 
 
 def labels(text: str) -> list[str]:
@@ -201,14 +214,27 @@ def lookback(signals: Sequence[Signal]) -> int:
     return max((signal.rows for signal in signals), default=0)
 
 
-def compute(signals: Sequence[Signal], prices: Floats, scale: str = "rank") -> Floats:
+def compute(
+    signals: Sequence[Signal],
+    prices: Floats,
+    scale: str = "rank",
+    columns: Mapping[str, Floats] | None = None,
+) -> Floats:
     """Signals of shape (row, asset, signal), 0 where one is unknown.
 
-    Raises QfolioError if the scale is unknown, or if a signal has the wrong shape or looks ahead.
+    prices, columns: of shape (row, asset), NaN where unknown.
+
+    Raises QfolioError if the scale or a column is unknown, or if a signal has the wrong shape or
+    looks ahead.
     """
     if scale not in SCALES:
         raise QfolioError(f"signal_scale is {scale!r}; it must be one of {', '.join(SCALES)}.")
-    found = [_scaled(_checked(signal, prices), signal.shared, scale) for signal in signals]
+    values = [
+        _column(signal.name, columns or {}) if isinstance(signal, Column)
+        else _checked(signal, prices)
+        for signal in signals
+    ]  # fmt: skip
+    found = [_scaled(x, _is_shared(s, x), scale) for s, x in zip(signals, values, strict=True)]
     return np.stack(found, -1) if found else np.zeros((*prices.shape, 0))
 
 
@@ -225,7 +251,25 @@ def _split(text: str) -> tuple[str, dict[str, str]]:
     return name, {key: value for key, value in pairs if value is not None}
 
 
+def _is_shared(signal: Signal, values: Floats) -> bool:
+    """Whether all assets have the same number, as in a column about the whole market."""
+    own = isinstance(signal, Column) and np.array_equal(
+        values, np.broadcast_to(values[:, :1], values.shape), equal_nan=True
+    )
+    return signal.shared or own
+
+
+def _column(name: str, columns: Mapping[str, Floats]) -> Floats:
+    if name not in columns:
+        raise QfolioError(
+            f"The signal {COLUMN}{name} names no column of the table; name it with --features, too."
+        )
+    return columns[name]
+
+
 def _named(text: str) -> Signal:
+    if text.startswith(COLUMN):
+        return Column(name=text.removeprefix(COLUMN))
     name, chosen = _split(text)
     return build("signal", name, chosen)
 

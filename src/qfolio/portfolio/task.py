@@ -19,10 +19,13 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Position, Simplex
 from qfolio.portfolio import anchors, signals
-from qfolio.portfolio.market import Market, Relatives
+from qfolio.portfolio.market import Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
 
 Row = Int[Array, ""]
+
+LEAST = 1e-6
+"""Share of an anchor that is spread equally."""
 
 
 class Portfolio(Market):
@@ -84,7 +87,8 @@ class Portfolio(Market):
         chosen = signals.parse(self.signals)
         logs = np.zeros(prices.values.shape)
         logs[1:] = np.nan_to_num(np.diff(np.log(prices.values), axis=0))
-        computed = signals.compute(chosen, prices.values, self.signal_scale)
+        columns = dict(zip(prices.feature_names, np.moveaxis(prices.features, -1, 0), strict=True))
+        computed = signals.compute(chosen, prices.values, self.signal_scale, columns)
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
         followed = anchors.path(self.anchor, prices) if self.anchor else logs[:0]
         where = lambda t: (t.log_relatives, t.extra, t.anchors)  # noqa: E731
@@ -135,8 +139,10 @@ class Portfolio(Market):
 
     @property
     def parts(self) -> list[object]:
-        """Cost model, reward and signals, which a user may have named."""
-        return [self.costs, self.reward_function, *signals.parse(self.signals)]
+        """Cost model, reward, signals and anchor, which a user may have named."""
+        anchor = anchors.made(self.anchor) if self.anchor else None
+        named = [*signals.parse(self.signals), *([] if anchor is None else [anchor])]
+        return [self.costs, self.reward_function, *named]
 
     @property
     def actions(self) -> Actions:
@@ -162,13 +168,34 @@ class Portfolio(Market):
         return jnp.swapaxes((channels - self.center) / self.scale, 0, 1)
 
     def anchor_weights(self, market: Row) -> Float[Array, " asset"] | None:
-        """The anchor's weights; those of assets that cannot be traded go to the others."""
+        """The anchor's weights; those of assets that cannot be traded go to the others.
+
+        An asset that can be traded has at least ``LEAST`` times an equal weight, so that zeros say
+        which cannot.
+        """
         if not self.anchor:
             return None
         weights = lax.dynamic_index_in_dim(self.anchors, market, keepdims=False)
-        kept = jnp.where(self.limits > 0, weights, 0.0)
+        open_to = self.limits > 0
+        kept = jnp.where(open_to, weights, 0.0)
         share = kept / jnp.maximum(kept.sum(), 1e-9)
+        share = (1 - LEAST) * share + LEAST * open_to / open_to.sum()
         return jnp.minimum(weights.sum() * share, self.limits)
+
+    @property
+    def tilting(self) -> int:
+        return len(signals.parse(self.signals))
+
+    def signalled(self, market: Row) -> Signalled | None:
+        """The anchor (equal weights, if there is none) and the signals of a row, unscaled."""
+        if not self.tilting:
+            return None
+        anchor = self.anchor_weights(market)
+        if anchor is None:
+            open_to = self.limits > 0
+            anchor = jnp.minimum(open_to / open_to.sum(), self.limits)
+        others = lax.dynamic_index_in_dim(self.extra, market, keepdims=False)
+        return Signalled(anchor, others[:, others.shape[1] - self.tilting :])
 
     @property
     def moves(self) -> Float[Array, ""]:

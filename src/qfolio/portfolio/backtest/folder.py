@@ -8,8 +8,7 @@ report.
 """
 
 import csv
-import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -24,13 +23,12 @@ from qfolio.core.files import (
     read_json,
     read_tree,
     write_arrays,
-    write_bytes,
+    write_csv,
     write_json,
     write_tree,
 )
 from qfolio.core.mdp import Agent
 from qfolio.core.registry import BASELINES, name_of
-from qfolio.core.text import csv_cell
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Row
 from qfolio.experiments.presets import Preset
@@ -162,7 +160,7 @@ class BacktestFolder:
 
     def write_records(self, agent: str, fold: str, rows: Sequence[Row]) -> None:
         header = list(rows[0]) if rows else []
-        write_bytes(self._records(agent, fold), _csv(header, (row.values() for row in rows)))
+        write_csv(self._records(agent, fold), header, (row.values() for row in rows))
 
     def read_records(self, agent: str, fold: str) -> list[Row]:
         """The training episodes of a fold; none if their table is missing."""
@@ -178,7 +176,21 @@ class BacktestFolder:
     def write_returns(self, days: Sequence[str], columns: dict[str, np.ndarray]) -> None:
         """returns.csv, a column per strategy and seed."""
         rows = zip(days, *columns.values(), strict=True)
-        write_bytes(self.path / "returns.csv", _csv(["date", *columns], rows))
+        write_csv(self.path / "returns.csv", ["date", *columns], rows)
+
+    def read_returns(self) -> tuple[list[str], dict[str, np.ndarray]]:
+        """The days, and the returns by column; raises QfolioError if returns.csv is damaged."""
+        path = self.path / "returns.csv"
+        try:
+            header, *rows = csv.reader(path.read_text().splitlines())
+            table = np.array([row[1:] for row in rows], dtype=float)
+            columns = dict(zip(header[1:], table.T, strict=True))
+        except (OSError, csv.Error, ValueError) as error:
+            raise QfolioError(
+                f"{path} is damaged ({error}); write it again with qfolio backtest --resume "
+                f"{self.path}."
+            ) from None
+        return [row[0] for row in rows], columns
 
     def write_weights(
         self, days: Sequence[str], assets: Sequence[str], weights: dict[str, np.ndarray]
@@ -190,7 +202,7 @@ class BacktestFolder:
             for day, row in zip(days, table.round(6), strict=True)
         )
         header = ["date", "strategy", "cash", *assets]
-        write_bytes(self.path / "weights.csv", _csv(header, rows))
+        write_csv(self.path / "weights.csv", header, rows)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         write_json(self.path / "summary.json", summary)
@@ -207,10 +219,3 @@ class BacktestFolder:
 
     def _records(self, agent: str, fold: str) -> Path:
         return self.path / "training" / agent / f"{fold}.csv"
-
-
-def _csv(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([csv_cell(cell) for cell in row] for row in (header, *rows))
-    return text.getvalue().encode()

@@ -68,6 +68,25 @@ def walk_forward(
     return folds
 
 
+def require_fold(dates: np.ndarray, train: str, test: str, lag: int) -> None:
+    """Raise QfolioError unless a table has rows for training and one whole fold.
+
+    The last row may be a holiday, a weekend or one period early.
+    """
+    start = walk_forward(dates, train, test, lag)[0].decisions.start + lag + 1
+    count, unit = parse_length(test)
+    if unit == "d":
+        whole = start + count <= len(dates)
+    else:
+        grace = max(np.timedelta64(7, "D"), np.median(np.diff(dates)))
+        whole = dates[-1] + grace >= _shift(dates[start], count, unit)
+    if not whole:
+        raise QfolioError(
+            f"{len(dates)} rows, {str(dates[0])[:10]} to {str(dates[-1])[:10]}, are fewer than "
+            f"train={train} and one fold of test={test}; shorten them, or give more rows."
+        )
+
+
 def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) -> Fold:
     """The training window of tomorrow's policy: the last ``train`` of the table, or all of it."""
     end = len(dates)

@@ -68,7 +68,7 @@ class NoTrade(OneAsset):
     def settle(
         self, market: Array, next_market: Array, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
-        target = self.target(holding.weights, action)
+        target = self.target(market, holding.weights, action)
         remainder, _ = self.costs.trade(holding.weights, target, Context())
         nodes, chances = np.polynomial.hermite_e.hermegauss(self.NODES)
         gains = jnp.expm1(self._log_relative(jnp.asarray(nodes, jnp.float32)))

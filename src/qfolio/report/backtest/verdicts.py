@@ -24,7 +24,7 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
         if math.isfinite(end)
     ]
     low, high = min(ends, default=0.0), max(ends, default=0.0)
-    ticks = _ticks(min(low, 0), max(high, 0))
+    ticks, digits = ticks_around(low, high)
     low, high = min(low, ticks[0]), max(high, ticks[-1])
     margin = 0.04 * (high - low) or 1.0  # any, if there is nothing to show
 
@@ -48,9 +48,15 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
         "agents": [
             (name, [row(claim, each) for claim, each in claimed]) for name, claimed in agents
         ],
-        "ticks": [(percent(tick, _digits(ticks), sign=True), place(tick)) for tick in ticks],
+        "ticks": [(percent(tick, digits, sign=True), place(tick)) for tick in ticks],
         "zero": place(0),
     }
+
+
+def ticks_around(low: float, high: float) -> tuple[list[float], int]:
+    """Round numbers around an interval and zero, and the decimals that they need in percent."""
+    ticks = _ticks(min(low, 0), max(high, 0))
+    return ticks, _digits(ticks)
 
 
 def _ticks(low: float, high: float) -> list[float]:

@@ -1,5 +1,6 @@
 """What a signal is worth, where it is known what the policy follows."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -78,4 +79,23 @@ def test_the_signals_of_a_single_asset_are_shuffled_in_time():
     stretches = four_folds(prices)
     worth, _ = found("market", stretches, prices)
     assert [each.shared for each in worth.signals] == [True] * 4
+    assert not worth.ignored
+
+
+class FirstTilt(Known):
+    """Always the same choice of a menu: half of the way to the anchor, tilted by a signal."""
+
+    def policy(self, weights, observation):
+        return jnp.full(observation.holding.shape[0], 9)
+
+
+def test_a_menu_tilts_by_the_shuffled_signals(prices):
+    """The signals that a menu computes weights from are shuffled, too."""
+    task = {"signals": "momentum:20,reversal:3", "menu": "signals:1"}
+    stretches = four_folds(prices, **task)
+    names = ["log return", "momentum:20", "reversal:3"]
+    worth, replays = importance(FirstTilt("none"), stretches, names, prices.values, 252)
+    assert replays.targets[0].std() > 0.01
+    moved = abs(replays.targets[1:-3] - replays.targets[0]).max((1, 2)).reshape(3, 3).max(1)
+    assert (moved > 1e-3).tolist() == [False, True, False]
     assert not worth.ignored

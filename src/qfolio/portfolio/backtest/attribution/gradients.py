@@ -94,10 +94,10 @@ def _integrated(
 
     def day(given: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         row, held = given
-        features, anchor = task.features(row), task.anchor_weights(row)
+        features = task.features(row)
 
         def targets(features: Array) -> Array:
-            return answer(task, agent, members, features, held, anchor)[1:]
+            return answer(task, agent, members, row, features, held)[1:]
 
         def pull(channel: Array) -> Array:
             along = features * (jnp.arange(features.shape[-1]) == channel)

@@ -21,6 +21,7 @@ from qfolio.core.mdp import Agent
 from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.following import paths
+from qfolio.portfolio.market import Signalled
 from qfolio.portfolio.task import Portfolio
 
 AT_ONCE = 16
@@ -41,6 +42,13 @@ class Observed(Portfolio):
     def features(self, market: Int[Array, ""]) -> Float[Array, "asset time channel"]:
         start = market - self.window + 1 - self.begin
         return jnp.swapaxes(lax.dynamic_slice_in_dim(self.observed, start, self.window), 0, 1)
+
+    def signalled(self, market: Int[Array, ""]) -> Signalled | None:
+        found = super().signalled(market)
+        if found is None:
+            return None
+        latest = self.features(market)[:, -1] * self.scale + self.center
+        return found._replace(signals=latest[:, latest.shape[1] - self.tilting :])
 
 
 class Shuffle(NamedTuple):

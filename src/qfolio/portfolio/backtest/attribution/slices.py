@@ -24,9 +24,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from qfolio.core.market import View
 from qfolio.core.mdp import Agent
-from qfolio.portfolio.backtest.attribution.replays import channels
+from qfolio.portfolio.backtest.attribution.replays import Observed, channels
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.task import Portfolio
 
@@ -126,13 +125,14 @@ def slices(
 
 
 def answer(
-    task: Portfolio, agent: Agent, members: PyTree, features: Array, held: Array, anchor: PyTree
+    task: Portfolio, agent: Agent, members: PyTree, row: Array, features: Array, held: Array
 ) -> Float[Array, " entry"]:
-    """The target weights of a view, the mean of all members."""
-    view = View(*jax.tree.map(lambda x: x[None], (features, held[1:], anchor)))
+    """The target weights at a row whose features are given, the mean of all members."""
+    seen = Observed.given(task, jnp.swapaxes(features, 0, 1), row - task.window + 1)
+    view = jax.tree.map(lambda x: x[None], seen.view(row, held))
 
     def one(weights: PyTree) -> Array:
-        return task.target(held, agent.policy(weights, view)[0])
+        return seen.target(row, held, agent.policy(weights, view)[0])
 
     mean: Array = jax.vmap(one)(members).mean(0)
     return mean
@@ -146,10 +146,9 @@ def _answers(
     count = grids.shape[0]
     blank = jnp.zeros((task.limits.shape[0], task.window, count))
     latest = jnp.arange(task.window) == task.window - 1
-    anchor = task.anchor_weights(row)
 
     def order(features: Array, held: Array) -> Array:
-        return answer(task, agent, members, features, held, anchor)
+        return answer(task, agent, members, row, features, held)
 
     def rest(features: Array, held: Array) -> Array:
         decide = lambda _, held: order(features, held)  # noqa: E731

@@ -1,0 +1,230 @@
+"""What ``backtest`` and ``study`` share: their options, and what these choose."""
+
+import dataclasses
+import datetime
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import arg
+
+from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Names
+from qfolio.core import registry, settings
+from qfolio.core.errors import QfolioError
+
+if TYPE_CHECKING:
+    from qfolio.experiments.presets import Preset
+    from qfolio.portfolio.backtest.assessment import Assessment
+    from qfolio.portfolio.backtest.attribution.why import Why
+    from qfolio.portfolio.backtest.replay import Entry
+    from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.portfolio.prices.table import Prices
+
+Missing = Literal["error", "drop-asset", "forward-fill"]
+Late = Literal["error", "drop-asset", "trim", "join"]
+
+BASIS_POINT = 1e-4
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How agents are trained and tested on a table.
+
+    Args:
+        agents: Agents, separated by commas: tilts, dqn, pathwise, ppo, a2c, reinforce, sac, ddpg,
+            td3, or your own as module:Name.
+        preset: Preset of the agents.
+        cost_bps: Cost of buying or selling, in basis points of the value traded.
+        lag: Rows between the close that a decision sees and the close at which it trades.
+        train: Length of the first training window: 5y, 6m, 8w or 500d (d counts rows).
+        test: Length of a fold, after which agents are retrained.
+        rolling: Train on a window of fixed length instead of all rows so far.
+        cap: Largest weight of one asset, from 0 to 1.
+        cost_model: Cost of trading and holding: proportional, or your own as module:Name.
+        signals: Signals that agents observe beside returns, separated by commas, each with the rows
+            that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
+            own as module:Name (default: the preset's).
+        baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight
+            is always among them (default: all of qfolio's).
+        seeds: Agents of each kind (default: the preset's number).
+        seed: First seed; the others follow it.
+        episodes: Training episodes of each agent in a fold (default: the preset's number).
+        trials: Earlier trials on these prices, for the deflated Sharpe ratio; known trials on the
+            default table are added to them.
+        assignments: Hyperparameters of all agents that have them (learning_rate=1e-3) or of one
+            (dqn.discount=0.9), or of the task (window=20 reward=crra).
+        out: New folder (default: one in runs/).
+        resume: Folder to resume.
+        trust: Modules of your own code that the folder may name (default: none).
+        missing: How to treat missing prices.
+        late: How to treat assets that start later than the table.
+        features: Columns that hold features for agents instead of prices.
+        date: Column of dates (default: found by its name).
+    """
+
+    agents: str = "tilts,dqn"
+    preset: str = "fast"
+    cost_bps: float = 10.0
+    lag: int = 1
+    train: str = "5y"
+    test: str = "1y"
+    rolling: bool = False
+    cap: float = 1.0
+    cost_model: str = "proportional"
+    signals: Name = None
+    baselines: Name = None
+    seeds: Count = None
+    seed: int = 0
+    episodes: Count = None
+    trials: int = 0
+    assignments: Assignments = ()
+    out: Folder = None
+    resume: Folder = None
+    trust: Modules = ()
+    missing: Missing = "error"
+    late: Late = "error"
+    features: Names = ()
+    date: Name = None
+
+    @property
+    def only_resumes(self) -> bool:
+        """Whether nothing but ``resume`` and ``trust`` is given."""
+        return dataclasses.replace(self, resume=None, trust=()) == DEFAULTS
+
+    def folder(self, kind: str) -> Path:
+        """The new folder."""
+        return self.out or Path("runs") / f"{kind}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+
+    def load(self, file: Path | None) -> "Prices":
+        """A price table; the 20 US stocks without a file."""
+        from qfolio.portfolio.prices.table import load
+
+        return load(
+            file, missing=self.missing, late=self.late, features=self.features, date=self.date
+        )
+
+    def presets(self) -> "dict[str, Preset]":
+        """The agents by their short names, with all settings; imports their modules."""
+        chosen = {
+            name: _preset(agent, self.preset, self.episodes)
+            for name, agent in _split(self.agents).items()
+        }
+        observed = {} if self.signals is None else {"signals": self.signals}
+        return _assign(chosen, observed | settings.parse(self.assignments))
+
+    def settings(self) -> dict[str, Any]:
+        """The other arguments of ``Backtest.create``, but lag, cost and folder."""
+        seeds = (preset.seeds for preset in self.presets().values())
+        return {
+            "train": self.train,
+            "test": self.test,
+            "expanding": not self.rolling,
+            "cap": self.cap,
+            "cost_model": _known("cost", self.cost_model),
+            "baselines": list(registry.BASELINES)
+            if self.baselines is None
+            else [_known("baseline", name) for name in _split(self.baselines).values()],
+            "seeds": max(seeds, default=1) if self.seeds is None else self.seeds,
+            "seed": self.seed,
+            "trials": self.trials,
+            "command": shlex.join(["qfolio", *sys.argv[1:]]),
+        }
+
+
+DEFAULTS = Options()
+
+Shared = Annotated[Options, arg(name="")]
+"""The options, without a prefix on the command line."""
+
+
+def basis_points(option: str, value: float) -> float:
+    """A cost in basis points as a fraction; option: its name, for the message."""
+    if not 0 <= value <= 2000:
+        raise QfolioError(f"{option} is {value:g}; it must be from 0 to 2000.")
+    return value * BASIS_POINT
+
+
+def write_report(
+    run: "Backtest",
+    entries: "dict[str, Entry]",
+    assessment: "Assessment",
+    notes: list[str],
+    why: "Why | None" = None,
+) -> None:
+    """Writes the report of a backtest into its folder."""
+    from qfolio.report.backtest.page import write_backtest_report
+    from qfolio.report.collect import backtest_data
+
+    assert run.folder is not None
+    write_backtest_report(run.folder, backtest_data(run, entries, assessment, notes, why))
+
+
+def _split(text: str) -> dict[str, str]:
+    """The names in a comma-separated option, by their short names in the backtest."""
+    agents = [name.strip() for name in text.split(",") if name.strip()]
+    names = {registry.short(agent): agent for agent in agents}
+    if len(names) < len(agents):
+        raise QfolioError(f"{text} names one twice.")
+    return names
+
+
+def _known(kind: registry.Kind, name: str) -> str:
+    """The name of a part that a user has typed; imports its module."""
+    registry.find(kind, name)
+    return name
+
+
+def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
+    """The parts that a setting of the task names."""
+    from qfolio.portfolio.signals import COLUMN, names
+
+    if setting == "signals":
+        return [("signal", name) for name in names(value)]
+    if setting == "anchor" and value and not value.startswith(COLUMN):
+        return [("baseline", value)]
+    return [("reward", value)] if setting == "reward" else []
+
+
+def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
+    from qfolio.experiments import presets
+
+    registry.find("agent", name)
+    chosen = presets.preset(preset, "portfolio", name)
+    return chosen if episodes is None else chosen._replace(episodes=episodes)
+
+
+def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
+    """Presets with changed settings: of one agent (dqn.discount), of all that have it, or of the
+    task. Imports the modules of parts that they name."""
+    from qfolio.portfolio.task import Portfolio
+
+    used = set()
+    changed = {}
+    own_options = {"lag", "cost", "cost_model", "max_weight"}
+    for name, preset in presets.items():
+        kind = registry.find("agent", preset.agent)
+        own, task = {}, {}
+        for key, value in chosen.items():
+            who, dot, rest = key.rpartition(".")
+            if dot and who != name:
+                continue
+            if rest in settings.names(kind):
+                own[rest] = value
+            elif rest in settings.names(Portfolio) - own_options:
+                for part, named in _named(rest, value):
+                    registry.find(part, named)
+                task[rest] = value
+            else:
+                continue
+            used.add(key)
+        changed[name] = preset._replace(
+            settings={**preset.settings, **settings.convert(kind, own)},
+            task={**preset.task, **settings.convert(Portfolio, task)},
+        )
+    for key in chosen.keys() - used:
+        raise QfolioError(
+            f"--set {key}: none of {', '.join(presets)} has this setting, nor the portfolio task "
+            "(its lag, costs and cap have options of their own)."
+        )
+    return changed

@@ -1,0 +1,116 @@
+"""The command that runs one configuration over many price tables and pools the evidence."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from qfolio.commands.arguments import again
+from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points, write_report
+from qfolio.core import registry
+from qfolio.core.errors import QfolioError
+
+if TYPE_CHECKING:
+    from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.portfolio.prices.table import Prices
+    from qfolio.portfolio.study.folder import Variant
+
+Sets = Annotated[tuple[str, ...], arg(metavar="[NAME=]FILE …", help_behavior_hint="")]
+Numbers = Annotated[str | None, arg(metavar="N,N", help_behavior_hint="")]
+Folders = Annotated[tuple[Path, ...], arg(metavar="DIR …", help_behavior_hint="")]
+
+
+def study(
+    sets: Positional[Sets] = (),
+    *,
+    options: Shared = DEFAULTS,
+    lags: Numbers = None,
+    costs_bps: Numbers = None,
+    after: Folders = (),
+) -> None:
+    """Backtest one configuration on many price tables and pool the evidence.
+
+    Args:
+        sets: CSV or Parquet files with prices, a table each, as qfolio backtest reads them; NAME=
+            names a table (default: the file's name).
+        lags: Lags at which everything is trained and tested again, beside --lag (default: none).
+        costs_bps: Costs in basis points, likewise, beside --cost-bps; every lag is combined with
+            every cost (default: none).
+        after: Folders of earlier studies; their looks at the same tables are counted (default:
+            none).
+    """
+    from qfolio.core import devices
+
+    devices.configure()
+    registry.trust(options.trust)
+    from qfolio.commands import console
+    from qfolio.commands.progress import BacktestProgress, stop
+    from qfolio.portfolio.study.run import Study
+    from qfolio.report.study import write_study_report
+
+    if options.resume is None:
+        basis_points("--cost-bps", options.cost_bps)  # refuses a wrong one by its own name
+        costs = _numbers("--costs-bps", costs_bps, options.cost_bps)
+        run = Study.create(
+            _tables(sets, options.load),
+            options.presets(),
+            lags=[_whole("--lags", lag) for lag in _numbers("--lags", lags, options.lag)],
+            costs=[basis_points("--costs-bps", cost) for cost in costs],
+            after=after,
+            out=options.folder("study"),
+            **options.settings(),
+        )
+    elif options.only_resumes and not (sets or lags or costs_bps or after):
+        run = Study.open(options.resume)
+    else:
+        raise QfolioError("--resume keeps the study's settings; add only --trust.")
+    console.say(console.describe_study(run))
+    with console.bar("") as update:
+
+        def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
+            place = run.places.index((table, variant)) + 1
+            console.say(f"{place} of {len(run.places)}: {table}, {console.spell(variant)}")
+            return BacktestProgress(update)
+
+        run.run(listen, write_report)
+    if run.interrupted:
+        parts = run.backtest(next(iter(run.config.tables))).parts
+        stop(again("qfolio study --resume", run.folder, *parts))
+    with console.console.status("Pooling the evidence, writing the report"):
+        result = run.result()
+        write_study_report(run)
+    console.print_study(result)
+    console.say(f"Report: {run.folder / 'report.html'}")
+
+
+def _tables(sets: tuple[str, ...], load: Any) -> "dict[str, Prices]":
+    """The tables by name, in the order of the command line."""
+    files: dict[str, Path] = {}
+    for entry in sets:
+        named = re.fullmatch(r"([A-Za-z0-9_-]+)=(.+)", entry)
+        file = Path(named[2] if named else entry)
+        name = named[1] if named else re.sub(r"[^A-Za-z0-9_-]+", "-", file.stem)
+        if name in files:
+            raise QfolioError(
+                f"{files[name]} and {file} are both called {name}; name one with NAME=FILE."
+            )
+        files[name] = file
+    return {name: load(file) for name, file in files.items()}
+
+
+def _numbers(option: str, text: str | None, main: float) -> list[float]:
+    """The main value, and the others of a list such as "10,20,50"."""
+    try:
+        others = [float(part) for part in (text or "").split(",") if part.strip()]
+    except ValueError:
+        raise QfolioError(
+            f"{option} is {text!r}; it must be numbers separated by commas, for example 1,2."
+        ) from None
+    return list(dict.fromkeys([float(main), *others]))
+
+
+def _whole(option: str, value: float) -> int:
+    if value != int(value):
+        raise QfolioError(f"{option} has {value:g}; lags are whole numbers of rows.")
+    return int(value)

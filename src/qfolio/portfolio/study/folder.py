@@ -1,0 +1,194 @@
+"""The folder of a study.
+
+It holds study.json (what is run, the looks taken, and the pooled result at the end), study.csv (a
+row for each table, variant and agent), the report, and an ordinary backtest for each table and
+variant in tables/TABLE/VARIANT/.
+"""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+import numpy as np
+
+from qfolio.core.config import Config, read_config, write_config
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import read_json, write_csv
+from qfolio.portfolio.backtest.folder import AgentName, BacktestFolder
+from qfolio.portfolio.study.pooling import Pools, TableReturns
+
+FILE = "study.json"
+
+NAME = r"^[A-Za-z0-9_-]+$"
+"""The names of tables, which become folders."""
+
+TableName = Annotated[str, msgspec.Meta(pattern=NAME)]
+
+
+class Variant(msgspec.Struct, frozen=True):
+    """A lag, and a cost as a fraction of the value traded."""
+
+    lag: int
+    cost: float
+
+    @property
+    def bps(self) -> float:
+        """The cost in basis points."""
+        return round(1e4 * self.cost, 6)
+
+    @property
+    def name(self) -> str:
+        """Its name as a folder: lag1-10bp."""
+        return f"lag{self.lag}-{self.bps:g}bp"
+
+
+class TableConfig(msgspec.Struct, frozen=True, kw_only=True):
+    """A table of the study."""
+
+    source: str
+    digest: str
+    rows: int
+    assets: int
+    first: str
+    last: str
+    note: str
+    trials: int  # earlier looks at this table, those of earlier studies included
+
+
+class Look(msgspec.Struct, frozen=True, kw_only=True):
+    """Agents whose result on a table was computed; each of them is a look at the table.
+
+    study: when the study was created, which tells studies apart.
+    """
+
+    study: str
+    table: str
+    digest: str
+    lag: int
+    cost: float
+    agents: tuple[str, ...]
+
+
+class VariantResult(msgspec.Struct, frozen=True, kw_only=True):
+    """The pooled evidence at one lag and cost, by agent."""
+
+    variant: Variant
+    agents: dict[str, Pools]
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """The result of a study.
+
+    variants: the main one first. looks: taken by this study. earlier: looks at its tables before.
+    trials: the most looks at any one of its tables, all of them counted. threshold: z that the best
+    of so many trials is expected to reach without skill. verdicts: sentences by agent.
+    """
+
+    variants: list[VariantResult]
+    looks: int
+    earlier: int
+    trials: int
+    threshold: float
+    verdicts: dict[str, list[str]]
+
+
+class StudyConfig(Config, frozen=True):
+    """The content of study.json."""
+
+    kind: ClassVar[str] = "study"
+    format: ClassVar[int] = 1
+
+    tables: Annotated[dict[TableName, TableConfig], msgspec.Meta(min_length=1)]
+    left_out: dict[TableName, str]
+    variants: Annotated[list[Variant], msgspec.Meta(min_length=1)]
+    agents: Annotated[list[AgentName], msgspec.Meta(min_length=1)]
+    train: str
+    test: str
+    command: str
+    device: str
+    started: str
+    earlier: list[Look] = msgspec.field(default_factory=list)
+    looks: list[Look] = msgspec.field(default_factory=list)
+    result: Result | None = None
+
+
+class StudyFolder:
+    """Reads and writes a study's files."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def write(self, config: StudyConfig) -> None:
+        write_config(self.path / FILE, config)
+
+    def read(self) -> StudyConfig:
+        """Raises QfolioError if the folder holds no study of this version."""
+        return read_config(self.path / FILE, StudyConfig)
+
+    def place(self, table: str, variant: Variant) -> Path:
+        """The folder of a backtest."""
+        return self.path / "tables" / table / variant.name
+
+    def read_returns(self, table: str, variant: Variant, agents: Iterable[str]) -> TableReturns:
+        """The returns of a finished backtest.
+
+        Raises:
+            QfolioError: returns.csv or summary.json is missing or damaged.
+        """
+        files = BacktestFolder(self.place(table, variant))
+        days, columns = files.read_returns()
+        summary = read_json(files.path / "summary.json")
+        try:
+            kinds = {name: entry["kind"] for name, entry in summary["strategies"].items()}
+            reference = summary["reference"]
+            baselines = _of_kind("baseline", kinds, columns)
+            return TableReturns(
+                tuple(days),
+                float(summary["periods_per_year"]),
+                {agent: _traded(agent, columns) for agent in agents},
+                {reference: columns[reference], **_of_kind("rebalancing", kinds, columns)},
+                baselines,
+            )
+        except (AttributeError, KeyError, StopIteration, TypeError, ValueError):
+            raise QfolioError(
+                f"{files.path} is damaged; write its tables again with qfolio backtest --resume "
+                f"{files.path}."
+            ) from None
+
+    def write_table(self, result: Result) -> None:
+        """study.csv: a row for each table, variant and agent."""
+        rows = list(_rows(result))
+        write_csv(self.path / "study.csv", rows[0], (row.values() for row in rows))
+
+
+def _rows(result: Result) -> Iterator[dict[str, Any]]:
+    for entry in result.variants:
+        for agent, pools in entry.agents.items():
+            for table, known in pools.evidence.items():
+                row = {
+                    "table": table,
+                    "lag": entry.variant.lag,
+                    "cost_bps": entry.variant.bps,
+                    "agent": agent,
+                    **msgspec.to_builtins(known),
+                }
+                for against in ("to_reference", "to_rebalanced"):
+                    row |= {f"{against}_{key}": x for key, x in row.pop(against).items()}
+                yield row
+
+
+def _of_kind(
+    kind: str, kinds: dict[str, str], columns: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    return {name: columns[name] for name, its in kinds.items() if its == kind}
+
+
+def _traded(agent: str, columns: dict[str, np.ndarray]) -> np.ndarray:
+    """The returns of an agent as it is traded: all seeds together, or its only seed."""
+    from qfolio.portfolio.backtest.run import TOGETHER
+
+    if (together := f"{agent}{TOGETHER}") in columns:
+        return columns[together]
+    (only,) = (name for name in columns if name.rpartition("/")[0] == agent)
+    return columns[only]

@@ -1,0 +1,343 @@
+"""Evidence on one table, and the evidence of several tables pooled.
+
+``evidence`` compares an agent on one table with the reference, with the reference at its best speed
+of rebalancing and with the best baseline; ``pool`` combines what several tables say about an agent.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from qfolio.portfolio.backtest.bootstrap import (
+    block_length,
+    percentile_interval,
+    stationary_bootstrap_indices,
+)
+from qfolio.portfolio.backtest.estimates import MARGIN, Estimate, estimate
+from qfolio.portfolio.backtest.measures import (
+    Floats,
+    log_growth,
+    paired_difference,
+    ratio_or_zero,
+)
+
+RESAMPLES = 2000
+"""Histories that the hierarchical bootstrap draws."""
+
+_CHUNK = 2_000_000  # resampled days held at a time
+
+Against = Literal["to_reference", "to_rebalanced"]
+AGAINST: tuple[Against, ...] = ("to_reference", "to_rebalanced")
+"""What an agent is compared with: the reference, and its best rebalancing."""
+
+Finding = Literal["better", "worse", "none"]
+
+
+class TableReturns(NamedTuple):
+    """Simple daily returns on one table over the days of its test, each of shape (days,).
+
+    agents: by name, each traded as ``allocate`` trades it. rebalancings: the reference first, then
+    the reference at other speeds. baselines: all of them, the reference included.
+    """
+
+    days: Sequence[str]
+    periods_per_year: float
+    agents: Mapping[str, Floats]
+    rebalancings: Mapping[str, Floats]
+    baselines: Mapping[str, Floats]
+
+
+class Active(msgspec.Struct, frozen=True, kw_only=True):
+    """An agent less a reference on one table; numbers are annual, None if they are not finite."""
+
+    reference: str
+    growth: float | None  # of log wealth
+    low: float | None  # 95 % interval of the growth
+    high: float | None
+    tracking_error: float | None  # standard deviation of the differences in log return
+    information_ratio: float | None  # growth over tracking error
+    t: float | None  # growth over its standard error, which allows for autocorrelation
+    z: float | None  # the normal quantile of the one-sided p-value that the agent is better
+
+
+class Evidence(msgspec.Struct, frozen=True, kw_only=True):
+    """What one table says about one agent."""
+
+    first: str
+    last: str
+    days: int
+    years: float
+    to_reference: Active
+    to_rebalanced: Active  # less the best rebalancing; z is of the claim that it beats them all
+    baseline: str  # that with the highest Sharpe ratio over the same days
+    sharpe: float | None  # annual Sharpe ratio less that of this baseline
+    sharpe_t: float | None
+
+
+class Pooled(msgspec.Struct, frozen=True, kw_only=True):
+    """What all tables say about one agent against one reference."""
+
+    growth: float | None  # mean over tables of the active growth a year
+    low: float | None  # 95 % interval by the hierarchical bootstrap
+    high: float | None
+    z: float | None  # Stouffer's
+    p: float | None  # two-sided; against rebalancings only the claim "better" is tested
+    p_holm: float | None = None  # corrected for all comparisons of the main variant; decides
+    finding: Finding | None = None  # none for other variants
+    positive: int  # tables on which the agent grew more
+    worst: str  # the table with the least active growth
+
+
+class Pools(msgspec.Struct, frozen=True, kw_only=True):
+    """What all tables say about one agent; evidence: of each table, by its name."""
+
+    evidence: dict[str, Evidence]
+    to_reference: Pooled
+    to_rebalanced: Pooled
+
+
+def evidence(tested: TableReturns, agent: str) -> Evidence:
+    """Compare an agent with its references on one table.
+
+    The estimator is that of a backtest (``estimates.py``). The best rebalancing and the best
+    baseline are chosen with hindsight. To beat the best rebalancing, an agent has to beat them all:
+    its z is the least of them (an intersection–union test, Berger 1982).
+    """
+    ours, year = tested.agents[agent], tested.periods_per_year
+    to = {
+        name: estimate(ours[None], theirs[None], year)["growth"]
+        for name, theirs in tested.rebalancings.items()
+    }
+    reference, best = next(iter(to)), _best_rebalancing(tested)
+    sharpes = {name: _sharpe(returns) for name, returns in tested.baselines.items()}
+    baseline = max(sharpes, key=lambda name: sharpes[name])
+    sharpe = estimate(ours[None], tested.baselines[baseline][None], year)["sharpe"]
+    return Evidence(
+        first=tested.days[0],
+        last=tested.days[-1],
+        days=len(tested.days),
+        years=len(tested.days) / year,
+        to_reference=_active(tested, agent, reference, to[reference], z_of(to[reference])),
+        to_rebalanced=_active(tested, agent, best, to[best], min(map(z_of, to.values()))),
+        baseline=baseline,
+        sharpe=finite(sharpe.value),
+        sharpe_t=finite(_t(sharpe)),
+    )
+
+
+def active_returns(tested: TableReturns, agent: str, against: Against) -> Floats:
+    """Daily differences in log return, of shape (days,)."""
+    reference = next(iter(tested.rebalancings))
+    name = reference if against == "to_reference" else _best_rebalancing(tested)
+    ours, theirs = tested.agents[agent], tested.rebalancings[name]
+    return paired_difference(log_growth(ours), log_growth(theirs))
+
+
+def pool(
+    tables: Mapping[str, TableReturns], agents: Sequence[str], seed: int = 0
+) -> dict[str, Pools]:
+    """Pool the evidence of tables on each agent, without Holm's correction.
+
+    Args:
+        tables: By name, at least one.
+        agents: Names of agents that all tables have.
+        seed: Seed of the bootstrap; all agents share the tables and days that are drawn.
+    """
+    keys = [(agent, against) for agent in agents for against in AGAINST]
+    # Any number will do for a total loss, which has neither an interval nor a z.
+    active = [
+        np.nan_to_num([active_returns(table, *key) for key in keys], neginf=0.0, posinf=0.0)
+        for table in tables.values()
+    ]
+    years = [table.periods_per_year for table in tables.values()]
+    annual = [year * daily for year, daily in zip(years, active, strict=True)]
+    drawn = hierarchical_bootstrap(annual, RESAMPLES, np.random.default_rng(seed))
+    known = {a: {name: evidence(table, a) for name, table in tables.items()} for a in agents}
+    days = [table.days for table in tables.values()]
+    pooled = {
+        (agent, against): _pooled(
+            {name: getattr(each, against) for name, each in known[agent].items()},
+            [math.sqrt(each.years) for each in known[agent].values()],
+            correlations(days, [daily[place] for daily in active]),
+            drawn[:, place],
+            both=against == "to_reference",
+        )
+        for place, (agent, against) in enumerate(keys)
+    }
+    return {
+        agent: Pools(
+            evidence=known[agent],
+            to_reference=pooled[agent, "to_reference"],
+            to_rebalanced=pooled[agent, "to_rebalanced"],
+        )
+        for agent in agents
+    }
+
+
+def _pooled(
+    tables: Mapping[str, Active], weights: list[float], shared: Floats, drawn: Floats, *, both: bool
+) -> Pooled:
+    """From differences by table, their weights and correlations, and resampled means."""
+    growth = {name: _known(each.growth) for name, each in tables.items()}
+    mean = float(np.mean(list(growth.values())))
+    low, high = percentile_interval(drawn) if math.isfinite(mean) else np.full(2, math.nan)
+    z = stouffer([_known(each.z) for each in tables.values()], weights, shared)
+    return Pooled(
+        growth=finite(mean),
+        low=finite(float(low)),
+        high=finite(float(high)),
+        z=finite(z),
+        p=finite(p_value(z, both=both)),
+        positive=sum(value > 0 for value in growth.values()),
+        # A growth that is not finite is that of a total loss.
+        worst=min(growth, key=lambda name: (math.isfinite(growth[name]), growth[name])),
+    )
+
+
+def z_of(difference: Estimate) -> float:
+    """The standard normal quantile of an estimate: as likely as its t, without any difference.
+
+    0 for a rounding error, NaN if the error is not known.
+    """
+    from scipy.special import ndtri, stdtr
+
+    if not difference.known:
+        return math.nan
+    if abs(difference.value) <= MARGIN:
+        return 0.0
+    tail = float(stdtr(difference.freedom, -abs(_t(difference))))
+    return math.copysign(float(ndtri(tail)), difference.value)
+
+
+def stouffer(z: ArrayLike, weights: ArrayLike, correlation: ArrayLike | None = None) -> float:
+    """Combine one-sided tests of several tables: Σ wz / √(w'Rw), standard normal without an edge.
+
+    Stouffer et al. (1949), "The American Soldier", with the weights of Lipták (1958); R allows for
+    tables with common shocks (Strube 1985).
+
+    Args:
+        z: Normal quantiles of shape (tables,).
+        weights: Positive numbers of the same shape. √years has the most power if all tables have
+            one information ratio, because the expected z is that ratio times √years.
+        correlation: R of shape (tables, tables) (default: independent tables).
+    """
+    scores, w = np.asarray(z, dtype=float), np.asarray(weights, dtype=float)
+    shared = np.eye(len(w)) if correlation is None else np.asarray(correlation, dtype=float)
+    return float(w @ scores / math.sqrt(w @ shared @ w))
+
+
+def correlations(days: Sequence[Sequence[str]], active: Sequence[Floats]) -> Floats:
+    """Estimate the correlations of the tables' mean active returns from their common days.
+
+    That of two means is ρ · n / √(n₁n₂), where ρ is the correlation of the n common days. Negative
+    ones count as 0, so that the pooled z is never larger than that of independent tables.
+
+    Args:
+        days: Of each table.
+        active: Daily differences of each table, of shape (days,).
+    """
+    shared = np.eye(len(days))
+    for i in range(len(days)):
+        for j in range(i):
+            _, here, there = np.intersect1d(days[i], days[j], return_indices=True)
+            first, second = active[i][here], active[j][there]
+            if len(here) > 2 and first.std() > 0 and second.std() > 0:
+                rho = float(np.corrcoef(first, second)[0, 1])
+                part = len(here) / math.sqrt(len(days[i]) * len(days[j]))
+                shared[i, j] = shared[j, i] = max(0.0, rho * part)
+    return shared
+
+
+def hierarchical_bootstrap(
+    tables: Sequence[Floats], resamples: int, rng: np.random.Generator
+) -> Floats:
+    """Resample the mean over tables of their means over days: draw tables, then days within them.
+
+    Tables are drawn with replacement, and the days of each drawn table by the stationary bootstrap
+    (Davison & Hinkley 1997, section 3.8; Politis & Romano 1994). The days' noise is in the
+    differences between tables, too, so intervals are wide rather than narrow. One table alone is
+    resampled by days.
+
+    Args:
+        tables: Daily numbers of each table, shape (series, days); days may differ, series not.
+        resamples: How many to draw.
+        rng: Source of randomness.
+
+    Returns:
+        Means of shape (resamples, series).
+    """
+    picks = rng.integers(len(tables), size=(resamples, len(tables)))
+    total = np.zeros((resamples, len(tables[0])))
+    for place, table in enumerate(tables):
+        block = max(block_length(series) for series in table)
+        rows = np.nonzero(picks == place)[0]
+        np.add.at(total, rows, _resampled_means(table, block, len(rows), rng))
+    return total / len(tables)
+
+
+def p_value(z: float, *, both: bool) -> float:
+    """The two-sided p-value of a z; if not ``both``, that of a negative z is 1."""
+    from scipy.special import ndtr
+
+    return float(np.minimum(1.0, 2 * ndtr(-abs(z) if both else -z)))
+
+
+def finite(value: float) -> float | None:
+    """The number as JSON can hold it: None if it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _resampled_means(
+    table: Floats, block: float, resamples: int, rng: np.random.Generator
+) -> Floats:
+    """Means of shape (resamples, series) over histories of shape (series, days)."""
+    days = table.shape[1]
+    means = np.zeros((resamples, len(table)))
+    chunk = max(1, _CHUNK // days)
+    for start in range(0, resamples, chunk):
+        size = min(chunk, resamples - start)
+        drawn = stationary_bootstrap_indices(days, block, size, rng)
+        cells = drawn + days * np.arange(size)[:, None]
+        counts = np.bincount(cells.ravel(), minlength=size * days).reshape(size, days)
+        means[start : start + size] = counts @ table.T / days
+    return means
+
+
+def _active(tested: TableReturns, agent: str, name: str, shown: Estimate, z: float) -> Active:
+    daily = paired_difference(
+        log_growth(tested.agents[agent]), log_growth(tested.rebalancings[name])
+    )
+    daily = daily if shown.known else np.full(2, math.nan)  # a total loss has no spread
+    spread = math.sqrt(tested.periods_per_year) * float(daily.std(ddof=1))
+    low, high = shown.interval()
+    return Active(
+        reference=name,
+        growth=finite(shown.value),
+        low=finite(low),
+        high=finite(high),
+        tracking_error=finite(spread),
+        information_ratio=finite(float(ratio_or_zero(shown.value, spread))),
+        t=finite(_t(shown)),
+        z=finite(z),
+    )
+
+
+def _best_rebalancing(tested: TableReturns) -> str:
+    growth = {name: float(log_growth(x).mean()) for name, x in tested.rebalancings.items()}
+    return max(growth, key=lambda name: growth[name])
+
+
+def _sharpe(returns: Floats) -> float:
+    return float(ratio_or_zero(returns.mean(), returns.std(ddof=1)))
+
+
+def _t(difference: Estimate) -> float:
+    return float(ratio_or_zero(difference.value, difference.error)) if difference.known else 0.0
+
+
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value

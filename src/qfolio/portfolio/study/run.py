@@ -1,0 +1,350 @@
+"""A study: one frozen configuration, backtested on many price tables, and the evidence pooled.
+
+Each table is an ordinary backtest in a folder of its own, and so is each variant of a table: the
+same agents trained and tested at another lag or cost. All of them are written before the first is
+trained, so that nothing is chosen after a result is known.
+"""
+
+import contextlib
+import itertools
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from qfolio.core import devices
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import locked, new_folder
+from qfolio.core.mdp import Agent
+from qfolio.core.statistics import holm
+from qfolio.experiments.executor import Executor, Job
+from qfolio.experiments.fit import Listener
+from qfolio.experiments.interrupts import interruptible
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.assessment import Assessment
+from qfolio.portfolio.backtest.bootstrap import LEVEL
+from qfolio.portfolio.backtest.folds import require_fold
+from qfolio.portfolio.backtest.replay import Entry
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe
+from qfolio.portfolio.prices.table import Prices, describe, trials_on
+from qfolio.portfolio.study.folder import (
+    NAME,
+    Look,
+    Result,
+    StudyConfig,
+    StudyFolder,
+    TableConfig,
+    Variant,
+    VariantResult,
+)
+from qfolio.portfolio.study.pooling import AGAINST, Finding, Pooled, Pools, TableReturns, pool
+from qfolio.portfolio.study.verdict import verdicts
+
+Listen = Callable[[Job, float, float], Sequence[Listener]]
+Report = Callable[[Backtest, dict[str, Entry], Assessment, list[str]], None]
+
+
+class Study:
+    """Made by ``create`` or ``open``; ``run`` does what is missing and ``result`` pools it.
+
+    interrupted: whether Ctrl-C stopped the last ``run``.
+    """
+
+    def __init__(
+        self, config: StudyConfig, folder: Path, agents: Mapping[str, Agent] | None = None
+    ) -> None:
+        self.config, self.folder, self._files = config, folder, StudyFolder(folder)
+        self._agents = dict(agents or {})
+        self.interrupted = False
+
+    @classmethod
+    def create(
+        cls,
+        tables: Mapping[str, Prices],
+        agents: Mapping[str, Preset | Agent],
+        *,
+        lags: Sequence[int] = (1,),
+        costs: Sequence[float] = (0.001,),
+        train: str = "5y",
+        test: str = "1y",
+        trials: int = 0,
+        after: Sequence[Path | str] = (),
+        command: str = "",
+        out: Path | str,
+        **options: Any,
+    ) -> "Study":
+        """A study before its first backtest.
+
+        Tables without one whole fold are left out (``config.left_out`` says why).
+
+        Args:
+            tables: Price tables by name; names become folders.
+            agents: The agents to train, by name, as ``Backtest.create`` takes them.
+            lags, costs: Every lag is combined with every cost (a fraction of the value traded); the
+                first of each make the main variant.
+            train, test: Lengths such as "5y" or "500d".
+            trials: Earlier looks at each of the tables.
+            after: Folders of earlier studies; their looks at the same tables are counted, too.
+            command: The command that started it, for the reports.
+            out: A new or empty folder.
+            options: Further arguments of ``Backtest.create``: expanding, seeds, baselines, ….
+
+        Raises:
+            QfolioError: A name or a table is given twice, all tables are too short, or a backtest
+                refuses its arguments.
+        """
+        variants = [Variant(int(lag), float(cost)) for lag, cost in itertools.product(lags, costs)]
+        _require_plan(tables, variants)
+        earlier = list(dict.fromkeys(look for folder in after for look in looks_of(folder)))
+        left_out = _too_short(tables, train, test, max(lags, default=1))
+        kept = {name: table for name, table in tables.items() if name not in left_out}
+        if not kept:
+            reasons = " ".join(f"{name} is too short: {why}" for name, why in left_out.items())
+            raise QfolioError(reasons)
+        config = StudyConfig(
+            tables={
+                name: _table_config(table, trials + _count(earlier, table.digest))
+                for name, table in kept.items()
+            },
+            left_out=left_out,
+            variants=variants,
+            agents=list(agents),
+            train=train,
+            test=test,
+            command=command,
+            earlier=earlier,
+            **devices.circumstances(),
+        )
+        with new_folder(Path(out)) as folder:
+            files = StudyFolder(folder)
+            for (name, table), variant in itertools.product(kept.items(), variants):
+                with _of(name):
+                    Backtest.create(
+                        table,
+                        agents,
+                        train=train,
+                        test=test,
+                        lag=variant.lag,
+                        cost=variant.cost,
+                        trials=config.tables[name].trials,
+                        command=command,
+                        out=files.place(name, variant),
+                        **options,
+                    )
+            files.write(config)
+        own = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
+        return cls(config, Path(out), own)
+
+    @classmethod
+    def open(cls, folder: Path | str, agents: Mapping[str, Agent] | None = None) -> "Study":
+        """A study as its last finished group of folds left it.
+
+        agents: by name, those that are not registered with qfolio.
+        """
+        return cls(StudyFolder(Path(folder)).read(), Path(folder), agents)
+
+    def __repr__(self) -> str:
+        tables = f"{len(self.config.tables)} table" + "s" * (len(self.config.tables) > 1)
+        done = f"{len(self.config.looks)} of {len(self.places)} backtests finished"
+        return f"<Study: {', '.join(self.config.agents)} on {tables}, {done}, in {self.folder}>"
+
+    @property
+    def places(self) -> list[tuple[str, Variant]]:
+        """Every table and variant, in the order in which they run: the main variant first."""
+        return [(name, each) for each in self.config.variants for name in self.config.tables]
+
+    def finished(self, table: str, variant: Variant) -> bool:
+        """Whether the result on a table was computed, which is a look at it."""
+        return any(
+            (look.table, look.lag, look.cost) == (table, variant.lag, variant.cost)
+            for look in self.config.looks
+        )
+
+    def backtest(self, table: str, variant: Variant | None = None) -> Backtest:
+        """The backtest of a table (default: in the main variant)."""
+        if table not in self.config.tables:
+            known = ", ".join(self.config.tables)
+            raise QfolioError(f"The study has no table {table!r}; choose from {known}.")
+        place = self._files.place(table, variant or self.config.variants[0])
+        return Backtest.open(place, self._agents)
+
+    def run(
+        self,
+        listen: Callable[[str, Variant, Backtest], Listen] | None = None,
+        report: Report | None = None,
+        executor: Executor | None = None,
+    ) -> None:
+        """Runs every backtest that is not finished.
+
+        A first Ctrl-C stops after the current chunk of training and sets ``interrupted``; finished
+        groups of folds are kept.
+
+        Args:
+            listen: Called before each backtest; returns the ``listen`` of ``Backtest.run``.
+            report: Called with each finished backtest, its entries, assessment and notes, before it
+                counts as finished.
+            executor: Where training runs (default: in this process).
+        """
+        with locked(self.folder), interruptible() as stop:
+            for name, variant in self.places:
+                if self.finished(name, variant):
+                    continue
+                with _of(name):
+                    backtest = self.backtest(name, variant)
+                    listeners = _silent if listen is None else listen(name, variant, backtest)
+                    backtest.run(listeners, executor)
+                    if backtest.interrupted:
+                        break
+                    entries, notes = backtest.entries()
+                    assessment = backtest.assess(entries)
+                    backtest.write_tables(entries, assessment)
+                    if report is not None:
+                        report(backtest, entries, assessment, notes)
+                self._note(name, variant)
+            self.interrupted = stop.is_set() and not self._complete
+
+    def result(self) -> Result:
+        """The pooled evidence; writes it into study.json and study.csv.
+
+        Raises QfolioError if a backtest is not finished.
+        """
+        config = self.config
+        if not self._complete:
+            raise QfolioError(
+                f"The study is not finished; continue with qfolio study --resume {self.folder}."
+            )
+        result = summarise(
+            config,
+            [
+                {
+                    name: self._files.read_returns(name, each, config.agents)
+                    for name in config.tables
+                }
+                for each in config.variants
+            ],
+        )
+        self.config = msgspec.structs.replace(config, result=result)
+        self._files.write(self.config)
+        self._files.write_table(result)
+        return result
+
+    @property
+    def _complete(self) -> bool:
+        return all(self.finished(*place) for place in self.places)
+
+    def _note(self, table: str, variant: Variant) -> None:
+        """Records a look, which marks the backtest as finished."""
+        look = Look(
+            study=self.config.started,
+            table=table,
+            digest=self.config.tables[table].digest,
+            lag=variant.lag,
+            cost=variant.cost,
+            agents=tuple(self.config.agents),
+        )
+        self.config = msgspec.structs.replace(self.config, looks=[*self.config.looks, look])
+        self._files.write(self.config)
+
+
+def _silent(job: Job, done: float, share: float) -> Sequence[Listener]:
+    return ()
+
+
+def summarise(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]]) -> Result:
+    """Pool the evidence of a study.
+
+    Args:
+        config: With the looks that were taken.
+        tested: The returns on each table, by variant.
+    """
+    pooled = [pool(tables, config.agents) for tables in tested]
+    pooled[0] = corrected(pooled[0])
+    before = [table.trials + trials_on(table.source) for table in config.tables.values()]
+    trials = max(before) + len(config.variants) * len(config.agents)
+    return Result(
+        variants=[
+            VariantResult(variant=variant, agents=agents)
+            for variant, agents in zip(config.variants, pooled, strict=True)
+        ],
+        looks=sum(len(look.agents) for look in config.looks),
+        earlier=sum(before),
+        trials=trials,
+        threshold=expected_maximum_sharpe(trials, 1.0),
+        verdicts=verdicts(pooled[0]),
+    )
+
+
+def looks_of(folder: Path | str) -> list[Look]:
+    """All looks that a study knows of: those before it and its own."""
+    config = StudyFolder(Path(folder)).read()
+    return [*config.earlier, *config.looks]
+
+
+def corrected(agents: Mapping[str, Pools]) -> dict[str, Pools]:
+    """The pooled evidence with Holm's correction over all agents and references, which decides."""
+    pooled: list[Pooled] = [getattr(agents[name], key) for name in agents for key in AGAINST]
+    p_holm = holm([1.0 if each.p is None else each.p for each in pooled]).tolist()
+    found = iter([_found(each, p) for each, p in zip(pooled, p_holm, strict=True)])
+    return {
+        name: msgspec.structs.replace(pools, to_reference=next(found), to_rebalanced=next(found))
+        for name, pools in agents.items()
+    }
+
+
+def _found(pooled: Pooled, p: float) -> Pooled:
+    finding: Finding = "none"
+    if p <= 1 - LEVEL and pooled.z is not None:
+        finding = "better" if pooled.z > 0 else "worse"
+    return msgspec.structs.replace(pooled, p_holm=p, finding=finding)
+
+
+def _too_short(tables: Mapping[str, Prices], train: str, test: str, lag: int) -> dict[str, str]:
+    """The tables without one whole fold, each with the reason."""
+    reasons = {}
+    for name, table in tables.items():
+        try:
+            require_fold(table.dates, train, test, lag)
+        except QfolioError as error:
+            reasons[name] = str(error)
+    return reasons
+
+
+def _table_config(prices: Prices, trials: int) -> TableConfig:
+    facts = describe(prices)
+    kept = {key: facts[key] for key in ("source", "digest", "rows", "assets", "first", "last")}
+    return TableConfig(**kept, note=str(facts["note"] or ""), trials=trials)
+
+
+def _count(looks: Sequence[Look], digest: str) -> int:
+    return sum(len(look.agents) for look in looks if look.digest == digest)
+
+
+def _require_plan(tables: Mapping[str, Prices], variants: Sequence[Variant]) -> None:
+    """Raises QfolioError if there is nothing to do, something counts twice, or a name is no
+    folder's."""
+    if not (tables and variants):
+        what = "table; name its file" if variants else "lag and one cost"
+        raise QfolioError(f"A study needs at least one {what}.")
+    names: dict[str, str] = {}
+    for name, table in tables.items():
+        if not re.fullmatch(NAME, name):
+            raise QfolioError(f"A table is called {name!r}; use letters, digits, - and _.")
+        if (twin := names.setdefault(table.digest, name)) != name:
+            raise QfolioError(f"{twin} and {name} are the same table; give it once.")
+    for variant in variants:
+        if variants.count(variant) > 1:
+            raise QfolioError(
+                f"A lag of {variant.lag} with a cost of {variant.bps:g} bp is given twice."
+            )
+
+
+@contextlib.contextmanager
+def _of(table: str) -> Iterator[None]:
+    """Errors in this block name the table."""
+    try:
+        yield
+    except QfolioError as error:
+        raise QfolioError(f"{table}: {error}") from None

@@ -1,0 +1,273 @@
+"""The report of a study: one self-contained page without scripts.
+
+All of its numbers are in study.json, so that the report can be written again from it.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from qfolio.core.files import write_bytes
+from qfolio.portfolio.backtest.verdict import p_value
+from qfolio.portfolio.study.folder import Result, StudyConfig, Variant
+from qfolio.portfolio.study.pooling import Active, Evidence, Pools
+from qfolio.portfolio.study.run import Study
+from qfolio.portfolio.study.verdict import decimal, looks_sentence, percent
+from qfolio.report import rendering
+from qfolio.report.backtest.verdicts import ticks_around
+from qfolio.report.rendering import THIN_SPACE, counted, number, render, setting_groups
+
+REACH = 1.6
+"""The axis reaches this many times as far as the estimates; intervals beyond it are cut."""
+
+HIDDEN = ("prices", "assets", "feature_names", "command", "lag", "cost", "trials")
+"""Settings of a backtest that differ between tables or are shown elsewhere."""
+
+
+class Bar(NamedTuple):
+    """An interval on the axis: places in percent of its width, and which ends are cut off."""
+
+    left: float
+    width: float
+    dot: float
+    cut_left: bool
+    cut_right: bool
+
+
+class Row(NamedTuple):
+    """A table in the forest plot."""
+
+    name: str
+    link: str | None
+    period: str
+    years: str
+    bar: Bar | None
+    side: str  # above, below or neither: where the interval lies
+    size: float  # of the mark, in pixels
+    worst: bool
+    cells: list[tuple[str, ...]]  # values, each with remarks
+    label: str  # of the bar, for readers who do not see it
+
+
+def write_study_report(study: Study) -> None:
+    """Write report.html into the folder of a finished study.
+
+    Raises:
+        QfolioError: The study is not finished, or a backtest's folder is damaged.
+        OSError: The file cannot be written.
+    """
+    result = study.config.result or study.result()
+    first = study.backtest(next(iter(study.config.tables))).config
+    settings = {k: v for k, v in msgspec.to_builtins(first).items() if k not in HIDDEN}
+    links = {
+        name: place
+        for name in study.config.tables
+        if (study.folder / (place := _place(name, study.config.variants[0]))).exists()
+    }
+    page = render_study(study.config, result, settings, links)
+    write_bytes(study.folder / "report.html", page.encode("utf-8"))
+
+
+def render_study(
+    config: StudyConfig, result: Result, settings: dict[str, Any], links: dict[str, str]
+) -> str:
+    """Return the text of the page.
+
+    Args:
+        config: The study.
+        result: Its pooled evidence.
+        settings: Settings of its backtests, to list them.
+        links: Where the reports of tables are, as far as they exist, by table.
+    """
+    main, agents = result.variants[0], " and ".join(config.agents)
+    tables = len(config.tables)
+    return render(
+        "study.html",
+        data=config,
+        result=result,
+        title=f"{agents} on {tables} table{'s' * (tables != 1)}",
+        spelled=_spelled(main.variant),
+        facts=_facts(config, result),
+        looks=looks_sentence(result),
+        notes=sorted({table.note for table in config.tables.values() if table.note}),
+        agents=[
+            {
+                "name": name,
+                "verdicts": result.verdicts[name],
+                "to_reference": next(iter(pools.evidence.values())).to_reference.reference,
+                **_forest(pools, links),
+                "variants": _variants(result, name),
+            }
+            for name, pools in main.agents.items()
+        ],
+        counted=counted(tables, "table"),
+        repeats="The same tables and seeds give the same results",
+        subject="study",
+        settings=setting_groups(settings),
+    )
+
+
+def _facts(config: StudyConfig, result: Result) -> list[tuple[str, str, str]]:
+    """The key figures: name, value and a remark."""
+    main = result.variants[0]
+    known = next(iter(main.agents.values())).evidence.values()
+    variants = len(config.variants)
+    earlier = f", {number(result.earlier, 0)} earlier" if result.earlier else ""
+    return [
+        ("Tables", str(len(config.tables)), f"{len(config.left_out)} left out"),
+        ("Tested", f"{number(sum(one.years for one in known))} years", "all tables together"),
+        ("Folds", config.test, f"after {config.train} of training"),
+        ("Cost", f"{main.variant.bps:g}{THIN_SPACE}bp", f"lag {main.variant.lag}"),
+        ("Looks", number(result.looks, 0), f"{variants} variant{'s' * (variants > 1)}{earlier}"),
+        ("z by luck", decimal(result.threshold), f"best of {number(result.trials, 0)} trials"),
+    ]
+
+
+def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
+    """The rows of the forest plot, the best first, the pooled row, and the axis."""
+    actives = {name: known.to_reference for name, known in pools.evidence.items()}
+    pooled = pools.to_reference
+    points = [x for one in actives.values() if (x := one.growth) is not None]
+    points += [x for x in (pooled.low, pooled.growth, pooled.high, 0.0) if x is not None]
+    ends = [x for one in actives.values() for x in (one.low, one.high) if x is not None]
+    low = max(min([*points, *ends]), REACH * min(points) - 0.25 * max(points))
+    high = min(max([*points, *ends]), REACH * max(points) - 0.25 * min(points))
+    ticks, digits = ticks_around(low, high)
+    low, high = min(low, ticks[0]), max(high, ticks[-1])
+
+    def place(value: float) -> float:
+        share = (value - low) / (high - low) if high > low else 0.5
+        return round(100 * min(max(share, 0.0), 1.0), 2)
+
+    def bar(growth: float | None, left: float | None, right: float | None) -> Bar | None:
+        if growth is None or left is None or right is None:
+            return None
+        width = round(place(right) - place(left), 2)
+        return Bar(place(left), width, place(growth), left < low, right > high)
+
+    longest = max(known.years for known in pools.evidence.values())
+    order = sorted(actives, key=lambda name: _or(actives[name].growth), reverse=True)
+    rows = [
+        Row(
+            name=name,
+            link=links.get(name),
+            period=_period(known := pools.evidence[name]),
+            years=number(known.years),
+            bar=bar(one.growth, one.low, one.high),
+            side=_side(one.low, one.high),
+            size=round(6 + 6 * math.sqrt(known.years / longest), 1),
+            worst=len(actives) > 1 and name == pooled.worst,
+            cells=_cells(known),
+            label=_label(one.growth, one.low, one.high),
+        )
+        for name in order
+        for one in [actives[name]]
+    ]
+    rest = pools.to_rebalanced
+    return {
+        "rows": rows,
+        "pooled": {
+            "years": number(sum(known.years for known in pools.evidence.values())),
+            "bar": bar(pooled.growth, pooled.low, pooled.high),
+            "side": _side(pooled.low, pooled.high),
+            "cells": [
+                (percent(pooled.growth), _interval(pooled.low, pooled.high)),
+                ("",),
+                (f"z {decimal(pooled.z)}", _chance(pooled.p_holm)),
+                (percent(rest.growth), f"z {decimal(rest.z)}", _chance(rest.p_holm)),
+                ("",),
+            ],
+            "label": _label(pooled.growth, pooled.low, pooled.high),
+        },
+        "ticks": [(rendering.percent(tick, digits, sign=True), place(tick)) for tick in ticks],
+        "zero": place(0.0),
+        "mean": None if pooled.growth is None else place(pooled.growth),
+        "cut": any(row.bar and (row.bar.cut_left or row.bar.cut_right) for row in rows),
+    }
+
+
+def _cells(known: Evidence) -> list[tuple[str, ...]]:
+    active, rest = known.to_reference, known.to_rebalanced
+    return [
+        (percent(active.growth), _interval(active.low, active.high)),
+        (decimal(active.information_ratio), f"TE {_spread(active)}"),
+        (decimal(active.t),),
+        (percent(rest.growth), f"t {decimal(rest.t)}"),
+        (decimal(known.sharpe), f"t {decimal(known.sharpe_t)}", known.baseline),
+    ]
+
+
+def _variants(result: Result, agent: str) -> dict[str, Any] | None:
+    """The pooled results by lag (rows) and cost (columns); none if there is one variant."""
+    if len(result.variants) < 2:
+        return None
+    pools = {(each.variant.lag, each.variant.bps): each.agents[agent] for each in result.variants}
+    main = next(iter(pools))
+    lags, costs = sorted({lag for lag, _ in pools}), sorted({bps for _, bps in pools})
+    return {
+        "costs": [f"{bps:g}{THIN_SPACE}bp" for bps in costs],
+        "rows": [
+            (f"Lag {lag}", [_cell(pools[lag, bps], (lag, bps) == main) for bps in costs])
+            for lag in lags
+        ],
+    }
+
+
+def _cell(pools: Pools, main: bool) -> dict[str, Any]:
+    pooled = pools.to_reference
+    return {
+        "growth": percent(pooled.growth),
+        "interval": _interval(pooled.low, pooled.high),
+        "z": decimal(pooled.z),
+        "rest": decimal(pools.to_rebalanced.z),
+        "shade": _shade(pooled.z),
+        "main": main,
+    }
+
+
+def _shade(z: float | None) -> str:
+    level = 0 if z is None else min(5, round(abs(z)))
+    return f"{'win' if z and z > 0 else 'loss'}{level}" if level else ""
+
+
+def _side(low: float | None, high: float | None) -> str:
+    if low is not None and low > 0:
+        return "above"
+    return "below" if high is not None and high < 0 else "neither"
+
+
+def _interval(low: float | None, high: float | None) -> str:
+    return "no interval" if low is None or high is None else f"{percent(low)} … {percent(high)}"
+
+
+def _label(growth: float | None, low: float | None, high: float | None) -> str:
+    return f"{percent(growth)}, 95 % interval {_interval(low, high)}"
+
+
+def _chance(p: float | None) -> str:
+    return "" if p is None else f"p {p_value(p)}"
+
+
+def _spread(active: Active) -> str:
+    spread = active.tracking_error
+    return "undefined" if spread is None else rendering.percent(spread)
+
+
+def _period(known: Evidence) -> str:
+    return f"{known.first[:4]} to {known.last[:4]}"
+
+
+def _spelled(variant: Variant) -> str:
+    return f"lag {variant.lag}, {variant.bps:g}{THIN_SPACE}bp"
+
+
+def _place(table: str, variant: Variant) -> str:
+    return str(Path("tables") / table / variant.name / "report.html")
+
+
+def _or(value: float | None) -> float:
+    return -math.inf if value is None else value

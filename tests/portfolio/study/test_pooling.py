@@ -1,0 +1,143 @@
+import math
+
+import numpy as np
+import pytest
+
+from qfolio.portfolio.backtest.estimates import estimate
+from qfolio.portfolio.study.pooling import (
+    TableReturns,
+    correlations,
+    evidence,
+    hierarchical_bootstrap,
+    p_value,
+    pool,
+    stouffer,
+    z_of,
+)
+
+from studies import made_up
+
+
+def days(first, count):
+    dates = np.datetime64("2001-01-01") + np.arange(first, first + count)
+    return tuple(map(str, dates))
+
+
+def constant(active, count=40):
+    """An agent that earns these log returns more than equal weights, which earn nothing."""
+    flat = np.zeros(count)
+    ours = np.expm1(np.resize(active, count))
+    return TableReturns(days(0, count), 252.0, {"a": ours}, {"ew": flat}, {"ew": flat})
+
+
+def test_stouffer_by_hand():
+    assert stouffer([1, 2], [1, 1]) == pytest.approx(3 / math.sqrt(2))
+    assert stouffer([1, 2], [1, 2]) == pytest.approx(5 / math.sqrt(5))
+    assert stouffer([1, 2], [1, 1], np.ones((2, 2))) == pytest.approx(1.5)  # one table, twice
+    assert stouffer([1.7], [3]) == pytest.approx(1.7)
+
+
+def test_p_values_by_hand():
+    assert p_value(1.959964, both=True) == pytest.approx(0.05, abs=1e-6)
+    assert p_value(-1.959964, both=True) == pytest.approx(0.05, abs=1e-6)
+    assert p_value(-1.959964, both=False) == 1.0
+
+
+def test_a_z_is_as_likely_as_its_t():
+    rng = np.random.default_rng(0)
+    ours, theirs = rng.normal(5e-4, 0.01, (2, 1, 400))
+    difference = estimate(ours, theirs, 252)["growth"]
+    tails = difference.tails()
+    z = z_of(difference)
+    assert p_value(z, both=True) == pytest.approx(2 * min(tails))
+    assert (z > 0) == (difference.value > 0)
+    assert z_of(difference.negated()) == pytest.approx(-z)
+    assert z_of(estimate(ours, ours, 252)["growth"]) == 0
+
+
+def test_the_information_ratio_by_hand():
+    found = evidence(constant([0.002, -0.001]), "a").to_reference
+    spread = math.sqrt(252) * 0.0015 * math.sqrt(40 / 39)
+    assert found.growth == pytest.approx(252 * 0.0005)
+    assert found.tracking_error == pytest.approx(spread)
+    assert found.information_ratio == pytest.approx(252 * 0.0005 / spread)
+    assert evidence(constant([0.002]), "a").years == pytest.approx(40 / 252)
+
+
+def test_to_beat_the_best_rebalancing_is_to_beat_them_all():
+    rng = np.random.default_rng(1)
+    tested = made_up(rng, 600, 3e-4, "2001-01-02")
+    jumpy = tested.rebalancings["equal-weight"] - 1e-4 + 0.02 * rng.standard_normal(600)
+    tested = tested._replace(rebalancings={**tested.rebalancings, "jumpy": jumpy})
+    ours = tested.agents["tilts"][None]
+    each = {
+        name: z_of(estimate(ours, theirs[None], 252)["growth"])
+        for name, theirs in tested.rebalancings.items()
+    }
+    found = evidence(tested, "tilts")
+    assert found.to_reference.z == pytest.approx(each["equal-weight"])
+    assert found.to_rebalanced.z == pytest.approx(min(each.values()))
+    growth = {name: np.log1p(x).mean() for name, x in tested.rebalancings.items()}
+    assert found.to_rebalanced.reference == max(growth, key=lambda name: growth[name])
+
+
+def test_correlations_come_from_common_days():
+    rng = np.random.default_rng(2)
+    x = rng.standard_normal(100)
+    same, half = days(0, 100), days(50, 100)
+    assert correlations([same, same], [x, 2 * x])[0, 1] == pytest.approx(1)
+    assert correlations([same, same], [x, -x])[0, 1] == 0
+    assert correlations([same, half], [x, np.append(x[50:], x[:50])])[0, 1] == pytest.approx(0.5)
+    assert correlations([same, days(100, 100)], [x, x])[0, 1] == 0
+
+
+def test_the_bootstrap_draws_tables():
+    tables = [np.zeros((1, 30)), np.ones((1, 50))]
+    drawn = hierarchical_bootstrap(tables, 4000, np.random.default_rng(0))[:, 0]
+    values, counts = np.unique(drawn.round(9), return_counts=True)
+    assert values.tolist() == [0, 0.5, 1]
+    assert counts / 4000 == pytest.approx([0.25, 0.5, 0.25], abs=0.03)
+
+
+def test_the_bootstrap_of_one_table_draws_days():
+    days = np.random.default_rng(3).standard_normal((1, 400))
+    drawn = hierarchical_bootstrap([days], 2000, np.random.default_rng(0))[:, 0]
+    assert drawn.mean() == pytest.approx(days.mean(), abs=0.01)
+    assert drawn.std() == pytest.approx(1 / 20, rel=0.15)
+
+
+@pytest.mark.parametrize("between", [0.0, 0.1])
+def test_intervals_cover_the_mean_of_all_tables(between):
+    rng = np.random.default_rng(4)
+    covered = 0
+    for _ in range(100):
+        tables = [
+            0.1 + between * rng.standard_normal() + rng.standard_normal((1, 100)) for _ in range(8)
+        ]
+        drawn = hierarchical_bootstrap(tables, 400, rng)[:, 0]
+        low, high = np.quantile(drawn, [0.025, 0.975])
+        covered += low <= 0.1 <= high
+    assert covered >= 92  # the noise of days counts twice, so that intervals are rather wide
+
+
+def test_tables_are_pooled():
+    tables = {f"t{i}": constant([0.002 * (i + 1), 0.0], 40 + 10 * i) for i in range(3)}
+    pooled = pool(tables, ["a"])["a"].to_reference
+    each = [evidence(tested, "a").to_reference for tested in tables.values()]
+    growths = [active.growth or math.nan for active in each]
+    assert pooled.growth == pytest.approx(np.mean(growths))
+    assert pooled.low is not None
+    assert pooled.high is not None
+    assert pooled.low <= np.mean(growths) <= pooled.high
+    assert pooled.worst == "t0"
+    assert pooled.positive == 3
+    assert pool(tables, ["a"]) == pool(tables, ["a"])
+
+
+def test_a_total_loss_is_the_worst_and_has_no_numbers():
+    lost = constant([0.001])
+    lost.agents["a"][7] = -1.0
+    pooled = pool({"good": constant([0.002, 0.0]), "lost": lost}, ["a"])["a"].to_reference
+    assert pooled.worst == "lost"
+    assert (pooled.growth, pooled.low, pooled.z, pooled.p) == (None, None, None, None)
+    assert pooled.positive == 1

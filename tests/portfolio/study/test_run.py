@@ -1,0 +1,203 @@
+import json
+
+import msgspec
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.statistics import holm
+from qfolio.experiments.executor import Here
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.folds import require_fold
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.study.folder import Variant
+from qfolio.portfolio.study.run import Study, corrected
+
+from listeners import Interrupt
+from studies import study
+
+AGENTS = {
+    "pathwise": Preset(
+        "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (4,)},
+        episodes=8, seeds=2, task={"window": 10, "horizon": 20},
+    ),
+}  # fmt: skip
+
+
+def table(seed, rows=160):
+    rng = np.random.default_rng(seed)
+    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0))
+    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    return Prices(dates, ("A", "B", "C"), values, source=f"made up {seed}")
+
+
+TABLES = {"one": table(0), "two": table(1)}
+
+
+def create(folder, tables=TABLES, **options):
+    chosen = {"train": "80d", "test": "40d", "seeds": 2, "baselines": [], **options}
+    return Study.create(tables, AGENTS, out=folder, **chosen)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    done = create(tmp_path_factory.mktemp("studies") / "study", costs=(0.001, 0.005))
+    done.run()
+    done.result()
+    return done
+
+
+class Killed(Here):
+    """Stops as a killed process does, after some jobs."""
+
+    def __init__(self, jobs):
+        self.jobs = jobs
+
+    def map(self, jobs, listen):
+        for done in super().map(jobs, listen):
+            if not self.jobs:
+                raise RuntimeError("killed")
+            self.jobs -= 1
+            yield done
+
+
+def test_a_study_killed_and_resumed_equals_an_undisturbed_one(finished, tmp_path):
+    broken = create(tmp_path / "study", costs=(0.001, 0.005))
+    with pytest.raises(RuntimeError, match="killed"):
+        broken.run(executor=Killed(5))
+    again = Study.open(tmp_path / "study")
+    with pytest.raises(QfolioError, match="not finished; continue with qfolio study --resume"):
+        again.result()
+    assert 0 < len(again.config.looks) < 4
+    trained = []
+
+    def listen(name, variant, backtest):
+        trained.append((name, variant))
+        return lambda job, done, share: ()
+
+    again.run(listen)
+    left = [place for place in finished.places if place not in finished.places[: 4 - len(trained)]]
+    assert trained == left  # finished tables are not run again
+    assert again.result() == finished.config.result
+    assert (tmp_path / "study/study.csv").read_text() == (finished.folder / "study.csv").read_text()
+
+
+def test_ctrl_c_stops_after_the_current_chunk(tmp_path):
+    made = create(tmp_path / "study")
+    made.run(lambda *place: lambda job, done, share: [Interrupt()])
+    assert made.interrupted
+    assert not made.config.looks
+    made.run()
+    assert not made.interrupted
+    assert len(made.config.looks) == 2
+
+
+def test_a_study_writes_typed_finite_numbers(finished):
+    content = json.loads((finished.folder / "study.json").read_text())
+    assert content["kind"] == "study"
+    assert Study.open(finished.folder).config == finished.config
+    lines = (finished.folder / "study.csv").read_text().splitlines()
+    assert len(lines) == 1 + 2 * 2
+    assert lines[0].startswith("table,lag,cost_bps,agent,")
+    main = content["result"]["variants"][0]["agents"]["pathwise"]
+    assert main["to_reference"]["p_holm"] is not None
+    assert content["result"]["variants"][1]["agents"]["pathwise"]["to_reference"]["p_holm"] is None
+    assert "4 of 4 backtests finished" in repr(finished)
+
+
+def test_each_table_is_an_ordinary_backtest(finished):
+    backtest = finished.backtest("two", Variant(1, 0.005))
+    assert backtest.config.cost == 0.005
+    summary = json.loads((backtest.folder / "summary.json").read_text())
+    contrast = summary["strategies"]["pathwise-together"]["to_reference"]["growth"]
+    assert finished.config.result is not None
+    pools = finished.config.result.variants[1].agents["pathwise"]
+    active = pools.evidence["two"].to_reference
+    assert active.growth == pytest.approx(contrast["value"])
+    assert (active.low, active.high) == pytest.approx(tuple(contrast["interval"]))
+    with pytest.raises(QfolioError, match="no table 'three'; choose from one, two"):
+        finished.backtest("three")
+
+
+def test_looks_are_counted_and_inherited(finished, tmp_path):
+    result = finished.config.result
+    assert (result.looks, result.earlier, result.trials) == (4, 0, 2)
+    tables = {"again": TABLES["one"], "new": table(7)}
+    later = create(tmp_path / "later", tables, trials=3, after=[finished.folder, finished.folder])
+    assert later.config.tables["again"].trials == 3 + 2  # both costs
+    assert later.config.tables["new"].trials == 3
+    assert later.backtest("again").config.trials == 5
+    assert len(later.config.earlier) == 4  # each once
+
+
+def _untested(pools):
+    """As ``pool`` returns them."""
+    return msgspec.structs.replace(
+        pools,
+        **{
+            key: msgspec.structs.replace(getattr(pools, key), p_holm=None, finding=None)
+            for key in ("to_reference", "to_rebalanced")
+        },
+    )
+
+
+def test_the_correction_counts_all_agents_and_references():
+    _, result = study(3)
+    agents = result.variants[0].agents
+    pooled = [
+        each for name in agents for each in (agents[name].to_reference, agents[name].to_rebalanced)
+    ]
+    found = corrected({name: _untested(pools) for name, pools in agents.items()})
+    after = [
+        each for name in found for each in (found[name].to_reference, found[name].to_rebalanced)
+    ]
+    assert after == pooled
+    assert [each.p_holm for each in after] == pytest.approx(
+        holm(np.array([each.p for each in after]))
+    )
+    better = [pools.to_reference.finding for pools in found.values()]
+    assert set(better) <= {"better", "worse", "none"}
+    worse = msgspec.structs.replace(
+        agents["tilts"],
+        to_reference=msgspec.structs.replace(agents["tilts"].to_reference, z=-9.0, p=1e-9),
+    )
+    assert corrected({"tilts": worse})["tilts"].to_reference.finding == "worse"
+
+
+def test_short_tables_are_left_out_with_a_reason(tmp_path):
+    short = table(3, rows=100)
+    part = create(tmp_path / "part", {**TABLES, "short": short})
+    assert list(part.config.tables) == ["one", "two"]
+    assert "are fewer than train=80d and one fold of test=40d" in part.config.left_out["short"]
+    with pytest.raises(QfolioError, match="short is too short: 100 rows"):
+        create(tmp_path / "none", {"short": short})
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_fold_may_end_on_a_holiday():
+    weekdays = np.busday_offset("2001-01-01", np.arange(520), roll="forward")
+    last = np.searchsorted(weekdays, np.datetime64("2002-12-30"))
+    require_fold(weekdays[: last + 1].astype("datetime64[s]"), "1y", "1y", 1)
+    with pytest.raises(QfolioError, match="one fold of test=1y"):
+        require_fold(weekdays[: last - 9].astype("datetime64[s]"), "1y", "1y", 1)
+    months = np.arange("2001-01", "2003-01", dtype="datetime64[M]").astype("datetime64[s]")
+    require_fold(months, "1y", "1y", 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tables": {}}, "needs at least one table"),
+        ({"costs": ()}, "needs at least one lag and one cost"),
+        ({"tables": {"../a": TABLES["one"]}}, "A table is called '../a'"),
+        ({"tables": {"a": TABLES["one"], "b": TABLES["one"]}}, "a and b are the same table"),
+        ({"lags": (1, 1)}, "lag of 1 with a cost of 10 bp is given twice"),
+        ({"baselines": ["equl-weight"]}, "one: .*equl-weight"),
+        ({"train": "five"}, "A length is 'five'"),
+        ({"after": ["nowhere"]}, "nowhere is no study"),
+    ],
+)
+def test_studies_that_are_refused(tmp_path, options, message):
+    with pytest.raises(QfolioError, match=message):
+        create(tmp_path / "study", **options)
+    assert not (tmp_path / "study").exists()

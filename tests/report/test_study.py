@@ -1,0 +1,52 @@
+import pytest
+
+from qfolio.report.study import render_study
+
+from backtests import ATTACK, Page
+from studies import study
+
+
+def page(count, lags=1, costs=1, **changes):
+    config, result = study(count, lags, costs, **changes)
+    return Page(render_study(config, result, {"train": "1y", "agents": {"tilts": {}}}, {}))
+
+
+@pytest.mark.parametrize("count", [1, 6, 20])
+def test_every_table_has_a_row_and_an_interval(count):
+    shown = page(count)
+    bars = [at for _, at in shown.tags if (at.get("class") or "").startswith("bar ")]
+    assert len(bars) == 2 * (count + 1)  # two agents, each with a pooled row
+    assert all("95 % interval" in (at["aria-label"] or "") for at in bars)
+    styles = [at["style"] or "" for _, at in shown.tags if "left:" in (at.get("style") or "")]
+    places = [float(style.split("left:")[1].split("%")[0].split(";")[0]) for style in styles]
+    assert all(0 <= place <= 100 for place in places)
+    assert shown.text.count("Pooled") >= 2
+    assert "short is left out. 120 rows are too few." in shown.text
+    assert "its worst is" in shown.text
+    assert ("worst" in [word.strip() for word in shown.words]) == (count > 1)
+
+
+def test_the_page_shows_variants_and_counts_looks():
+    assert "Other costs and lags" not in page(2).text
+    shown = page(2, 2, 3)
+    assert "Other costs and lags" in shown.text
+    cells = [at.get("class") or "" for tag, at in shown.tags if tag == "td"]
+    assert sum("main" in name.split() for name in cells) == 2
+    assert "This study took 24 looks; 6 earlier looks at its tables are known." in shown.text
+    assert "The best of 15 configurations without skill" in shown.text
+
+
+def test_texts_of_others_cannot_run():
+    config, result = study(2)
+    config = type(config)(
+        **{
+            **{name: getattr(config, name) for name in config.__struct_fields__},
+            "command": ATTACK,
+            "left_out": {"short": ATTACK},
+            "device": ATTACK,
+        }
+    )
+    shown = Page(render_study(config, result, {ATTACK: ATTACK}, {}))
+    assert not shown.scripts
+    assert not [tag for tag, _ in shown.tags if tag in ("img", "script", "link")]
+    assert ATTACK in shown.text
