@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines import Baseline, History, baseline
+from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
 from qfolio.portfolio.costs import drift
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.signals import COLUMN
@@ -41,27 +42,35 @@ def path(name: str, prices: Prices) -> Weights:
     if chosen is None:
         return _column(name.removeprefix(COLUMN), prices)
     month = max(1, round(prices.periods_per_year / 12))
-    values, known = prices.values, ~np.isnan(prices.values)
+    values = prices.values
     held = np.eye(values.shape[1] + 1)[0]
     rows = np.empty(values.shape)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a table's first rows are too few for any estimate
         for row in range(len(values)):
-            if row % month == 0 or chosen.calendar == "row":
-                year = known[max(0, row - 12 * month) : row + 1].all(0)
-                first = max(0, row - MONTHS * month)
-                complete = year & known[first : row + 1].all(0)
-                train = slice(first if (complete == year).all() else row - 12 * month, row + 1)
-                history = History(
-                    prices.dates[: row + 1], values[: row + 1], slice(max(0, train.start), row + 1),
-                    year if year.any() else known[row], 1.0, month,
-                )  # fmt: skip
-                wanted = chosen.decide(history, held)
+            # The first two rows are too few for a baseline, which has a training window in a test.
+            if row % month == 0 or row == 2 or chosen.calendar == "row":
+                rule = chosen if row >= 2 else EqualWeight()
+                wanted = rule.decide(_history(prices, row, month), held)
                 held = held if wanted is None else np.asarray(wanted, float)
             rows[row] = held[1:]
             if row + 1 < len(values) and chosen.calendar != "fold":
                 held = drift(held, np.nan_to_num(values[row + 1] / values[row], nan=1.0))
     return rows
+
+
+def _history(prices: Prices, row: int, month: int) -> History:
+    """What a baseline knows at a row; it estimates from five years, or from one after a start."""
+    known = ~np.isnan(prices.values[: row + 1])
+    tradable = known[max(0, row - 12 * month) :].all(0)
+    if not tradable.any():
+        tradable = known[row]
+    first = max(0, row - MONTHS * month)
+    if not known[first:, tradable].all():
+        first = max(0, row - 12 * month)
+    past = slice(0, row + 1)
+    train = slice(first, row + 1)
+    return History(prices.dates[past], prices.values[past], train, tradable, 1.0, month)
 
 
 def _column(name: str, prices: Prices) -> Weights:

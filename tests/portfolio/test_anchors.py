@@ -1,0 +1,68 @@
+"""Anchors: a baseline followed on a whole table, without look-ahead, or a column of weights."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.registry import BASELINES
+from qfolio.portfolio import anchors
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import LEAST, Portfolio
+
+ROWS = 320
+
+
+def table(rows=ROWS, features=None, late=False):
+    rng = np.random.default_rng(0)
+    values = 100 * np.exp(np.cumsum(rng.normal(0, 0.01, (ROWS, 4)) * [1, 2, 1, 3], 0))
+    if late:
+        values[:60, 3] = np.nan
+    dates = np.datetime64("2020-01-01") + np.arange(ROWS)
+    if features is None:
+        return Prices(dates[:rows], tuple("abcd"), values[:rows])
+    return Prices(dates[:rows], tuple("abcd"), values[:rows], features[..., None], ("weight",))
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_row_depends_on_no_later_one(name):
+    whole = anchors.path(name, table())
+    assert whole.min() >= 0
+    assert whole.sum(1).max() <= 1 + 1e-9
+    np.testing.assert_array_equal(anchors.path(name, table(290)), whole[:290])
+
+
+def test_equal_weights_stay_equal_and_monthly_ones_drift():
+    np.testing.assert_allclose(anchors.path("equal-weight", table()), 0.25)
+    prices = table()
+    found = anchors.path("equal-weight-monthly", prices)
+    month = round(prices.periods_per_year / 12)
+    np.testing.assert_allclose(found[month], 0.25)
+    grown = prices.values[month + 3] / prices.values[month]
+    np.testing.assert_allclose(found[month + 3], grown / grown.sum())
+
+
+def test_an_asset_joins_after_a_year_of_prices():
+    found = anchors.path("inverse-volatility", table(late=True))
+    assert not found[:60, 3].any()
+    assert found[:60, :3].sum(1).min() > 0.99
+
+
+def test_a_column_of_weights():
+    weights = np.tile([0.4, 0.3, 0.2, 0.1], (ROWS, 1))
+    np.testing.assert_array_equal(anchors.path("feature:weight", table(features=weights)), weights)
+    with pytest.raises(QfolioError, match="add up to at most 1"):
+        anchors.path("feature:weight", table(features=2 * weights))
+    with pytest.raises(QfolioError, match="has no column missing"):
+        anchors.path("feature:missing", table())
+    with pytest.raises(QfolioError, match="no baseline 'nothing'"):
+        anchors.path("nothing", table())
+
+
+def test_what_cannot_be_traded_goes_to_the_others():
+    task = Portfolio.of(table(), window=1, horizon=10, anchor="equal-weight")
+    part = task.part(0, 200, np.array([True, True, True, False]))
+    weights = np.asarray(part.anchor_weights(jnp.array(50)))
+    np.testing.assert_allclose(weights, [1 / 3, 1 / 3, 1 / 3, 0], atol=1e-6)
+    assert weights[3] == 0
+    assert LEAST < 1e-5
