@@ -129,6 +129,35 @@ def test_merton_scenarios_have_the_moments_that_are_stated():
     np.testing.assert_allclose(logs.mean(0), expected, atol=1e-9)
 
 
+def test_regimes_may_differ_in_how_long_they_last_and_what_they_pay():
+    task = settings.build(Regime, {"stay": "0.9,0.98", "mean": "-0.004,0.001"})
+    assert settings.build(Regime, settings.describe(task)) == task
+    assert settings.build(Regime, {"stay": 0.9}) == Regime(stay=(0.9,))
+    keys = start_keys(4000)
+    markets = jax.jit(jax.vmap(task.reset_market))(keys)
+    assert float(markets.mean()) == pytest.approx(0.1 / 0.12, abs=0.03)
+    for market, stay, mean in ((0, 0.9, -0.004), (1, 0.98, 0.001)):
+        now = jnp.array(market)
+        after = jax.jit(jax.vmap(lambda key, now=now: task.next_market(now, key)))(keys)
+        assert float((after == market).mean()) == pytest.approx(stay, abs=0.02)
+        np.testing.assert_allclose(jnp.log(task.relatives(now, now).earning), mean, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("stay", "1"),
+        ("stay", "0.9,0.9,0.9"),
+        ("mean", "0"),
+        ("mean", "0.01,0.001"),
+        ("mean", "-1,0"),
+    ],
+)
+def test_regimes_that_make_no_sense(name, value):
+    with pytest.raises(QfolioError, match=f"^{name} is "):
+        settings.build(Regime, {name: value})
+
+
 def test_the_regime_pays_what_was_seen():
     task = Regime(cost=0.005)
     for market, sign in ((0, -1), (1, 1)):
@@ -203,9 +232,19 @@ def test_gradient_of_a_rollout_against_finite_differences(tail):
             total -= reward.sum() / (3 * (8 - tail))
         return total
 
-    linear = policy.network.linear
-    gradient = jax.jit(jax.grad(lambda x: agent._loss(with_linear(x), task, rollout)))(linear)
+    linear, zeros = policy.network.linear, jnp.zeros((8, 3, 1))
+
+    @jax.jit
+    def loss(linear, nudges):
+        return agent._loss(with_linear(linear), nudges, None, task, rollout)[0]
+
+    gradient, worth = jax.jit(jax.grad(loss, (0, 1)))(linear, zeros)
     assert abs(gradient).max() > 1e-4
+    for time, path in ((0, 0), (3, 1), (7, 2)):
+        bump = np.zeros(zeros.shape)
+        bump[time, path] = 1e-7
+        slope = (loss(linear, jnp.asarray(bump)) - loss(linear, jnp.asarray(-bump))) / 2e-7
+        np.testing.assert_allclose(worth[time, path, 0], slope, rtol=1e-4, atol=1e-8)
     for place in ((0, 0), (1, 1), (0, 1)):
         bump = np.zeros(linear.shape)
         bump[place] = 1e-7

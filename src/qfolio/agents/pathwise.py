@@ -33,7 +33,7 @@ from qfolio.core.mdp import (
 )
 from qfolio.learning import optimizer
 from qfolio.learning.networks import SHARED, Reading, Shared
-from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.optimizer import CosineSchedule, Optimizer
 
 
 class Band(eqx.Module):
@@ -64,30 +64,57 @@ class Band(eqx.Module):
         self, reading: Reading, holding: Float[Array, "batch asset"]
     ) -> Float[Array, "batch entry"]:
         """The holding, clipped to the edges; cash is the rest."""
-        # Among many assets weights are small, and the outputs are scaled to match.
-        start, unit, scale = 0.0, 1.0, 1.0
-        if isinstance(self.actions, Simplex):
-            start = unit = 1 / (1 + self.actions.assets)
-            scale = 2 * unit
-        edges = (
-            start
-            + unit / 8 * jnp.array([-1.0, 1.0])
-            + scale * self.network.answer(reading, holding)[1]
-        )
-        # By selection, as in targets.smallest.
-        one, other = edges[..., 0], edges[..., 1]
-        swapped = other < one
-        low, high = jnp.where(swapped, other, one), jnp.where(swapped, one, other)
+        low, high = self.edges(reading, holding)
         assets = lax.clamp(low, holding, high)
         if isinstance(self.actions, Box):
             return assets
         return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
 
+    def edges(
+        self, reading: Reading, holding: Float[Array, "*batch asset"]
+    ) -> tuple[Float[Array, "*batch asset"], Float[Array, "*batch asset"]]:
+        """The lower and the upper edge of each asset."""
+        answer = self.network.answer(reading, holding)[1]
+        if isinstance(self.actions, Box):
+            edges = jnp.array([-1.0, 1.0]) / 8 + answer
+        else:
+            # Among many assets weights are small, and the outputs are scaled to match.
+            unit = 1 / (1 + self.actions.assets)
+            distance = unit / 8 * jnp.array([-1.0, 1.0]) + 2 * unit * answer
+            # In log odds, so that no edge leaves the weights that are held: beyond them nothing
+            # trades to it, and its gradient would be zero for good.
+            start, slope = -math.log(self.actions.assets), 1 / (unit * (1 - unit))
+            edges = jax.nn.sigmoid(start + slope * distance)
+        # By selection, as in targets.smallest.
+        one, other = edges[..., 0], edges[..., 1]
+        swapped = other < one
+        return jnp.where(swapped, other, one), jnp.where(swapped, one, other)
+
+
+class Slopes(eqx.Module):
+    """What a little more of each asset is worth after a rollout, in scaled rewards.
+
+    At the low edge it is the cost of buying, which is about to be saved, and at the high edge minus
+    the cost of selling, however close the two are. So the network sees the place of a holding
+    between its edges instead of the holding.
+    """
+
+    network: Shared
+
+    def __call__(self, policy: Band, view: View) -> Float[Array, "*batch asset"]:
+        low, high = policy.edges(policy.network.read(view.features), view.holding)
+        inside = (lax.clamp(low, view.holding, high) - low) / jnp.maximum(high - low, 1e-6)
+        # From −2 to 2, so that the kinks of the random first layer lie in between.
+        place = lax.stop_gradient(4 * inside - 2)
+        return self.network.answer(self.network.read(view.features), place)[1][..., 0]
+
 
 class PathwiseState(eqx.Module):
     policy: Band
-    optimizer: optimizer.Optimizer
+    optimizer: Optimizer
     steps: Int[Array, ""]
+    slopes: Slopes | None  # with bootstrap
+    slope_optimizer: Optimizer | None
 
 
 class Pathwise(Agent):
@@ -98,11 +125,13 @@ class Pathwise(Agent):
     num_envs: int = static(64)  # paths in a batch
     rollout_length: int = static(50)  # steps of each path that a gradient goes through
     tail: int = static(0)  # of these, last steps without a gradient of their own
+    bootstrap: bool = static(False)  # learn what the last holdings are worth after the rollout
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     gradient_steps: int = static(1)  # gradient steps per rollout
     learning_rate: float = number(1e-3)
     learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e4)  # gradient steps of the cosine
+    slope_learning_rate_ratio: float = number(20.0)  # of bootstrap, as a share of the band's
     max_grad_norm: float = number(math.inf)  # longer gradients are rescaled to it
     reward_scale: float = number(1.0)
     simplex_penalty: float = number(0.01)  # on weights off the simplex, where the gradient is zero
@@ -114,7 +143,8 @@ class Pathwise(Agent):
             )
         require(self, "num_envs rollout_length gradient_steps", lambda x: x >= 1, "at least 1")
         require(self, "episode_steps tail", lambda x: x >= 0, "at least 0")
-        require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
+        positive = "max_grad_norm slope_learning_rate_ratio"
+        require(self, positive, lambda x: x > 0, "greater than 0")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         self._schedule.check()
         require_sizes(self)
@@ -155,10 +185,17 @@ class Pathwise(Agent):
         last = lambda n: (n.head.weights[-1], n.head.biases[-1])  # noqa: E731
         network = eqx.tree_at(last, network, replace_fn=jnp.zeros_like)
         policy = Band(network, task.actions)
+        slopes = None
+        if self.bootstrap:
+            key = jax.random.fold_in(key, 1)
+            network = Shared(self.network, view, self.hidden, pooled=0, each=1, key=key)
+            slopes = Slopes(eqx.tree_at(last, network, replace_fn=jnp.zeros_like))
         return PathwiseState(
             policy=policy,
             optimizer=optimizer.begin(policy),
             steps=jnp.array(0, jnp.int32),
+            slopes=slopes,
+            slope_optimizer=optimizer.begin(slopes) if slopes else None,
         )
 
     def warm_up(self) -> int:
@@ -183,43 +220,76 @@ class Pathwise(Agent):
     ) -> tuple[PathwiseState, Metrics]:
         assert isinstance(task, ExogenousTask)
 
-        def update(carry: Any, _: None) -> Any:
-            policy, adam = carry
-            loss, gradient = jax.value_and_grad(self._loss)(policy, task, rollout)
+        def update(state: PathwiseState, _: None) -> tuple[PathwiseState, Float[Array, ""]]:
+            nudges = jnp.zeros(rollout.observation.holding.shape)
+            differentiate = jax.value_and_grad(self._loss, (0, 1), has_aux=True)
+            (loss, held), (gradient, worth) = differentiate(
+                state.policy, nudges, state.slopes, task, rollout
+            )
+            rate = self._schedule(state.optimizer.count + 1)
             gradient = optimizer.clip(gradient, self.max_grad_norm)
-            rate = self._schedule(adam.count + 1)
-            return optimizer.descend(policy, gradient, adam, rate), loss
+            policy, adam = optimizer.descend(state.policy, gradient, state.optimizer, rate)
+            slopes, slope_adam = state.slopes, state.slope_optimizer
+            if slopes is not None and slope_adam is not None:
+                cut = len(held)
+                views = View(rollout.observation.features[:cut], held)
+                # Of the sum of a path's rewards; the loss is minus a mean.
+                worth = -worth[:cut] * rollout.reward.size
 
-        carry = (state.policy, state.optimizer)
-        (policy, adam), losses = lax.scan(update, carry, None, length=self.gradient_steps)
-        return PathwiseState(policy, adam, state.steps + 1), {"loss": losses.mean()}
+                def off(slopes: Slopes) -> Float[Array, ""]:
+                    return ((slopes(state.policy, views) - worth) ** 2).mean()
 
-    def _loss(self, policy: Band, task: ExogenousTask, rollout: Transition) -> Float[Array, ""]:
-        """Minus the mean reward per step of ``policy`` along the rollout's market."""
+                rate = rate * self.slope_learning_rate_ratio
+                slopes, slope_adam = optimizer.descend(
+                    slopes, jax.grad(off)(slopes), slope_adam, rate
+                )
+            return PathwiseState(policy, adam, state.steps, slopes, slope_adam), loss
+
+        state, losses = lax.scan(update, state, None, length=self.gradient_steps)
+        return eqx.tree_at(lambda s: s.steps, state, state.steps + 1), {"loss": losses.mean()}
+
+    def _loss(
+        self,
+        policy: Band,
+        nudges: Float[Array, "time batch asset"],
+        slopes: Slopes | None,
+        task: ExogenousTask,
+        rollout: Transition,
+    ) -> tuple[Float[Array, ""], Float[Array, "decision batch asset"]]:
+        """Minus the mean reward per step of ``policy`` along the rollout's market; the holdings.
+
+        Holdings are those before each decision that has a gradient. nudges: zeros, added to the
+        holdings; their gradient says what more of an asset is worth.
+        """
 
         def follow(policy: Band, holding: PyTree, steps: slice) -> Any:
             def step(holding: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
-                market, next_market, reading = moves
+                market, next_market, reading, nudge = moves
+                holding = jax.vmap(task.shift)(holding, nudge)
                 view = jax.vmap(task.observe)(Position(market, holding))
                 wanted = policy.wanted(reading, view.holding)
                 action = policy.allowed(wanted)
                 off = ((wanted - action) ** 2).sum(-1)
                 reward, holding = jax.vmap(task.settle)(market, next_market, holding, action)
-                return holding, (reward, off)
+                return holding, (reward, off, view.holding)
 
-            moves = (rollout.state.market, rollout.next_state.market, rollout.observation)
-            market, next_market, seen = jax.tree.map(lambda x: x[steps], moves)
+            moves = (rollout.state.market, rollout.next_state.market, rollout.observation, nudges)
+            market, next_market, seen, nudge = jax.tree.map(lambda x: x[steps], moves)
             # All windows are read at once, before the scan over holdings.
-            return lax.scan(
-                step, holding, (market, next_market, policy.network.read(seen.features))
-            )
+            reading = policy.network.read(seen.features)
+            return lax.scan(step, holding, (market, next_market, reading, nudge))
 
         start = jax.tree.map(lambda x: x[0], rollout.state.holding)
         cut = self.rollout_length - self.tail
-        holding, (rewards, off) = follow(policy, start, slice(None, cut))
+        holding, (rewards, off, held) = follow(policy, start, slice(None, cut))
         total = rewards.sum()
         if self.tail:
             # Without a tail, a trade near the end would pay its cost without earning its return.
-            _, (later, _) = follow(lax.stop_gradient(policy), holding, slice(cut, None))
+            holding, (later, _, _) = follow(lax.stop_gradient(policy), holding, slice(cut, None))
             total += later.sum()
-        return self.simplex_penalty * off.mean() - self.reward_scale * total / rewards.size
+        total *= self.reward_scale
+        if slopes is not None:
+            market = jax.tree.map(lambda x: x[-1], rollout.next_state.market)
+            view = jax.vmap(task.observe)(Position(market, holding))
+            total += (lax.stop_gradient(slopes(policy, view)) * view.holding).sum()
+        return self.simplex_penalty * off.mean() - total / rewards.size, held

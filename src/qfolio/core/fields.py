@@ -1,7 +1,7 @@
 """How agents and tasks declare and check their settings."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -27,6 +27,15 @@ def constant(default: float) -> Any:
 def sizes(*default: int) -> Any:
     """Layer sizes."""
     return eqx.field(static=True, converter=tuple, default=default)
+
+
+def numbers(*default: float) -> Any:
+    """Several numbers that shape the program; one number alone is a tuple of one."""
+    return eqx.field(static=True, converter=_floats, default=default)
+
+
+def _floats(values: float | Iterable[float]) -> tuple[float, ...]:
+    return tuple(map(float, values if isinstance(values, Iterable) else (values,)))
 
 
 def require(instance: Any, names: str, holds: Callable[[Any], bool], wanted: str) -> None:

@@ -208,6 +208,10 @@ class ExogenousTask(Task):
     ) -> tuple[Float[Array, ""], PyTree]:
         """Reward and next holding of an action, given how the market moved."""
 
+    def shift(self, holding: PyTree, by: Float[Array, " asset"]) -> PyTree:
+        """The holding with ``by`` more of each asset."""
+        return holding + by
+
     def reset(self, key: PRNGKeyArray) -> Position:
         market_key, holding_key = jax.random.split(key)
         return Position(self.reset_market(market_key), self.draw_holding(holding_key))

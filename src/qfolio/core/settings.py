@@ -28,7 +28,7 @@ def names(kind: type) -> set[str]:
 def _types(kind: type) -> dict[str, Any]:
     """Types of the settings; fields that hold arrays are not settings."""
     hints = typing.get_type_hints(kind)
-    kinds = (bool, int, float, str, tuple[int, ...])
+    kinds = (bool, int, float, str, tuple[int, ...], tuple[float, ...])
     return {f.name: hints[f.name] for f in dataclasses.fields(kind) if hints[f.name] in kinds}
 
 
@@ -83,11 +83,15 @@ def _convert(name: str, kind: Any, value: Any) -> Any:
             if not isinstance(value, str):
                 raise ValueError
             return value
+        item_kind = typing.get_args(kind)[0]
         if isinstance(value, str):  # tuple[int, ...]: 256,256
             value = value.strip("()[] ").rstrip(",").split(",")
-        return tuple(_convert(name, int, item) for item in value)
+        elif item_kind is float and isinstance(value, int | float):
+            value = [value]
+        return tuple(_convert(name, item_kind, item) for item in value)
     except (ValueError, TypeError, KeyError, OverflowError, QfolioError):
         examples = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+        examples[tuple[float, ...]] = "numbers separated by commas, for example 0.9,0.98"
         wanted = examples.get(kind, "whole numbers separated by commas, for example 256,256")
         raise QfolioError(
             f"{name} is {json.dumps(value, default=str)}; it must be {wanted}."

@@ -229,6 +229,11 @@ class Market(ExogenousTask):
         """A holding without a history."""
         return Holding(weights, self.reward_function.init())
 
+    def shift(self, holding: Holding, by: Float[Array, " asset"]) -> Holding:
+        """The holding with ``by`` more in each asset, and less in cash."""
+        change = jnp.concatenate([-by.sum(keepdims=True), by])
+        return holding._replace(weights=holding.weights + change)
+
     def settle(
         self, market: PyTree, next_market: PyTree, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:

@@ -43,9 +43,25 @@ PRESETS: Presets = {
         153_600, num_envs=512, rollout_length=5, learning_rate_steps=300.0, reward_scale=10.0
     ),
     ("market/regime", "pathwise"): _pathwise(
-        12_800, num_envs=64, rollout_length=50, learning_rate_steps=200.0, reward_scale=100.0
+        25_600,
+        num_envs=64,
+        rollout_length=50,
+        bootstrap=True,
+        slope_learning_rate_ratio=3.0,
+        learning_rate=5e-3,
+        learning_rate_steps=400.0,
+        reward_scale=100.0,
+        max_grad_norm=1e-4,
     ),
-    ("market/regime", "dqn"): _all_actions(2048, batch_size=512, learning_rate_steps=500.0),
+    # Regimes of a hundred steps need a discount near 1.
+    ("market/regime", "dqn"): _all_actions(
+        8192,
+        batch_size=1024,
+        discount=0.99,
+        tau=0.02,
+        learning_rate=1e-2,
+        learning_rate_steps=2000.0,
+    ),
     ("market/ar1", "pathwise"): _pathwise(
         25_600,
         num_envs=64,
@@ -55,13 +71,19 @@ PRESETS: Presets = {
         reward_scale=100.0,
     ),
     ("market/ar1", "dqn"): _all_actions(8192, batch_size=1024, learning_rate_steps=2016.0),
+    # A trade pays off over years, which at daily steps are thousands of steps: the slopes carry its
+    # worth beyond the rollout. All gradients are cut, so that the long first ones, far from the
+    # region, do not outweigh the later ones in Adam's mean of squares.
     ("market/no-trade", "pathwise"): _pathwise(
-        19_200,
-        num_envs=64,
-        rollout_length=120,
-        tail=60,
-        learning_rate_steps=300.0,
-        reward_scale=1000.0,
+        12_800,
+        num_envs=32,
+        rollout_length=480,
+        bootstrap=True,
+        slope_learning_rate_ratio=40.0,
+        learning_rate=1e-3,
+        learning_rate_steps=400.0,
+        reward_scale=100.0,
+        max_grad_norm=1e-4,
     ),
     ("market/garleanu-pedersen", "pathwise"): _pathwise(
         25_600,

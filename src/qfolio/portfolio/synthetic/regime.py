@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.core.fields import constant, number, require, static
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import constant, numbers, require, static
 from qfolio.core.mdp import Policy, Position
 from qfolio.portfolio.market import Relatives
 from qfolio.portfolio.synthetic.base import OneAsset, require_cost
@@ -18,34 +19,56 @@ class Regime(OneAsset):
     """One asset that grows by ``mean`` a step in good times and loses it in bad ones.
 
     Each regime lasts another step with probability ``stay``; it is observed before it pays.
+    Two numbers are those of bad and of good times: stay=0.9,0.98 mean=-0.004,0.001.
     """
 
-    stay: float = number(0.95)
-    mean: float = number(0.002)
+    stay: tuple[float, ...] = numbers(0.95)
+    mean: tuple[float, ...] = numbers(0.002)  # log growth a step
     cost: float = constant(0.005)
     menu: str = static("")
     horizon: int = static(250)
 
     def __check_init__(self) -> None:
-        require(self, "stay", lambda x: 0 <= x < 1, "at least 0 and below 1")
-        require(self, "mean", lambda x: 0 < x <= 0.5, "above 0 and at most 0.5")
+        one_or_two = "one number, or one for bad and one for good times"
+        require(self, "stay mean", lambda x: len(x) in (1, 2), one_or_two)
+        require(self, "stay", lambda x: 0 <= min(x) <= max(x) < 1, "at least 0 and below 1")
+        if not -0.5 <= self.means[0] < self.means[1] <= 0.5:
+            raise QfolioError(
+                f"mean is {self.mean}; it must be above 0 and at most 0.5, or two numbers from "
+                "-0.5 to 0.5, the smaller one first."
+            )
         require_cost(self)
 
+    @property
+    def stays(self) -> tuple[float, float]:
+        """Of bad and good times."""
+        return self.stay[0], self.stay[-1]
+
+    @property
+    def means(self) -> tuple[float, float]:
+        """Of bad and good times."""
+        return (
+            (-self.mean[0], self.mean[0]) if len(self.mean) == 1 else (self.mean[0], self.mean[1])
+        )
+
     def reset_market(self, key: PRNGKeyArray) -> Int[Array, ""]:
-        return jax.random.bernoulli(key).astype(jnp.int32)
+        bad, good = self.stays
+        return jax.random.bernoulli(key, (1 - bad) / (2 - bad - good)).astype(jnp.int32)
 
     def next_market(self, market: Array, key: PRNGKeyArray) -> Int[Array, ""]:
-        return jnp.where(jax.random.uniform(key) < self.stay, market, 1 - market)
+        return jnp.where(
+            jax.random.uniform(key) < jnp.array(self.stays)[market], market, 1 - market
+        )
 
     def features(self, market: Array) -> Float[Array, "asset time channel"]:
         return (2.0 * market - 1.0).reshape(1, 1, 1)
 
     def relatives(self, market: Array, next_market: Array) -> Relatives:
-        moved = jnp.exp(self.mean * (2.0 * market - 1.0))[None]
+        moved = jnp.exp(jnp.array(self.means))[market][None]
         return Relatives(jnp.ones(1), moved, moved)
 
     def best(self) -> Policy:
-        solution = regime((self.stay, self.stay), (-self.mean, self.mean), -np.log1p(-self.cost))
+        solution = regime(self.stays, self.means, -np.log1p(-self.cost))
         table = jnp.asarray(solution.policy)
 
         def policy(state: Position) -> Array:
