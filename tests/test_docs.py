@@ -136,9 +136,13 @@ def test_an_environment_in_the_current_directory(own, monkeypatch, tmp_path):
 
 TINY = {"hidden": (4,), "num_envs": 4, "rollout_length": 10}
 LENGTH = {"horizon": 20}
-SMALL = {"episodes": 16, "settings": TINY, "task": {"window": 10, **LENGTH}}
+SMALL = {
+    "episodes": 16,
+    "settings": {"num_envs": 4, "rollout_length": 20, "head": 5},
+    "task": {"window": 1, "signals": "momentum:21", "anchor": "equal-weight", **LENGTH},
+}
 SMALLER = {
-    '"portfolio", "pathwise")': '"portfolio", "pathwise")._replace(**SMALL)',
+    '"portfolio", "tilts")': '"portfolio", "tilts")._replace(**SMALL)',
     'out="runs/mine")': 'out="runs/mine", train="200d", test="150d", seeds=1)',
     "train_size=1260, test_size=252": "train_size=200, test_size=150",
     "seeds=2, cost=0.001": "seeds=1, episodes=16, window=10, settings=TINY | LENGTH",
