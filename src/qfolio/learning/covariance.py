@@ -1,0 +1,161 @@
+"""A covariance of the next returns that is learned end to end.
+
+Its parts are those of Bongiorno, Manolakis & Mantegna (2025, "End-to-end large portfolio
+optimization for variance minimization with neural networks through covariance cleaning"): weights
+of past days, a cleaning of the eigenvalues of the correlations by a network that does not depend on
+the number of assets, and volatilities. Here weights of days fall exponentially, and the network
+sees one eigenvalue at a time.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+LEAST = 1e-3
+"""Eigenvalues of correlations are at least this."""
+
+APART = 1e-4
+"""Eigenvalues that are closer count as equal in derivatives."""
+
+TINY = 1e-9
+"""Added to variances, in units of the squared scale of returns."""
+
+
+class Covariance(eqx.Module):
+    """The estimate Σ = D C D of volatilities D and cleaned correlations C.
+
+    C has the eigenvectors of the weighted sample correlations. Their eigenvalues λ become
+    ((1 − a)λ + a) exp(g(log λ, log λ₊)), with a learned share a of the identity and a layer g of
+    tanh units; then the diagonal is made 1 again. λ₊ = (1 + √q)² is the largest eigenvalue of noise
+    (Marčenko & Pastur 1967) for q assets to a day, where days count by their weights.
+    """
+
+    volatility: Float[Array, ""]  # log of a half-life in rows
+    correlation: Float[Array, ""]  # likewise
+    shrinkage: Float[Array, ""]  # logit of a
+    layer: Float[Array, "input unit"]
+    offset: Float[Array, " unit"]
+    output: Float[Array, " unit"]
+
+    def __init__(self, units: int, key: PRNGKeyArray) -> None:
+        """Half-lives of 60 and 250 rows, and a tenth of the identity; g is 0."""
+        self.volatility, self.correlation = jnp.log(60.0), jnp.log(250.0)
+        self.shrinkage = jnp.array(math.log(0.1 / 0.9))
+        first, second = jax.random.split(key)
+        self.layer = jax.random.normal(first, (2, units))
+        self.offset = jax.random.normal(second, (units,))
+        self.output = jnp.zeros(units)
+
+    @property
+    def described(self) -> dict[str, Array]:
+        """Half-lives in rows and the share of the identity, as named scalars."""
+        return {
+            "volatility_half_life": jnp.exp(self.volatility),
+            "correlation_half_life": jnp.exp(self.correlation),
+            "shrinkage": jax.nn.sigmoid(self.shrinkage),
+        }
+
+    def __call__(
+        self, returns: Float[Array, "*batch asset time"], open_to: Bool[Array, "*batch asset"]
+    ) -> Float[Array, "*batch asset asset"]:
+        """Σ in units of the mean variance of the assets that are open; the others have none.
+
+        returns: scaled alike for all assets, the last one at the end.
+        """
+        returns = jnp.where(open_to[..., None], returns, 0.0)
+        weights = _decay(self.correlation, returns.shape[-1])
+        seen = returns * jnp.sqrt(weights)
+        count = open_to.sum(-1, keepdims=True)
+        cleaned = self._cleaned(
+            _correlations(jnp.einsum("...at,...bt->...ab", seen, seen)), count * (weights**2).sum()
+        )
+        variance = (returns**2 @ _decay(self.volatility, returns.shape[-1])) + TINY
+        scale = jnp.sqrt(variance / (variance.sum(-1, keepdims=True) / count))
+        return cleaned * scale[..., :, None] * scale[..., None, :]
+
+    def _cleaned(
+        self, correlations: Float[Array, "*batch asset asset"], per_day: Float[Array, "*batch 1"]
+    ) -> Float[Array, "*batch asset asset"]:
+        values, vectors = spectrum(correlations)
+        values = jnp.maximum(values, LEAST)
+        edge = jnp.broadcast_to(2 * jnp.log1p(jnp.sqrt(per_day)), values.shape)
+        inputs = jnp.stack([jnp.log(values), edge], -1)
+        share = jax.nn.sigmoid(self.shrinkage)
+        factor = jnp.exp(jnp.tanh(inputs @ self.layer + self.offset) @ self.output)
+        cleaned = (share + (1 - share) * values) * factor
+        return _correlations((vectors * cleaned[..., None, :]) @ jnp.swapaxes(vectors, -1, -2))
+
+
+class Means(eqx.Module):
+    """Expected returns of assets in units of their volatility, from their own past.
+
+    The mean returns of each asset over some half-lives, less their mean over the assets, times
+    learned coefficients: momentum where they are positive, reversal where they are negative.
+    """
+
+    half_lives: Float[Array, " speed"]  # logs, in rows
+    coefficients: Float[Array, " speed"]
+
+    def __init__(self) -> None:
+        """Half-lives of 1, 5, 21 and 126 rows; nothing is expected."""
+        self.half_lives = jnp.log(jnp.array([1.0, 5.0, 21.0, 126.0]))
+        self.coefficients = jnp.zeros(4)
+
+    @property
+    def described(self) -> dict[str, Array]:
+        """Each coefficient and its half-life, as named scalars."""
+        speeds = range(len(self.coefficients))
+        return {f"mean_{i}": self.coefficients[i] for i in speeds} | {
+            f"mean_{i}_half_life": jnp.exp(self.half_lives[i]) for i in speeds
+        }
+
+    def __call__(
+        self, returns: Float[Array, "*batch asset time"], open_to: Bool[Array, "*batch asset"]
+    ) -> Float[Array, "*batch asset"]:
+        weights = jax.vmap(lambda one: _decay(one, returns.shape[-1]), out_axes=1)(self.half_lives)
+        spread = jnp.sqrt((returns**2).mean(-1, keepdims=True) + TINY)
+        # A mean over more days is smaller; divided by its standard error, it is not.
+        means = (returns / spread) @ (weights / jnp.sqrt((weights**2).sum(0)))
+        means = jnp.where(open_to[..., None], means, 0.0)
+        count = open_to.sum(-1)[..., None, None]
+        centered = means - means.sum(-2, keepdims=True) / count
+        return jnp.where(open_to, centered @ self.coefficients, 0.0)
+
+
+def _decay(half_life: Float[Array, ""], rows: int) -> Float[Array, " time"]:
+    """Weights of rows, of sum 1; they halve from a row to the one that much earlier."""
+    age = jnp.arange(rows)[::-1]
+    return jax.nn.softmax(-math.log(2) * age * jnp.exp(-half_life))
+
+
+def _correlations(moments: Float[Array, "*batch asset asset"]) -> Array:
+    """Of second moments; assets without any have correlations of 0."""
+    eye = jnp.eye(moments.shape[-1])
+    moments = moments + TINY * eye
+    scale = jnp.sqrt(jnp.diagonal(moments, axis1=-2, axis2=-1))
+    return moments / scale[..., :, None] / scale[..., None, :]
+
+
+@jax.custom_jvp
+def spectrum(symmetric: Float[Array, "*batch n n"]) -> tuple[Array, Array]:
+    """Eigenvalues and eigenvectors, with a derivative where eigenvalues are equal.
+
+    Vectors of equal eigenvalues are not defined one by one, and jax gives no number for their
+    derivatives. What is made from vectors and a smooth function of values has one nevertheless; the
+    terms left out here are zero for it.
+    """
+    return tuple(jnp.linalg.eigh(symmetric))
+
+
+@spectrum.defjvp
+def _spectrum_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple:
+    values, vectors = spectrum(*primals)
+    turned = jnp.swapaxes(vectors, -1, -2) @ tangents[0] @ vectors
+    gap = values[..., None, :] - values[..., :, None]
+    apart = jnp.abs(gap) > APART
+    rotation = jnp.where(apart, turned / jnp.where(apart, gap, 1.0), 0.0)
+    change = jnp.diagonal(turned, axis1=-2, axis2=-1)
+    return (values, vectors), (change, vectors @ rotation)

@@ -1,0 +1,102 @@
+"""The learned covariance: what it estimates at its start, and gradients of all that it learns."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from qfolio.learning.covariance import Covariance, Means, spectrum
+
+ALL = jnp.ones(4, bool)
+
+
+def returns(rows=500, assets=4, seed=0):
+    rng = np.random.default_rng(seed)
+    common = rng.normal(0, 1, (1, rows))
+    own = rng.normal(0, 1, (assets, rows)) * np.linspace(0.5, 2, assets)[:, None]
+    return jnp.asarray(common + own, jnp.float32)
+
+
+def exact(**changes):
+    """Without shrinkage or a network; half-lives so long that all rows count alike."""
+    start = Covariance(3, jax.random.key(0))
+    values = {"volatility": 20.0, "correlation": 20.0, "shrinkage": -30.0, **changes}
+    where = lambda c: [getattr(c, name) for name in values]  # noqa: E731
+    return eqx.tree_at(where, start, [jnp.asarray(x) for x in values.values()])
+
+
+def test_without_cleaning_it_is_the_second_moments():
+    seen = returns()
+    moments = np.asarray(seen @ seen.T, float) / seen.shape[1]
+    wanted = moments / np.trace(moments) * 4
+    np.testing.assert_allclose(exact()(seen, ALL), wanted, rtol=1e-3, atol=1e-3)
+
+
+def test_half_lives_weigh_late_rows_more():
+    rows = np.ones((2, 100))
+    rows[0, :90], rows[1, 90:] = 0.0, 0.5
+    found = exact(volatility=np.log(10.0))(jnp.asarray(rows), jnp.ones(2, bool))
+    early = 0.5 - 0.5**10  # what the rows before the last ten weigh, over all but what is cut
+    ratio = (0.5 / (early + 0.5 * 0.25)) * 1.0
+    np.testing.assert_allclose(found[0, 0] / found[1, 1], ratio, rtol=0.01)
+
+
+def test_the_identity_takes_its_share_of_the_correlations():
+    seen = returns()
+    raw, shrunk = exact()(seen, ALL), exact(shrinkage=np.log(0.25 / 0.75))(seen, ALL)
+    off = ~np.eye(4, dtype=bool)
+    np.testing.assert_allclose(shrunk[off], 0.75 * raw[off], rtol=1e-4)
+    np.testing.assert_allclose(np.diag(shrunk), np.diag(raw), rtol=1e-5)
+
+
+def test_assets_that_are_not_open_count_for_nothing():
+    seen = returns()
+    open_to = jnp.array([True, True, False, True])
+    start = Covariance(3, jax.random.key(0))
+    start = eqx.tree_at(lambda c: c.output, start, jnp.array([0.3, -0.2, 0.1]))
+    found = start(seen, open_to)
+    kept = np.array([0, 1, 3])
+    wanted = start(seen[kept], jnp.ones(3, bool))
+    np.testing.assert_allclose(found[np.ix_(kept, kept)], wanted, rtol=1e-3, atol=1e-4)
+
+
+def test_learned_parts_all_have_gradients_also_with_fewer_rows_than_assets():
+    seen = returns(rows=6, assets=10)  # four eigenvalues are zero
+    worth = jax.random.normal(jax.random.key(1), (10, 10))
+
+    def value(one):
+        return (one(seen, jnp.ones(10, bool)) * worth).sum()
+
+    start = Covariance(3, jax.random.key(0))
+    start = eqx.tree_at(lambda c: c.output, start, jnp.array([0.3, -0.2, 0.1]))
+    for leaf in jax.tree.leaves(jax.grad(value)(start)):
+        assert np.isfinite(leaf).all()
+        assert np.abs(leaf).max() > 1e-5
+
+
+def test_spectrum_has_the_derivative_of_functions_of_the_matrix():
+    """The square of a matrix with equal eigenvalues, made from its eigenvectors."""
+    matrix = jnp.diag(jnp.array([1.0, 1.0, 3.0]))
+    change = jnp.array([[0.1, 0.5, 0.2], [0.5, -0.3, 0.4], [0.2, 0.4, 0.6]])
+
+    def square(x):
+        values, vectors = spectrum(x)
+        return (vectors * values**2) @ vectors.T
+
+    _, found = jax.jvp(square, (matrix,), (change,))
+    wanted = matrix @ change + change @ matrix
+    equal = np.zeros((3, 3), bool)
+    equal[:2, :2] = ~np.eye(2, dtype=bool)  # the terms that are left out
+    np.testing.assert_allclose(found[~equal], wanted[~equal], atol=1e-5)
+
+
+def test_means_are_relative_and_nothing_at_the_start():
+    seen = returns()
+    start = Means()
+    assert not start(seen, ALL).any()
+    found = eqx.tree_at(lambda m: m.coefficients, start, jnp.array([0.0, 0.0, 0.0, 1.0]))(seen, ALL)
+    np.testing.assert_allclose(found.sum(), 0, atol=1e-4)
+    higher = eqx.tree_at(lambda m: m.coefficients, start, jnp.array([0.0, 0.0, 0.0, 1.0]))(
+        seen.at[1, -100:].add(1.0), ALL
+    )
+    assert higher[1] > found[1]
