@@ -16,6 +16,7 @@ from qfolio.core.mdp import Transition
 from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.learning import heads
+from qfolio.learning.bootstrapped import Heads
 from qfolio.learning.distributional import (
     Categorical,
     Expected,
@@ -289,7 +290,9 @@ def test_adam_equals_its_formula(task):
     after, _ = jit(agent.learn)(Pendulum(), before, rollout(agent), jax.random.key(1))
     replay = jit(agent.observe)(before, rollout(agent)).replay
     batch = jit(replay.sample)(jax.random.key(1), 4)
-    loss = lambda w: agent._losses(w, before.target, batch, 0.99, jax.random.key(0))  # noqa: E731
+    target = before.target
+    assert not isinstance(target, Heads)
+    loss = lambda w: agent._losses(w, target, batch, 0.99, jax.random.key(0))  # noqa: E731
     gradient = jax.jit(jax.grad(lambda w: loss(w).each.mean()))(before.online)
     # At the first step Adam's direction is g / (|g| + ε).
     step = jax.tree.map(lambda g: 0.01 * g / (np.abs(g) + 1e-8), gradient)

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 
 from qfolio.agents.tilts import (
-    Evidence,
     Tilt,
     TiltPolicy,
     Tilts,
-    Trading,
+    tilted,
 )
+from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
 from qfolio.core.mdp import Simplex
 from qfolio.core.population import Population
+from qfolio.learning.evidence import Evidence
+from qfolio.learning.trading import Trading
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
@@ -55,9 +57,18 @@ def view(held, features=((0.0,), (0.0,), (0.0,)), anchor=(0.25, 0.25, 0.5)):
     return View(channels[:, None], jnp.asarray(held, float), jnp.asarray(anchor, float))
 
 
-def test_target_is_the_anchor_plus_softmax_less_equal_weights():
-    found = tilt([1.0]).target(view([0, 0, 0], [[np.log(2.0)], [0.0], [0.0]]))
-    np.testing.assert_allclose(found, [0, 5 / 12, 2 / 12, 5 / 12], atol=1e-6)
+def test_target_is_the_anchor_plus_scores_less_their_mean():
+    found = tilt([1.0]).target(view([0, 0, 0], [[0.3], [0.0], [-0.3]]))
+    np.testing.assert_allclose(found, [0, 0.35, 0.25, 0.4], atol=1e-6)
+
+
+def test_target_is_the_nearest_without_negative_weights():
+    wanted = jax.random.normal(jax.random.key(0), (200, 12)) * jnp.linspace(0, 3, 200)[:, None]
+    anchor = jax.random.dirichlet(jax.random.key(1), jnp.ones(12), (200,))
+    found = tilted(anchor, 12 * wanted, Simplex(12))
+    exact = simplex.project(anchor + wanted)
+    np.testing.assert_allclose(found[:, 1:], exact, atol=1e-5)
+    np.testing.assert_allclose(found[:, 0], 0, atol=1e-6)
 
 
 def test_interaction_multiplies_inputs_with_their_mean_over_the_assets():
@@ -124,12 +135,12 @@ def test_no_evidence_of_nothing():
     assert Evidence.none(8).t == 0
 
 
-def trained(values, seeds=1, rounds=40, **settings):
-    task = Portfolio.of(prices(values), **TASK)
-    population = Population([task] * seeds, Tilts(**SMALL, **settings), list(range(seeds)))
+def trained(*tables, rounds=40, **settings):
+    tasks = [Portfolio.of(prices(values), **TASK) for values in tables]
+    population = Population(tasks, Tilts(**SMALL, **settings), list(range(len(tables))))
     while population.steps < rounds * SMALL["rollout_length"]:
         population.advance(SMALL["rollout_length"] * rounds - population.steps)
-    return population
+    return jax.tree.map(jnp.asarray, population.fetch().agent)
 
 
 def walk(rows, assets, seed, drift=0.0):
@@ -137,14 +148,15 @@ def walk(rows, assets, seed, drift=0.0):
 
 
 def test_stays_at_the_anchor_where_prices_hold_nothing():
-    shares = [float(trained(walk(1500, 8, seed)).state.agent.policy.share[0]) for seed in range(3)]
-    assert shares.count(0.0) >= 2
+    states = trained(*(walk(1500, 8, seed) for seed in range(3)))
+    assert states.evidence.steps.min() > 0
+    assert (states.policy.share == 0).sum() >= 2
 
 
 def test_finds_momentum():
     rng = np.random.default_rng(1)
     drift = np.repeat(rng.normal(0, 0.004, (15, 8)), 100, axis=0)
-    state = jax.tree.map(lambda x: x[0], trained(walk(1500, 8, 2, drift)).state.agent)
+    state = jax.tree.map(lambda x: x[0], trained(walk(1500, 8, 2, drift)))
     assert state.evidence.t > 4
     assert state.policy.members.linear[:, 0].min() > 0.1
 
@@ -157,8 +169,14 @@ def test_needs_an_anchor():
         Tilts().init(Pendulum(), jax.random.key(0))
 
 
+def test_a_rollout_must_not_span_two_episodes():
+    task = Portfolio.of(prices(walk(300, 3, 0)), **{**TASK, "horizon": 50})
+    with pytest.raises(QfolioError, match="must divide the 50 steps"):
+        Tilts(**SMALL).init(task, jax.random.key(0))
+
+
 @pytest.mark.parametrize(
-    "settings", [{"head": 84}, {"members": 0}, {"threshold": -1.0}, {"members": 40}]
+    "settings", [{"head": 84}, {"members": 1}, {"threshold": -1.0}, {"members": 40}]
 )
 def test_settings_out_of_range(settings: dict[str, Any]):
     with pytest.raises(QfolioError, match=next(iter(settings))):

@@ -20,8 +20,8 @@ def test_every_kind_of_agent_has_one():
 
 @pytest.mark.parametrize("name", AGENTS)
 def test_its_actions_are_those_of_the_task(name):
-    values = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (160, 3)).cumsum(0))
-    prices = Prices(np.datetime64("2020-01-01") + np.arange(160), ("a", "b", "c"), values)
+    values = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (600, 3)).cumsum(0))
+    prices = Prices(np.datetime64("2020-01-01") + np.arange(600), ("a", "b", "c"), values)
     preset = PRESETS["portfolio", name]["fast"]
     task = Portfolio.of(prices, **settings.convert(Portfolio, preset.task))
     agent = preset.build()

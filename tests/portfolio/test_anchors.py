@@ -7,6 +7,7 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES
 from qfolio.portfolio import anchors
+from qfolio.portfolio.backtest.baselines import Baseline
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import LEAST, Portfolio
 
@@ -48,6 +49,16 @@ def test_an_asset_joins_after_a_year_of_prices():
     assert found[:60, :3].sum(1).min() > 0.99
 
 
+class Debt(Baseline):
+    def decide(self, history, held):
+        return np.array([-1.0, 2.0, 0.0, 0.0, 0.0])
+
+
+def test_a_baseline_with_invalid_weights_is_named():
+    with pytest.raises(QfolioError, match=r"Debt at 2020-01-03 .* minimum of -1"):
+        anchors.path(f"{__name__}:Debt", table())
+
+
 def test_a_column_of_weights():
     weights = np.tile([0.4, 0.3, 0.2, 0.1], (ROWS, 1))
     np.testing.assert_array_equal(anchors.path("feature:weight", table(features=weights)), weights)
@@ -65,4 +76,6 @@ def test_what_cannot_be_traded_goes_to_the_others():
     weights = np.asarray(part.anchor_weights(jnp.array(50)))
     np.testing.assert_allclose(weights, [1 / 3, 1 / 3, 1 / 3, 0], atol=1e-6)
     assert weights[3] == 0
-    assert LEAST < 1e-5
+    sparse = Portfolio.of(table(), window=1, horizon=10, anchor="momentum")
+    held = np.asarray(sparse.anchor_weights(jnp.array(300)))
+    assert held.min() == pytest.approx(LEAST / 4)  # not 0: it may be traded

@@ -63,6 +63,7 @@ def test_formulas_by_hand():
         "reversal:8": -np.log(values[t] / values[t - 8]),
         "volatility:8": np.log(r[last].std(0)),
         "volatility:8-2": np.log(r[skipped].std(0)),
+        "drift:8-3": np.log(values[t] / values[t - 3]) / (r[last].std(0) * 3**0.5),
         "volatility-ratio:8-3": np.log(r[t - 3 : t].std(0) / r[last].std(0)),
         "high:8": level[-1] - level.max(0),
         "moving-average:8": np.log(values[t] / values[t - 7 : t + 1].mean(0)),
@@ -112,7 +113,16 @@ def test_scales_by_hand():
     unit = 1.5**0.5
     np.testing.assert_allclose(of("z-score")[0], [-unit, unit, 0.0, 0.0])
     np.testing.assert_allclose(of("z-score")[2], 0)
+    np.testing.assert_allclose(of("centered")[0], [-1, 1, 0, 0])
+    np.testing.assert_allclose(of("centered")[1], [-1.5, -1.5, 2.5, 0.5])
     np.testing.assert_allclose(of("raw")[0], [1, 3, 2, 0])
+
+
+def test_drift_keeps_its_scale():
+    found = signals.compute(signals.parse("drift:8-2"), prices(), "rank")
+    wanted = signals.compute(signals.parse("drift:8-2"), prices(), "centered")
+    np.testing.assert_array_equal(found, wanted)
+    assert abs(found[20:]).max() > 1
 
 
 def test_what_all_assets_share_has_no_rank():
@@ -163,8 +173,6 @@ def test_a_portfolio_observes_them():
     again = on_table(task, table(50))
     np.testing.assert_array_equal(again.extra, task.extra[:50])
     np.testing.assert_array_equal(again.scale, task.scale)
-    with pytest.raises(QfolioError, match="8 rows of prices are too few: a signal looks back on 8"):
-        on_table(task, table(8))
     with pytest.raises(QfolioError, match="signal_scale is 'log'"):
         Portfolio.of(table(), window=2, horizon=10, signals=text, signal_scale="log")
 

@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.costs import drift
 from qfolio.portfolio.following import follow
-from qfolio.portfolio.market import Menu
+from qfolio.portfolio.market import Menu, Signalled
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
@@ -210,6 +212,66 @@ def test_menus():
     expected = [held, [0, 0.5, 0.5], [0, 0.55, 0.45], [0, 0.45, 0.55]]
     np.testing.assert_allclose(choices, np.array(expected), atol=1e-6)
     assert portfolio().actions == Simplex(3)
+
+
+def test_a_menu_of_signals_by_hand():
+    menu = Menu("signals:2", jnp.ones(2), signals=1)
+    assert menu.actions == MenuActions(3, pooled=3, each=0)
+    start = Signalled(jnp.array([0.5, 0.5]), jnp.array([[1.0], [-1.0]]))
+
+    def orders(held):
+        return [menu.weights(jnp.array(held), jnp.array(i), start) for i in range(3)]
+
+    def on_the_way(held, first, second):
+        return 0.7 * np.array(held) + 0.3 * np.array([0, first, second]) / (first + second)
+
+    for held in ([0, 0.6, 0.4], [1.0, 0, 0]):
+        targets = [(1, 1), (np.exp(2), np.exp(-2)), (np.exp(-2), np.exp(2))]
+        expected = [on_the_way(held, *target) for target in targets]
+        np.testing.assert_allclose(orders(held), np.array(expected), atol=1e-6)
+
+
+def signalling(**settings):
+    values = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (160, 3)).cumsum(0))
+    prices = Prices(np.datetime64("2020-01-01") + np.arange(160), ("a", "b", "c"), values)
+    given = {"window": 1, "signals": "momentum:5,volatility:21", "menu": "signals:0.5"}
+    return Portfolio.of(prices, **given, **settings)
+
+
+def test_a_menu_of_signals_draws_holdings_near_the_anchor():
+    task, row = signalling(anchor="equal-weight"), jnp.array(100)
+    draw = partial(task.draw_reachable, row)
+    weights = jax.vmap(draw)(jax.random.split(jax.random.key(0), 200)).weights
+    np.testing.assert_allclose(weights[:, 0], 0, atol=1e-6)
+    np.testing.assert_allclose(weights.sum(1), 1, rtol=1e-5)
+    assert weights[:, 1:].std(0).min() > 0.02
+    np.testing.assert_allclose(weights[:, 1:].mean(0), 1 / 3, atol=0.03)
+    plain = portfolio()
+    key = jax.random.key(1)
+    np.testing.assert_array_equal(
+        plain.draw_reachable(row, key).weights, plain.draw_holding(key).weights
+    )
+
+
+def test_a_view_shows_what_a_menu_of_signals_orders_within_the_cap():
+    task, held = signalling(max_weight=0.35), jnp.array([0, 0.4, 0.3, 0.3])
+    view = task.view(jnp.array(100), held)
+    assert view.choices is not None
+    assert view.choices.shape == (5, 3)
+    assert view.choices.max() <= 0.35 + 1e-6
+    np.testing.assert_allclose(
+        view.choices[3], task.target(jnp.array(100), held, jnp.array(3))[1:], rtol=1e-6
+    )
+    assert portfolio(menu="tilts:0.1").view(jnp.array(100), held).choices is None
+
+
+def test_the_reference_is_the_reward_of_holding_the_anchor():
+    task, row = signalling(anchor="equal-weight"), jnp.array(100)
+    reward = task.reference(row, row + 1)
+    moved = task.relatives(row, row + 1)
+    after = moved.waiting / moved.waiting.sum()
+    np.testing.assert_allclose(reward, jnp.log((after * moved.earning).sum()), atol=1e-6)
+    assert signalling().reference(row, row + 1) is None
 
 
 @pytest.mark.parametrize("menu", ["grid", "grid:0", "grid:1.5", "tilts:1", "tilts:x", "grid:400"])

@@ -30,6 +30,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, sizes, static
 from qfolio.core.mdp import Agent, Discrete, ExogenousTask, Metrics, Task, Transition
 from qfolio.learning import heads, optimizer
+from qfolio.learning.bootstrapped import Heads, cautious, samples
 from qfolio.learning.distributional import ValueConfig, Values
 from qfolio.learning.exploration import EpsilonSchedule, LinearSchedule, epsilon_greedy
 from qfolio.learning.heads import HeadConfig
@@ -39,19 +40,22 @@ from qfolio.learning.priorities import ImportanceSchedule, Priorities
 from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
 from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
 
+Weights = Network | Heads
+"""One network of action values, or bootstrapped heads."""
+
 
 class DQNState(eqx.Module):
     """The state of a DQN agent."""
 
-    online: Network
-    target: Network
+    online: Weights
+    target: Weights
     optimizer: optimizer.Optimizer
     replay: Replay
     episodes: Int[Array, ""]  # finished; ε follows it
     steps: Int[Array, ""]  # of each environment; the target network follows them, and a linear ε
 
 
-Learned = tuple[Network, optimizer.Optimizer, Priorities | None]
+Learned = tuple[Weights, optimizer.Optimizer, Priorities | None]
 
 
 class Losses(NamedTuple):
@@ -88,7 +92,10 @@ class DQN(Agent):
     noisy: bool = static(False)  # explore by learned noise on weights, in addition to ε
     noise_scale: float = number(0.5)  # σ₀
     all_actions: bool = static(False)  # learn all actions at once, from random holdings
-    market_baseline: bool = static(False)  # with all_actions: rewards relative to other holdings'
+    outcomes: int = static(0)  # with all_actions: actions learned for each move; 0: all
+    market_baseline: bool = static(False)  # with all_actions: rewards over the anchor's or others'
+    bootstrap_heads: int = static(1)  # with all_actions: networks, each of some blocks of the data
+    caution: float = number(0.0)  # standard errors by which an action has to beat the first one
     time_limit_terminal: bool = static(False)  # wrong, but often done
     target_update_interval: int = static(200)  # steps between target updates
     tau: float = number(1.0)  # step towards the online network; 1 copies it
@@ -132,6 +139,13 @@ class DQN(Agent):
             )
         if self.all_actions:
             hindsight.require_plain({name: getattr(self, name) for name in hindsight.PLAIN})
+        require(self, "outcomes", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "bootstrap_heads", lambda x: 1 <= x <= 1000, "from 1 to 1,000")
+        require(self, "caution", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
+        if self.bootstrap_heads > 1 and not self.all_actions:
+            raise QfolioError("bootstrap_heads learn from moves of a market; set all_actions=true.")
+        if isinstance(self.caution, float) and self.caution and self.bootstrap_heads == 1:
+            raise QfolioError("caution compares heads; set bootstrap_heads to 2 or more.")
         if self.market_baseline and self.batch_size < 2:
             raise QfolioError(
                 "market_baseline compares holdings; it needs a batch_size of 2 or more."
@@ -193,7 +207,10 @@ class DQN(Agent):
             )
         state = task.reset(key)
         observation = task.observe(state)
-        online = heads.build(self._networks, self._head, task, observation, key)
+        build = partial(heads.build, self._networks, self._head, task, observation)
+        online: Weights = build(key)
+        if self.bootstrap_heads > 1:
+            online = Heads.build(build, self.bootstrap_heads, key)
         zero = jnp.array(0, jnp.int32)
         if self.all_actions:
             hindsight.require_exogenous(task)
@@ -222,17 +239,21 @@ class DQN(Agent):
     def carry_over(self, state: DQNState, fresh: DQNState) -> DQNState:
         return eqx.tree_at(lambda s: s.replay, state, fresh.replay)
 
-    def weights(self, state: DQNState) -> Network:
+    def weights(self, state: DQNState) -> Weights:
         return state.online
 
     def action_values(
-        self, weights: Network, observation: PyTree
+        self, weights: Weights, observation: PyTree
     ) -> Float[Array, "batch action"] | None:
         """Q(s, ·) in units of the task's reward; None if they are relative to a baseline."""
-        return None if self.market_baseline else self._q(weights, observation) / self.reward_scale
+        if self.market_baseline:
+            return None
+        if isinstance(weights, Heads):
+            return self._head_values(weights, observation).mean(0) / self.reward_scale
+        return self._q(weights, observation) / self.reward_scale
 
-    def policy(self, weights: Network, observation: PyTree) -> Int[Array, " batch"]:
-        return self._q(weights, observation).argmax(-1)
+    def policy(self, weights: Weights, observation: PyTree) -> Int[Array, " batch"]:
+        return self._merits(weights, observation).argmax(-1)
 
     def act(self, state: DQNState, observation: PyTree, key: PRNGKeyArray) -> Int[Array, " batch"]:
         online = state.online
@@ -241,7 +262,20 @@ class DQN(Agent):
             online = heads.draw_noise(online, noise_key)
         epsilon = self._epsilon(state)
         last = state.replay.latest().action if self.persistence else None
-        return epsilon_greedy(key, self._q(online, observation), epsilon, last, self.persistence)
+        merits = self._merits(online, observation)
+        return epsilon_greedy(key, merits, epsilon, last, self.persistence)
+
+    def _merits(self, weights: Weights, observation: PyTree) -> Float[Array, "batch action"]:
+        """What a greedy action maximises: its value, or its cautious advantage."""
+        if isinstance(weights, Heads):
+            values = self._head_values(weights, observation)
+            return cautious(values, self.caution)
+        return self._q(weights, observation)
+
+    def _head_values(
+        self, weights: Heads, observation: PyTree
+    ) -> Float[Array, "head batch action"]:
+        return jax.vmap(self._q, (0, None))(weights.networks, observation)
 
     def _q(self, network: Network, observation: PyTree) -> Float[Array, "batch action"]:
         return self._values.mean(self._read(network, observation))
@@ -280,7 +314,7 @@ class DQN(Agent):
         return DQNState(online, target, adam, replay, state.episodes, state.steps), metrics
 
     def _update(
-        self, task: Task, replay: Replay, target: Network, learned: Learned, key: PRNGKeyArray
+        self, task: Task, replay: Replay, target: Weights, learned: Learned, key: PRNGKeyArray
     ) -> tuple[Learned, Metrics]:
         """One gradient step, with its loss and the batch's mean max_a Q(s, a)."""
         online, adam, priorities = learned
@@ -292,10 +326,12 @@ class DQN(Agent):
         if priorities is not None:
             weight = priorities.importance(index, self._importance(adam.count))
 
-        def objective(online: Network) -> tuple[Float[Array, ""], Losses]:
+        def objective(online: Weights) -> tuple[Float[Array, ""], Losses]:
             if self.all_actions:
                 losses = self._all_action_losses(task, online, target, replay.at(index), key)
             else:
+                assert not isinstance(online, Heads)
+                assert not isinstance(target, Heads)
                 batch, discount = join(replay, index, self.discount)
                 losses = self._losses(online, target, batch, discount, key)
             return (weight * losses.each).mean(), losses
@@ -332,11 +368,24 @@ class DQN(Agent):
         return Losses(each, off, values.mean(z).max(1).mean() / self.reward_scale)
 
     def _all_action_losses(
-        self, task: Task, online: Network, target: Network, moves: Move, key: PRNGKeyArray
+        self, task: Task, online: Weights, target: Weights, moves: Move, key: PRNGKeyArray
     ) -> Losses:
         assert isinstance(task, ExogenousTask)
-        q = partial(self._q, online), partial(self._q, target)
-        rule = hindsight.Rule(self.discount, self.reward_scale, self.double, self.market_baseline)
-        error, values = hindsight.errors(rule, task, moves, key, *q)
-        each = huber_loss(error, self.huber_delta)
-        return Losses(each, None, values.max(1).mean() / self.reward_scale)
+        rule = hindsight.Rule(
+            self.discount, self.reward_scale, self.double, self.market_baseline, self.outcomes
+        )
+
+        def errors(online: Network, target: Network) -> tuple[Array, Array]:
+            q = partial(self._q, online), partial(self._q, target)
+            return hindsight.errors(rule, task, moves, key, *q)
+
+        if isinstance(online, Heads) and isinstance(target, Heads):
+            error, values = jax.vmap(errors)(online.networks, target.networks)
+            count = samples(task, moves.market, self.bootstrap_heads)
+            each = (count[..., None] * huber_loss(error, self.huber_delta)).sum(0)
+        else:
+            assert not isinstance(online, Heads)
+            assert not isinstance(target, Heads)
+            error, values = errors(online, target)
+            each = huber_loss(error, self.huber_delta)
+        return Losses(each, None, values.max(-1).mean() / self.reward_scale)

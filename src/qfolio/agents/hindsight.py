@@ -72,29 +72,34 @@ class Rule(NamedTuple):
     discount: Scalar
     reward_scale: Scalar
     double: bool
-    market_baseline: bool  # rewards are relative to another holding's mean over actions
+    market_baseline: bool  # rewards are relative to the anchor's, or another holding's mean
+    outcomes: int = 0  # actions learned for each move, drawn at random; 0: all
 
 
 def errors(
     rule: Rule, task: ExogenousTask, moves: Move, key: PRNGKeyArray, online: Q, target: Q
-) -> tuple[Float[Array, "batch action"], Float[Array, "batch action"]]:
-    """Target minus value of every action, from a random holding for each move; and the values."""
+) -> tuple[Float[Array, "batch learned"], Float[Array, "batch action"]]:
+    """Target minus value of each action learned, from a random holding per move; all values."""
     count = len(jax.tree.leaves(moves)[0])
-    holdings = jax.vmap(task.draw_holding)(jax.random.split(key, count))
-    q = online(jax.vmap(task.observe)(Position(moves.market, holdings)))
-
-    def after(holdings: PyTree, action: Array) -> tuple[Array, PyTree]:
-        settle = jax.vmap(task.settle, (0, 0, 0, None))
-        return settle(moves.market, moves.next_market, holdings, action)
-
+    holdings = jax.vmap(task.draw_reachable)(moves.market, jax.random.split(key, count))
+    values = q = online(jax.vmap(task.observe)(Position(moves.market, holdings)))
     actions = jnp.arange(q.shape[-1])
+    if rule.outcomes:
+        shape = (rule.outcomes, count)
+        actions = jax.random.randint(jax.random.fold_in(key, 0), shape, 0, len(actions))
+        q = jnp.take_along_axis(values, actions.T, 1)
+    settle = jax.vmap(task.settle, (0, 0, 0, 0 if rule.outcomes else None))
+    after = partial(settle, moves.market, moves.next_market)
     reward, next_holdings = jax.vmap(partial(after, holdings))(actions)  # (action, batch)
     if rule.market_baseline:
         # It depends on the market alone: subtracting it does not change the best policy, and
         # removes the market noise that all actions share (input-dependent baselines, Mao et al.
         # 2019).
-        others = jax.tree.map(lambda x: jnp.roll(x, 1, 0), holdings)
-        reward = reward - jax.vmap(partial(after, others))(actions)[0].mean(0)
+        shared = jax.vmap(task.reference)(moves.market, moves.next_market)
+        if shared is None:
+            others = jax.tree.map(lambda x: jnp.roll(x, 1, 0), holdings)
+            shared = jax.vmap(partial(after, others))(actions)[0].mean(0)
+        reward = reward - shared
     never = jnp.zeros(reward.shape[1:], bool)
 
     def towards(reward: Array, holding: PyTree) -> Array:
@@ -104,4 +109,4 @@ def errors(
         return td_target(rule.reward_scale * reward, never, following, rule.discount)
 
     targets = lax.stop_gradient(jax.vmap(towards)(reward, next_holdings)).T
-    return targets - q, q
+    return targets - q, values

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
+from qfolio.agents.paths import OnPaths
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, require_sizes, sizes, static
 from qfolio.core.market import View
 from qfolio.core.mdp import (
-    Agent,
     Box,
     Discrete,
     ExogenousTask,
@@ -33,7 +33,7 @@ from qfolio.core.mdp import (
 )
 from qfolio.learning import optimizer
 from qfolio.learning.networks import SHARED, Reading, Shared
-from qfolio.learning.optimizer import CosineSchedule, Optimizer
+from qfolio.learning.optimizer import Optimizer
 
 
 class Band(eqx.Module):
@@ -117,7 +117,7 @@ class PathwiseState(eqx.Module):
     slope_optimizer: Optimizer | None
 
 
-class Pathwise(Agent):
+class Pathwise(OnPaths):
     """Gradient ascent on net growth through whole rollouts."""
 
     network: str = static("mlp")  # mlp, cnn or rnn, shared by all assets
@@ -153,32 +153,13 @@ class Pathwise(Agent):
                 f"tail is {self.tail}; it must be less than rollout_length, {self.rollout_length}."
             )
 
-    @property
-    def _schedule(self) -> CosineSchedule:
-        return CosineSchedule(
-            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
-        )
-
-    @property
-    def discount(self) -> None:
-        return None
-
-    @property
-    def rollout_steps(self) -> int:
-        return self.rollout_length
-
     def init(self, task: Task, key: PRNGKeyArray) -> PathwiseState:
         if not isinstance(task, ExogenousTask) or isinstance(task.actions, Discrete):
             raise QfolioError(
                 "pathwise needs a market whose actions are weights or positions; "
                 f"{task.name} is not one (in a market, leave menu empty)."
             )
-        episode = min(self.episode_steps or task.horizon, task.horizon)
-        if episode % self.rollout_length:
-            raise QfolioError(
-                f"rollout_length is {self.rollout_length}; it must divide the {episode} steps of "
-                "an episode (episode_steps, or the task's horizon)."
-            )
+        self._require_whole(task)
         view = task.observe(task.reset(key))
         network = Shared(self.network, view, self.hidden, pooled=0, each=2, key=key)
         # With an output layer of zeros, the first policy is the initial band.
@@ -198,9 +179,6 @@ class Pathwise(Agent):
             slope_optimizer=optimizer.begin(slopes) if slopes else None,
         )
 
-    def warm_up(self) -> int:
-        return 0
-
     def weights(self, state: PathwiseState) -> Band:
         return state.policy
 
@@ -211,9 +189,6 @@ class Pathwise(Agent):
         self, state: PathwiseState, observation: View, key: PRNGKeyArray
     ) -> Float[Array, "batch entry"]:
         return state.policy(observation)
-
-    def observe(self, state: PathwiseState, rollout: Transition) -> PathwiseState:
-        return state
 
     def learn(
         self, task: Task, state: PathwiseState, rollout: Transition, key: PRNGKeyArray

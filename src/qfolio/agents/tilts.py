@@ -11,61 +11,28 @@ is shrunk to the anchor by it, after James & Stein (1961), and stays there witho
 docs/tilts.md lists formulas and their sources.
 """
 
-import math
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from qfolio.agents.paths import OnPaths, unchanged
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, static
 from qfolio.core.market import View
-from qfolio.core.mdp import Agent, ExogenousTask, Metrics, Position, Simplex, Task, Transition
+from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
-from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.evidence import Evidence, blocks_of
 from qfolio.learning.scores import NETWORKS, Attention, Hidden
+from qfolio.learning.trading import Trading, ratio
+
+PASSES = 8
+"""Passes that look for the assets which a target holds."""
 
 LARGEST = 3.0
 """Inputs are clipped to ± this many standard deviations of the training data."""
-
-
-class Trading(eqx.Module):
-    """How to trade towards a target."""
-
-    rate: Float[Array, ""]  # logit of the share of the way that is traded at a step
-    band: Float[Array, ""]  # log of the deviation that is not traded, in equal weights
-
-    @staticmethod
-    def start() -> "Trading":
-        """30 % of the way at each step, outside a band of 5 % of an equal weight."""
-        return Trading(jnp.array(math.log(0.3 / 0.7)), jnp.array(math.log(0.05)))
-
-    def __call__(
-        self,
-        held: Float[Array, "*batch asset"],
-        target: Float[Array, "*batch entry"],
-        anchor: Float[Array, "*batch asset"],
-    ) -> Float[Array, "*batch entry"]:
-        """The order: part of the way from the weights held to the target.
-
-        What an asset is off its target beyond the band is traded at the rate, as far as purchases
-        and sales pay for each other. Cash beyond the target's is invested at once.
-        """
-        gap = target[..., 1:] - held
-        band = jnp.exp(self.band) * _equal(anchor)
-        bought, sold = jnp.maximum(gap - band, 0.0), jnp.maximum(-gap - band, 0.0)
-        buying, selling = bought.sum(-1, keepdims=True), sold.sum(-1, keepdims=True)
-        matched = jnp.where(buying < selling, buying, selling)
-        trade = bought * _ratio(matched, buying) - sold * _ratio(matched, selling)
-        idle = 1 - held.sum(-1, keepdims=True) - target[..., :1]
-        source = jnp.where(idle > 0, target[..., 1:], held)
-        invested = idle * source * _ratio(1.0, source.sum(-1, keepdims=True))
-        assets = held + jax.nn.sigmoid(self.rate) * trade + invested
-        return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
 
 
 class Tilt(eqx.Module):
@@ -121,54 +88,35 @@ class TiltPolicy(eqx.Module):
 def tilted(
     anchor: Float[Array, "*batch asset"], scores: Float[Array, "*batch asset"], actions: Simplex
 ) -> Float[Array, "*batch entry"]:
-    """The anchor plus softmax(scores) less equal weights, cash first.
+    """The weights nearest to the anchor plus scores over the number of assets, cash first.
 
-    A weight of 0 can grow; negative weights are set to 0, and the sum is kept (Brandt, Santa-Clara
-    & Valkanov 2009, section 1.3). Weights that are exactly 0 in the anchor cannot be traded.
+    None is negative, and their sum is the anchor's. Weights that are exactly 0 in the anchor cannot
+    be traded.
     """
     total = anchor.sum(-1, keepdims=True)
-    wanted = anchor + total * jax.nn.softmax(scores, where=anchor > 0) - _equal(anchor)
-    wanted = jnp.maximum(wanted, 0.0)
-    wanted = total * wanted / wanted.sum(-1, keepdims=True)
+    share = ratio(total, (anchor > 0).sum(-1, keepdims=True))
+    wanted = _nearest(anchor + share * scores, anchor > 0, total)
     target = jnp.concatenate([1 - total, wanted], -1)
     return target if actions.cap == 1 else simplex.project(target, jnp.asarray(actions.caps))
 
 
-class Evidence(NamedTuple):
-    """What the members earned over the anchor in the blocks that they have not seen."""
+def _nearest(
+    wanted: Float[Array, "*batch asset"],
+    open_to: Bool[Array, "*batch asset"],
+    total: Float[Array, "*batch 1"],
+) -> Float[Array, "*batch asset"]:
+    """The weights nearest to those wanted that are not negative and have a given sum.
 
-    steps: Float[Array, " block"]  # earlier ones count less
-    total: Float[Array, " block"]  # of rewards over the anchor's
-    square: Float[Array, " block"]
-
-    @staticmethod
-    def none(blocks: int) -> "Evidence":
-        return Evidence(*jnp.zeros((3, blocks)))
-
-    def add(
-        self,
-        block: Int[Array, "time path"],
-        active: Float[Array, "time path"],
-        counted: Float[Array, "time path"],
-        memory: Array | float,
-    ) -> "Evidence":
-        """With the steps of a rollout, counted by 1 or 0; all else fades."""
-        new = (counted, counted * active, counted * active**2)
-        where = block.ravel()
-        return Evidence(
-            *(memory * old.at[where].add(x.ravel()) for old, x in zip(self, new, strict=True))
-        )
-
-    @property
-    def t(self) -> Float[Array, ""]:
-        """The t-statistic over blocks of mean over deviation: each weighs the same, calm or not."""
-        known = self.steps > 1
-        mean = _ratio(self.total, self.steps)
-        deviation = jnp.sqrt(jnp.maximum(_ratio(self.square, self.steps) - mean**2, 0.0))
-        ratio, blocks = _ratio(mean, deviation), known.sum()
-        center = _ratio((known * ratio).sum(), blocks)
-        spread = _ratio((known * (ratio - center) ** 2).sum(), jnp.maximum(blocks - 1.0, 0.0))
-        return _ratio(center * jnp.sqrt(1.0 * blocks), jnp.sqrt(spread))
+    They are what exceeds a level, which rises as assets below it drop out (Michelot 1986). Few
+    passes find it almost always; what is missing then is made up in proportion.
+    """
+    above, level = open_to, jnp.zeros_like(total)
+    for _ in range(PASSES):
+        level = ratio(jnp.where(above, wanted, 0.0).sum(-1, keepdims=True) - total,
+                      above.sum(-1, keepdims=True))  # fmt: skip
+        above = above & (wanted > level)
+    kept = jnp.where(above, wanted - level, 0.0)
+    return kept * ratio(total, kept.sum(-1, keepdims=True))
 
 
 class TiltsState(eqx.Module):
@@ -179,14 +127,14 @@ class TiltsState(eqx.Module):
     evidence: Evidence
 
 
-class Tilts(Agent):
+class Tilts(OnPaths):
     """Gradient ascent on net utility, with a penalty on tracking error and on tilts."""
 
     network: str = static("linear")  # or hidden or attention, which are added to linear scores
     units: int = static(8)  # of such a network
     members: int = static(4)  # each learns without every so-many-th block of the data
     blocks: int = static(32)  # of the data, of equal length
-    num_envs: int = static(32)  # paths in a batch
+    num_envs: int = static(24)  # paths in a batch
     rollout_length: int = static(84)  # steps of a path
     head: int = static(21)  # of these, first steps that only lead to a holding
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
@@ -201,7 +149,8 @@ class Tilts(Agent):
     def __check_init__(self) -> None:
         kinds = ", ".join(("linear", *NETWORKS))
         require(self, "network", lambda x: x in ("linear", *NETWORKS), f"one of {kinds}")
-        require(self, "members blocks num_envs units", lambda x: 1 <= x < 2**31, "at least 1")
+        require(self, "blocks num_envs units", lambda x: 1 <= x < 2**31, "at least 1")
+        require(self, "members", lambda x: x >= 2, "at least 2, since each leaves blocks out")
         require(self, "rollout_length", lambda x: x >= 2, "at least 2")
         require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
@@ -216,20 +165,6 @@ class Tilts(Agent):
                 f"{self.blocks}."
             )
 
-    @property
-    def _schedule(self) -> CosineSchedule:
-        return CosineSchedule(
-            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
-        )
-
-    @property
-    def discount(self) -> None:
-        return None
-
-    @property
-    def rollout_steps(self) -> int:
-        return self.rollout_length
-
     def init(self, task: Task, key: PRNGKeyArray) -> TiltsState:
         view = task.observe(task.reset(key))
         if not isinstance(task, ExogenousTask) or getattr(view, "anchor", None) is None:
@@ -239,37 +174,25 @@ class Tilts(Agent):
             )
         if not isinstance(task.actions, Simplex):
             raise QfolioError("tilts gives weights; leave menu empty.")
+        self._require_whole(task)
         channels, actions = view.features.shape[-1] - 1, task.actions
 
         def member(key: PRNGKeyArray) -> Tilt:
             kind = NETWORKS.get(self.network)
             network = None if kind is None else kind(channels, self.units, key)
             square = jnp.zeros((channels, channels))
-            return Tilt(jnp.zeros(channels), square, network, Trading.start())
+            return Tilt(jnp.zeros(channels), square, network, Trading.start(0.3))
 
         members = jax.vmap(member)(jax.random.split(key, self.members))
         policy = TiltPolicy(members, jnp.array(0.0), actions)
         return TiltsState(policy, optimizer.begin(members), Evidence.none(self.blocks))
 
-    def warm_up(self) -> int:
-        return 0
-
     def monitor(self, state: TiltsState) -> Metrics:
-        trading = state.policy.trading
-        return {
-            "evidence": state.evidence.t,
-            "share": state.policy.share,
-            "rate": jax.nn.sigmoid(trading.rate),
-            "band": jnp.exp(trading.band),
-        }
+        found = {"evidence": state.evidence.t, "share": state.policy.share}
+        return found | state.policy.trading.described
 
     def weights(self, state: TiltsState) -> TiltPolicy:
         return state.policy
-
-    def _share(self, evidence: Evidence) -> Float[Array, ""]:
-        """1 − (threshold/t)², and 0 for t up to the threshold."""
-        t = jnp.maximum(evidence.t, 1e-9)
-        return jnp.maximum(1 - (self.threshold / t) ** 2, 0.0)
 
     def policy(self, weights: TiltPolicy, observation: View) -> Float[Array, "batch entry"]:
         return weights(observation)
@@ -277,16 +200,13 @@ class Tilts(Agent):
     def act(
         self, state: TiltsState, observation: View, key: PRNGKeyArray
     ) -> Float[Array, "batch entry"]:
-        return state.policy(observation)
-
-    def observe(self, state: TiltsState, rollout: Transition) -> TiltsState:
-        return state
+        return unchanged(observation)
 
     def learn(
         self, task: Task, state: TiltsState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[TiltsState, Metrics]:
         assert isinstance(task, ExogenousTask)
-        block = self._blocks(task, rollout)
+        block = blocks_of(task, rollout, self.blocks)
         counted = jnp.arange(self.rollout_length)[:, None] >= self.head
         left_out = block % self.members == jnp.arange(self.members)[:, None, None]
 
@@ -308,16 +228,8 @@ class Tilts(Agent):
         evidence = state.evidence.add(
             block, (unseen * active).sum(0), 1.0 * unseen.any(0), self.memory
         )
-        policy = TiltPolicy(members, self._share(evidence), state.policy.actions)
+        policy = TiltPolicy(members, evidence.share(self.threshold), state.policy.actions)
         return TiltsState(policy, adam, evidence), {"loss": -utility}
-
-    def _blocks(self, task: ExogenousTask, rollout: Transition) -> Int[Array, "time path"]:
-        """The block of each step; where moves are drawn anew, each path is of one block."""
-        place = jax.vmap(jax.vmap(task.place))(rollout.state.market)
-        own = jnp.arange(self.num_envs) % self.blocks
-        share = jnp.clip(place / task.moves, 0.0, 1.0)
-        found = jnp.minimum((self.blocks * share).astype(jnp.int32), self.blocks - 1)
-        return jnp.where(jnp.isfinite(task.moves), found, own)
 
     def _paths(
         self, member: Tilt, task: ExogenousTask, rollout: Transition
@@ -331,35 +243,6 @@ class Tilts(Agent):
         assert isinstance(task.actions, Simplex)
         target = tilted(view.anchor, member.scores(view.features), task.actions)
         anchor = jnp.concatenate([1 - view.anchor.sum(-1, keepdims=True), view.anchor], -1)
-        fixed = lax.stop_gradient(member.trading)
-
-        def step(holdings: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
-            market, next_market, first, weights, targets = moves
-
-            def settled(trade: Trading, holding: PyTree, target: Array) -> tuple[Array, PyTree]:
-                held = jax.vmap(task.observe)(Position(market, holding)).holding
-                action = jnp.where(first, target, trade(held, target, weights))
-                return jax.vmap(task.settle)(market, next_market, holding, action)
-
-            followers = zip((member.trading, fixed), holdings, targets, strict=True)
-            rewards, after = zip(*(settled(*each) for each in followers), strict=True)
-            return after, rewards
-
-        start = jax.tree.map(lambda x: x[0], rollout.state.holding)
-        first = jnp.arange(self.rollout_length) == 0
-        market, next_market = rollout.state.market, rollout.next_state.market
-        moves = (market, next_market, first, view.anchor, (target, anchor))
-        _, (rewards, anchored) = lax.scan(jax.checkpoint(step), (start, start), moves)
+        followers = (member.trading, target), (lax.stop_gradient(member.trading), anchor)
+        (rewards, anchored), _ = self._followed(task, rollout, followers, view.anchor)
         return rewards, anchored
-
-
-def _equal(anchor: Float[Array, "*batch asset"]) -> Float[Array, "*batch asset"]:
-    """The anchor's sum, in equal parts over the assets that can be traded."""
-    open_to = anchor > 0
-    share = anchor.sum(-1, keepdims=True) / open_to.sum(-1, keepdims=True)
-    return jnp.where(open_to, share, 0.0)
-
-
-def _ratio(part: Array | float, whole: Array) -> Array:
-    """The ratio, 0 for a whole of 0."""
-    return jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), 0.0)

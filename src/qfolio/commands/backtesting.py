@@ -32,8 +32,8 @@ class Options:
     """How agents are trained and tested on a table.
 
     Args:
-        agents: Agents, separated by commas: tilts, dqn, pathwise, ppo, a2c, reinforce, sac, ddpg,
-            td3, or your own as module:Name.
+        agents: Agents, separated by commas: tilts, mean-variance-learned, minimum-variance-learned,
+            dqn, pathwise, ppo, a2c, reinforce, sac, ddpg, td3, or your own as module:Name.
         preset: Preset of the agents.
         cost_bps: Cost of buying or selling, in basis points of the value traded.
         lag: Rows between the close that a decision sees and the close at which it trades.

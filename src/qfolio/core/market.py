@@ -9,11 +9,15 @@ from qfolio.core.mdp import Discrete
 
 
 class View(NamedTuple):
-    """An observation of a market: the features of each asset and the weights held."""
+    """An observation of a market: the features of each asset and the weights held.
+
+    choices: the weights that each action of a menu of signals orders.
+    """
 
     features: Float[Array, "*batch asset time channel"]
     holding: Float[Array, "*batch asset"]  # weights, without cash
     anchor: Float[Array, "*batch asset"] | None = None  # weights to depart from, if any
+    choices: Float[Array, "*batch action asset"] | None = None
 
 
 class MenuActions(Discrete):

@@ -202,6 +202,14 @@ class ExogenousTask(Task):
     def draw_holding(self, key: PRNGKeyArray) -> PyTree:
         """A random holding, so that an agent learns to act from any."""
 
+    def draw_reachable(self, market: PyTree, key: PRNGKeyArray) -> PyTree:
+        """A random holding of the kind that actions lead to in a market; else any."""
+        return self.draw_holding(key)
+
+    def reference(self, market: PyTree, next_market: PyTree) -> Float[Array, ""] | None:
+        """The reward to compare a move's others with, if the task has one."""
+        return None
+
     @abc.abstractmethod
     def settle(
         self, market: PyTree, next_market: PyTree, holding: PyTree, action: Array
@@ -214,7 +222,8 @@ class ExogenousTask(Task):
 
     def reset(self, key: PRNGKeyArray) -> Position:
         market_key, holding_key = jax.random.split(key)
-        return Position(self.reset_market(market_key), self.draw_holding(holding_key))
+        market = self.reset_market(market_key)
+        return Position(market, self.draw_reachable(market, holding_key))
 
     def step(self, state: Position, action: Array, key: PRNGKeyArray) -> Step:
         market = self.next_market(state.market, key)

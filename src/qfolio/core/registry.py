@@ -40,6 +40,8 @@ AGENTS = {
     "dqn": "qfolio.agents.dqn:DQN",
     "pathwise": "qfolio.agents.pathwise:Pathwise",
     "tilts": "qfolio.agents.tilts:Tilts",
+    "mean-variance-learned": "qfolio.agents.mean_variance:MeanVariance",
+    "minimum-variance-learned": "qfolio.agents.mean_variance:MinimumVariance",
     "q-learning": "qfolio.agents.tabular:QLearning",
     "sarsa": "qfolio.agents.tabular:Sarsa",
     "expected-sarsa": "qfolio.agents.tabular:ExpectedSarsa",
@@ -83,6 +85,7 @@ REWARDS = {
 SIGNALS = {
     "momentum": "qfolio.portfolio.signals:Momentum",
     "reversal": "qfolio.portfolio.signals:Reversal",
+    "drift": "qfolio.portfolio.signals:Drift",
     "volatility": "qfolio.portfolio.signals:Volatility",
     "volatility-ratio": "qfolio.portfolio.signals:VolatilityRatio",
     "high": "qfolio.portfolio.signals:High",

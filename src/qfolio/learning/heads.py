@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Task
 from qfolio.learning import networks
 from qfolio.learning.encoders import MLP
@@ -99,6 +100,11 @@ def build(
     If it is dueling, the numbers of the state's value come first.
     """
     atoms, dueling, noise = head
+    if config.network == "positions" and (dueling or noise is not None or atoms > 1):
+        raise QfolioError(
+            "network=positions gives plain action values; set dueling=false, noisy=false and "
+            "values=expected."
+        )
     pooled, each, _ = networks.outputs_of(task.actions)
     outputs = networks.Outputs((pooled + dueling) * atoms, each * atoms, atoms)
     network = networks.build(config, task, observation, outputs, key)

@@ -174,17 +174,42 @@ class PerAsset(eqx.Module):
         return jnp.concatenate([market, blocks.reshape(*market.shape[:-1], -1)], -1)
 
 
+class Positions(eqx.Module):
+    """Values of a menu's actions: what the positions that an action orders are worth.
+
+    Q(s, a) = Σᵢ (bᵢ − anchorᵢ) θ·xᵢ − p Σᵢ |bᵢ − hᵢ| + v, where b are the weights that action a
+    orders, h those held, and x the latest features of an asset except the first, its return.
+    Rewards are nearly linear in weights, so that one θ serves all actions, as the value of the
+    state after a decision does (Powell 2011, section 4.6). All values start at 0.
+    """
+
+    linear: Float[Array, " channel"]  # θ
+    price: Float[Array, ""]  # p
+    value: Float[Array, ""]  # v
+
+    def __init__(self, view: View) -> None:
+        self.linear = jnp.zeros(view.features.shape[-1] - 1)
+        self.price, self.value = jnp.zeros(()), jnp.zeros(())
+
+    def __call__(self, view: View) -> Float[Array, "batch action"]:
+        assert view.choices is not None
+        held, signals = view.holding[..., None, :], view.features[..., -1, 1:]
+        active = view.choices if view.anchor is None else view.choices - view.anchor[..., None, :]
+        traded = jnp.abs(view.choices - held).sum(-1)
+        return self.value + (active @ signals) @ self.linear - self.price * traded
+
+
 _ENCODERS: dict[str, Any] = {"mlp": Window, "cnn": CNN, "rnn": RNN, "lstm": LSTM}
 
 SHARED = tuple(_ENCODERS)
 """Kinds of networks that assets share."""
 
-KINDS = ("flat", *SHARED)
+KINDS = ("flat", *SHARED, "positions")
 
 _READS = {"cnn": (2, 3), "rnn": (2,), "lstm": (2,)}
 """Dimensions of an encoder's input: (time, channel), or (height, width, channel)."""
 
-Network = Flat | LateAction | PerAsset
+Network = Flat | LateAction | PerAsset | Positions
 
 
 class NetworkConfig(NamedTuple):
@@ -274,6 +299,13 @@ def build(
             observation, hidden, count, key, gain, task.states,
             activation=activation, initialization=initialization,
         )  # fmt: skip
+    if kind == "positions":
+        if not isinstance(observation, View) or observation.choices is None:
+            raise QfolioError(
+                "network=positions values the positions that a menu of signals leads to; set a "
+                f"menu such as signals:1 in a portfolio with signals, which {task.name} has not."
+            )
+        return Positions(observation)
     if not isinstance(observation, View):
         shape = jnp.shape(observation) if isinstance(observation, Array) else ()
         if kind not in _READS or len(shape) not in _READS[kind]:

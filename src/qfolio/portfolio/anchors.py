@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines import Baseline, History, baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
+from qfolio.portfolio.backtest.orders import checked
 from qfolio.portfolio.costs import drift
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.signals import COLUMN
@@ -35,14 +36,13 @@ def path(name: str, prices: Prices) -> Weights:
     (the calendar "fold"). It may hold the assets that have had prices for a year, or all there are
     until then.
 
-    Raises QfolioError if there is no such baseline or column, or if a column's weights are not at
-    least 0, with a sum of at most 1.
+    Raises QfolioError if there is no such baseline or column, if a baseline gives invalid weights,
+    or if a column's weights are not at least 0, with a sum of at most 1.
     """
     chosen = made(name)
     if chosen is None:
         return _column(name.removeprefix(COLUMN), prices)
-    month = max(1, round(prices.periods_per_year / 12))
-    values = prices.values
+    month, values = prices.month, prices.values
     held = np.eye(values.shape[1] + 1)[0]
     rows = np.empty(values.shape)
     with warnings.catch_warnings():
@@ -51,8 +51,9 @@ def path(name: str, prices: Prices) -> Weights:
             # The first two rows are too few for a baseline, which has a training window in a test.
             if row % month == 0 or row == 2 or chosen.calendar == "row":
                 rule = chosen if row >= 2 else EqualWeight()
-                wanted = rule.decide(_history(prices, row, month), held)
-                held = held if wanted is None else np.asarray(wanted, float)
+                history = _history(prices, row, month)
+                wanted = rule.decide(history, held)
+                held = held if wanted is None else checked(name, wanted, history)
             rows[row] = held[1:]
             if row + 1 < len(values) and chosen.calendar != "fold":
                 held = drift(held, np.nan_to_num(values[row + 1] / values[row], nan=1.0))

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, PyTree
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Agent
-from qfolio.portfolio import signals
 from qfolio.portfolio.costs import Context, grown
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -21,15 +20,7 @@ TOLERANCE = 1e-4
 
 
 def on_table(task: Portfolio, prices: Prices) -> Portfolio:
-    """The same task over all rows of another table, with the scale of its training data.
-
-    Raises QfolioError if the table is too short to know every signal at its last row.
-    """
-    if len(prices) <= (least := signals.lookback(signals.parse(task.signals))):
-        raise QfolioError(
-            f"{len(prices)} rows of prices are too few: a signal looks back on {least}; bring more "
-            "rows."
-        )
+    """The same task over all rows of another table, with the scale of its training data."""
     rows = jnp.array(task.window, jnp.int32), jnp.array(len(prices) - 1, jnp.int32)
     where = lambda t: (t.first_decision, t.last_decision)  # noqa: E731
     return eqx.tree_at(where, task.on(prices), rows)

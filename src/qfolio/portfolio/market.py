@@ -12,6 +12,7 @@ from math import comb
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
@@ -26,8 +27,8 @@ from qfolio.portfolio.rewards import Outcome, Reward
 
 MENU_LIMIT = 2000
 
-RATES = (0.1, 0.5)
-"""Shares of the way to a target that the menu "signals" offers."""
+RATE = 0.3
+"""The share of the way to a target that the menu "signals" trades."""
 
 
 class Holding(NamedTuple):
@@ -59,8 +60,8 @@ class Menu(eqx.Module):
     text: "grid:10" for all weights in tenths; "tilts:0.1" for: no order, all cash, equal weights,
     all in one asset, and a tenth of the holding moved into one asset (each for every asset);
     "overweight:0.1" for: no order, all cash, equal weights, and equal weights with a tenth of the
-    wealth moved into one asset; "signals:1" for: no order, and each of ``RATES`` of the way to the
-    anchor and to the anchor times exp(±1·signal), for every signal. signals: how many there are.
+    wealth moved into one asset; "signals:1" for: ``RATE`` of the way to the anchor, and to the
+    anchor times exp(±1·signal) for every signal. signals: how many there are.
     """
 
     keep: Float[Array, " choice"]
@@ -98,11 +99,11 @@ class Menu(eqx.Module):
         elif kind == "signals" and 0 < value <= 10:
             if not signals:
                 raise QfolioError(f"menu={text} tilts by signals; name some with --signals.")
-            ways = value * jnp.concatenate([jnp.zeros((1, signals)), *_sides(signals)])
-            tilts = jnp.concatenate([ways[:1], *[ways] * len(RATES)])
-            keep = 1 - jnp.concatenate([jnp.zeros(1), jnp.repeat(jnp.array(RATES), len(ways))])
-            target = jnp.zeros((len(keep), assets + 1))
-            self.actions = MenuActions(len(keep), pooled=len(keep), each=0)
+            one = jnp.eye(signals)
+            tilts = value * jnp.concatenate([jnp.zeros((1, signals)), one, -one])
+            target = jnp.zeros((len(tilts), assets + 1))
+            keep = jnp.full(len(tilts), 1 - RATE)
+            self.actions = MenuActions(len(tilts), pooled=len(tilts), each=0)
         else:
             raise QfolioError(
                 f"menu is {text!r}; it must be like grid:10, tilts:0.1, overweight:0.1 or "
@@ -120,14 +121,15 @@ class Menu(eqx.Module):
         target = self.target[choice]
         if self.tilts is not None:
             assert signalled is not None
-            tilted = signalled.anchor * jnp.exp(signalled.signals @ self.tilts[choice])
-            tilted = tilted * signalled.anchor.sum() / tilted.sum()
-            target = jnp.append(1 - tilted.sum(), tilted)
+            target = self.tilted(signalled, self.tilts[choice])
         return self.keep[choice] * held + (1 - self.keep[choice]) * target
 
-
-def _sides(signals: int) -> tuple[Float[Array, "signal signal"], Float[Array, "signal signal"]]:
-    return jnp.eye(signals), -jnp.eye(signals)
+    @staticmethod
+    def tilted(signalled: Signalled, tilt: Float[Array, " signal"]) -> Float[Array, " entry"]:
+        """The anchor times exp(signals·tilt), with the anchor's sum."""
+        weights = signalled.anchor * jnp.exp(signalled.signals @ tilt)
+        weights = weights * signalled.anchor.sum() / weights.sum()
+        return jnp.append(1 - weights.sum(), weights)
 
 
 class Market(ExogenousTask):
@@ -174,6 +176,11 @@ class Market(ExogenousTask):
         return Menu(self.menu, self.limits, self.tilting)
 
     @property
+    def _signal_menu(self) -> Menu | None:
+        menu = self._menu if self.menu else None
+        return None if menu is None or menu.tilts is None else menu
+
+    @property
     def tilting(self) -> int:
         """How many signals a menu may tilt by."""
         return 0
@@ -217,13 +224,39 @@ class Market(ExogenousTask):
 
     def view(self, market: PyTree, weights: Float[Array, " entry"]) -> View:
         """The observation of a market, from weights held."""
-        return View(self.features(market), weights[1:], self.anchor_weights(market))
+        choices = None
+        if (menu := self._signal_menu) is not None:
+            order = jax.vmap(self.target, (None, None, 0))
+            choices = order(market, weights, jnp.arange(menu.actions.n))[:, 1:]
+        return View(self.features(market), weights[1:], self.anchor_weights(market), choices)
 
     def observe(self, state: Position) -> View:
         return self.view(state.market, state.holding.weights)
 
     def draw_holding(self, key: PRNGKeyArray) -> Holding:
         return self.hold(self.feasible.draw(key))
+
+    def draw_reachable(self, market: PyTree, key: PRNGKeyArray) -> Holding:
+        """With a menu of signals the anchor, tilted at random by all of them.
+
+        It is as near to the anchor as what is held, and its returns have as little noise.
+        """
+        menu, signalled = self._signal_menu, self.signalled(market)
+        if menu is None or menu.tilts is None or signalled is None:
+            return self.draw_holding(key)
+        spread_key, key = jax.random.split(key)
+        normal = jax.random.normal(key, (signalled.signals.shape[1],))
+        tilt = menu.tilts.max() * jax.random.uniform(spread_key) * normal
+        weights = menu.tilted(signalled, tilt)
+        return self.hold(self.feasible.project(weights, weights))
+
+    def reference(self, market: PyTree, next_market: PyTree) -> Float[Array, ""] | None:
+        """That of holding the anchor, if there is one."""
+        anchor = self.anchor_weights(market)
+        if anchor is None:
+            return None
+        weights = jnp.append(1 - anchor.sum(), anchor)
+        return self._earn(market, next_market, self.hold(weights), weights)[0]
 
     def hold(self, weights: Float[Array, " entry"]) -> Holding:
         """A holding without a history."""
@@ -237,8 +270,13 @@ class Market(ExogenousTask):
     def settle(
         self, market: PyTree, next_market: PyTree, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
-        costs, moved = self.costs, self.relatives(market, next_market)
         target = self.target(market, holding.weights, action)
+        return self._earn(market, next_market, holding, target)
+
+    def _earn(
+        self, market: PyTree, next_market: PyTree, holding: Holding, target: Float[Array, " entry"]
+    ) -> tuple[Float[Array, ""], Holding]:
+        costs, moved = self.costs, self.relatives(market, next_market)
         wait = Context(rows=self.lag)
         waiting = costs.carry(moved.waiting, wait)
         before, after = grown(holding.weights, waiting), grown(target, waiting)

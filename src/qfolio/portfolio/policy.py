@@ -22,6 +22,7 @@ from qfolio.core.training import episode_steps
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Listener, fit
 from qfolio.experiments.presets import Preset, preset
+from qfolio.portfolio import signals
 from qfolio.portfolio.following import follow, on_table
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
@@ -222,6 +223,13 @@ class Policy:
             raise QfolioError(
                 f"The price table has {len(table)} rows; the policy's window needs at least "
                 f"{self.task.window + 1}."
+            )
+        # A policy that learned from a shorter table has never known its longest signals.
+        looked = min(signals.lookback(signals.parse(self.task.signals)), self.rows - 1)
+        if len(table) <= looked:
+            raise QfolioError(
+                f"The price table has {len(table)} rows; the policy's signals look back on "
+                f"{looked}, so bring at least {looked + 1}."
             )
         table = table.select(self.assets)
         # An asset that may be held needs prices in the whole window, the others at its end.

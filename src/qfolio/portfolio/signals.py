@@ -25,9 +25,9 @@ Floats = NDArray[np.float64]
 
 COLUMN = "feature:"
 
-SCALES = ("rank", "z-score", "raw")
+SCALES = ("rank", "z-score", "centered", "raw")
 """Across assets, row by row: ranks from −1 to 1; distances from the mean in standard deviations,
-cut at ±3; or the numbers themselves."""
+cut at ±3; distances from the mean; or the numbers themselves."""
 
 
 class Signal(eqx.Module):
@@ -38,6 +38,8 @@ class Signal(eqx.Module):
 
     shared: ClassVar[bool] = False
     """Whether all assets have the same number, which then has no rank."""
+    scale: ClassVar[str | None] = None
+    """One of ``SCALES`` that the signal always has; None for the one that is set."""
 
     rows: int = static(21)
     skip: int = static(0)
@@ -77,6 +79,27 @@ class Reversal(Momentum):
 
     def measure(self, prices: Floats, rows: int) -> Floats:
         return -super().measure(prices, rows)
+
+
+class Drift(Signal):
+    """Log return over the latest ``skip`` rows, in standard deviations of such a return.
+
+    The standard deviation is that of rows over all ``rows``, times √skip. It is never ranked: large
+    moves are rare, and tell more (Moskowitz, Ooi & Pedersen 2012 scale returns in the same way).
+    """
+
+    scale = "centered"
+    rows: int = static(252)
+    skip: int = static(21)
+
+    def __call__(self, prices: Floats) -> Floats:
+        return self.measure(prices, self.rows)
+
+    def measure(self, prices: Floats, rows: int) -> Floats:
+        latest = max(1, self.skip)
+        logs = np.log(prices)
+        usual = _deviation(_returns(prices), rows) * np.sqrt(latest)
+        return (logs - _before(logs, latest)) / np.where(usual > 0, usual, np.nan)
 
 
 class Volatility(Signal):
@@ -234,7 +257,9 @@ def compute(
         else _checked(signal, prices)
         for signal in signals
     ]  # fmt: skip
-    found = [_scaled(x, _is_shared(s, x), scale) for s, x in zip(signals, values, strict=True)]
+    found = [
+        _scaled(x, _is_shared(s, x), s.scale or scale) for s, x in zip(signals, values, strict=True)
+    ]
     return np.stack(found, -1) if found else np.zeros((*prices.shape, 0))
 
 
@@ -300,12 +325,13 @@ def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
         ranks = pd.DataFrame(values).rank(axis=1).to_numpy()
         count = (~np.isnan(values)).sum(1, keepdims=True)
         values = np.where(count > 1, 2 * (ranks - 1) / np.maximum(count - 1, 1) - 1, 0)
-    elif not shared and scale == "z-score":
+    elif not shared and scale in ("z-score", "centered"):
         known = ~np.isnan(values)
         count = np.maximum(known.sum(1, keepdims=True), 1)
-        centred = values - np.nansum(values, 1, keepdims=True) / count
-        spread = np.sqrt(np.nansum(centred**2, 1, keepdims=True) / count)
-        values = np.clip(centred / np.where(spread > 0, spread, 1), -3, 3)
+        values = values - np.nansum(values, 1, keepdims=True) / count
+        if scale == "z-score":
+            spread = np.sqrt(np.nansum(values**2, 1, keepdims=True) / count)
+            values = np.clip(values / np.where(spread > 0, spread, 1), -3, 3)
     return np.nan_to_num(values, posinf=0, neginf=0)
 
 

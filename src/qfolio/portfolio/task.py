@@ -49,7 +49,7 @@ class Portfolio(Market):
     max_weight: float = constant(1.0)  # of one asset
     menu: str = static("")
     signals: str = static("")  # names of signals that are observed, see portfolio.signals
-    signal_scale: str = static("rank")  # of signals across assets: rank, z-score or raw
+    signal_scale: str = static("rank")  # of signals: rank, z-score, centered or raw
     anchor: str = static("")  # that agents may depart from, see portfolio.anchors
     reward: str = static("log")
     risk_aversion: float = number(3.0)

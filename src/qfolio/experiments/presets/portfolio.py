@@ -7,21 +7,25 @@ from qfolio.experiments.presets.preset import Preset, Presets
 _TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
 
 
+# The values of actions differ by little, next to the noise of a day's returns: hence large batches,
+# linear values of positions, and actions that have to be better by standard errors.
 _DQN = {
-    "network": "mlp",
-    "hidden": (16, 16),
+    "network": "positions",
     "all_actions": True,
+    "outcomes": 1,
     "market_baseline": True,
-    "num_envs": 8,
-    "batch_size": 64,
+    "bootstrap_heads": 32,
+    "caution": 2.5,
+    "num_envs": 32,
+    "batch_size": 256,
     "replay_capacity": 8192,
-    "learning_starts": 3200,
+    "learning_starts": 4096,
     "target_update_interval": 1,
-    "tau": 0.05,
-    "discount": 0.99,
-    "learning_rate": 3e-4,
+    "tau": 0.1,
+    "discount": 0.95,
+    "learning_rate": 0.01,
     "learning_rate_final": 0.0,
-    "learning_rate_steps": 600.0,
+    "learning_rate_steps": 300.0,
     "reward_scale": 100.0,
 }
 
@@ -95,15 +99,23 @@ _SAC = {**_OFF_POLICY, "initial_temperature": 0.1}
 
 
 SIGNALS = (
-    "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,momentum:63,momentum:126,"
-    "momentum:252-21,momentum:42-21,volatility:21,volatility:126,volatility-ratio:252-21,high:252,"
-    "maximum:21,moving-average:10,moving-average:200,beta:252,residual-volatility:252,"
-    "correlation:252,market-volatility:63"
+    "drift:252-1,drift:252-2,drift:252-5,drift:252-10,drift:252-21,drift:252-63,drift:252-126,"
+    "momentum:252-21,volatility:21,volatility:126,volatility-ratio:252-21,high:252,maximum:21,"
+    "beta:252,residual-volatility:252,correlation:252,market-volatility:63"
 )
+
+
+SHORT_SIGNALS = "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,moving-average:10"
+"""Those that pay off within days: values of single moves are too noisy for slower ones."""
 
 
 def _on_weights(agent: str, settings: dict[str, Any], episodes: int) -> dict[str, Preset]:
     return {"fast": Preset(agent, settings, episodes, seeds=5, task=_TASK)}
+
+
+def _on_covariance(agent: str) -> dict[str, Preset]:
+    task = {"window": 504, "horizon": 63, "anchor": "equal-weight"}
+    return {"fast": Preset(agent, {}, episodes=1920, seeds=5, task=task)}
 
 
 def of_any(agent: str) -> Preset:
@@ -116,9 +128,16 @@ PRESETS: Presets = {
         "fast": Preset(
             "dqn",
             _DQN,
-            episodes=160,
+            episodes=224,
             seeds=5,
-            task={**_TASK, "menu": "overweight:0.1"},
+            task={
+                "window": 1,
+                "horizon": 64,
+                "reward": "log",
+                "signals": SHORT_SIGNALS,
+                "anchor": "equal-weight",
+                "menu": "signals:2",
+            },
         ),
     },
     ("portfolio", "pathwise"): _on_weights("pathwise", _PATHWISE, episodes=800),
@@ -126,11 +145,13 @@ PRESETS: Presets = {
         "fast": Preset(
             "tilts",
             {},
-            episodes=2560,
+            episodes=1920,
             seeds=5,
             task={"window": 1, "horizon": 84, "signals": SIGNALS, "anchor": "equal-weight"},
         )
     },
+    ("portfolio", "mean-variance-learned"): _on_covariance("mean-variance-learned"),
+    ("portfolio", "minimum-variance-learned"): _on_covariance("minimum-variance-learned"),
     ("portfolio", "ppo"): _on_weights("ppo", _PPO, episodes=480),
     ("portfolio", "a2c"): _on_weights("a2c", _A2C, episodes=800),
     ("portfolio", "reinforce"): _on_weights("reinforce", _REINFORCE, episodes=960),

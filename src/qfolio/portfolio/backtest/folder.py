@@ -8,7 +8,7 @@ report.
 """
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -34,8 +34,17 @@ from qfolio.experiments.fit import Row
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.prices.table import Prices
 
+TOGETHER = "-together"
+"""Suffix of an agent's ensemble: the mean of all its seeds, which is the policy for tomorrow."""
+
 # Names become folders.
 AgentName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")]
+
+
+def followed(agent: str, names: Container[str]) -> str:
+    """The strategy that ``allocate`` follows: all seeds of an agent together, or its only one."""
+    together = f"{agent}{TOGETHER}"
+    return together if together in names else agent
 
 
 class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):

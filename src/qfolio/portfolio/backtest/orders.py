@@ -88,7 +88,7 @@ def orders(
                 held = _drifted(ordered, prices[row_ordered], prices[row])
                 wanted = baseline.decide(history, held)
                 if wanted is not None:
-                    ordered, row_ordered = _checked(name, wanted, history), row
+                    ordered, row_ordered = checked(name, wanted, history), row
                     part[row - rows[0]] = ordered
         if baseline.calendar == "fold":
             part[:] = part[0]
@@ -125,7 +125,7 @@ def _drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
     return np.asarray(worth / worth.sum())
 
 
-def _checked(name: str, wanted: ArrayLike, history: History) -> Floats:
+def checked(name: str, wanted: ArrayLike, history: History) -> Floats:
     """A baseline's target weights; raises QfolioError if they are invalid."""
     target = np.asarray(wanted, dtype=float)
     where = f"The baseline {name} at {str(history.dates[-1])[:10]}"

@@ -29,7 +29,12 @@ from qfolio.portfolio.backtest import assessment
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
-from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
+from qfolio.portfolio.backtest.folder import (
+    TOGETHER,
+    AgentConfig,
+    BacktestConfig,
+    BacktestFolder,
+)
 from qfolio.portfolio.backtest.folds import Fold, latest, spell, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.orders import orders
@@ -47,9 +52,6 @@ LATEST = "latest"
 """Name of the policies trained on the last rows of the table."""
 
 EQUAL_WEIGHT = "equal-weight"
-
-TOGETHER = "-together"
-"""Suffix of an agent's ensemble: the mean of all its seeds, which is the policy for tomorrow."""
 
 FOLDS_AT_ONCE = 8
 """Folds that train at once if members advance in lockstep; results are kept after each group."""
@@ -277,11 +279,10 @@ class Backtest:
                 together = self._decide(name, together=True)
                 entries[f"{name}{TOGETHER}"] = self._entry("ensemble", together)
         table, cap = self.prices, self.config.cap
-        month = max(1, round(table.periods_per_year / 12))
         slower = {f"{EQUAL_WEIGHT} at {speed:g}": EqualWeightAt(speed) for speed in SPEEDS}
         for name, made in {**self.baselines, **slower}.items():
             decided = orders(
-                name, made, self.folds, table.dates, table.values, cap=cap, month=month
+                name, made, self.folds, table.dates, table.values, cap=cap, month=table.month
             )
             kind = "rebalancing" if name in slower else "baseline"
             entries[name] = self._entry(kind, decided.decisions[None])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json
-from qfolio.portfolio.backtest.run import TOGETHER
+from qfolio.portfolio.backtest.folder import followed
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Standing:
                 raise QfolioError(
                     f"The backtest has no agent {agent!r}; choose from {', '.join(agents)}."
                 )
-            name = f"{agent}{TOGETHER}" if f"{agent}{TOGETHER}" in strategies else agent
+            name = followed(agent, strategies)
             worse = any(
                 strategies[name][key] is not None
                 and strategies[name][key]["growth"]["finding"] == "worse"

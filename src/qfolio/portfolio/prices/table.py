@@ -25,7 +25,7 @@ DEFAULT_NOTE = (
     "20 US stocks, chosen in hindsight from those still listed in 2022 (survivors): strategies "
     "that hold them look better than they could have been at the time."
 )
-DEFAULT_TRIALS = 104
+DEFAULT_TRIALS = 162
 """Earlier trials on the default table, as docs/results.md lists them."""
 
 
@@ -111,6 +111,11 @@ class Prices:
     def periods_per_year(self) -> float:
         """Rows per year, from the dates; cf. ``frequency.periods_per_year``."""
         return periods_per_year(self.dates)
+
+    @property
+    def month(self) -> int:
+        """Rows in a month, at least 1."""
+        return max(1, round(self.periods_per_year / 12))
 
     @property
     def digest(self) -> str:

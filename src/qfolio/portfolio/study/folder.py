@@ -15,7 +15,7 @@ import numpy as np
 from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json, write_csv
-from qfolio.portfolio.backtest.folder import AgentName, BacktestFolder
+from qfolio.portfolio.backtest.folder import AgentName, BacktestFolder, followed
 from qfolio.portfolio.study.pooling import Pools, TableReturns
 
 FILE = "study.json"
@@ -186,9 +186,7 @@ def _of_kind(
 
 def _traded(agent: str, columns: dict[str, np.ndarray]) -> np.ndarray:
     """The returns of an agent as it is traded: all seeds together, or its only seed."""
-    from qfolio.portfolio.backtest.run import TOGETHER
-
-    if (together := f"{agent}{TOGETHER}") in columns:
+    if (together := followed(agent, columns)) in columns:
         return columns[together]
     (only,) = (name for name in columns if name.rpartition("/")[0] == agent)
     return columns[only]

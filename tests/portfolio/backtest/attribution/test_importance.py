@@ -83,10 +83,10 @@ def test_the_signals_of_a_single_asset_are_shuffled_in_time():
 
 
 class FirstTilt(Known):
-    """Always the same choice of a menu: half of the way to the anchor, tilted by a signal."""
+    """Always the same choice of a menu: towards the anchor, tilted by the first signal."""
 
     def policy(self, weights, observation):
-        return jnp.full(observation.holding.shape[0], 9)
+        return jnp.full(observation.holding.shape[0], 1)
 
 
 def test_a_menu_tilts_by_the_shuffled_signals(prices):

@@ -19,8 +19,9 @@ from qfolio.portfolio.backtest.attribution.importance import importance, of_seed
 from qfolio.portfolio.backtest.attribution.replays import channel_names, channels
 from qfolio.portfolio.backtest.attribution.slices import slices
 from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
+from qfolio.portfolio.backtest.folder import followed
 from qfolio.portfolio.backtest.replay import Entry, Stretch
-from qfolio.portfolio.backtest.run import EQUAL_WEIGHT, TOGETHER, Backtest
+from qfolio.portfolio.backtest.run import EQUAL_WEIGHT, Backtest
 from qfolio.portfolio.costs import Context
 
 
@@ -37,14 +38,14 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
     reference = entries[EQUAL_WEIGHT].simulation.returns[0]
     agents, diagnosis = {}, {}
     for name, agent in backtest.agents.items():
-        followed = f"{name}{TOGETHER}" if config.seeds > 1 else name
-        entry, stretches = entries[followed], backtest.stretches(name)
+        traded = followed(name, entries)
+        entry, stretches = entries[traded], backtest.stretches(name)
         net = entry.simulation.returns[0]
         names = channel_names(backtest.tasks[name], prices.feature_names)
         worth, replays = importance(agent, stretches, names, prices.values, year)
         held, few = replays.held[0], of_seeds(stretches, worth.seeds)
         shared = [each.shared for each in worth.signals] or [False] * len(names)
-        agents[followed] = AgentWhy(
+        agents[traded] = AgentWhy(
             decomposition=decompose(
                 net,
                 entry.simulation.weights[0],
@@ -61,8 +62,8 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
             rule=_rule(entry.decisions[0], stretches, names),
             menu=isinstance(stretches[0].task.actions, Discrete),
         )
-        for each in dict.fromkeys((name, followed)):
-            ignored = worth.ignored and each == followed
+        for each in dict.fromkeys((name, traded)):
+            ignored = worth.ignored and each == traded
             said = diagnose(each, entries[each], list(folds.values()), prices.assets, ignored)
             if said:
                 diagnosis[each] = said

@@ -1,0 +1,117 @@
+"""What agents share that differentiate rewards through whole paths of a market.
+
+They learn from rollouts that begin with an episode or within one, and never span two; they store
+nothing, and estimate no values. ``pathwise.py``, ``tilts.py`` and ``mean_variance.py`` differ in
+the policy and the loss.
+"""
+
+from typing import TYPE_CHECKING, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.market import View
+from qfolio.core.mdp import Agent, ExogenousTask, Position, Task, Transition
+from qfolio.core.training import episode_steps
+from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.trading import Trading
+
+State = TypeVar("State")
+
+Rewards = tuple[Float[Array, "time path"], ...]
+
+
+class OnPaths(Agent):
+    """The schedule and the rollouts; subclasses define the policy and ``learn``."""
+
+    if TYPE_CHECKING:  # as in Agent
+
+        @property
+        def rollout_length(self) -> int: ...
+
+        @property
+        def learning_rate(self) -> float: ...
+
+        @property
+        def learning_rate_final(self) -> float: ...
+
+        @property
+        def learning_rate_steps(self) -> float: ...
+    else:
+        rollout_length: eqx.AbstractVar[int]
+        learning_rate: eqx.AbstractVar[float]
+        learning_rate_final: eqx.AbstractVar[float]
+        learning_rate_steps: eqx.AbstractVar[float]
+
+    @property
+    def _schedule(self) -> CosineSchedule:
+        return CosineSchedule(
+            self.learning_rate, self.learning_rate_final, self.learning_rate_steps
+        )
+
+    @property
+    def discount(self) -> None:
+        return None
+
+    @property
+    def rollout_steps(self) -> int:
+        return self.rollout_length
+
+    def warm_up(self) -> int:
+        return 0
+
+    def observe(self, state: State, rollout: Transition) -> State:
+        return state
+
+    def _require_whole(self, task: Task) -> None:
+        """Raises QfolioError if a rollout would span two episodes."""
+        episode = episode_steps(task, self)
+        if episode % self.rollout_length:
+            raise QfolioError(
+                f"rollout_length is {self.rollout_length}; it must divide the {episode} steps of "
+                "an episode (episode_steps, or the task's horizon)."
+            )
+
+    def _followed(
+        self,
+        task: ExogenousTask,
+        rollout: Transition,
+        followers: tuple[tuple[Trading, Float[Array, "time path entry"]], ...],
+        anchor: Float[Array, "time path asset"],
+    ) -> tuple[Rewards, Rewards]:
+        """Rewards of each follower of targets along the rollout's market, and those without costs.
+
+        Each begins at its first target. anchor: says which assets can be traded.
+        """
+
+        def step(holdings: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
+            market, next_market, first, weights, targets = moves
+
+            def settled(trade: Trading, holding: PyTree, target: Array) -> tuple:
+                held = jax.vmap(task.observe)(Position(market, holding)).holding
+                action = jnp.where(first, target, trade(held, target, weights))
+                settle = jax.vmap(task.settle)
+                reward, after = settle(market, next_market, holding, action)
+                there = jax.vmap(task.shift)(holding, action[..., 1:] - held)
+                without, _ = settle(market, next_market, there, action)
+                return reward, without, after
+
+            each = zip(trades, holdings, targets, strict=True)
+            rewards, without, after = zip(*(settled(*one) for one in each), strict=True)
+            return after, (rewards, without)
+
+        trades, targets = zip(*followers, strict=True)
+        start = jax.tree.map(lambda x: x[0], rollout.state.holding)
+        first = jnp.arange(self.rollout_length) == 0
+        market, next_market = rollout.state.market, rollout.next_state.market
+        moves = (market, next_market, first, anchor, targets)
+        return lax.scan(jax.checkpoint(step), (start,) * len(trades), moves)[1]
+
+
+def unchanged(view: View) -> Float[Array, "*batch entry"]:
+    """The order that trades nothing, for agents that learn from the market's moves alone."""
+    return jnp.concatenate([1 - view.holding.sum(-1, keepdims=True), view.holding], -1)

@@ -1,0 +1,64 @@
+"""How far what is learned earns more than what it departs from, beyond luck."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from qfolio.core.mdp import ExogenousTask, Transition
+from qfolio.learning.trading import ratio
+
+
+class Evidence(NamedTuple):
+    """Active rewards, a policy's less those of what it departs from, by block of the data."""
+
+    steps: Float[Array, " block"]  # earlier ones count less
+    total: Float[Array, " block"]
+    square: Float[Array, " block"]
+
+    @staticmethod
+    def none(blocks: int) -> "Evidence":
+        return Evidence(*jnp.zeros((3, blocks)))
+
+    def add(
+        self,
+        block: Int[Array, "time path"],
+        active: Float[Array, "time path"],
+        counted: Float[Array, "time path"],
+        memory: Array | float,
+    ) -> "Evidence":
+        """With the steps of a rollout, counted by 1 or 0; older ones fade."""
+        new = (counted, counted * active, counted * active**2)
+        where = block.ravel()
+        return Evidence(
+            *(memory * old.at[where].add(x.ravel()) for old, x in zip(self, new, strict=True))
+        )
+
+    @property
+    def t(self) -> Float[Array, ""]:
+        """The t-statistic over blocks of mean over deviation: each weighs the same, calm or not."""
+        known = self.steps > 1
+        mean = ratio(self.total, self.steps)
+        deviation = jnp.sqrt(jnp.maximum(ratio(self.square, self.steps) - mean**2, 0.0))
+        each, blocks = ratio(mean, deviation), known.sum()
+        center = ratio((known * each).sum(), blocks)
+        spread = ratio((known * (each - center) ** 2).sum(), jnp.maximum(blocks - 1.0, 0.0))
+        return ratio(center * jnp.sqrt(1.0 * blocks), jnp.sqrt(spread))
+
+    def share(self, threshold: Array | float) -> Float[Array, ""]:
+        """What it leaves of a departure: 1 − (threshold/t)², and 0 for t up to the threshold.
+
+        The positive-part estimator of James & Stein (1961) for one number.
+        """
+        t = jnp.maximum(self.t, 1e-9)
+        return jnp.maximum(1 - (threshold / t) ** 2, 0.0)
+
+
+def blocks_of(task: ExogenousTask, rollout: Transition, blocks: int) -> Int[Array, "time path"]:
+    """The block of each step; where moves are drawn anew, each path is of one block."""
+    place = jax.vmap(jax.vmap(task.place))(rollout.state.market)
+    own = jnp.arange(place.shape[1]) % blocks
+    share = jnp.clip(place / task.moves, 0.0, 1.0)
+    found = jnp.minimum((blocks * share).astype(jnp.int32), blocks - 1)
+    return jnp.where(jnp.isfinite(task.moves), found, own)

@@ -1,0 +1,60 @@
+"""How a policy trades from the weights that it holds towards a target."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Trading(eqx.Module):
+    """A share of the way to the target, outside a band; both are learned."""
+
+    rate: Float[Array, ""]  # logit of the share of the way that is traded at a step
+    band: Float[Array, ""]  # log of the deviation that is not traded, in equal weights
+
+    @staticmethod
+    def start(rate: float) -> "Trading":
+        """A share of the way at each step, outside a band of 5 % of an equal weight."""
+        return Trading(jnp.array(math.log(rate / (1 - rate))), jnp.array(math.log(0.05)))
+
+    @property
+    def described(self) -> dict[str, Array]:
+        """The share of the way, and the band in equal weights, as named scalars."""
+        return {"rate": jax.nn.sigmoid(self.rate), "band": jnp.exp(self.band)}
+
+    def __call__(
+        self,
+        held: Float[Array, "*batch asset"],
+        target: Float[Array, "*batch entry"],
+        anchor: Float[Array, "*batch asset"],
+    ) -> Float[Array, "*batch entry"]:
+        """The order: part of the way from the weights held to the target.
+
+        What an asset is off its target beyond the band is traded at the rate, as far as purchases
+        and sales pay for each other. Cash beyond the target's is invested at once.
+        """
+        gap = target[..., 1:] - held
+        band = jnp.exp(self.band) * equal(anchor)
+        bought, sold = jnp.maximum(gap - band, 0.0), jnp.maximum(-gap - band, 0.0)
+        buying, selling = bought.sum(-1, keepdims=True), sold.sum(-1, keepdims=True)
+        matched = jnp.where(buying < selling, buying, selling)
+        trade = bought * ratio(matched, buying) - sold * ratio(matched, selling)
+        idle = 1 - held.sum(-1, keepdims=True) - target[..., :1]
+        source = jnp.where(idle > 0, target[..., 1:], held)
+        invested = idle * source * ratio(1.0, source.sum(-1, keepdims=True))
+        assets = held + jax.nn.sigmoid(self.rate) * trade + invested
+        return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
+
+
+def equal(anchor: Float[Array, "*batch asset"]) -> Float[Array, "*batch asset"]:
+    """The anchor's sum, in equal parts over the assets that can be traded."""
+    open_to = anchor > 0
+    share = anchor.sum(-1, keepdims=True) / open_to.sum(-1, keepdims=True)
+    return jnp.where(open_to, share, 0.0)
+
+
+def ratio(part: Array | float, whole: Array) -> Array:
+    """The ratio, 0 for a whole of 0."""
+    return jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), 0.0)

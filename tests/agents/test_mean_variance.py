@@ -1,0 +1,111 @@
+"""Learned mean and variance: lags that fit the market, and weights that may be held."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.mean_variance import MeanVariance, MinimumVariance
+from qfolio.core.errors import QfolioError
+from qfolio.core.population import Population
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+from qfolio.tasks.pendulum import Pendulum
+
+SMALL: dict[str, Any] = {
+    "num_envs": 8,
+    "rollout_length": 42,
+    "head": 7,
+    "learning_rate_steps": 40.0,
+}
+TASK: dict[str, Any] = {"window": 126, "horizon": 42, "anchor": "equal-weight"}
+
+
+def prices(moves):
+    values = np.exp(np.cumsum(moves, 0))
+    dates = np.datetime64("2000-01-03", "s") + np.arange(len(values)) * np.timedelta64(86400, "s")
+    return Prices(dates, tuple(f"a{i}" for i in range(values.shape[1])), values)
+
+
+def trained(*tables, task=None, rounds=40, agent=MinimumVariance, **settings):
+    """The tasks of some tables, and the states of agents trained on them."""
+    tasks = [Portfolio.of(prices(moves), **TASK, **(task or {})) for moves in tables]
+    population = Population(tasks, agent(**{**SMALL, **settings}), list(range(len(tables))))
+    while population.steps < rounds * SMALL["rollout_length"]:
+        population.advance(SMALL["rollout_length"] * rounds - population.steps)
+    states = jax.tree.map(jnp.asarray, population.fetch().agent)
+    pick = lambda i: jax.tree.map(lambda x: x[i], states)  # noqa: E731
+    return tasks, [pick(i) for i in range(len(tables))]
+
+
+def changing(rows=2000, assets=6, block=40):
+    """Volatilities that are drawn anew every ``block`` rows."""
+    rng = np.random.default_rng(0)
+    levels = np.repeat(rng.uniform(0.003, 0.03, (rows // block, assets)), block, 0)
+    return rng.normal(0, 1, levels.shape) * levels
+
+
+def test_learns_shorter_half_lives_where_volatility_changes():
+    calm = np.random.default_rng(0).normal(0, 0.01, (2000, 6))
+    (market, _), (state, steady) = trained(changing(), calm, task={"cost": 0.0}, learning_rate=0.1)
+    found, other = (one.policy.covariance.described for one in (state, steady))
+    assert found["volatility_half_life"] < 30 < other["volatility_half_life"]
+    assert state.policy.trading.described["rate"] > 2 * steady.policy.trading.described["rate"]
+
+    def realised(policy):
+        rows = jnp.arange(500, 1900)
+        views = jax.vmap(lambda row: market.view(row, jnp.append(1.0, jnp.zeros(6))))(rows)
+        weights = policy.target(views)[:, 1:]
+        earned = (weights * jnp.expm1(jax.vmap(market.coming)(rows + 1))).sum(-1)
+        return float(earned.std())
+
+    assert realised(state.policy) < 0.95 * realised(state.start)
+
+
+def test_expected_returns_are_learned_only_where_there_is_momentum():
+    rng = np.random.default_rng(1)
+    drift = np.repeat(rng.normal(0, 0.004, (20, 6)), 100, axis=0)
+    noise = rng.normal(0, 0.01, (4, 2000, 6))
+    _, (found, *nothing) = trained(noise[0] + drift, *noise[1:], agent=MeanVariance)
+    assert found.policy.means.coefficients.sum() > 0.5
+    assert found.policy.share > 0.5
+    assert [float(state.policy.share) for state in nothing].count(0.0) >= 2
+
+
+def test_cap_and_assets_that_cannot_be_traded():
+    market = Portfolio.of(prices(changing()), **TASK, max_weight=0.3)
+    market = market.part(0, 1000, np.array([True] * 5 + [False]))
+    agent = MinimumVariance(**SMALL)
+    policy = agent.init(market, jax.random.key(0)).policy
+    weights = policy.target(market.observe(market.reset(jax.random.key(1))))
+    np.testing.assert_allclose(weights.sum(), 1, atol=1e-5)
+    assert weights[1:].max() <= 0.3 + 1e-6
+    assert weights[-1] == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"every": 5}, "divisor"),
+        ({"head": 42}, "head"),
+        ({"risk_aversion": 0.0}, "risk_aversion"),
+        ({"ridge": -1.0}, "ridge"),
+        ({"units": 0}, "units"),
+    ],
+)
+def test_settings_out_of_range_are_named(settings, says):
+    with pytest.raises(QfolioError, match=says):
+        MinimumVariance(**{**SMALL, **settings})
+
+
+def test_needs_a_portfolio_with_an_anchor():
+    with pytest.raises(QfolioError, match="anchor"):
+        MinimumVariance(**SMALL).init(Pendulum(), jax.random.key(0))
+    market = Portfolio.of(prices(changing()), window=126, horizon=42)
+    with pytest.raises(QfolioError, match="anchor=equal-weight"):
+        MinimumVariance(**SMALL).init(market, jax.random.key(0))
+    menu = Portfolio.of(prices(changing()), **TASK, menu="grid:2")
+    with pytest.raises(QfolioError, match="menu"):
+        MinimumVariance(**SMALL).init(menu, jax.random.key(0))
