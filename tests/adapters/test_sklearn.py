@@ -130,6 +130,21 @@ def test_what_it_knows_once_fitted():
         fitted.predict(x.rename(columns={"A": "Z"}))
 
 
+def test_signals_look_back_further_than_the_window(decided):
+    """A prediction knows the signals of all rows before it, as a policy does on a price table."""
+    x = returns()
+    fitted = model(settings={**TINY, "signals": "momentum:21,volatility:30"}).fit(x[:TRAIN])
+    values = np.cumprod(np.vstack([np.ones(3), 1 + x.to_numpy()]), axis=0)
+    frame = pd.DataFrame(values, columns=list("ABC"), index=pd.bdate_range("2019", periods=71))
+    expected = fitted.policy_.weights(frame[: TRAIN + 1])
+    np.testing.assert_allclose(fitted.weights_, [expected[name] for name in "ABC"], atol=1e-5)
+    fitted.predict(x[TRAIN:])
+    first = fitted.policy_.weights(frame[: TRAIN + 1 - 2])  # the lag is 2 rows
+    np.testing.assert_allclose(decided[0][0, 1:], [first[name] for name in "ABC"], atol=1e-5)
+    with pytest.raises(QfolioError, match="has 20 rows; the policy's signals look back on 30"):
+        fitted.policy_.weights(frame[:20])
+
+
 def test_odd_returns_are_refused():
     x = returns()
     for value, said in ((np.nan, "NaN"), (-1.0, "above -1")):

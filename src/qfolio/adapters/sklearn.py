@@ -263,9 +263,8 @@ class PortfolioPolicy(BaseOptimization):
         return np.asarray(held / held.sum())
 
     def _next_weights(self) -> np.ndarray:
-        window = self.policy_.task.window
-        prices = _prices(self.returns_[-window:], self._assets())
-        targets, _ = self.policy_.decide(prices, window, self._held(), 1)
+        prices = _prices(self.returns_, self._assets())
+        targets, _ = self.policy_.decide(prices, len(prices) - 1, self._held(), 1)
         return np.asarray(targets[0, 1:])
 
     def _before(self, X: Any) -> np.ndarray:
@@ -281,22 +280,20 @@ class PortfolioPolicy(BaseOptimization):
     def _followed(self, before: np.ndarray, returns: np.ndarray) -> Simulation:
         task, days = self.policy_.task, len(returns)
         window, lag = task.window, task.lag
-        before = before[max(0, len(before) - window - lag) :]
         # Rows missing before the first decision's window; their returns are zero.
-        missing = window + lag - len(before)
+        missing = max(0, window + lag - len(before))
         still = np.zeros((missing, returns.shape[1]))
         prices = _prices(np.concatenate([still, before, returns]), self._assets())
-        values = prices.values
-        # Row window + lag is the last before X, and row window that of the first decision.
-        since = task.costs.carry(values[window + lag] / values[window], Context(rows=lag))
+        values, last = prices.values, missing + len(before)  # the last row before X
+        since = task.costs.carry(values[last] / values[last - lag], Context(rows=lag))
         start = grown(self._held(), 1 / since)
         decisions = np.full((days, 1 + returns.shape[1]), np.nan)  # NaN: no order
         if missing < days:
-            first = window + missing
-            moved = task.costs.carry(values[first] / values[window], Context(rows=missing))
+            first = last - lag + missing
+            moved = task.costs.carry(values[first] / values[last - lag], Context(rows=missing))
             held = grown(start, moved)
             decisions[missing:], _ = self.policy_.decide(prices, first, held, days - missing)
-        return simulate(values, decisions, first=window, cost=task.costs, lag=lag, start=start)
+        return simulate(values, decisions, first=last - lag, cost=task.costs, lag=lag, start=start)
 
 
 class PolicyPortfolio(Portfolio):
