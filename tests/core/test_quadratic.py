@@ -56,6 +56,23 @@ def test_no_change_improves_the_best(cap):
         assert w.max() <= cap + 1e-6
 
 
+@pytest.mark.parametrize("cap", [1.0, 0.2])
+def test_a_similar_problem_leads_to_the_same_weights(cap):
+    rng = np.random.default_rng(2)
+    found = []
+    for _ in range(50):
+        moves = rng.normal(size=(250, 20)) * rng.uniform(0.5, 2, 20) + rng.normal(size=(250, 1))
+        sigma = np.cov(moves.T)
+        given = (
+            jnp.asarray(sigma / np.trace(sigma) * 20, jnp.float32),
+            jnp.asarray(rng.normal(0, 0.05, 20), jnp.float32),
+        )
+        every = jnp.ones(20, bool)
+        least = best(given[0], jnp.zeros(20), every, cap)
+        found.append(abs(best(*given, every, cap, least) - best(*given, every, cap)).max())
+    assert np.mean(np.array(found) < 1e-4) >= 0.98
+
+
 def test_assets_that_are_not_open_have_no_weight():
     sigma = next(covariances(6, 1))
     open_to = np.array([True, False, True, True, False, True])

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from qfolio.learning.covariance import Covariance, Means, spectrum
+from qfolio.learning.covariance import Covariance, Means
 
 ALL = jnp.ones(4, bool)
 
@@ -72,22 +72,6 @@ def test_learned_parts_all_have_gradients_also_with_fewer_rows_than_assets():
     for leaf in jax.tree.leaves(jax.grad(value)(start)):
         assert np.isfinite(leaf).all()
         assert np.abs(leaf).max() > 1e-5
-
-
-def test_spectrum_has_the_derivative_of_functions_of_the_matrix():
-    """The square of a matrix with equal eigenvalues, made from its eigenvectors."""
-    matrix = jnp.diag(jnp.array([1.0, 1.0, 3.0]))
-    change = jnp.array([[0.1, 0.5, 0.2], [0.5, -0.3, 0.4], [0.2, 0.4, 0.6]])
-
-    def square(x):
-        values, vectors = spectrum(x)
-        return (vectors * values**2) @ vectors.T
-
-    _, found = jax.jvp(square, (matrix,), (change,))
-    wanted = matrix @ change + change @ matrix
-    equal = np.zeros((3, 3), bool)
-    equal[:2, :2] = ~np.eye(2, dtype=bool)  # the terms that are left out
-    np.testing.assert_allclose(found[~equal], wanted[~equal], atol=1e-5)
 
 
 def test_means_are_relative_and_nothing_at_the_start():

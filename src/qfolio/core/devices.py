@@ -41,10 +41,6 @@ def configure() -> None:
         "--xla_force_host_platform_device_count": str(count),
         "--xla_cpu_multi_thread_eigen": "false",
     }
-    # Threads that devices share. A batched decomposition or solution waits in one for its parts,
-    # which need threads, too, and a program may have a few at once: with one thread for each
-    # device, as jax has by default, they wait for each other for ever.
-    os.environ.setdefault("NPROC", str(8 * count))
     new = [f"{flag}={value}" for flag, value in wanted.items() if flag not in flags]
     os.environ["XLA_FLAGS"] = " ".join([flags, *new]).strip()
     if not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]

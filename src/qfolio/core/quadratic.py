@@ -4,11 +4,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from qfolio.core import symmetric
+
 ITERATIONS = 8
 CLOSE = 1e-5
 """Mean product of weights and multipliers at which the method stops."""
 EXCHANGES = 3
 """Corrections of which weights lie between their bounds."""
+FROM_NEAR = 5
+"""The same, if that is guessed from the solution of another problem."""
 SLOPE = 1e-6
 """Slopes up to this do not free a weight at its bound."""
 
@@ -18,6 +22,7 @@ def best(
     gain: Float[Array, "*batch asset"],
     open_to: Bool[Array, "*batch asset"],
     cap: Float[Array, ""] | float = 1.0,
+    near: Float[Array, "*batch asset"] | None = None,
 ) -> Float[Array, "*batch asset"]:
     """The weights w that maximise gain·w − w'Σw/2 with Σw = 1, 0 ≤ w ≤ cap, and 0 if not open.
 
@@ -25,6 +30,9 @@ def best(
     between their bounds. Given that, they follow from one linear system, which is what is
     differentiated. A covariance should be in units of its mean variance, and positive definite.
     Caps below 1.01 equal weights are raised to that.
+
+    near: weights that solve a similar problem, from which to start without an interior point. That
+    takes half the time, and rarely misses the solution.
     """
     both = open_to[..., :, None] & open_to[..., None, :]
     sigma = jnp.where(both, covariance, 0.0) + (~open_to)[..., None] * jnp.eye(covariance.shape[-1])
@@ -32,8 +40,12 @@ def best(
     count = open_to.sum(-1, keepdims=True)
     roof = jnp.maximum(cap, 1.01 / count)  # room for the interior
     given = lax.stop_gradient((sigma, gain))
-    free, full = _between(*given, open_to, roof)
-    for _ in range(EXCHANGES):
+    if near is None:
+        free, full = _between(*given, open_to, roof)
+    else:
+        full = open_to & (near >= roof) & (roof < 1)
+        free = open_to & (near > 0) & ~full
+    for _ in range(EXCHANGES if near is None else FROM_NEAR):
         weights, slope = _solved(*given, free, full, roof)
         low, high = weights <= 0, weights >= roof
         rising, falling = open_to & (slope < -SLOPE), slope > SLOPE
@@ -110,7 +122,7 @@ def _between(
 
 
 def _both_solved(system: Array, one: Array, other: Array) -> tuple[Array, Array]:
-    found = jnp.linalg.solve(system, jnp.stack([one, other], -1))
+    found = symmetric.solve(system, jnp.stack([one, other], -1))
     return found[..., 0], found[..., 1]
 
 

@@ -14,11 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from qfolio.core.symmetric import spectrum
+
 LEAST = 1e-3
 """Eigenvalues of correlations are at least this."""
-
-APART = 1e-4
-"""Eigenvalues that are closer count as equal in derivatives."""
 
 TINY = 1e-9
 """Added to variances, in units of the squared scale of returns."""
@@ -137,25 +136,3 @@ def _correlations(moments: Float[Array, "*batch asset asset"]) -> Array:
     moments = moments + TINY * eye
     scale = jnp.sqrt(jnp.diagonal(moments, axis1=-2, axis2=-1))
     return moments / scale[..., :, None] / scale[..., None, :]
-
-
-@jax.custom_jvp
-def spectrum(symmetric: Float[Array, "*batch n n"]) -> tuple[Array, Array]:
-    """Eigenvalues and eigenvectors, with a derivative where eigenvalues are equal.
-
-    Vectors of equal eigenvalues are not defined one by one, and jax gives no number for their
-    derivatives. What is made from vectors and a smooth function of values has one nevertheless; the
-    terms left out here are zero for it.
-    """
-    return tuple(jnp.linalg.eigh(symmetric))
-
-
-@spectrum.defjvp
-def _spectrum_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple:
-    values, vectors = spectrum(*primals)
-    turned = jnp.swapaxes(vectors, -1, -2) @ tangents[0] @ vectors
-    gap = values[..., None, :] - values[..., :, None]
-    apart = jnp.abs(gap) > APART
-    rotation = jnp.where(apart, turned / jnp.where(apart, gap, 1.0), 0.0)
-    change = jnp.diagonal(turned, axis1=-2, axis2=-1)
-    return (values, vectors), (change, vectors @ rotation)
