@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,7 +51,7 @@ def changing(rows=2000, assets=6, block=40):
 def test_learns_shorter_half_lives_where_volatility_changes():
     calm = np.random.default_rng(0).normal(0, 0.01, (2000, 6))
     (market, _), (state, steady) = trained(changing(), calm, task={"cost": 0.0}, learning_rate=0.1)
-    found, other = (one.policy.covariance.described for one in (state, steady))
+    found, other = (one.policy.learned.covariance.described for one in (state, steady))
     assert found["volatility_half_life"] < 30 < other["volatility_half_life"]
     assert state.policy.trading.described["rate"] > 2 * steady.policy.trading.described["rate"]
 
@@ -61,7 +62,8 @@ def test_learns_shorter_half_lives_where_volatility_changes():
         earned = (weights * jnp.expm1(jax.vmap(market.coming)(rows + 1))).sum(-1)
         return float(earned.std())
 
-    assert realised(state.policy) < 0.95 * realised(state.start)
+    started = eqx.tree_at(lambda policy: policy.learned, state.policy, state.start)
+    assert realised(state.policy) < 0.95 * realised(started)
 
 
 def test_expected_returns_are_learned_only_where_there_is_momentum():
@@ -69,9 +71,21 @@ def test_expected_returns_are_learned_only_where_there_is_momentum():
     drift = np.repeat(rng.normal(0, 0.004, (20, 6)), 100, axis=0)
     noise = rng.normal(0, 0.01, (4, 2000, 6))
     _, (found, *nothing) = trained(noise[0] + drift, *noise[1:], agent=MeanVariance)
-    assert found.policy.means.coefficients.sum() > 0.5
+    assert found.policy.learned.members.means.coefficients.sum(1).mean() > 0.5
     assert found.policy.share > 0.5
     assert [float(state.policy.share) for state in nothing].count(0.0) >= 2
+
+
+def test_without_evidence_it_is_the_least_variance():
+    market, held = Portfolio.of(prices(changing()), **TASK), jnp.full(7, 1 / 7)
+    policy = MeanVariance(**SMALL).init(market, jax.random.key(0)).policy
+    least = MinimumVariance(**SMALL).init(market, jax.random.key(0)).policy
+    members = jax.tree.map(lambda x: x + 0.3, policy.learned.members)
+    policy = eqx.tree_at(lambda one: one.learned.members, policy, members)
+    view = market.view(jnp.array(500), held)
+    np.testing.assert_array_equal(policy(view), least(view))
+    full = eqx.tree_at(lambda one: one.share, policy, jnp.array(1.0))
+    assert abs(full(view) - least(view)).max() > 0.01
 
 
 def test_cap_and_assets_that_cannot_be_traded():

@@ -18,7 +18,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
 from qfolio.core.mdp import Simplex
 from qfolio.core.population import Population
-from qfolio.learning.evidence import Evidence
+from qfolio.learning.evidence import Evidence, left_out
 from qfolio.learning.trading import Trading
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -125,7 +125,10 @@ def test_evidence_is_the_t_statistic_of_ratios_by_block():
     rng = np.random.default_rng(0)
     active = rng.normal(0.1, 1, (50, 3)) * [1.0, 10.0, 0.1]  # a block in each path
     block = jnp.broadcast_to(jnp.arange(3), (50, 3))
-    evidence = Evidence.none(4).add(block, jnp.asarray(active), jnp.ones((50, 3)), 0.9)
+    unseen = left_out(block, 2)
+    np.testing.assert_array_equal(unseen[:, 0], [[True, False, True], [False, True, False]])
+    seen_too = jnp.where(unseen, jnp.asarray(active), 99.0)  # by the other member
+    evidence = Evidence.none(4).add(block, seen_too, unseen, 0.9)
     ratio = active.mean(0) / active.std(0)
     wanted = ratio.mean() / ratio.std(ddof=1) * np.sqrt(3)
     np.testing.assert_allclose(evidence.t, wanted, rtol=1e-4)

@@ -1,9 +1,13 @@
 """Learned minimum variance, and learned mean and variance: portfolios that are trained end to end.
 
-The policy estimates a covariance from its window of returns, and expected returns if it is to
-(``learning/covariance.py``). It takes the best weights for them (``core/quadratic.py``), and trades
-a share of the way there, outside a band. All that it learns is trained together, by the gradient of
-realised variance, returns and costs through whole paths, as in ``pathwise.py``.
+The policy estimates a covariance from its window of returns (``learning/covariance.py``), takes the
+best weights for it (``core/quadratic.py``), and trades a share of the way there, outside a band.
+All that it learns is trained together, by the gradient of realised variance and costs through whole
+paths, as in ``pathwise.py``.
+
+With returns, several members learn which ones to expect, each without some blocks of the data. As
+in ``tilts.py``, what a member earns over the least variance in blocks that it has not seen is the
+evidence; without it, the policy is that of least variance.
 docs/mean_variance.md lists formulas and their sources.
 """
 
@@ -21,16 +25,33 @@ from qfolio.core.market import View
 from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.covariance import Covariance, Means
-from qfolio.learning.evidence import Evidence, blocks_of
+from qfolio.learning.evidence import Evidence, blocks_of, left_out
 from qfolio.learning.trading import Trading
+
+
+class Member(eqx.Module):
+    """What a member learns: returns to expect, and how to trade on them."""
+
+    means: Means
+    trading: Trading
+
+
+class Learned(eqx.Module):
+    """All that is trained."""
+
+    covariance: Covariance
+    trading: Trading  # towards the least variance
+    members: Member | None  # with a leading member axis; None if no returns are expected
+
+    def sigma(self, view: View) -> Float[Array, "*batch asset asset"]:
+        assert view.anchor is not None
+        return self.covariance(view.features[..., 0], view.anchor > 0)
 
 
 class Efficient(eqx.Module):
     """Maps a view of the market to an order towards the weights of the best mean and variance."""
 
-    covariance: Covariance
-    means: Means | None
-    trading: Trading
+    learned: Learned
     share: Float[Array, ""]  # of the expected returns that the evidence leaves
     actions: Simplex
 
@@ -39,35 +60,52 @@ class Efficient(eqx.Module):
         return self.trading(view.holding, self.target(view), view.anchor)
 
     def target(self, view: View) -> Float[Array, "*batch entry"]:
-        return self.weights(view, self.sigma(view), self.share)
+        members, gain = self.learned.members, None
+        if members is not None:
+            gain = self.share * jax.vmap(lambda one: expected(view, one.means))(members).mean(0)
+        return best(view, self.learned.sigma(view), gain, self.actions)
 
-    def sigma(self, view: View) -> Float[Array, "*batch asset asset"]:
-        assert view.anchor is not None
-        return self.covariance(view.features[..., 0], view.anchor > 0)
+    @property
+    def trading(self) -> Trading:
+        """Between that towards the least variance and the members', by the share."""
+        least, members = self.learned.trading, self.learned.members
+        if members is None:
+            return least
+        between = lambda x, each: x + self.share * (each.mean(0) - x)  # noqa: E731
+        return jax.tree.map(between, least, members.trading)
 
-    def weights(
-        self, view: View, sigma: Float[Array, "*batch asset asset"], share: Array | float
-    ) -> Float[Array, "*batch entry"]:
-        """The best weights for a covariance and a share of the expected returns.
 
-        They are fully invested, as far as the anchor is.
-        """
-        assert view.anchor is not None
-        open_to = view.anchor > 0
-        gain = jnp.zeros_like(view.anchor)
-        if self.means is not None:
-            expected = self.means(view.features[..., 0], open_to)
-            gain = share * expected / open_to.sum(-1, keepdims=True)
-        total = view.anchor.sum(-1, keepdims=True)
-        wanted = quadratic.best(sigma, gain, open_to, self.actions.cap)
-        return jnp.concatenate([1 - total, total * wanted], -1)
+def expected(view: View, means: Means) -> Float[Array, "*batch asset"]:
+    """Expected returns in units of the best weights' problem."""
+    assert view.anchor is not None
+    open_to = view.anchor > 0
+    return means(view.features[..., 0], open_to) / open_to.sum(-1, keepdims=True)
+
+
+def best(
+    view: View,
+    sigma: Float[Array, "*batch asset asset"],
+    gain: Float[Array, "*batch asset"] | None,
+    actions: Simplex,
+    near: Float[Array, "*batch entry"] | None = None,
+) -> Float[Array, "*batch entry"]:
+    """The best weights, cash first; as much is invested as the anchor invests.
+
+    near: the best weights for the same covariance and another gain, which save time.
+    """
+    assert view.anchor is not None
+    total = view.anchor.sum(-1, keepdims=True)
+    gain = jnp.zeros_like(view.anchor) if gain is None else gain
+    start = None if near is None else near[..., 1:] / total
+    wanted = quadratic.best(sigma, gain, view.anchor > 0, actions.cap, start)
+    return jnp.concatenate([1 - total, total * wanted], -1)
 
 
 class MeanVarianceState(eqx.Module):
     """The state of a MeanVariance agent."""
 
     policy: Efficient
-    start: Efficient  # that a penalty pulls to
+    start: Learned  # that a penalty pulls to
     optimizer: optimizer.Optimizer
     evidence: Evidence
 
@@ -76,23 +114,25 @@ class MeanVariance(OnPaths):
     """Gradient ascent on mean return less realised variance and costs."""
 
     returns: bool = static(True)  # learn expected returns, too
+    members: int = static(4)  # that learn them, each without every so-many-th block of the data
     units: int = static(8)  # of the network that cleans eigenvalues
     blocks: int = static(32)  # of the data, of equal length
-    num_envs: int = static(16)  # paths in a batch
+    num_envs: int = static(8)  # paths in a batch
     rollout_length: int = static(63)  # steps of a path
     head: int = static(21)  # of these, first steps that only lead to a holding
     every: int = static(7)  # steps from a covariance to the next one, in training
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
     learning_rate: float = number(0.05)
     learning_rate_final: float = number(0.0)  # share of it that remains at the end of the cosine
-    learning_rate_steps: float = number(120.0)  # gradient steps of the cosine
+    learning_rate_steps: float = number(80.0)  # gradient steps of the cosine
     risk_aversion: float = number(10.0)  # half of it times variance is worth a return, or a cost
     ridge: float = number(3.0)  # on squared changes of what is learned, divided by the data's moves
-    threshold: float = number(3.0)  # t-statistic up to which no returns are expected
+    threshold: float = number(2.0)  # t-statistic up to which no returns are expected
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 
     def __check_init__(self) -> None:
         require(self, "num_envs units blocks", lambda x: 1 <= x < 2**31, "at least 1")
+        require(self, "members", lambda x: x >= 2, "at least 2, since each leaves blocks out")
         require(self, "rollout_length", lambda x: x >= 2, "at least 2")
         require(self, "head", lambda x: 0 <= x < self.rollout_length, "at least 0 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
@@ -118,24 +158,27 @@ class MeanVariance(OnPaths):
                 "A learned minimum variance, or mean and variance, gives weights; leave menu empty."
             )
         self._require_whole(task)
-        policy = Efficient(
-            Covariance(self.units, key),
-            Means() if self.returns else None,
-            Trading.start(0.1),
-            jnp.array(0.0),
-            task.actions,
+        each = Member(Means(), Trading.start(0.1))
+        members = jax.tree.map(lambda x: jnp.stack([x] * self.members), each)
+        learned = Learned(
+            Covariance(self.units, key), Trading.start(0.1), members if self.returns else None
         )
+        policy = Efficient(learned, jnp.array(0.0), task.actions)
         return MeanVarianceState(
-            policy, policy, optimizer.begin(policy), Evidence.none(self.blocks)
+            policy, learned, optimizer.begin(learned), Evidence.none(self.blocks)
         )
 
     def monitor(self, state: MeanVarianceState) -> Metrics:
-        covariance, means = state.policy.covariance, state.policy.means
-        found = {"evidence": state.evidence.t, "share": state.policy.share}
+        policy, learned = state.policy, state.policy.learned
+        found = learned.covariance.described | policy.trading.described
+        if learned.members is None:
+            return found
+        means = jax.tree.map(lambda x: x.mean(0), learned.members.means)
         return {
-            **({} if means is None else found | means.described),
-            **covariance.described,
-            **state.policy.trading.described,
+            "evidence": state.evidence.t,
+            "share": policy.share,
+            **means.described,
+            **found,
         }
 
     def weights(self, state: MeanVarianceState) -> Efficient:
@@ -154,42 +197,70 @@ class MeanVariance(OnPaths):
     ) -> tuple[MeanVarianceState, Metrics]:
         assert isinstance(task, ExogenousTask)
         view: View = rollout.observation
-        assert view.anchor is not None
-        anchor, some = view.anchor, jax.tree.map(lambda x: x[:: self.every], view)
+        actions = state.policy.actions
+        some = jax.tree.map(lambda x: x[:: self.every], view)
+        block = blocks_of(task, rollout, self.blocks)
+        counted = jnp.arange(self.rollout_length)[:, None] >= self.head
+        left = left_out(block, self.members)
 
-        def loss(policy: Efficient) -> tuple[Array, tuple[Array, Array]]:
+        def loss(learned: Learned) -> tuple[Array, tuple[Array, Array | None]]:
             # Covariances change slowly, so each serves some steps.
-            sigma = policy.sigma(some)
+            sigma = learned.sigma(some)
             held = lambda x: jnp.repeat(x, self.every, 0)  # noqa: E731
-            base = held(policy.weights(some, sigma, 0.0))
-            followers: tuple = ((policy.trading, base),)
-            if policy.means is not None:
-                base = lax.stop_gradient(base)
-                target = policy.weights(view, held(sigma), 1.0)
-                followers = (policy.trading, target), (lax.stop_gradient(policy.trading), base)
-            found = self._followed(task, rollout, followers, anchor)
-            nets, grosses = jax.tree.map(lambda x: x[self.head :], found)
-            net, gross = nets[0], grosses[0]
-            variance, cost = gross.var(), (gross - net).mean()
-            mean = gross.mean() if self.returns else 0.0
-            off = jax.tree.map(lambda x, y: ((x - y) ** 2).sum(), policy, state.start)
-            squares = sum(jax.tree.leaves(off), jnp.array(0.0))
+            least = held(best(some, sigma, None, actions))
+            net, gross = self._path(task, rollout, learned.trading, least)
+            mean, variance = _moments(counted, gross)
+            cost = mean - _moments(counted, net)[0]
             # Relative to the variance, so that tables of any volatility are learned alike.
-            worse = variance / 2 + (cost - mean) / self.risk_aversion
-            penalised = worse / lax.stop_gradient(variance) + self.ridge / task.moves * squares
-            return penalised, (jnp.sqrt(variance), net - nets[-1])
+            unit = lax.stop_gradient(variance)
+            worse = variance / 2 + cost / self.risk_aversion
+            off = jax.tree.map(lambda x, y: ((x - y) ** 2).sum(), learned, state.start)
+            penalty = self.ridge / task.moves * sum(jax.tree.leaves(off), jnp.array(0.0))
+            if learned.members is None:
+                return worse / unit + penalty, (variance, None)
+            fixed = lax.stop_gradient(held(sigma))
 
-        gradient, (volatility, active) = jax.grad(loss, has_aux=True)(state.policy)
+            def on_returns(member: Member) -> Array:
+                gain = expected(view, member.means)
+                target = best(view, fixed, gain, actions, lax.stop_gradient(least))
+                return self._path(task, rollout, member.trading, target)[0]
+
+            rewards = jax.vmap(on_returns)(learned.members)
+            means, variances = jax.vmap(_moments)(counted & ~left, rewards)
+            falling = (variances / 2 - means / self.risk_aversion).sum()
+            return (worse + falling) / unit + penalty, (variance, rewards - net)
+
+        gradient, (variance, active) = jax.grad(loss, has_aux=True)(state.policy.learned)
         rate = self._schedule(state.optimizer.count + 1)
-        policy, adam = optimizer.descend(state.policy, gradient, state.optimizer, rate)
-        block = blocks_of(task, rollout, self.blocks)[self.head :]
-        evidence = state.evidence.add(block, active, jnp.ones_like(active), self.memory)
-        policy = eqx.tree_at(lambda p: p.share, policy, evidence.share(self.threshold))
-        return MeanVarianceState(policy, state.start, adam, evidence), {"loss": volatility}
+        learned, adam = optimizer.descend(state.policy.learned, gradient, state.optimizer, rate)
+        evidence = state.evidence
+        if active is not None:
+            evidence = evidence.add(block, active, counted & left, self.memory)
+        policy = Efficient(learned, evidence.share(self.threshold), actions)
+        loss_now = {"loss": jnp.sqrt(variance)}
+        return MeanVarianceState(policy, state.start, adam, evidence), loss_now
+
+    def _path(
+        self, task: ExogenousTask, rollout: Transition, trading: Trading, target: Array
+    ) -> tuple[Float[Array, "time path"], Float[Array, "time path"]]:
+        """Rewards net of costs and before them, from the first target on."""
+        view: View = rollout.observation
+        assert view.anchor is not None
+        (net,), (gross,) = self._followed(task, rollout, ((trading, target),), view.anchor)
+        return net, gross
+
+
+def _moments(counted: Array, values: Array) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean and variance over the steps that count."""
+    steps = jnp.maximum((counted & jnp.ones_like(values, bool)).sum(), 1)
+    mean = (counted * values).sum() / steps
+    return mean, (counted * (values - mean) ** 2).sum() / steps
 
 
 class MinimumVariance(MeanVariance):
     """Learned minimum variance: no returns are expected, and risk counts for more than costs."""
 
     returns: bool = static(False)
+    num_envs: int = static(16)
+    learning_rate_steps: float = number(120.0)
     risk_aversion: float = number(30.0)

@@ -24,7 +24,7 @@ from qfolio.core.fields import number, require, static
 from qfolio.core.market import View
 from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
-from qfolio.learning.evidence import Evidence, blocks_of
+from qfolio.learning.evidence import Evidence, blocks_of, left_out
 from qfolio.learning.scores import NETWORKS, Attention, Hidden
 from qfolio.learning.trading import Trading, ratio
 
@@ -208,12 +208,12 @@ class Tilts(OnPaths):
         assert isinstance(task, ExogenousTask)
         block = blocks_of(task, rollout, self.blocks)
         counted = jnp.arange(self.rollout_length)[:, None] >= self.head
-        left_out = block % self.members == jnp.arange(self.members)[:, None, None]
+        left = left_out(block, self.members)
 
         def loss(members: Tilt) -> tuple[Array, tuple[Array, Array]]:
             rewards, anchored = jax.vmap(lambda one: self._paths(one, task, rollout))(members)
             active = rewards - anchored
-            seen = counted & ~left_out
+            seen = counted & ~left
             steps = jnp.maximum(seen.sum((1, 2)), 1)
             mean = lambda x: (seen * x).sum((1, 2)) / steps  # noqa: E731
             variance = mean(active**2) - mean(active) ** 2
@@ -224,10 +224,7 @@ class Tilts(OnPaths):
         gradient, (utility, active) = jax.grad(loss, has_aux=True)(state.policy.members)
         rate = self._schedule(state.optimizer.count + 1)
         members, adam = optimizer.descend(state.policy.members, gradient, state.optimizer, rate)
-        unseen = counted & left_out
-        evidence = state.evidence.add(
-            block, (unseen * active).sum(0), 1.0 * unseen.any(0), self.memory
-        )
+        evidence = state.evidence.add(block, active, counted & left, self.memory)
         policy = TiltPolicy(members, evidence.share(self.threshold), state.policy.actions)
         return TiltsState(policy, adam, evidence), {"loss": -utility}
 

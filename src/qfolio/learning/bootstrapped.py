@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.mdp import ExogenousTask
+from qfolio.learning.evidence import block_of
 from qfolio.learning.networks import Network
 from qfolio.learning.targets import Scalar
 
@@ -36,9 +37,7 @@ def samples(task: ExogenousTask, market: PyTree, heads: int) -> Float[Array, "he
 
     Where moves are drawn anew, there is nothing to sample, and each counts once.
     """
-    place = jax.vmap(task.place)(market)
-    share = jnp.clip(place / task.moves, 0.0, 1.0)
-    block = jnp.minimum((BLOCKS * share).astype(jnp.int32), BLOCKS - 1)
+    block = jax.vmap(lambda one: block_of(task, one, BLOCKS))(market)
     counts = 2.0 * jax.random.bernoulli(jax.random.key(0), shape=(heads, BLOCKS))
     return jnp.where(jnp.isfinite(task.moves), counts[:, block], 1.0)
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from qfolio.core.mdp import ExogenousTask, Transition
 from qfolio.learning.trading import ratio
@@ -24,12 +24,13 @@ class Evidence(NamedTuple):
     def add(
         self,
         block: Int[Array, "time path"],
-        active: Float[Array, "time path"],
-        counted: Float[Array, "time path"],
+        active: Float[Array, "member time path"],
+        unseen: Bool[Array, "member time path"],
         memory: Array | float,
     ) -> "Evidence":
-        """With the steps of a rollout, counted by 1 or 0; older ones fade."""
-        new = (counted, counted * active, counted * active**2)
+        """With a rollout's steps, by the member that has not learned from them; older ones fade."""
+        counted, earned = 1.0 * unseen.any(0), (unseen * active).sum(0)
+        new = (counted, earned, earned**2)
         where = block.ravel()
         return Evidence(
             *(memory * old.at[where].add(x.ravel()) for old, x in zip(self, new, strict=True))
@@ -55,10 +56,19 @@ class Evidence(NamedTuple):
         return jnp.maximum(1 - (threshold / t) ** 2, 0.0)
 
 
+def block_of(task: ExogenousTask, market: PyTree, blocks: int) -> Int[Array, ""]:
+    """The block of the data that a move is in; the first one where moves are drawn anew."""
+    share = jnp.clip(task.place(market) / task.moves, 0.0, 1.0)
+    return jnp.minimum((blocks * share).astype(jnp.int32), blocks - 1)
+
+
 def blocks_of(task: ExogenousTask, rollout: Transition, blocks: int) -> Int[Array, "time path"]:
     """The block of each step; where moves are drawn anew, each path is of one block."""
-    place = jax.vmap(jax.vmap(task.place))(rollout.state.market)
-    own = jnp.arange(place.shape[1]) % blocks
-    share = jnp.clip(place / task.moves, 0.0, 1.0)
-    found = jnp.minimum((blocks * share).astype(jnp.int32), blocks - 1)
+    found = jax.vmap(jax.vmap(lambda one: block_of(task, one, blocks)))(rollout.state.market)
+    own = jnp.arange(found.shape[1]) % blocks
     return jnp.where(jnp.isfinite(task.moves), found, own)
+
+
+def left_out(block: Int[Array, "time path"], members: int) -> Bool[Array, "member time path"]:
+    """The steps that each member does not learn from: every so-many-th block."""
+    return block % members == jnp.arange(members)[:, None, None]

@@ -113,9 +113,9 @@ def _on_weights(agent: str, settings: dict[str, Any], episodes: int) -> dict[str
     return {"fast": Preset(agent, settings, episodes, seeds=5, task=_TASK)}
 
 
-def _on_covariance(agent: str) -> dict[str, Preset]:
+def _on_covariance(agent: str, episodes: int) -> dict[str, Preset]:
     task = {"window": 504, "horizon": 63, "anchor": "equal-weight"}
-    return {"fast": Preset(agent, {}, episodes=1920, seeds=5, task=task)}
+    return {"fast": Preset(agent, {}, episodes=episodes, seeds=5, task=task)}
 
 
 def of_any(agent: str) -> Preset:
@@ -150,8 +150,8 @@ PRESETS: Presets = {
             task={"window": 1, "horizon": 84, "signals": SIGNALS, "anchor": "equal-weight"},
         )
     },
-    ("portfolio", "mean-variance-learned"): _on_covariance("mean-variance-learned"),
-    ("portfolio", "minimum-variance-learned"): _on_covariance("minimum-variance-learned"),
+    ("portfolio", "mean-variance-learned"): _on_covariance("mean-variance-learned", 640),
+    ("portfolio", "minimum-variance-learned"): _on_covariance("minimum-variance-learned", 1920),
     ("portfolio", "ppo"): _on_weights("ppo", _PPO, episodes=480),
     ("portfolio", "a2c"): _on_weights("a2c", _A2C, episodes=800),
     ("portfolio", "reinforce"): _on_weights("reinforce", _REINFORCE, episodes=960),
