@@ -174,6 +174,7 @@ class HostPopulation(Population):
         length = self.agent.rollout_steps
         self._rows = length * -(-CHUNK // length)
         self._programs = programs_of((form, "host", self._rows))
+        self._require_memory()
         self._own = [jax.device_put([x[i] for x in own]) for i in range(len(self.seeds))]
         self._states = [
             self._start("begin", lambda task, agent, seed: begin(task, agent, seed), seed, own)

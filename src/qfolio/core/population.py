@@ -40,13 +40,18 @@ class Population:
                 "agents that differ in them in separate populations."
             )
         # Only properties that all members share are read from the first.
-        self.task, self.agent = task, agent = tasks[0], agents[0]
+        self.task, self.agent = tasks[0], agents[0]
         self._tail = max(tail_steps(agent.discount) for agent in agents)
         self.seconds_compile = 0.0
-        first = jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))
-        require_memory(first, len(self.seeds))
         own, self._shared, self._join, form = _split(list(zip(tasks, agents, strict=True)))
         self._begin(own, form)
+
+    def _require_memory(self) -> None:
+        """Raises QfolioError if there is too little for a new form; others had enough before."""
+        if not self._programs:
+            seed = jnp.array(0, jnp.uint32)
+            first = jax.eval_shape(lambda: begin(self.task, self.agent, seed))
+            require_memory(first, len(self.seeds))
 
     def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
         """Sets up the members before their first step; ``own`` and ``form`` are from ``_split``."""
@@ -55,6 +60,7 @@ class Population:
         # The key holds everything that a compiled program depends on.
         rows = chunk_steps(self.task, self.agent)
         self._programs = programs_of((form, len(self.seeds), self._members.one_by_one, rows))
+        self._require_memory()
         seeds = self._members.place(np.array(self.seeds, np.uint32))
         self.state: TrainingState = self._run(
             "begin", lambda task, agent, seed: begin(task, agent, seed), seeds

@@ -12,6 +12,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.replay import Stretch, decide
 from qfolio.portfolio.backtest.run import LATEST, Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.following import follow
@@ -102,18 +103,21 @@ def test_costs_are_charged(finished):
 
 @pytest.mark.parametrize("name", AGENTS)
 @pytest.mark.parametrize("together", [False, True])
-def test_holdings_carry_over_from_fold_to_fold(finished, name, together, monkeypatch):
+def test_holdings_carry_over_from_fold_to_fold(finished, name, together):
     """Folds that all have one policy decide as that policy does in a single stretch."""
     same = Backtest.open(finished.folder)
-    fold, members = same.folds[0], same._members(name, same.folds[0].name)
-    task = same._part(same.tasks[name], fold)
-    monkeypatch.setattr(same, "_members", lambda *_: members)
-    monkeypatch.setattr(same, "_part", lambda *_: task)
+    task, members, fold = same.stretches(name)[0]
     held = np.zeros((1 if together else 2, 4))
     held[:, 0] = 1
     agent, first = same.agents[name], fold.decisions.start
     targets, _ = follow(task, agent, members, first, held, 160, together=together)
-    np.testing.assert_allclose(same._decide(name, together), targets, atol=1e-6)
+    stretches = [Stretch(task, members, each) for each in same.folds]
+    decided = decide(agent, stretches, len(held), together=together)
+    np.testing.assert_allclose(decided, targets, atol=1e-6)
+
+
+def members(backtest: Backtest) -> list:
+    return [stretch.members for stretch in backtest.stretches("pathwise")]
 
 
 @pytest.mark.slow  # programs that are hardly optimised round differently
@@ -133,10 +137,9 @@ def test_what_is_learned_does_not_depend_on_the_group(finished, tmp_path):
 
     alone = create(tmp_path / "run", agents={"pathwise": AGENTS["pathwise"]})
     alone.run(executor=FoldByFold())
-    for fold in alone.folds:
-        one, other = (b._members("pathwise", fold.name) for b in (alone, finished))
-        for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
-            np.testing.assert_array_equal(x, y)
+    one, other = (members(backtest) for backtest in (alone, finished))
+    for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
 def test_rebalancing_at_speeds(finished):
@@ -186,13 +189,9 @@ def test_what_was_trained_stays(finished, tmp_path):
     rows = resumed.records("pathwise", resumed.folds[0].name)
     assert rows == finished.records("pathwise", finished.folds[0].name)
     assert {row["seed"] for row in rows} == {0, 1}
-    for fold in (*resumed.folds, None):
-        one, other = (
-            b._members("pathwise", fold.name) if fold else b.policy("pathwise").learner
-            for b in (resumed, finished)
-        )
-        for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
-            np.testing.assert_array_equal(x, y)
+    one, other = ((members(b), b.policy("pathwise").learner) for b in (resumed, finished))
+    for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
 def test_no_strategy_looks_ahead():

@@ -8,6 +8,7 @@ float64, beside classical allocators under the same rules.
 import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -254,8 +255,10 @@ class Backtest:
 
     def stretches(self, agent: str) -> list[Stretch]:
         """The folds with an agent's policies."""
+        task, trained = self.tasks[agent], self.agents[agent]
+        members = trained.weights(state_template(task, trained, self.config.seeds))
         return [
-            Stretch(self._part(self.tasks[agent], fold), self._members(agent, fold.name), fold)
+            Stretch(self._part(task, fold), self._load(agent, fold.name, members), fold)
             for fold in self.folds
         ]
 
@@ -274,19 +277,20 @@ class Backtest:
         ]
         entries = {}
         for name in self.agents:
-            entries[name] = self._entry("agent", self._decide(name))
+            decided = partial(decide, self.agents[name], self.stretches(name))
+            each = decided(self.config.seeds, together=False)
+            entries[name] = self._entry("agent", each)
             if self.config.seeds > 1:
-                together = self._decide(name, together=True)
-                entries[f"{name}{TOGETHER}"] = self._entry("ensemble", together)
+                entries[f"{name}{TOGETHER}"] = self._entry("ensemble", decided(1, together=True))
         table, cap = self.prices, self.config.cap
         slower = {f"{EQUAL_WEIGHT} at {speed:g}": EqualWeightAt(speed) for speed in SPEEDS}
         for name, made in {**self.baselines, **slower}.items():
-            decided = orders(
+            given = orders(
                 name, made, self.folds, table.dates, table.values, cap=cap, month=table.month
             )
             kind = "rebalancing" if name in slower else "baseline"
-            entries[name] = self._entry(kind, decided.decisions[None])
-            notes += decided.notes
+            entries[name] = self._entry(kind, given.decisions[None])
+            notes += given.notes
         return entries, notes
 
     @property
@@ -417,12 +421,6 @@ class Backtest:
         else:
             self._folder.write_policy(name, fold, tree)
 
-    def _members(self, name: str, job: str) -> Any:
-        """The weights of a fold's agents."""
-        agent = self.agents[name]
-        state = state_template(self.tasks[name], agent, self.config.seeds)
-        return self._load(name, job, agent.weights(state))
-
     def _load(self, name: str, job: str, template: Any) -> Any:
         if not self._is_trained(name, job):
             where = f"qfolio backtest --resume {self.folder}" if self.folder else "run()"
@@ -431,12 +429,7 @@ class Backtest:
             return self._policies[name, job]
         return self._folder.read_policy(name, job, template)
 
-    # Deciding ------------------------------------------------------------------------------------
-
-    def _decide(self, name: str, together: bool = False) -> np.ndarray:
-        """Decisions over all folds, (seed, day, entry); see ``decide``."""
-        seeds = 1 if together else self.config.seeds
-        return decide(self.agents[name], self.stretches(name), seeds, together=together)
+    # Replaying -----------------------------------------------------------------------------------
 
     def _entry(self, kind: str, decisions: np.ndarray) -> Entry:
         simulation = simulate(
