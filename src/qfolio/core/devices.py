@@ -87,18 +87,20 @@ def require_memory(tree: Any, count: int) -> None:
 class Members:
     """``count`` members spread over the devices, each in a slot of its device.
 
+    room: members that there are slots for, if more than ``count``; programs depend on it alone.
     one_by_one: whether a device runs its members in turn instead of in lockstep.
 
     Outside, leaves have a leading axis of length ``count``; on the devices, an axis of slots.
     ``place`` and ``fetch`` convert between the two.
     """
 
-    def __init__(self, count: int) -> None:
-        devices = jax.devices()[: min(len(jax.devices()), count)]
+    def __init__(self, count: int, room: int = 0) -> None:
+        self.room = max(count, room)
+        devices = jax.devices()[: min(len(jax.devices()), self.room)]
         self.one_by_one = devices[0].platform not in LOCKSTEP
         # At least two slots if members take turns: XLA drops an axis of length one and then rounds
         # differently. An empty slot costs memory, but no time.
-        slots = max(2 if self.one_by_one else 1, -(-count // len(devices)))
+        slots = max(2 if self.one_by_one else 1, -(-self.room // len(devices)))
         shares = np.array_split(np.arange(count), len(devices))
         self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
         self._filling = np.concatenate([np.resize(share, slots) for share in shares])

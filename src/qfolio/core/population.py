@@ -17,11 +17,16 @@ from qfolio.core.evaluation import CURVE_STARTS, STARTS, Greedy, evaluate, tail_
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import Episodes, TrainingState, advance, begin, chunk_steps, episode_steps
 
+LARGE = 1000
+"""Numbers of an array that members share. Smaller ones are each member's own even if they are all
+the same, so that the program is that of other members, too."""
+
 
 class Population:
     """Members trained side by side, and the programs that do it.
 
     tasks, agents: one for all members, or one for each, differing in numbers and arrays only.
+    room: members of the largest population that shares these programs, if there are larger ones.
     state: the members' TrainingState, with a leading member axis.
     starts, curve_starts: how many starts a final evaluation and the learning curve use.
     """
@@ -29,9 +34,13 @@ class Population:
     starts, curve_starts = STARTS, CURVE_STARTS
 
     def __init__(
-        self, tasks: Task | Sequence[Task], agents: Agent | Sequence[Agent], seeds: Sequence[int]
+        self,
+        tasks: Task | Sequence[Task],
+        agents: Agent | Sequence[Agent],
+        seeds: Sequence[int],
+        room: int = 0,
     ) -> None:
-        self.seeds = list(seeds)
+        self.seeds, self._room = list(seeds), room
         tasks = [tasks] * len(self.seeds) if isinstance(tasks, Task) else list(tasks)
         agents = [agents] * len(self.seeds) if isinstance(agents, Agent) else list(agents)
         if len({jax.tree.structure(agent) for agent in agents}) > 1:
@@ -51,15 +60,15 @@ class Population:
         if not self._programs:
             seed = jnp.array(0, jnp.uint32)
             first = jax.eval_shape(lambda: begin(self.task, self.agent, seed))
-            require_memory(first, len(self.seeds))
+            require_memory(first, max(len(self.seeds), self._room))
 
     def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
         """Sets up the members before their first step; ``own`` and ``form`` are from ``_split``."""
-        self._members = Members(len(self.seeds))
+        self._members = Members(len(self.seeds), self._room)
         self._own = self._members.place(own)
         # The key holds everything that a compiled program depends on.
         rows = chunk_steps(self.task, self.agent)
-        self._programs = programs_of((form, len(self.seeds), self._members.one_by_one, rows))
+        self._programs = programs_of((form, self._members.room, self._members.one_by_one, rows))
         self._require_memory()
         seeds = self._members.place(np.array(self.seeds, np.uint32))
         self.state: TrainingState = self._run(
@@ -229,14 +238,16 @@ def _split(
 ) -> tuple[list[np.ndarray], list[Any], Callable[[Any, Any], PyTree], Hashable]:
     """Splits the members' numbers and arrays into own and shared ones.
 
-    Numbers are own, so that one program serves all members; an array is shared if it is the same
-    object in all. Returns the own ones with a leading member axis, the shared ones, a function that
-    rebuilds one member, and a key of everything that a program for them depends on.
+    Numbers are own, so that one program serves all members; an array is shared if it is large and
+    the same object in all. Returns the own ones with a leading member axis, the shared ones, a
+    function that rebuilds one member, and a key of everything that a program for them depends on.
     """
     columns = list(zip(*(jax.tree.leaves(member) for member in members), strict=True))
     structure = jax.tree.structure(members[0])
     is_own = [
-        isinstance(column[0], float) or any(leaf is not column[0] for leaf in column)
+        isinstance(column[0], float)
+        or (isinstance(column[0], np.ndarray | Array) and column[0].size < LARGE)
+        or any(leaf is not column[0] for leaf in column)
         for column in columns
     ]
     own = [

@@ -382,9 +382,10 @@ class Backtest:
         missing = [fold for fold in self._jobs if not self._is_trained(name, fold.name)]
         lockstep = jax.devices()[0].platform in devices.LOCKSTEP
         size = max(len(jax.devices()), FOLDS_AT_ONCE if lockstep else 1)
-        return [self._job(name, missing[i : i + size]) for i in range(0, len(missing), size)]
+        most = min(size, len(missing))
+        return [self._job(name, missing[i : i + size], most) for i in range(0, len(missing), size)]
 
-    def _job(self, name: str, folds: Sequence[Fold]) -> FoldsJob:
+    def _job(self, name: str, folds: Sequence[Fold], most: int) -> FoldsJob:
         return FoldsJob(
             name,
             self.agents[name],
@@ -392,6 +393,7 @@ class Backtest:
             tuple(self._part(self.tasks[name], fold) for fold in folds),
             tuple(seed_range(self.config.seeds, self.config.seed)),
             Budget(self.config.agents[name].episodes),
+            most,
         )
 
     def _late(self, fold: Fold) -> list[str]:

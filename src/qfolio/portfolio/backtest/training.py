@@ -30,7 +30,7 @@ class FoldsJob:
     """Trains all seeds of an agent on some folds, as one population.
 
     agent_name: of the agent in the backtest. folds: their names. tasks: each fold's part of the
-    table.
+    table. most: folds of the backtest's largest job; all share its programs.
     """
 
     agent_name: str
@@ -39,6 +39,7 @@ class FoldsJob:
     tasks: tuple[Portfolio, ...]
     seeds: tuple[int, ...]
     budget: Budget
+    most: int
 
     @property
     def name(self) -> str:
@@ -47,7 +48,8 @@ class FoldsJob:
     def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:
         """The trained folds by name; None if Ctrl-C stopped it."""
         tasks = [task for task in self.tasks for _ in self.seeds]
-        population = Population(tasks, self.agent, self.seeds * len(self.folds))
+        seeds, room = self.seeds * len(self.folds), self.most * len(self.seeds)
+        population = Population(tasks, self.agent, seeds, room)
         kept = _RowsByFold(self)
         training = fit(population, self.budget, [kept, *listeners], config={"job": self.name})
         if training.interrupted and not training.finished:
