@@ -150,6 +150,7 @@ class Members:
 def _map(function: Callable[[Any], Any], members: Any, count: Array) -> Any:
     """``lax.map`` over the first ``count`` members only."""
     at = lambda i: jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, i, 0, False), members)  # noqa: E731
+    function = jax.jit(function, inline=True)  # traced once, here and below
     shapes = jax.eval_shape(function, at(0))
     length = jax.tree.leaves(members)[0].shape[0]
     results = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)

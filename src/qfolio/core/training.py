@@ -92,13 +92,14 @@ def advance(
     it stay empty.
     """
     length = agent.rollout_steps
-    _, record, _ = jax.eval_shape(partial(_rollout, task, agent, learning=learning), state)
+    rollout = jax.jit(partial(_rollout, task, agent, learning=learning), inline=True)
+    _, record, _ = jax.eval_shape(rollout, state)  # traced once, here and below
     rows = chunk_steps(task, agent)
     empty = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape[1:]), x.dtype), record)
 
     def body(i: Array, carry: tuple[TrainingState, Episodes]) -> tuple[TrainingState, Episodes]:
         state, episodes = carry
-        state, record, _ = _rollout(task, agent, state, learning=learning)
+        state, record, _ = rollout(state)
         put = lambda all, some: lax.dynamic_update_slice_in_dim(all, some, i * length, 0)  # noqa: E731
         return state, jax.tree.map(put, episodes, record)
 
