@@ -39,6 +39,8 @@ def test_the_command_writes_the_whole_folder(place):
     assert list(study.config.tables) == ["one", "other"]
     assert [each.name for each in study.config.variants] == ["lag1-10bp"]
     assert (folder / "tables/other/lag1-10bp/report.html").exists()
+    why = json.loads((folder / "tables/other/lag1-10bp/why.json").read_text())
+    assert list(why["agents"]) == ["pathwise"]
     assert study.config.result is not None
     assert study.config.result.looks == 2
     page = (folder / "report.html").read_text()

@@ -150,7 +150,7 @@ def write_report(
     entries: "dict[str, Entry]",
     assessment: "Assessment",
     notes: list[str],
-    why: "Why | None" = None,
+    why: "Why | None",
 ) -> None:
     """Writes the report of a backtest into its folder."""
     from qfolio.report.backtest.page import write_backtest_report

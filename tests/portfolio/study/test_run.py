@@ -108,6 +108,8 @@ def test_a_study_writes_typed_finite_numbers(finished):
 def test_each_table_is_an_ordinary_backtest(finished):
     backtest = finished.backtest("two", Variant(1, 0.005))
     assert backtest.config.cost == 0.005
+    assert not (backtest.folder / "why.json").exists()
+    assert (finished.backtest("two").folder / "why.json").exists()  # the main variant
     summary = json.loads((backtest.folder / "summary.json").read_text())
     contrast = summary["strategies"]["pathwise-together"]["to_reference"]["growth"]
     assert finished.config.result is not None

@@ -24,6 +24,8 @@ from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.assessment import Assessment
+from qfolio.portfolio.backtest.attribution.explain import explain
+from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.bootstrap import LEVEL
 from qfolio.portfolio.backtest.folds import require_fold
 from qfolio.portfolio.backtest.replay import Entry
@@ -44,7 +46,7 @@ from qfolio.portfolio.study.pooling import AGAINST, Finding, Pooled, Pools, Tabl
 from qfolio.portfolio.study.verdict import verdicts
 
 Listen = Callable[[Job, float, float], Sequence[Listener]]
-Report = Callable[[Backtest, dict[str, Entry], Assessment, list[str]], None]
+Report = Callable[[Backtest, dict[str, Entry], Assessment, list[str], Why | None], None]
 
 
 class Study:
@@ -184,8 +186,8 @@ class Study:
 
         Args:
             listen: Called before each backtest; returns the ``listen`` of ``Backtest.run``.
-            report: Called with each finished backtest, its entries, assessment and notes, before it
-                counts as finished.
+            report: Called with each finished backtest, its entries, assessment, notes and, in the
+                main variant, attributions, before it counts as finished.
             executor: Where training runs (default: in this process).
         """
         with locked(self.folder), interruptible() as stop:
@@ -200,9 +202,10 @@ class Study:
                         break
                     entries, notes = backtest.entries()
                     assessment = backtest.assess(entries)
-                    backtest.write_tables(entries, assessment)
+                    why = explain(backtest, entries) if variant == self.config.variants[0] else None
+                    backtest.write_tables(entries, assessment, why)
                     if report is not None:
-                        report(backtest, entries, assessment, notes)
+                        report(backtest, entries, assessment, notes, why)
                 self._note(name, variant)
             self.interrupted = stop.is_set() and not self._complete
 
