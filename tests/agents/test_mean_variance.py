@@ -107,6 +107,7 @@ def test_cap_and_assets_that_cannot_be_traded():
         ({"risk_aversion": 0.0}, "risk_aversion"),
         ({"ridge": -1.0}, "ridge"),
         ({"units": 0}, "units"),
+        ({"members": 33}, "from 2 to the number of blocks, 32"),
     ],
 )
 def test_settings_out_of_range_are_named(settings, says):

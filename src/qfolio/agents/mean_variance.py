@@ -25,7 +25,7 @@ from qfolio.core.market import View
 from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.covariance import Covariance, Means
-from qfolio.learning.evidence import Evidence, blocks_of, left_out
+from qfolio.learning.evidence import Evidence, blocks_of, left_out, require_members
 from qfolio.learning.trading import Trading
 
 
@@ -132,7 +132,7 @@ class MeanVariance(OnPaths):
 
     def __check_init__(self) -> None:
         require(self, "num_envs units blocks", lambda x: 1 <= x < 2**31, "at least 1")
-        require(self, "members", lambda x: x >= 2, "at least 2, since each leaves blocks out")
+        require_members(self.members, self.blocks)
         require(self, "rollout_length", lambda x: x >= 2, "at least 2")
         require(self, "head", lambda x: 0 <= x < self.rollout_length, "at least 0 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip

@@ -24,7 +24,7 @@ from qfolio.core.fields import number, require, static
 from qfolio.core.market import View
 from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
-from qfolio.learning.evidence import Evidence, blocks_of, left_out
+from qfolio.learning.evidence import Evidence, blocks_of, left_out, require_members
 from qfolio.learning.scores import NETWORKS, Attention, Hidden
 from qfolio.learning.trading import Trading, ratio
 
@@ -150,7 +150,7 @@ class Tilts(OnPaths):
         kinds = ", ".join(("linear", *NETWORKS))
         require(self, "network", lambda x: x in ("linear", *NETWORKS), f"one of {kinds}")
         require(self, "blocks num_envs units", lambda x: 1 <= x < 2**31, "at least 1")
-        require(self, "members", lambda x: x >= 2, "at least 2, since each leaves blocks out")
+        require_members(self.members, self.blocks)
         require(self, "rollout_length", lambda x: x >= 2, "at least 2")
         require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
@@ -159,11 +159,6 @@ class Tilts(OnPaths):
         require(self, "threshold", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
         require(self, "memory", lambda x: 0 <= x < 1, "at least 0 and below 1")
         self._schedule.check()
-        if self.members > self.blocks:
-            raise QfolioError(
-                f"members is {self.members}; with {self.blocks} blocks it can be at most "
-                f"{self.blocks}."
-            )
 
     def init(self, task: Task, key: PRNGKeyArray) -> TiltsState:
         view = task.observe(task.reset(key))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import ExogenousTask, Transition
 from qfolio.learning.trading import ratio
 
@@ -67,6 +68,15 @@ def blocks_of(task: ExogenousTask, rollout: Transition, blocks: int) -> Int[Arra
     found = jax.vmap(jax.vmap(lambda one: block_of(task, one, blocks)))(rollout.state.market)
     own = jnp.arange(found.shape[1]) % blocks
     return jnp.where(jnp.isfinite(task.moves), found, own)
+
+
+def require_members(members: int, blocks: int) -> None:
+    """Raises QfolioError unless each member can leave out some block, and learn from another."""
+    if not 2 <= members <= blocks:
+        raise QfolioError(
+            f"members is {members}; each leaves blocks out, so it must be from 2 to the number of "
+            f"blocks, {blocks}."
+        )
 
 
 def left_out(block: Int[Array, "time path"], members: int) -> Bool[Array, "member time path"]:
