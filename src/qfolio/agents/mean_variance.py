@@ -252,7 +252,7 @@ class MeanVariance(OnPaths):
 
 def _moments(counted: Array, values: Array) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Mean and variance over the steps that count."""
-    steps = jnp.maximum((counted & jnp.ones_like(values, bool)).sum(), 1)
+    steps = jnp.maximum(jnp.broadcast_to(counted, values.shape).sum(), 1)
     mean = (counted * values).sum() / steps
     return mean, (counted * (values - mean) ** 2).sum() / steps
 
