@@ -71,6 +71,17 @@ def planted(rows=800, seed=2):
     return Prices(dates, tuple("ABCDEF"), np.exp(logs))
 
 
+def persistent(rows=700, assets=6, seed=0, market=0.0):
+    """Prices whose relative returns persist for a while; the market adds noise to all of them."""
+    rng = np.random.default_rng(seed)
+    drift = np.zeros((rows, assets))
+    for row in range(1, rows):
+        drift[row] = 0.95 * drift[row - 1] + rng.normal(0, 0.001, assets)
+    moves = drift + rng.normal(0, 0.005, drift.shape) + market * rng.normal(size=(rows, 1))
+    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    return Prices(dates, tuple("abcdef"[:assets]), 50 * np.exp(moves.cumsum(0)))
+
+
 def four_folds(prices, **changed):
     """Four folds with two seeds, whose rules have coefficients 0.4 and 0.6."""
     settings = {"signals": SIGNALS, "window": 2, "horizon": 20, "cost": 0.0005, **changed}

@@ -9,25 +9,19 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.hindsight import Move
 from qfolio.core.errors import QfolioError
 from qfolio.learning.bootstrapped import BLOCKS, Heads, cautious, samples
-from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.portfolio.task import Portfolio
 from qfolio.report.contrast import contrast_of
 
+from planted import persistent
+
 KEY = jax.random.key(0)
 
 
-def planted(rows=700, assets=6, seed=0):
-    """Prices whose relative returns persist for a while, and the momentum that shows it."""
-    rng = np.random.default_rng(seed)
-    drift = np.zeros((rows, assets))
-    for row in range(1, rows):
-        drift[row] = 0.95 * drift[row - 1] + rng.normal(0, 0.001, assets)
-    values = 50 * np.exp((drift + rng.normal(0, 0.005, drift.shape)).cumsum(0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows)
-    prices = Prices(dates, tuple("abcdef"[:assets]), values)
+def planted():
+    """A table of persistent relative returns, and the momentum that shows them."""
     return Portfolio.of(
-        prices, window=1, horizon=64, anchor="equal-weight", menu="signals:1",
+        persistent(), window=1, horizon=64, anchor="equal-weight", menu="signals:1",
         signals="momentum:21,volatility:21",
     )  # fmt: skip
 
@@ -120,7 +114,7 @@ def test_a_report_compares_heads_with_one_network():
 
 
 def test_positions_need_a_menu_of_signals():
-    with pytest.raises(QfolioError, match="network=positions values"):
+    with pytest.raises(QfolioError, match="network=positions is for portfolios"):
         agent().init(Merton(menu="grid:2"), KEY)
     with pytest.raises(QfolioError, match="plain action values"):
         agent(dueling=True).init(planted(), KEY)

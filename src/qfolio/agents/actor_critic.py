@@ -22,6 +22,7 @@ from qfolio.learning import networks, optimizer
 from qfolio.learning.exploration import uniform
 from qfolio.learning.networks import Flat, LateAction, Network, NetworkConfig
 from qfolio.learning.optimizer import CosineSchedule
+from qfolio.learning.positions import OrderValue, Values
 from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
 from qfolio.learning.targets import Scalar, Scale, huber_loss, possible_values, td_target
 
@@ -127,7 +128,7 @@ State = TypeVar("State", bound=ActorCriticState)
 class ActorCritic(Agent, Generic[L]):
     """Settings, buffer and gradient steps; an algorithm adds what it learns and how it explores."""
 
-    network: str = static("flat")  # the actor's: over everything observed; mlp, cnn, rnn: by asset
+    network: str = static("flat")  # the actor's; positions: also the critics', linear in them
     hidden: tuple[int, ...] = sizes(256, 256)  # of actor and critics
     num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
@@ -289,6 +290,8 @@ class ActorCritic(Agent, Generic[L]):
         gains = jnp.append(gain, jnp.full(action.shape, 1 / unit))
 
         def make(key: PRNGKeyArray) -> Network:
+            if self.network == "positions":
+                return OrderValue(Values(observation))
             if late:
                 return LateAction(both, self.hidden, key, gain, 1 / unit)
             return Flat(both, self.hidden, 1, key, gains)

@@ -61,7 +61,7 @@ class Batch(NamedTuple):
 class OnPolicy(Agent):
     """Acting, the networks and the optimiser's step; subclasses define ``learn``."""
 
-    network: str = static("flat")  # over everything observed; or mlp, cnn, rnn, shared by assets
+    network: str = static("flat")  # over everything observed; or one of networks.KINDS
     hidden: tuple[int, ...] = sizes(64, 64)  # of the actor, and of the critic
     activation: str = static("relu")  # of the hidden units; or tanh, silu
     initialization: str = static("uniform")  # in ±1/√inputs; or orthogonal
@@ -128,7 +128,7 @@ class OnPolicy(Agent):
         actor = build(outputs_of(task.actions), actor_key)
         weights = PolicyAndValue(
             # A last layer of zeros: the first policy is the same everywhere.
-            actor=eqx.tree_at(networks.last_layer, actor, replace_fn=jnp.zeros_like),
+            actor=networks.start_at_zero(actor),
             log_std=jnp.full(_coordinates(task.actions), jnp.log(self.initial_std)),
             critic=build(Outputs(1), critic_key),
             actions=task.actions,

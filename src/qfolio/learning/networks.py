@@ -22,6 +22,7 @@ from qfolio.learning.encoders import (
     Window,
     uniform,
 )
+from qfolio.learning.positions import OrderValue, Tilting, Values
 from qfolio.learning.targets import Scalar
 
 
@@ -174,31 +175,6 @@ class PerAsset(eqx.Module):
         return jnp.concatenate([market, blocks.reshape(*market.shape[:-1], -1)], -1)
 
 
-class Positions(eqx.Module):
-    """Values of a menu's actions: what the positions that an action orders are worth.
-
-    Q(s, a) = Σᵢ (bᵢ − anchorᵢ) θ·xᵢ − p Σᵢ |bᵢ − hᵢ| + v, where b are the weights that action a
-    orders, h those held, and x the latest features of an asset except the first, its return.
-    Rewards are nearly linear in weights, so that one θ serves all actions, as the value of the
-    state after a decision does (Powell 2011, section 4.6). All values start at 0.
-    """
-
-    linear: Float[Array, " channel"]  # θ
-    price: Float[Array, ""]  # p
-    value: Float[Array, ""]  # v
-
-    def __init__(self, view: View) -> None:
-        self.linear = jnp.zeros(view.features.shape[-1] - 1)
-        self.price, self.value = jnp.zeros(()), jnp.zeros(())
-
-    def __call__(self, view: View) -> Float[Array, "batch action"]:
-        assert view.choices is not None
-        held, signals = view.holding[..., None, :], view.features[..., -1, 1:]
-        active = view.choices if view.anchor is None else view.choices - view.anchor[..., None, :]
-        traded = jnp.abs(view.choices - held).sum(-1)
-        return self.value + (active @ signals) @ self.linear - self.price * traded
-
-
 _ENCODERS: dict[str, Any] = {"mlp": Window, "cnn": CNN, "rnn": RNN, "lstm": LSTM}
 
 SHARED = tuple(_ENCODERS)
@@ -209,7 +185,10 @@ KINDS = ("flat", *SHARED, "positions")
 _READS = {"cnn": (2, 3), "rnn": (2,), "lstm": (2,)}
 """Dimensions of an encoder's input: (time, channel), or (height, width, channel)."""
 
-Network = Flat | LateAction | PerAsset | Positions
+LINEAR = (Values, OrderValue, Tilting)
+"""Networks without layers, which start at zero."""
+
+Network = Flat | LateAction | PerAsset | Values | OrderValue | Tilting
 
 
 class NetworkConfig(NamedTuple):
@@ -270,8 +249,17 @@ def last_layer(network: Any) -> Any:
     return mlp.weights[-1], mlp.biases[-1]
 
 
+def start_at_zero(network: Network) -> Network:
+    """The network with an output layer of zeros: its outputs are the same everywhere."""
+    if isinstance(network, LINEAR):
+        return network
+    return eqx.tree_at(last_layer, network, replace_fn=jnp.zeros_like)
+
+
 def with_last_layer(network: Network, bound: float) -> Network:
     """The network with its uniform last layer rescaled to ±``bound``."""
+    if isinstance(network, LINEAR):
+        return network
     factor = bound * math.sqrt(last_layer(network)[0].shape[-2])
     return eqx.tree_at(last_layer, network, replace_fn=lambda x: factor * x)
 
@@ -300,12 +288,7 @@ def build(
             activation=activation, initialization=initialization,
         )  # fmt: skip
     if kind == "positions":
-        if not isinstance(observation, View) or observation.choices is None:
-            raise QfolioError(
-                "network=positions values the positions that a menu of signals leads to; set a "
-                f"menu such as signals:1 in a portfolio with signals, which {task.name} has not."
-            )
-        return Positions(observation)
+        return _linear(task, observation, outputs)
     if not isinstance(observation, View):
         shape = jnp.shape(observation) if isinstance(observation, Array) else ()
         if kind not in _READS or len(shape) not in _READS[kind]:
@@ -323,6 +306,21 @@ def build(
         )
     shared = Shared(kind, observation, hidden, outputs.pooled, outputs.each, key)
     return PerAsset(shared, outputs.atoms)
+
+
+def _linear(task: Task, observation: PyTree, outputs: Outputs) -> Values | Tilting:
+    """Values that are linear in positions; of weights, a policy of tilts."""
+    fits = isinstance(observation, View) and observation.features.shape[-1] > 1
+    weights = isinstance(task.actions, Simplex)
+    if not fits or (observation.anchor if weights else observation.choices) is None:
+        raise QfolioError(
+            "network=positions is for portfolios with signals, and either an anchor (such as "
+            "anchor=equal-weight) or a menu of signals (such as menu=signals:1), which "
+            f"{task.name} has not."
+        )
+    if weights and outputs.each:
+        return Tilting(observation, spread=outputs.each > 1)
+    return Values(observation)
 
 
 def _does_not_fit(kind: str, task: Task, shape: tuple[int, ...]) -> str:

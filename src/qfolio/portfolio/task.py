@@ -19,7 +19,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Position, Simplex
 from qfolio.portfolio import anchors, signals
-from qfolio.portfolio.market import Market, Relatives, Signalled
+from qfolio.portfolio.market import Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
 
 Row = Int[Array, ""]
@@ -52,6 +52,7 @@ class Portfolio(Market):
     signal_scale: str = static("rank")  # of signals: rank, z-score, centered or raw
     anchor: str = static("")  # that agents may depart from, see portfolio.anchors
     reward: str = static("log")
+    active: bool = static(False)  # rewards are those over the anchor's
     risk_aversion: float = number(3.0)
     sharpe_rate: float = number(0.01)
     horizon: int = static(50)
@@ -101,6 +102,16 @@ class Portfolio(Market):
         require(self, "max_weight", lambda x: 0 < x <= 1, "above 0 and at most 1")
         require(self, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
         _ = self.parts  # which check their own settings
+        if self.active and not self.anchor:
+            raise QfolioError(
+                "active rewards are those over the anchor's; set an anchor, such as "
+                "anchor=equal-weight."
+            )
+        if self.active and self.path_dependent:
+            raise QfolioError(
+                f"active compares single steps, and reward={self.reward} depends on earlier ones; "
+                "set reward=log, or active=false."
+            )
 
     def part(self, first: int, last: int, tradable: np.ndarray | None = None) -> "Portfolio":
         """The same task on rows ``first`` to ``last`` alone.
@@ -203,6 +214,18 @@ class Portfolio(Market):
 
     def place(self, market: Row) -> Float[Array, ""]:
         return 1.0 * (market - self.first_decision)
+
+    def settle(
+        self, market: Row, next_market: Row, holding: Holding, action: Array
+    ) -> tuple[Float[Array, ""], Holding]:
+        """As in any market; ``active`` subtracts what holding the anchor earns, free of cost.
+
+        That depends on the market alone: the best policy stays the same, and the noise goes that
+        all policies share (input-dependent baselines, Mao et al. 2019).
+        """
+        reward, after = super().settle(market, next_market, holding, action)
+        shared = self.reference(market, next_market) if self.active else None
+        return reward if shared is None else reward - shared, after
 
     def relatives(self, market: Row, next_market: Row) -> Relatives:
         # Rows up to market + lag + 1 exist for every decision that is settled.

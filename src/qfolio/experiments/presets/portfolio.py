@@ -7,6 +7,27 @@ from qfolio.experiments.presets.preset import Preset, Presets
 _TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
 
 
+SIGNALS = (
+    "drift:252-1,drift:252-2,drift:252-5,drift:252-10,drift:252-21,drift:252-63,drift:252-126,"
+    "momentum:252-21,volatility:21,volatility:126,volatility-ratio:252-21,high:252,maximum:21,"
+    "beta:252,residual-volatility:252,correlation:252,market-volatility:63"
+)
+
+
+SHORT_SIGNALS = "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,moving-average:10"
+"""Those that pay off within days: values of single moves are too noisy for slower ones."""
+
+
+_ON_SIGNALS = {
+    "window": 1,
+    "horizon": 50,
+    "reward": "log",
+    "active": True,
+    "signals": SIGNALS,
+    "anchor": "equal-weight",
+}
+
+
 # The values of actions differ by little, next to the noise of a day's returns: hence large batches,
 # linear values of positions, and actions that have to be better by standard errors.
 _DQN = {
@@ -46,14 +67,13 @@ _PATHWISE = {
 # steps, because daily returns have far more noise than signal, discount strongly, because a trade
 # pays off within days, and explore near their holdings, because trades cost.
 _ON_POLICY = {
-    "network": "mlp",
-    "hidden": (16, 16),
+    "network": "positions",
     "num_envs": 16,
     "rollout_length": 50,
     "discount": 0.9,
-    "learning_rate": 1e-3,
+    "learning_rate": 0.005,
     "learning_rate_final": 0.0,
-    "initial_std": 0.1,
+    "initial_std": 0.3,
     "reward_scale": 100.0,
 }
 
@@ -63,54 +83,49 @@ _PPO = {
     "epochs": 2,
     "batch_size": 400,
     "gae_lambda": 0.9,
-    "learning_rate_steps": 120.0,
+    "learning_rate_steps": 1200.0,
 }
 
 
-_A2C = {**_ON_POLICY, "rollout_length": 25, "gae_lambda": 0.9, "learning_rate_steps": 100.0}
+_A2C = {**_ON_POLICY, "rollout_length": 25, "gae_lambda": 0.9, "learning_rate_steps": 600.0}
 
 
-_REINFORCE = {**_ON_POLICY, "learning_rate_steps": 60.0}
+_REINFORCE = {**_ON_POLICY, "learning_rate_steps": 300.0}
 
 
+# Values of orders are linear, so that without a small step an actor would go to one asset. Rewards
+# are small, and an entropy that is worth more than they are would drown them.
 _OFF_POLICY = {
-    "network": "mlp",
-    "hidden": (16, 16),
-    "num_envs": 8,
-    "batch_size": 64,
-    "replay_capacity": 8192,
-    "learning_starts": 3200,
+    "network": "positions",
+    "num_envs": 16,
+    "batch_size": 256,
+    "replay_capacity": 16384,
+    "learning_starts": 256,
     "tau": 0.05,
     "discount": 0.9,
-    "learning_rate": 3e-4,
+    "learning_rate": 0.004,
     "learning_rate_final": 0.0,
-    "learning_rate_steps": 600.0,
+    "learning_rate_steps": 2400.0,
+    "actor_learning_rate_ratio": 0.15,
     "reward_scale": 100.0,
 }
 
 
-_DDPG = {**_OFF_POLICY, "exploration_noise": 0.02}
+_DDPG = {**_OFF_POLICY, "exploration_noise": 0.01}
 
 
-_TD3 = {**_DDPG, "target_noise": 0.02, "target_noise_clip": 0.05}
+_TD3 = {**_DDPG, "target_noise": 0.01, "target_noise_clip": 0.02}
 
 
-_SAC = {**_OFF_POLICY, "initial_temperature": 0.1}
-
-
-SIGNALS = (
-    "drift:252-1,drift:252-2,drift:252-5,drift:252-10,drift:252-21,drift:252-63,drift:252-126,"
-    "momentum:252-21,volatility:21,volatility:126,volatility-ratio:252-21,high:252,maximum:21,"
-    "beta:252,residual-volatility:252,correlation:252,market-volatility:63"
-)
-
-
-SHORT_SIGNALS = "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,moving-average:10"
-"""Those that pay off within days: values of single moves are too noisy for slower ones."""
+_SAC = {**_OFF_POLICY, "initial_temperature": 0.001}
 
 
 def _on_weights(agent: str, settings: dict[str, Any], episodes: int) -> dict[str, Preset]:
     return {"fast": Preset(agent, settings, episodes, seeds=5, task=_TASK)}
+
+
+def _on_signals(agent: str, settings: dict[str, Any], episodes: int) -> dict[str, Preset]:
+    return {"fast": Preset(agent, settings, episodes, seeds=5, task=_ON_SIGNALS)}
 
 
 def _on_covariance(agent: str, episodes: int) -> dict[str, Preset]:
@@ -152,10 +167,10 @@ PRESETS: Presets = {
     },
     ("portfolio", "mean-variance-learned"): _on_covariance("mean-variance-learned", 640),
     ("portfolio", "minimum-variance-learned"): _on_covariance("minimum-variance-learned", 1920),
-    ("portfolio", "ppo"): _on_weights("ppo", _PPO, episodes=480),
-    ("portfolio", "a2c"): _on_weights("a2c", _A2C, episodes=800),
-    ("portfolio", "reinforce"): _on_weights("reinforce", _REINFORCE, episodes=960),
-    ("portfolio", "ddpg"): _on_weights("ddpg", _DDPG, episodes=160),
-    ("portfolio", "td3"): _on_weights("td3", _TD3, episodes=160),
-    ("portfolio", "sac"): _on_weights("sac", _SAC, episodes=160),
+    ("portfolio", "ppo"): _on_signals("ppo", _PPO, episodes=4800),
+    ("portfolio", "a2c"): _on_signals("a2c", _A2C, episodes=4800),
+    ("portfolio", "reinforce"): _on_signals("reinforce", _REINFORCE, episodes=4800),
+    ("portfolio", "ddpg"): _on_signals("ddpg", _DDPG, episodes=800),
+    ("portfolio", "td3"): _on_signals("td3", _TD3, episodes=800),
+    ("portfolio", "sac"): _on_signals("sac", _SAC, episodes=800),
 }
