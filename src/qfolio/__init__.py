@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from qfolio.core.errors import QfolioError as QfolioError
     from qfolio.experiments.budget import Budget as Budget
     from qfolio.experiments.fit import Listener as Listener
+    from qfolio.experiments.machines.choice import on as on
     from qfolio.experiments.presets import preset as preset
     from qfolio.experiments.run import Run as Run
     from qfolio.experiments.run import train as train
@@ -63,6 +64,7 @@ _HOMES = {
     "TD3": "qfolio.agents.td3:TD3",
     "Tilts": "qfolio.agents.tilts:Tilts",
     "load_prices": "qfolio.portfolio.prices.table:load",
+    "on": "qfolio.experiments.machines.choice:on",
     "preset": "qfolio.experiments.presets:preset",
     "train": "qfolio.experiments.run:train",
 }

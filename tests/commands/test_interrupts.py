@@ -5,8 +5,12 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
+
+from jobs import alive
+from tables import write_table
 
 TRAIN = ["train", "pendulum", "--no-compare", "--seeds", "2", "--episodes", "100000",
          "--set", "hidden=8", "num_envs=2", "batch_size=8", "learning_starts=16"]  # fmt: skip
@@ -60,3 +64,44 @@ def test_a_reader_that_leaves(tmp_path):
         process.stdout.close()
         assert process.wait(timeout=120) == 0
         assert process.stderr.read() == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2])
+def test_ctrl_c_with_workers(tmp_path, count):
+    """A terminal sends it to all processes; none stays, and finished folds do."""
+    prices = write_table(tmp_path / "prices.csv", rows=700)
+    command = ["backtest", str(prices), "--agents", "pathwise", "--train", "100d", "--test", "40d",
+               "--seeds", "2", "--episodes", "20000", "--on", "processes:2", "--set", "window=10",
+               "horizon=20", "hidden=8,8", "num_envs=4", "rollout_length=10"]  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-m", "qfolio", *command, "--out", str(tmp_path / "run")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    for _ in range(2):  # what is trained, and first progress
+        assert process.stdout.readline()
+    workers = children(process.pid)
+    assert len(workers) >= 2
+    for _ in range(count):
+        os.killpg(process.pid, signal.SIGINT)
+        time.sleep(0.01)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert err in ("", "qfolio: interrupted\n")
+    if count == 1:
+        resume = f"qfolio backtest --resume {tmp_path / 'run'} --on processes:2"
+        assert out.splitlines()[-1] == f"Stopped. Resume with: {resume}"
+    end = time.perf_counter() + 10
+    while any(map(alive, workers)):
+        assert time.perf_counter() < end
+        time.sleep(0.05)
+
+
+def children(parent):
+    """The processes that a process has started."""
+    threads = Path(f"/proc/{parent}/task").glob("*/children")
+    return [int(child) for thread in threads for child in thread.read_text().split()]

@@ -29,10 +29,11 @@ def budget_of(episodes: int | None, steps: int | None) -> Budget | None:
     return None if episodes is None and steps is None else Budget(episodes, steps)
 
 
-def again(command: str, folder: Path, *parts: object) -> str:
+def again(command: str, folder: Path, *parts: object, on: str = "here") -> str:
     """The command line that resumes the work in a folder.
 
-    parts: its tasks and agents; a user's own modules must be trusted again.
+    parts: its tasks and agents; a user's own modules must be trusted again. on: where it ran.
     """
     modules = own_modules(*parts)
-    return " ".join([command, str(folder), *(["--trust", *modules] if modules else [])])
+    words = [command, str(folder), *(["--trust", *modules] if modules else [])]
+    return " ".join([*words, *(["--on", on] if on != "here" else [])])

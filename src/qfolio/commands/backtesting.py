@@ -56,6 +56,7 @@ class Options:
             (dqn.discount=0.9), or of the task (window=20 reward=crra).
         out: New folder (default: one in runs/).
         resume: Folder to resume.
+        on: Where agents train: here, processes:4 (or another number), ray or ray://HOST:10001.
         trust: Modules of your own code that the folder may name (default: none).
         missing: How to treat missing prices.
         late: How to treat assets that start later than the table.
@@ -81,6 +82,7 @@ class Options:
     assignments: Assignments = ()
     out: Folder = None
     resume: Folder = None
+    on: str = "here"
     trust: Modules = ()
     missing: Missing = "error"
     late: Late = "error"
@@ -89,8 +91,8 @@ class Options:
 
     @property
     def only_resumes(self) -> bool:
-        """Whether nothing but ``resume`` and ``trust`` is given."""
-        return dataclasses.replace(self, resume=None, trust=()) == DEFAULTS
+        """Whether nothing but ``resume``, ``on`` and ``trust`` is given."""
+        return dataclasses.replace(self, resume=None, on=DEFAULTS.on, trust=()) == DEFAULTS
 
     def folder(self, kind: str) -> Path:
         """The new folder."""

@@ -62,9 +62,11 @@ def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> No
     registry.trust(options.trust)
     from qfolio.commands import console
     from qfolio.commands.progress import BacktestProgress, stop
+    from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.backtest.attribution.explain import explain
     from qfolio.portfolio.backtest.run import Backtest
 
+    executor = on(options.on)
     if options.resume is None:
         folder = options.folder("backtest")
         run = Backtest.create(
@@ -78,12 +80,12 @@ def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> No
     elif file is None and options.only_resumes:
         run, folder = Backtest.open(options.resume), options.resume
     else:
-        raise QfolioError("--resume keeps the backtest's settings; add only --trust.")
+        raise QfolioError("--resume keeps the backtest's settings; add only --on and --trust.")
     console.say(console.describe_backtest(run))
     with console.bar("compiling") as update:
-        run.run(BacktestProgress(update))
+        run.run(BacktestProgress(update), executor)
     if run.interrupted:
-        stop(again("qfolio backtest --resume", folder, *run.parts))
+        stop(again("qfolio backtest --resume", folder, *run.parts, on=options.on))
     with console.console.status("Replaying all strategies, drawing histories, writing the report"):
         entries, notes = run.entries()
         assessment = run.assess(entries)

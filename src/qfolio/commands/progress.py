@@ -83,18 +83,26 @@ class BarProgress(Listener):
 class BacktestProgress:
     """A bar over all jobs of a backtest, or a line for each tenth without a terminal.
 
-    Called before each job, it returns the listener of that job's training.
+    Called before each job, it returns the listener of that job's training. Jobs may run side by
+    side.
     """
 
     def __init__(self, update: Callable[..., None]) -> None:
         self.update, self.begun, self.said = update, perf_counter(), ""
+        self.parts: dict[str, float] = {}  # of all work: what each job has done
 
     def __call__(self, job: "Job", done: float, share: float) -> list[Listener]:
         """done, share: the finished share of all jobs, and the share of this job."""
-        return [_JobProgress(self, job.name.partition("/")[0], done, share)]
+        return [_JobProgress(self, job.name, share)]
 
-    def note(self, agent: str, done: float, known: bool) -> None:
-        """known: whether learning has begun, so that its speed predicts the time left."""
+    def note(self, job: str, part: float, learning: bool) -> None:
+        """learning: whether the job has begun to learn, so that its speed predicts the time left.
+
+        part: of all work, which the job has done.
+        """
+        self.parts[job] = part
+        agent, done = job.partition("/")[0], sum(self.parts.values())
+        known = learning or done > part
         spent = perf_counter() - self.begun
         left = time_left(spent * (1 / done - 1) if known and done else math.nan)
         description = f"{agent}  {left} left"
@@ -105,16 +113,15 @@ class BacktestProgress:
 
 
 class _JobProgress(Listener):
-    def __init__(self, whole: BacktestProgress, agent: str, done: float, share: float) -> None:
-        self.whole, self.agent, self.done, self.share = whole, agent, done, share
+    def __init__(self, whole: BacktestProgress, job: str, share: float) -> None:
+        self.whole, self.job, self.share = whole, job, share
 
     def on_start(self, training: Training) -> None:
-        self.whole.note(self.agent, self.done, known=self.done > 0)
+        self.whole.note(self.job, 0.0, learning=False)
 
     def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        done = self.done + self.share * training.share
         learning = not math.isnan(training.seconds_left)
-        self.whole.note(self.agent, done, known=learning or self.done > 0)
+        self.whole.note(self.job, self.share * training.share, learning)
 
 
 class SearchProgress:

@@ -46,9 +46,11 @@ def study(
     registry.trust(options.trust)
     from qfolio.commands import console
     from qfolio.commands.progress import BacktestProgress, stop
+    from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.study.run import Study
     from qfolio.report.study import write_study_report
 
+    executor = on(options.on)
     if options.resume is None:
         basis_points("--cost-bps", options.cost_bps)  # refuses a wrong one by its own name
         costs = _numbers("--costs-bps", costs_bps, options.cost_bps)
@@ -64,7 +66,7 @@ def study(
     elif options.only_resumes and not (sets or lags or costs_bps or after):
         run = Study.open(options.resume)
     else:
-        raise QfolioError("--resume keeps the study's settings; add only --trust.")
+        raise QfolioError("--resume keeps the study's settings; add only --on and --trust.")
     console.say(console.describe_study(run))
     with console.bar("") as update:
 
@@ -73,10 +75,10 @@ def study(
             console.say(f"{place} of {len(run.places)}: {table}, {console.spell(variant)}")
             return BacktestProgress(update)
 
-        run.run(listen, write_report)
+        run.run(listen, write_report, executor)
     if run.interrupted:
         parts = run.backtest(next(iter(run.config.tables))).parts
-        stop(again("qfolio study --resume", run.folder, *parts))
+        stop(again("qfolio study --resume", run.folder, *parts, on=options.on))
     with console.console.status("Pooling the evidence, writing the report"):
         result = run.result()
         write_study_report(run)

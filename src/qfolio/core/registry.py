@@ -209,6 +209,14 @@ def trust(modules: Iterable[str]) -> None:
         import_own(module)
 
 
+def trusted() -> list[str]:
+    """The modules of a user's own that this process has imported by name."""
+    return sorted(name for name in _trusted if not name.startswith("qfolio."))
+
+
+_trusted: set[str] = set()
+
+
 def import_own(module: str) -> ModuleType:
     """Imports a module that a user has named, also from the current directory."""
     if not _exists(module):
@@ -216,9 +224,11 @@ def import_own(module: str) -> ModuleType:
             f"{module} cannot be imported: it is neither installed nor in this folder."
         )
     try:
-        return import_module(module)
+        found = import_module(module)
     except Exception as error:
         raise QfolioError(f"{module} cannot be imported: {one_line(error)}.") from error
+    _trusted.add(module)
+    return found
 
 
 def _where(kind: Kind, name: str) -> str | None:

@@ -1,8 +1,11 @@
-"""Executors of jobs: in this process, one after another."""
+"""Executors of jobs: in this process, one after another; on many workers, see ``machines``."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Protocol, TypeVar, runtime_checkable
 
+import jax
+
+from qfolio.core.devices import LOCKSTEP
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
 
@@ -31,19 +34,40 @@ class Job(Protocol[R_co]):
 class Executor(Protocol):
     """Runs jobs and yields their results as they finish; ends early if Ctrl-C stopped one."""
 
+    @property
+    def devices(self) -> int:
+        """Devices of one worker."""
+        ...
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether a device steps its members in lockstep, as a GPU does."""
+        ...
+
     def map(
-        self, jobs: Sequence[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
-    ) -> Iterator[tuple[Job[R], R]]:
-        """Each finished job with its result; ``listen`` returns the listeners of a job."""
+        self, jobs: Iterable[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
+    ) -> Generator[tuple[Job[R], R], None, None]:
+        """Each finished job with its result; ``listen`` returns the listeners of a job.
+
+        ``jobs`` are taken one by one, when a worker is free.
+        """
         ...
 
 
 class Here:
     """Runs jobs in this process, one after another."""
 
+    @property
+    def devices(self) -> int:
+        return len(jax.devices())
+
+    @property
+    def lockstep(self) -> bool:
+        return jax.devices()[0].platform in LOCKSTEP
+
     def map(
-        self, jobs: Sequence[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
-    ) -> Iterator[tuple[Job[R], R]]:
+        self, jobs: Iterable[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
+    ) -> Generator[tuple[Job[R], R], None, None]:
         with interruptible() as stop:
             for job in jobs:
                 result = None if stop.is_set() else job.run(listen(job))

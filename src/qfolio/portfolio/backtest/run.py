@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from qfolio.core import devices, settings
@@ -208,22 +207,34 @@ class Backtest:
         Args:
             listen: Called before each job, with the finished share of all jobs and the share of
                 this job; returns the listeners of its training.
-            executor: Where the jobs run (default: in this process).
+            executor: Where the jobs run (default: in this process); see ``qfolio.on``.
         """
-        jobs = [job for name in self.agents for job in self._missing(name)]
-        done = 0
+        executor = executor or Here()
+        jobs, done = self.jobs(executor), 0
 
         def listeners(job: Job[dict[str, TrainedFold]]) -> Sequence[Listener]:
             return listen(job, done / len(jobs), 1 / len(jobs))
 
         lock = contextlib.nullcontext() if self.folder is None else locked(self.folder)
-        with lock, interruptible() as stop:
-            for job, trained in (executor or Here()).map(jobs, listeners):
-                agent = job.name.partition("/")[0]
-                for fold, result in trained.items():
-                    self._keep(agent, fold, result)
+        with (
+            lock,
+            interruptible() as stop,
+            contextlib.closing(executor.map(jobs, listeners)) as finished,
+        ):
+            for job, trained in finished:
+                self.store(job, trained)
                 done += 1
             self.interrupted = stop.is_set()
+
+    def jobs(self, executor: Executor) -> list[FoldsJob]:
+        """The training that is missing, in jobs that fill a worker; each goes to ``store``."""
+        return [job for name in self.agents for job in self._missing(name, executor)]
+
+    def store(self, job: Job[dict[str, TrainedFold]], trained: dict[str, TrainedFold]) -> None:
+        """Keeps what a job has trained."""
+        agent = job.name.partition("/")[0]
+        for fold, result in trained.items():
+            self._keep(agent, fold, result)
 
     @property
     def parts(self) -> list[object]:
@@ -377,11 +388,10 @@ class Backtest:
         values = self.prices.values
         return task.part(job.train.start, job.train.stop - 1, job.tradable(values))
 
-    def _missing(self, name: str) -> list[FoldsJob]:
-        """The folds that are still to be trained, in groups that fill the devices."""
+    def _missing(self, name: str, executor: Executor) -> list[FoldsJob]:
+        """The folds that are still to be trained, in groups that fill a worker's devices."""
         missing = [fold for fold in self._jobs if not self._is_trained(name, fold.name)]
-        lockstep = jax.devices()[0].platform in devices.LOCKSTEP
-        size = max(len(jax.devices()), FOLDS_AT_ONCE if lockstep else 1)
+        size = max(executor.devices, FOLDS_AT_ONCE if executor.lockstep else 1)
         most = min(size, len(missing))
         return [self._job(name, missing[i : i + size], most) for i in range(0, len(missing), size)]
 
@@ -393,6 +403,7 @@ class Backtest:
             tuple(self._part(self.tasks[name], fold) for fold in folds),
             tuple(seed_range(self.config.seeds, self.config.seed)),
             Budget(self.config.agents[name].episodes),
+            LATEST,
             most,
         )
 
@@ -413,9 +424,9 @@ class Backtest:
         else:
             self._folder.write_records(name, fold, trained.rows)
         if fold == LATEST:
-            self._keep_policy(name, fold, _learning(trained.learner, 0, self.prices.dates[-1]))
+            self._keep_policy(name, fold, _learning(trained.kept, 0, self.prices.dates[-1]))
         else:
-            self._keep_policy(name, fold, self.agents[name].weights(trained.learner))
+            self._keep_policy(name, fold, trained.kept)
 
     def _keep_policy(self, name: str, fold: str, tree: Any) -> None:
         if self._folder is None:

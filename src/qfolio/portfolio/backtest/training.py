@@ -17,11 +17,11 @@ from qfolio.portfolio.task import Portfolio
 class TrainedFold(NamedTuple):
     """The trained agents of a fold.
 
-    learner: their states, with a leading seed axis. rows: one for every training episode, in order
-    of time.
+    kept: their weights, with a leading seed axis, or their whole states. rows: one for every
+    training episode, in order of time.
     """
 
-    learner: PyTree
+    kept: PyTree
     rows: list[Row]
 
 
@@ -30,7 +30,9 @@ class FoldsJob:
     """Trains all seeds of an agent on some folds, as one population.
 
     agent_name: of the agent in the backtest. folds: their names. tasks: each fold's part of the
-    table. most: folds of the backtest's largest job; all share its programs.
+    table. whole: the fold whose states are kept, to learn on from; of the others only weights are,
+    because a state may hold a large replay memory. most: folds of the backtest's largest job; all
+    share its programs.
     """
 
     agent_name: str
@@ -39,6 +41,7 @@ class FoldsJob:
     tasks: tuple[Portfolio, ...]
     seeds: tuple[int, ...]
     budget: Budget
+    whole: str
     most: int
 
     @property
@@ -54,14 +57,16 @@ class FoldsJob:
         training = fit(population, self.budget, [kept, *listeners], config={"job": self.name})
         if training.interrupted and not training.finished:
             return None
-        learner = population.fetch().agent
-        count = len(self.seeds)
         return {
-            fold: TrainedFold(
-                jax.tree.map(lambda x, i=i: x[i * count : (i + 1) * count], learner), kept.rows[i]
-            )
+            fold: TrainedFold(self._kept(population, i), kept.rows[i])
             for i, fold in enumerate(self.folds)
         }
+
+    def _kept(self, population: Population, fold: int) -> PyTree:
+        whole = self.folds[fold] == self.whole
+        members = population.fetch().agent if whole else population.weights()
+        first, count = fold * len(self.seeds), len(self.seeds)
+        return jax.tree.map(lambda x: x[first : first + count], members)
 
 
 class _RowsByFold(Listener):

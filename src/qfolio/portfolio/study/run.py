@@ -9,6 +9,7 @@ import contextlib
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.statistics import holm
-from qfolio.experiments.executor import Executor, Job
+from qfolio.experiments.executor import Executor, Here, Job
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.presets import Preset
@@ -31,6 +32,7 @@ from qfolio.portfolio.backtest.folds import require_fold
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe
+from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.study.folder import (
     NAME,
@@ -185,29 +187,63 @@ class Study:
         groups of folds are kept.
 
         Args:
-            listen: Called before each backtest; returns the ``listen`` of ``Backtest.run``.
+            listen: Called before the first job of each backtest; returns the ``listen`` of
+                ``Backtest.run``.
             report: Called with each finished backtest, its entries, assessment, notes and, in the
                 main variant, attributions, before it counts as finished.
-            executor: Where training runs (default: in this process).
+            executor: Where training runs (default: in this process); see ``qfolio.on``.
         """
-        with locked(self.folder), interruptible() as stop:
-            for name, variant in self.places:
-                if self.finished(name, variant):
-                    continue
-                with _of(name):
-                    backtest = self.backtest(name, variant)
-                    listeners = _silent if listen is None else listen(name, variant, backtest)
-                    backtest.run(listeners, executor)
-                    if backtest.interrupted:
-                        break
-                    entries, notes = backtest.entries()
-                    assessment = backtest.assess(entries)
-                    why = explain(backtest, entries) if variant == self.config.variants[0] else None
-                    backtest.write_tables(entries, assessment, why)
-                    if report is not None:
-                        report(backtest, entries, assessment, notes, why)
-                self._note(name, variant)
+        executor = executor or Here()
+        missing = [place for place in self.places if not self.finished(*place)]
+        running: dict[str, _Running] = {}  # by the names of their jobs
+
+        def jobs() -> Iterator[PlacedJob]:
+            for table, variant in missing:
+                with _of(table):
+                    backtest = self.backtest(table, variant)
+                made = [PlacedJob(table, variant, job) for job in backtest.jobs(executor)]
+                place = _Running(table, variant, backtest, len(made))
+                running.update((job.name, place) for job in made)
+                yield from made
+
+        def listeners(job: Job[dict[str, TrainedFold]]) -> Sequence[Listener]:
+            assert isinstance(job, PlacedJob)
+            place = running[job.name]
+            if listen is not None and place.listen is None:
+                place.listen = listen(place.table, place.variant, place.backtest)
+            done, share = (place.count - place.left) / place.count, 1 / place.count
+            return [] if place.listen is None else place.listen(job.job, done, share)
+
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(locked(self.folder))
+            for table, variant in missing:
+                stack.enter_context(locked(self._files.place(table, variant)))
+            stop = stack.enter_context(interruptible())
+            finished = stack.enter_context(contextlib.closing(executor.map(jobs(), listeners)))
+            for job, trained in finished:
+                assert isinstance(job, PlacedJob)
+                place = running.pop(job.name)
+                place.backtest.store(job.job, trained)
+                place.left -= 1
+                if not (place.left or stop.is_set()):
+                    self._conclude(place.table, place.variant, place.backtest, report)
+            for table, variant in missing:  # those of which nothing but the end was missing
+                if not (self.finished(table, variant) or stop.is_set()):
+                    self._conclude(table, variant, self.backtest(table, variant), report)
             self.interrupted = stop.is_set() and not self._complete
+
+    def _conclude(
+        self, table: str, variant: Variant, backtest: Backtest, report: Report | None
+    ) -> None:
+        """Replays a backtest that has been trained, which is a look at its table."""
+        with _of(table):
+            entries, notes = backtest.entries()
+            assessment = backtest.assess(entries)
+            why = explain(backtest, entries) if variant == self.config.variants[0] else None
+            backtest.write_tables(entries, assessment, why)
+            if report is not None:
+                report(backtest, entries, assessment, notes, why)
+        self._note(table, variant)
 
     def result(self) -> Result:
         """The pooled evidence; writes it into study.json and study.csv.
@@ -248,12 +284,44 @@ class Study:
             cost=variant.cost,
             agents=tuple(self.config.agents),
         )
-        self.config = msgspec.structs.replace(self.config, looks=[*self.config.looks, look])
+        order = [(name, each.lag, each.cost) for name, each in self.places]
+        looks = [*self.config.looks, look]
+        # In the order of the places, whichever was finished first.
+        looks.sort(key=lambda look: order.index((look.table, look.lag, look.cost)))
+        self.config = msgspec.structs.replace(self.config, looks=looks)
         self._files.write(self.config)
 
 
-def _silent(job: Job, done: float, share: float) -> Sequence[Listener]:
-    return ()
+@dataclass(frozen=True)
+class PlacedJob:
+    """A job of one of the study's backtests."""
+
+    table: str
+    variant: Variant
+    job: FoldsJob
+
+    @property
+    def name(self) -> str:
+        return f"{self.table}/{self.variant.name}/{self.job.name}"
+
+    def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:
+        with _of(self.table):
+            return self.job.run(listeners)
+
+
+@dataclass
+class _Running:
+    """A backtest in training: its jobs, and those that are left."""
+
+    table: str
+    variant: Variant
+    backtest: Backtest
+    count: int
+    left: int = field(init=False)
+    listen: Listen | None = None
+
+    def __post_init__(self) -> None:
+        self.left = self.count
 
 
 def summarise(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]]) -> Result:

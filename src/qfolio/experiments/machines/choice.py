@@ -1,0 +1,36 @@
+"""Executors by name, as ``--on`` takes them."""
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.executor import Executor, Here
+
+MOST = 1024
+"""The largest number of processes on one machine."""
+
+
+def on(text: str) -> Executor:
+    """The executor that a text names.
+
+    Args:
+        text: "here" for this process, "processes:4" for four processes of this machine, "ray" for
+            the Ray cluster of this machine (started if there is none), "ray://HOST:10001" for the
+            one behind a Ray Client.
+    """
+    kind, _, rest = text.partition(":")
+    if text == "here":
+        return Here()
+    if kind == "processes" and rest.isdecimal() and 1 <= int(rest) <= MOST:
+        from qfolio.experiments.machines.processes import Processes
+
+        return Processes(int(rest))
+    if text == "ray" or (kind == "ray" and rest.startswith("//") and len(rest) > 2):
+        from qfolio.experiments.machines.rays import Ray
+
+        return Ray(text if rest else None)
+    if kind == "processes":
+        raise QfolioError(
+            f"--on is {text!r}; give a number of processes from 1 to {MOST}, such as processes:4."
+        )
+    raise QfolioError(
+        f"--on is {text!r}; it must be here, processes:4 (or another number), ray or "
+        "ray://HOST:10001."
+    )

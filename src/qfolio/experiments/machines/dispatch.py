@@ -1,0 +1,185 @@
+"""The driver's side: workers get jobs, listeners hear of them, results come out.
+
+A thread of its own talks to the workers, so that they get their next job while the main thread
+writes files or a report.
+"""
+
+import threading
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from itertools import chain, islice
+from queue import Empty, SimpleQueue
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.executor import Job
+from qfolio.experiments.fit import Listener
+from qfolio.experiments.interrupts import interruptible
+from qfolio.experiments.machines.messages import (
+    Done,
+    Failed,
+    Lost,
+    Message,
+    Ready,
+    Report,
+    versions,
+)
+from qfolio.experiments.machines.remote import hear
+from qfolio.experiments.machines.schedule import Schedule
+
+R = TypeVar("R")
+
+PATIENCE = 0.2
+"""Seconds until a thread looks up to see whether it should stop."""
+
+
+@runtime_checkable
+class Workers(Protocol):
+    """Places for workers, by number. All calls come from one thread; closing ends every worker."""
+
+    @property
+    def count(self) -> int: ...
+
+    def start(self, worker: int) -> None:
+        """Starts a fresh worker in a place; a ``Ready`` follows."""
+        ...
+
+    def send(self, worker: int, job: Job) -> None:
+        """Gives a worker a job; a ``Done`` or ``Failed`` follows, and ``Report``s before it."""
+        ...
+
+    def receive(self, seconds: float) -> list[tuple[int, Message]]:
+        """What workers have said, each message with its worker; waits at most so long."""
+        ...
+
+
+@dataclass
+class _Began:
+    job: Job
+
+
+@dataclass
+class _Ended:
+    """The thread has ended, with an error or without."""
+
+    error: BaseException | None
+
+
+def dispatch(
+    open_workers: Callable[[], AbstractContextManager[Workers]],
+    jobs: Iterable[Job[R]],
+    listen: Callable[[Job[R]], Sequence[Listener]],
+) -> Generator[tuple[Job[R], R], None, None]:
+    """Runs jobs on workers and yields each with its result, in the order in which they finish.
+
+    Ctrl-C stops all workers at once; results that have arrived are still yielded.
+    """
+    heard: SimpleQueue[tuple[Job | None, Any]] = SimpleQueue()
+    stop = threading.Event()
+
+    def talk() -> None:
+        error: BaseException | None = None
+        try:
+            with open_workers() as workers:
+                drive(workers, jobs, lambda job, said: heard.put((job, said)), stop)
+        except BaseException as raised:
+            error = raised
+        heard.put((None, _Ended(error)))
+
+    thread = threading.Thread(target=talk, daemon=True, name="qfolio-driver")
+    listeners: dict[str, Sequence[Listener]] = {}
+    with interruptible() as interrupted:
+        thread.start()
+        try:
+            while True:
+                if interrupted.is_set():
+                    stop.set()
+                try:
+                    job, said = heard.get(timeout=PATIENCE)
+                except Empty:
+                    continue
+                if job is None:
+                    if said.error is not None:
+                        raise said.error
+                    return
+                if isinstance(said, Done):
+                    listeners.pop(job.name, None)
+                    yield job, said.result
+                elif not interrupted.is_set():
+                    if isinstance(said, _Began):
+                        listeners[job.name] = listen(job)
+                    else:
+                        for listener in listeners[job.name]:
+                            hear(said, listener)
+        finally:
+            stop.set()
+            thread.join()
+
+
+def drive(
+    workers: Workers,
+    jobs: Iterable[Job],
+    tell: Callable[[Job, _Began | Report | Done], None],
+    stop: threading.Event,
+) -> None:
+    """Gives every job to a worker, and again if the worker is lost, until all are done.
+
+    tell: called with a job that a worker begins, and with what the worker says of it.
+
+    Raises:
+        QfolioError: A job failed or lost too many workers, or no worker starts.
+    """
+    jobs = iter(jobs)
+    first = list(islice(jobs, workers.count))
+    schedule, idle, there = Schedule(chain(first, jobs)), list[int](), set(range(len(first)))
+    for worker in there:
+        workers.start(worker)
+    wanted = versions()
+    more = bool(first)  # whether there may be jobs that nobody has begun
+    while (more or schedule.under_way) and not stop.is_set():
+        for worker, said in workers.receive(PATIENCE):
+            if isinstance(said, Ready):
+                _require_same(said, wanted)
+                schedule.start(worker)
+                idle.append(worker)
+            elif isinstance(said, Report):
+                tell(schedule.of(worker), said)
+            elif isinstance(said, Done):
+                tell(schedule.finish(worker), said)
+                idle.append(worker)
+            elif isinstance(said, Failed):
+                raise _failure(schedule.of(worker), said)
+            elif isinstance(said, Lost):
+                if worker in idle:
+                    idle.remove(worker)
+                if schedule.lose(worker, said.why):
+                    workers.start(worker)
+                else:
+                    there.remove(worker)
+                    if not there:
+                        raise QfolioError(f"No worker stays alive; the last one: {said.why}.")
+        while idle and not stop.is_set():
+            job = schedule.give(idle[-1])
+            more = job is not None
+            if job is None:
+                break
+            worker = idle.pop()
+            tell(job, _Began(job))
+            workers.send(worker, job)
+
+
+def _require_same(ready: Ready, wanted: dict[str, str]) -> None:
+    """Raises QfolioError if a worker has other versions than the driver."""
+    for name, version in wanted.items():
+        if (other := ready.versions.get(name)) != version:
+            raise QfolioError(
+                f"The worker {ready.where} has {name} {other}, and this machine {version}; install "
+                "the same version on all machines."
+            )
+
+
+def _failure(job: Job, failed: Failed) -> Exception:
+    if failed.plain:
+        return QfolioError(failed.error)
+    return RuntimeError(f"{job.name} failed on a worker:\n{failed.error}")

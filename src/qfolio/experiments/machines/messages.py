@@ -1,0 +1,69 @@
+"""What a worker tells the driver. Nothing here imports jax, which a worker sets up first."""
+
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import Any, Literal, NamedTuple
+
+from qfolio.core.version import __version__
+from qfolio.experiments.budget import Budget
+
+
+class Ready(NamedTuple):
+    """A worker has started and waits for a job."""
+
+    where: str  # its machine and process
+    versions: dict[str, str]
+
+
+class Report(NamedTuple):
+    """What the listeners of a training hear, as values."""
+
+    hook: Literal["on_start", "on_chunk", "on_end"]
+    budget: Budget
+    config: Mapping[str, Any]
+    begun: int
+    left: int
+    seconds: float
+    share: float
+    steps_per_second: float
+    seconds_left: float
+    rows: list[dict[str, float]]
+    members: Sequence[int]
+
+
+class Done(NamedTuple):
+    """A job's result; the worker waits for the next."""
+
+    result: Any
+
+
+class Failed(NamedTuple):
+    """A job raised an error, which would be the same on any worker.
+
+    plain: whether it is a QfolioError; otherwise ``error`` is a traceback.
+    """
+
+    error: str
+    plain: bool
+
+
+class Lost(NamedTuple):
+    """A worker is gone; why: in a few words."""
+
+    why: str
+
+
+Message = Ready | Report | Done | Failed | Lost
+
+
+def versions() -> dict[str, str]:
+    """What a worker and the driver must have in common, so that results are equal to the bit."""
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"qfolio": __version__, "jax": version("jax"), "Python": python}
+
+
+def place() -> str:
+    """This machine and process, for messages."""
+    return f"process {os.getpid()} on {platform.node()}"

@@ -1,0 +1,86 @@
+"""Jobs as bytes.
+
+Large arrays, such as prices, travel beside the jobs, so that a worker gets each of them once.
+"""
+
+import hashlib
+import io
+import pickle
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from qfolio.core.population import LARGE
+from qfolio.core.registry import trust, trusted
+
+
+class Parcel(NamedTuple):
+    """A job without its large arrays.
+
+    arrays: their digests. modules: a user's own, which settings of the job may name.
+    """
+
+    job: bytes
+    arrays: tuple[str, ...]
+    modules: tuple[str, ...]
+
+
+class Packer:
+    """Packs jobs; ``arrays`` holds each large array of all of them, as bytes, by its digest.
+
+    These bytes are read by the driver's own workers only; no file holds any.
+    """
+
+    def __init__(self) -> None:
+        self.arrays: dict[str, bytes] = {}
+        self._known: dict[int, tuple[Any, str]] = {}  # by id, with the object, which keeps the id
+
+    def pack(self, job: Any) -> Parcel:
+        file, needs = io.BytesIO(), dict[str, None]()
+
+        class Pickler(pickle.Pickler):
+            def persistent_id(_, value: Any) -> str | None:  # noqa: N805
+                if not (isinstance(value, jax.Array | np.ndarray) and value.size >= LARGE):
+                    return None
+                digest = self._digest(value)
+                needs[digest] = None
+                return digest
+
+        Pickler(file, protocol=5).dump(job)
+        return Parcel(file.getvalue(), tuple(needs), tuple(trusted()))
+
+    def _digest(self, array: Any) -> str:
+        if id(array) not in self._known:
+            content = pickle.dumps(array, protocol=5)
+            digest = hashlib.sha256(content).hexdigest()
+            self.arrays[digest] = content
+            self._known[id(array)] = (array, digest)
+        return self._known[id(array)][1]
+
+
+class Unpacker:
+    """Unpacks parcels; keeps the arrays, so that jobs share them as they did in the driver."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, Any] = {}
+
+    def keep(self, arrays: Mapping[str, bytes]) -> None:
+        """Keeps arrays that came beside a parcel."""
+        self._arrays |= {digest: pickle.loads(content) for digest, content in arrays.items()}
+
+    def lacks(self, parcel: Parcel) -> list[str]:
+        """The digests of arrays that have not come yet."""
+        return [digest for digest in parcel.arrays if digest not in self._arrays]
+
+    def unpack(self, parcel: Parcel) -> Any:
+        """The job; imports the modules that the driver has imported."""
+        trust(parcel.modules)
+        arrays = self._arrays
+
+        class Unpickler(pickle.Unpickler):
+            def persistent_load(_, digest: str) -> Any:  # noqa: N805
+                return arrays[digest]
+
+        return Unpickler(io.BytesIO(parcel.job)).load()

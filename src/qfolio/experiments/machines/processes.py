@@ -1,0 +1,155 @@
+"""Workers that are processes of this machine.
+
+They are spawned, because a fork of a process in which jax has started threads may deadlock. Each
+has a share of the cores to itself, and ends when the driver does, however that ends.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing import connection, resource_tracker
+from multiprocessing.context import SpawnProcess
+from typing import TypeVar
+
+import jax
+
+from qfolio.core.devices import LOCKSTEP
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.executor import Job
+from qfolio.experiments.fit import Listener
+from qfolio.experiments.machines.dispatch import dispatch
+from qfolio.experiments.machines.messages import Lost, Message
+from qfolio.experiments.machines.parcels import Packer
+from qfolio.experiments.machines.worker import environment, serve
+
+R = TypeVar("R")
+
+ENDING = 1.0
+"""Seconds that a process which has closed its pipe has for its end."""
+
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Runs jobs in ``count`` processes of this machine.
+
+    In a script of your own, put the call that runs them under ``if __name__ == "__main__":``,
+    because each process imports the script.
+
+    cores: of each process (default: an equal share).
+    """
+
+    count: int
+    cores: int | None = None
+    lockstep = False
+
+    def __post_init__(self) -> None:
+        for name, value in (("processes", self.count), ("cores of a process", self.cores or 1)):
+            if value < 1:
+                raise QfolioError(f"The number of {name} is {value}; it must be 1 or more.")
+
+    @property
+    def devices(self) -> int:
+        return self.cores or max(1, len(_cores()) // self.count)
+
+    def map(
+        self, jobs: Iterable[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
+    ) -> Generator[tuple[Job[R], R], None, None]:
+        _require_cores()
+        return dispatch(lambda: _opened(self), jobs, listen)
+
+
+class _Pool:
+    """The processes by number."""
+
+    def __init__(self, executor: Processes) -> None:
+        self.count, self._devices = executor.count, executor.devices
+        self._environment = environment(executor.devices)
+        self._packer = Packer()
+        self._processes: dict[int, SpawnProcess] = {}
+        self._pipes: dict[int, connection.Connection] = {}
+        self._sent: dict[int, set[str]] = {}
+
+    def start(self, worker: int) -> None:
+        ours, theirs = _SPAWN.Pipe()
+        cores, first = _cores(), worker * self._devices
+        mine = [cores[i % len(cores)] for i in range(first, first + self._devices)]
+        process = _SPAWN.Process(target=serve, args=(theirs, mine, self._environment), daemon=True)
+        process.start()
+        theirs.close()  # the worker's copy alone is left, so that its end is the pipe's
+        self._processes[worker], self._pipes[worker] = process, ours
+        self._sent[worker] = set()
+
+    def send(self, worker: int, job: Job) -> None:
+        parcel = self._packer.pack(job)
+        new = [digest for digest in parcel.arrays if digest not in self._sent[worker]]
+        self._sent[worker].update(new)
+        content = (parcel, {digest: self._packer.arrays[digest] for digest in new})
+        with contextlib.suppress(OSError):  # a worker that is gone is noticed when it is heard
+            self._pipes[worker].send_bytes(pickle.dumps(content, protocol=5))
+
+    def receive(self, seconds: float) -> list[tuple[int, Message]]:
+        workers = {pipe: worker for worker, pipe in self._pipes.items()}
+        heard: list[tuple[int, Message]] = []
+        for pipe in connection.wait(list(workers), seconds):
+            assert isinstance(pipe, connection.Connection)
+            worker = workers[pipe]
+            try:
+                heard.append((worker, pickle.loads(pipe.recv_bytes())))
+            except (EOFError, OSError):
+                heard.append((worker, Lost(self._bury(worker))))
+        return heard
+
+    def close(self) -> None:
+        """Ends all processes."""
+        for process in self._processes.values():
+            process.kill()  # whatever they compute is not wanted any more
+        for worker in list(self._processes):
+            self._bury(worker)
+
+    def _bury(self, worker: int) -> str:
+        """Removes a process that has closed its pipe, and says how it ended."""
+        process = self._processes.pop(worker)
+        self._pipes.pop(worker).close()
+        process.join(ENDING)
+        process.kill()
+        process.join()
+        code = process.exitcode
+        process.close()
+        if code is not None and code < 0:
+            return f"signal {signal.Signals(-code).name} ended its process"
+        return f"its process ended with code {code}"
+
+
+@contextlib.contextmanager
+def _opened(executor: Processes) -> Iterator[_Pool]:
+    if hasattr(signal, "pthread_sigmask"):
+        # Processes inherit what this thread blocks: Ctrl-C, which a terminal sends to all of them,
+        # is the driver's to act on. The tracker unblocks it when it starts, so it starts first.
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    pool = _Pool(executor)
+    try:
+        yield pool
+    finally:
+        pool.close()
+
+
+def _cores() -> list[int]:
+    """The cores that this process may use."""
+    known = hasattr(os, "sched_getaffinity")
+    return sorted(os.sched_getaffinity(0)) if known else list(range(os.cpu_count() or 1))
+
+
+def _require_cores() -> None:
+    """Raises QfolioError if jax computes on something that processes cannot share out."""
+    if (platform := jax.devices()[0].platform) in LOCKSTEP:
+        raise QfolioError(
+            f"Processes share out cores, but jax computes on a {platform} here; use --on ray, or "
+            "set JAX_PLATFORMS=cpu."
+        )

@@ -1,0 +1,163 @@
+"""Workers that are actors of a Ray cluster: one for each GPU, or one for so many cores.
+
+Actors live as long as the run, because a task of Ray on a GPU gets a new process, which compiles
+everything again.
+"""
+
+import contextlib
+import logging
+import pickle
+import re
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from typing import Any, TypeVar
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.version import __version__
+from qfolio.experiments.executor import Job
+from qfolio.experiments.fit import Listener
+from qfolio.experiments.machines.dispatch import dispatch
+from qfolio.experiments.machines.messages import Lost, Message, Report
+from qfolio.experiments.machines.parcels import Packer
+from qfolio.experiments.machines.worker import Actor, environment
+
+R = TypeVar("R")
+
+
+class Ray:
+    """Runs jobs on a Ray cluster, with Ray's own connection if there is one.
+
+    Args:
+        address: The cluster, such as "ray://HOST:10001" (default: that of RAY_ADDRESS, of this
+            machine, or a new one on this machine).
+        workers: Number of workers (default: as many as the cluster has room for at present).
+        cpus: Cores of each worker.
+        gpus: Whether each worker has a GPU (default: if the cluster has one).
+    """
+
+    def __init__(
+        self,
+        address: str | None = None,
+        *,
+        workers: int | None = None,
+        cpus: int = 1,
+        gpus: bool | None = None,
+    ) -> None:
+        ray = _connected(address)
+        there = ray.cluster_resources()
+        self.lockstep = bool(there.get("GPU")) if gpus is None else gpus
+        room = int(there.get("GPU", 0) if self.lockstep else there.get("CPU", 0) // max(cpus, 1))
+        self.workers, self.cpus = room if workers is None else workers, cpus
+        if self.workers < 1 or cpus < 1:
+            what = "GPU" if self.lockstep else f"node with {cpus} cores"
+            raise QfolioError(
+                f"The Ray cluster has no {what}, so no worker can start; add one, or give workers, "
+                "which then wait for it."
+            )
+
+    @property
+    def devices(self) -> int:
+        return 1 if self.lockstep else self.cpus
+
+    def map(
+        self, jobs: Iterable[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
+    ) -> Generator[tuple[Job[R], R], None, None]:
+        return dispatch(lambda: _opened(self), jobs, listen)
+
+
+class _Actors:
+    """The actors by number."""
+
+    def __init__(self, executor: Ray) -> None:
+        import ray
+
+        self._ray, self.count = ray, executor.workers
+        # Ray gives an actor without a GPU no GPU, but does not hide those of its machine.
+        hidden = {} if executor.lockstep else {"JAX_PLATFORMS": "cpu"}
+        self._environment = environment(executor.devices) | hidden
+        self._actor = ray.remote(
+            num_cpus=executor.cpus, num_gpus=int(executor.lockstep), max_restarts=0
+        )(Actor)
+        self._packer = Packer()
+        self._stored: dict[str, Any] = {}  # references to arrays in the cluster's store
+        self._actors: dict[int, Any] = {}
+        self._answers: dict[Any, int] = {}  # that are awaited, and whose
+
+    def start(self, worker: int) -> None:
+        self._actors[worker] = self._actor.remote(self._environment)
+        self._answers[self._actors[worker].ready.remote()] = worker
+
+    def send(self, worker: int, job: Job) -> None:
+        parcel = self._packer.pack(job)
+        for digest in parcel.arrays:
+            if digest not in self._stored:
+                self._stored[digest] = self._ray.put(self._packer.arrays[digest])
+        arrays = {digest: self._stored[digest] for digest in parcel.arrays}
+        self._actors[worker].begin.remote(pickle.dumps(parcel), arrays)
+        self._listen(worker)
+
+    def receive(self, seconds: float) -> list[tuple[int, Message]]:
+        awaited = list(self._answers)
+        if not self._ray.wait(awaited, timeout=seconds)[0]:
+            return []
+        answered, _ = self._ray.wait(awaited, num_returns=len(awaited), timeout=0)
+        heard: list[tuple[int, Message]] = []
+        for answer in answered:
+            worker = self._answers.pop(answer)
+            try:
+                said: list[Message] = pickle.loads(self._ray.get(answer))
+            except self._ray.exceptions.RayError as error:
+                said = [Lost(_reason(error))]
+                self._ray.kill(self._actors.pop(worker))
+            if isinstance(said[-1], Report):
+                self._listen(worker)
+            heard += [(worker, message) for message in said]
+        return heard
+
+    def close(self) -> None:
+        """Ends all actors."""
+        for actor in self._actors.values():
+            self._ray.kill(actor)
+
+    def _listen(self, worker: int) -> None:
+        self._answers[self._actors[worker].listen.remote()] = worker
+
+
+@contextlib.contextmanager
+def _opened(executor: Ray) -> Iterator[_Actors]:
+    actors = _Actors(executor)
+    try:
+        yield actors
+    finally:
+        actors.close()
+
+
+def _connected(address: str | None) -> Any:
+    """The module ray, connected to a cluster."""
+    try:
+        import ray
+    except ImportError:
+        raise QfolioError(
+            'Ray is not installed; install it with pip install "qfolio[ray]".'
+        ) from None
+    if not ray.is_initialized():
+        try:
+            ray.init(address, logging_level=logging.ERROR, log_to_driver=False)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            (first, *_) = str(error).strip().splitlines() or [type(error).__name__]
+            raise QfolioError(
+                f"The Ray cluster {address or 'of this machine'} cannot be reached "
+                f"({first.rstrip('.')}); check its address, and that it is running."
+            ) from None
+    return ray
+
+
+def _reason(error: Exception) -> str:
+    """Why an actor is gone; raises QfolioError if its machine lacks a module, as others will."""
+    text = str(error)
+    if missing := re.search(r"No module named '([\w.]+)'", text):
+        raise QfolioError(
+            f"A machine of the Ray cluster has no {missing[1]}; install qfolio {__version__} on "
+            "all of them."
+        )
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[0].rstrip(".") if lines else type(error).__name__

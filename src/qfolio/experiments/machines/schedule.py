@@ -1,0 +1,66 @@
+"""Which worker gets which job. Pure bookkeeping: no processes, no clock, no network."""
+
+from collections import Counter, deque
+from collections.abc import Iterable
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.executor import Job
+
+ATTEMPTS = 3
+"""Workers that may be lost to one job, and starts in a row that may fail in one place."""
+
+
+class Schedule:
+    """Gives jobs to workers in their order; the job of a lost worker is given out again, first.
+
+    jobs: taken one by one, when a worker is free. Workers are numbers.
+    """
+
+    def __init__(self, jobs: Iterable[Job]) -> None:
+        self._jobs = iter(jobs)
+        self._again: deque[Job] = deque()
+        self._running: dict[int, Job] = {}
+        self._losses: Counter[str] = Counter()
+        self._failed_starts: Counter[int] = Counter()
+
+    def give(self, worker: int) -> Job | None:
+        """The next job for a worker that is free; None if there is none at present."""
+        job = self._again.popleft() if self._again else next(self._jobs, None)
+        if job is not None:
+            self._running[worker] = job
+        return job
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a job is running or waits to run again."""
+        return bool(self._running or self._again)
+
+    def of(self, worker: int) -> Job:
+        """The job that a worker runs."""
+        return self._running[worker]
+
+    def start(self, worker: int) -> None:
+        """A worker has started."""
+        self._failed_starts[worker] = 0
+
+    def finish(self, worker: int) -> Job:
+        """A worker has finished its job, which is returned."""
+        return self._running.pop(worker)
+
+    def lose(self, worker: int, why: str) -> bool:
+        """A worker is gone; whether to start another one in its place.
+
+        Raises QfolioError if its job has lost too many workers.
+        """
+        job = self._running.pop(worker, None)
+        if job is None:
+            self._failed_starts[worker] += 1
+            return self._failed_starts[worker] < ATTEMPTS
+        self._losses[job.name] += 1
+        if self._losses[job.name] == ATTEMPTS:
+            raise QfolioError(
+                f"{job.name} was given up, because {ATTEMPTS} workers ended while they ran it "
+                f"(the last one: {why}); give each worker more memory, or run fewer at once."
+            )
+        self._again.append(job)
+        return True

@@ -1,0 +1,110 @@
+"""The worker's side: a process (``serve``) or an actor of Ray (``Actor``).
+
+jax is imported when cores and environment have been set.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from multiprocessing import connection
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.machines.messages import Done, Failed, Message, Ready, place, versions
+
+if TYPE_CHECKING:
+    from qfolio.experiments.machines.parcels import Parcel, Unpacker
+
+_COUNT = "--xla_force_host_platform_device_count"
+
+
+def prepare(environment: Mapping[str, str]) -> Ready:
+    """Sets jax up in a process in which nothing has imported it."""
+    os.environ.update(environment)
+    from qfolio.core import devices
+
+    devices.configure()
+    return Ready(place(), versions())
+
+
+def environment(cores: int) -> dict[str, str]:
+    """The flags of this process, for a worker with so many cores."""
+    flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if _COUNT not in flag]
+    return {"XLA_FLAGS": " ".join([*flags, f"{_COUNT}={cores}"])}
+
+
+def work(unpacker: "Unpacker", parcel: "Parcel", send: Callable[[Message], None]) -> None:
+    """Runs a job, and sends its reports and its result."""
+    from qfolio.experiments.machines.remote import Reporter
+
+    try:  # also the sending, which fails if a result cannot be pickled
+        send(Done(unpacker.unpack(parcel).run([Reporter(send)])))
+    except QfolioError as error:
+        send(Failed(str(error), plain=True))
+    except Exception:
+        send(Failed(traceback.format_exc(), plain=False))
+
+
+def serve(pipe: connection.Connection, cores: list[int], environment: dict[str, str]) -> None:
+    """The life of a process: jobs come through the pipe, until it is closed."""
+    threading.Thread(target=_end_with_the_driver, daemon=True).start()
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, cores)
+
+    def send(message: Message) -> None:
+        pipe.send_bytes(pickle.dumps(message, protocol=5))
+
+    with contextlib.suppress(EOFError, OSError):  # the driver has gone
+        send(prepare(environment))
+        from qfolio.experiments.machines.parcels import Unpacker
+
+        unpacker = Unpacker()
+        while True:
+            parcel, arrays = pickle.loads(pipe.recv_bytes())
+            unpacker.keep(arrays)
+            work(unpacker, parcel, send)
+
+
+def _end_with_the_driver() -> None:
+    """Waits for the driver's end, also in the middle of a job."""
+    driver = multiprocessing.parent_process()
+    assert driver is not None
+    connection.wait([driver.sentinel])
+    os._exit(1)
+
+
+class Actor:
+    """A worker that Ray keeps alive; its answers are messages as bytes."""
+
+    def __init__(self, environment: dict[str, str]) -> None:
+        self._ready = prepare(environment)
+        from qfolio.experiments.machines.parcels import Unpacker
+
+        self._unpacker, self._said = Unpacker(), SimpleQueue[Message]()
+
+    def ready(self) -> bytes:
+        return pickle.dumps([self._ready])
+
+    def begin(self, parcel: bytes, arrays: dict[str, Any]) -> None:
+        """Begins a job, which runs beside ``listen``; arrays: references to those that it needs."""
+        threading.Thread(target=self._run, args=(pickle.loads(parcel), arrays)).start()
+
+    def listen(self) -> bytes:
+        """What has been said; waits until there is something."""
+        said = [self._said.get()]
+        with contextlib.suppress(Empty):
+            while True:
+                said.append(self._said.get_nowait())
+        return pickle.dumps(said)
+
+    def _run(self, parcel: "Parcel", arrays: dict[str, Any]) -> None:
+        import ray
+
+        lacking = self._unpacker.lacks(parcel)
+        self._unpacker.keep({digest: ray.get(arrays[digest]) for digest in lacking})
+        work(self._unpacker, parcel, self._said.put)

@@ -1,0 +1,155 @@
+"""Workers that are processes of this machine."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.executor import Executor, Here, Job
+from qfolio.experiments.fit import Listener
+from qfolio.experiments.machines.choice import on
+from qfolio.experiments.machines.processes import Processes
+
+from jobs import Add, Die, Fail, Sleep, Tell, alive
+
+
+def silent(job):
+    return ()
+
+
+def wait_for(*files):
+    end = time.perf_counter() + 60
+    while not all(file.exists() for file in files):
+        assert time.perf_counter() < end, "no worker has begun"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("procesess:4", "--on is 'procesess:4'; it must be here, processes:4"),
+        ("processes:0", "--on is 'processes:0'; give a number of processes from 1 to 1024"),
+        ("processes", "a number of processes"), ("processes:two", "a number of processes"),
+        ("processes:-1", "a number of processes"), ("processes:9999", "from 1 to 1024"),
+        ("", "it must be here"), ("ray:", "it must be here"), ("here:1", "it must be here"),
+    ],
+)  # fmt: skip
+def test_texts_that_name_no_executor(text, message):
+    with pytest.raises(QfolioError, match=message):
+        on(text)
+
+
+def test_texts_that_name_executors():
+    assert isinstance(on("here"), Here)
+    assert on("processes:3") == Processes(3)
+    assert all(isinstance(on(text), Executor) for text in ("here", "processes:3"))
+    with pytest.raises(QfolioError, match="number of processes is 0"):
+        Processes(0)
+    with pytest.raises(QfolioError, match="number of cores of a process is -1"):
+        Processes(1, cores=-1)
+
+
+def test_long_lived_workers_get_a_large_array_once():
+    table = np.arange(4000.0)
+    jobs = [Add(str(i), i, table) for i in range(40)]
+    results = {job.name: result for job, result in Processes(1).map(jobs, silent)}
+    assert results.keys() == {job.name for job in jobs}
+    for i, result in enumerate(results[job.name] for job in jobs):
+        np.testing.assert_array_equal(result["sum"], table + i)
+    assert len({(result["place"], result["table"]) for result in results.values()}) == 1
+    assert results["0"]["place"] != os.getpid()
+
+
+def test_listeners_hear_of_trainings_on_workers():
+    heard: list[Any] = []
+
+    class Note(Listener):
+        def on_start(self, training):
+            heard.append(("start", training.share, training.finished))
+
+        def on_chunk(self, training, rows):
+            heard.append((rows, training.share, training.steps_per_second, training.seconds_left))
+            with pytest.raises(QfolioError, match="population of a training that runs on a worker"):
+                _ = training.population
+
+        def on_end(self, training):
+            heard.append(("end", training.finished, training.interrupted))
+
+    ((_, result),) = Processes(1).map([Tell("a")], lambda job: [Note()])
+    assert result == "told"
+    rows = [{"seed": 0, "episode": 1, "return": 2.5}]
+    assert heard == [("start", 0.0, False), (rows, 1.0, 7.0, 3.0), ("end", True, False)]
+
+
+def test_the_job_of_a_killed_worker_runs_again(tmp_path):
+    jobs: list[Job] = [Die("a", tmp_path / "count", 1), Add("b", 1.0)]
+    assert {job.name for job, _ in Processes(1).map(jobs, silent)} == {"a", "b"}
+    assert (tmp_path / "count").read_text() == "xx"
+
+
+def test_a_job_that_kills_every_worker(tmp_path):
+    with pytest.raises(QfolioError, match=r"^a was given up.*signal SIGKILL ended its process"):
+        list(Processes(1).map([Die("a", tmp_path / "count", 9)], silent))
+    assert (tmp_path / "count").read_text() == "xxx"
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "message"),
+    [
+        (QfolioError("the loss is not finite."), QfolioError, r"^the loss is not finite\.$"),
+        (ZeroDivisionError("by zero"), RuntimeError, r"(?s)^a failed on a worker:\nTraceback.*by"),
+    ],
+)
+def test_the_error_of_a_job(error, kind, message):
+    with pytest.raises(kind, match=message):
+        list(Processes(1).map([Fail("a", error)], silent))
+
+
+def test_ctrl_c_ends_all_workers_and_keeps_what_is_done(tmp_path):
+    names = ("a", "b")
+    files = [tmp_path / name for name in names]
+    jobs: list[Job] = [Add("done", 1.0), *(Sleep(name, tmp_path) for name in names)]
+
+    def press():
+        wait_for(*files)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=press).start()
+    begun = time.perf_counter()
+    assert [job.name for job, _ in Processes(2).map(jobs, silent)] == ["done"]
+    assert time.perf_counter() - begun < 45
+    assert not any(alive(int(file.read_text())) for file in files)
+
+
+def test_a_reader_that_leaves_ends_all_workers(tmp_path):
+    run = Processes(2).map([Add("done", 1.0), Sleep("a", tmp_path)], silent)
+    next(run)
+    wait_for(tmp_path / "a")
+    run.close()
+    assert not alive(int((tmp_path / "a").read_text()))
+
+
+def test_workers_end_with_a_driver_that_is_killed(tmp_path):
+    code = (
+        "import sys; sys.path[:0] = sys.argv[2:]\n"
+        "from pathlib import Path\n"
+        "from qfolio.experiments.machines.processes import Processes\n"
+        "from jobs import Sleep\n"
+        "if __name__ == '__main__':\n"
+        "    list(Processes(1).map([Sleep('a', Path(sys.argv[1]))], lambda job: ()))\n"
+    )
+    driver = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), *sys.path])
+    wait_for(tmp_path / "a")
+    driver.kill()
+    driver.wait()
+    process, end = int((tmp_path / "a").read_text()), time.perf_counter() + 10
+    while alive(process):
+        assert time.perf_counter() < end
+        time.sleep(0.05)

@@ -1,0 +1,152 @@
+"""Workers that are actors of Ray, on a cluster of several nodes on this machine."""
+
+import importlib.util
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.executor import Executor, Job
+from qfolio.experiments.machines import dispatch
+from qfolio.experiments.machines.choice import on
+from qfolio.experiments.machines.rays import Ray
+
+import jobs
+from jobs import Add, Die, Fail, Sleep, alive
+
+pytestmark = [
+    pytest.mark.filterwarnings("default"),  # Ray's own
+]
+needs_ray = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        importlib.util.find_spec("ray") is None, reason='needs pip install "ray[client]"'
+    ),
+]
+
+
+def silent(job):
+    return ()
+
+
+def test_without_ray(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(QfolioError, match=r'^Ray is not installed; .*pip install "qfolio\[ray\]"'):
+        on("ray")
+
+
+class Nodes:
+    """A cluster of nodes with one core each, and a driver without any."""
+
+    def __init__(self, count):
+        import ray
+        from ray.cluster_utils import Cluster
+
+        self.ray = ray
+        self.cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+        self.nodes = [self.cluster.add_node(num_cpus=1) for _ in range(count)]
+        ray.init(address=self.cluster.address, log_to_driver=False)
+
+    def close(self):
+        self.ray.shutdown()
+        self.cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def nodes():
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setenv("PYTHONPATH", str(Path(jobs.__file__).parent))
+        started = Nodes(3)
+    yield started
+    started.close()
+
+
+class TestRay:
+    pytestmark = needs_ray
+
+    def test_large_arrays_reach_each_worker_once(self, nodes):
+        executor = on("ray")
+        assert isinstance(executor, Executor)
+        assert isinstance(executor, Ray)
+        assert (executor.workers, executor.devices, executor.lockstep) == (3, 1, False)
+        table = np.arange(4000.0)
+        work = [Add(str(i), i, table) for i in range(60)]
+        results = {job.name: result for job, result in executor.map(work, silent)}
+        for i in range(60):
+            np.testing.assert_array_equal(results[str(i)]["sum"], table + i)
+        stored = {(result["place"], result["table"]) for result in results.values()}
+        places = {place for place, _ in stored}
+        assert len(stored) == len(places) > 1
+        assert wait(lambda: not any(map(alive, places)))
+
+    def test_a_killed_worker(self, nodes, tmp_path):
+        work: list[Job] = [Die("a", tmp_path / "count", 1), Add("b", 1.0)]
+        assert {job.name for job, _ in on("ray").map(work, silent)} == {"a", "b"}
+        assert (tmp_path / "count").read_text() == "xx"
+
+    def test_a_job_that_kills_every_worker(self, nodes, tmp_path):
+        with pytest.raises(QfolioError, match=r"^a was given up, because 3 workers ended"):
+            list(on("ray").map([Die("a", tmp_path / "count", 9)], silent))
+
+    def test_the_error_of_a_job(self, nodes):
+        with pytest.raises(QfolioError, match="the loss is not finite"):
+            list(on("ray").map([Fail("a")], silent))
+
+    def test_ctrl_c(self, nodes, tmp_path):
+        names = ("a", "b")
+
+        def press():
+            wait(lambda: all((tmp_path / name).exists() for name in names))
+            os.kill(os.getpid(), signal.SIGINT)
+
+        threading.Thread(target=press).start()
+        work: list[Job] = [Add("done", 1.0), *(Sleep(name, tmp_path) for name in names)]
+        assert [job.name for job, _ in on("ray").map(work, silent)] == ["done"]
+        places = [int((tmp_path / name).read_text()) for name in names]
+        assert wait(lambda: not any(map(alive, places)))
+
+    def test_other_versions_are_refused(self, nodes, monkeypatch):
+        monkeypatch.setattr(dispatch, "versions", lambda: {"qfolio": "99"})
+        with pytest.raises(QfolioError, match=r"^The worker process \d+ on .* this machine 99;"):
+            list(on("ray").map([Add("a", 1.0)], silent))
+
+    def test_a_node_without_qfolio(self, nodes, tmp_path):
+        (tmp_path / "qfolio").mkdir()
+        (tmp_path / "qfolio" / "__init__.py").write_text(
+            "raise ModuleNotFoundError(\"No module named 'qfolio'\")"
+        )
+        bare = nodes.cluster.add_node(
+            num_cpus=1, env_vars={"PYTHONPATH": str(tmp_path)}, resources={"bare": 1}
+        )
+        try:
+            with pytest.raises(QfolioError, match=r"has no qfolio; install qfolio .* on all"):
+                list(on("ray").map([Add(str(i), i) for i in range(4)], silent))
+        finally:
+            nodes.cluster.remove_node(bare)
+
+    def test_a_node_that_goes_away(self, nodes, tmp_path):
+        """Last, because it stays away: its job runs again on the others."""
+        names = [str(i) for i in range(3)]
+
+        def remove():
+            wait(lambda: all((tmp_path / name).exists() for name in names))
+            nodes.cluster.remove_node(nodes.nodes[0], allow_graceful=False)
+
+        threading.Thread(target=remove).start()
+        work = [Sleep(name, tmp_path, seconds=10.0) for name in names]
+        results = {job.name: result for job, result in on("ray").map(work, silent)}
+        assert sorted(results.values()) == ["begun before", "rested", "rested"]
+
+
+def wait(condition):
+    end = time.perf_counter() + 60
+    while not condition():
+        assert time.perf_counter() < end
+        time.sleep(0.05)
+    return True

@@ -1,0 +1,202 @@
+"""The scheduler, without processes; in the simulation, with a clock that jumps."""
+
+import contextlib
+import heapq
+import random
+import threading
+import time
+from dataclasses import dataclass, field
+
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.machines.dispatch import dispatch, drive
+from qfolio.experiments.machines.messages import Done, Failed, Lost, Ready, versions
+from qfolio.experiments.machines.schedule import ATTEMPTS, Schedule
+
+
+@dataclass(frozen=True)
+class Job:
+    name: str
+    seconds: float = 1.0
+
+    def run(self, listeners):
+        raise AssertionError("nobody runs it here")
+
+
+def given(schedule, worker):
+    job = schedule.give(worker)
+    return None if job is None else job.name
+
+
+def test_jobs_go_out_in_order_and_a_lost_one_first():
+    schedule = Schedule(Job(name) for name in "abc")
+    assert [given(schedule, worker) for worker in (0, 1)] == ["a", "b"]
+    assert schedule.lose(0, "x")
+    assert [given(schedule, worker) for worker in (2, 3, 4)] == ["a", "c", None]
+    assert [schedule.finish(worker).name for worker in (1, 3)] == ["b", "c"]
+    assert schedule.under_way
+    assert schedule.finish(2).name == "a"
+    assert not schedule.under_way
+
+
+def test_a_job_that_ends_every_worker_is_given_up():
+    schedule = Schedule([Job("dqn/2001"), Job("other")])
+    for attempt in range(ATTEMPTS - 1):
+        assert given(schedule, attempt) == "dqn/2001"
+        assert schedule.lose(attempt, "SIGKILL")
+    schedule.give(9)
+    with pytest.raises(QfolioError, match=r"^dqn/2001 was given up, because 3 workers.*SIGKILL"):
+        schedule.lose(9, "SIGKILL")
+
+
+def test_a_place_where_no_worker_starts_is_left():
+    schedule = Schedule([Job("a")])
+    assert [schedule.lose(0, "") for _ in range(ATTEMPTS)] == [True, True, False]
+    assert schedule.lose(1, "")
+    schedule.start(1)  # which counts anew
+    assert schedule.lose(1, "")
+
+
+@dataclass
+class Simulated:
+    """Workers on a clock of their own; some are lost in the middle of a job.
+
+    lost: the share of jobs that end their worker. start: seconds of a start. broken: places where
+    none starts.
+    """
+
+    count: int
+    lost: float = 0.0
+    start_seconds: float = 20.0
+    broken: frozenset[int] = frozenset()
+    versions: dict[str, str] = field(default_factory=versions)
+    now: float = 0.0
+    worked: float = 0.0
+    waited: float = 0.0  # real seconds in here
+
+    def __post_init__(self):
+        self.random, self.events, self.starts = random.Random(0), [], 0
+        self.runs: dict[str, int] = {}
+
+    def after(self, seconds, worker, message):
+        heapq.heappush(self.events, (self.now + seconds, len(self.events), worker, message))
+
+    def start(self, worker):
+        self.starts += 1
+        if worker in self.broken:
+            self.after(self.start_seconds, worker, Lost("no such node"))
+        else:
+            self.after(self.start_seconds, worker, Ready(f"worker {worker}", self.versions))
+
+    def send(self, worker, job):
+        self.runs[job.name] = self.runs.get(job.name, 0) + 1
+        if self.random.random() < self.lost:
+            self.after(self.random.random() * job.seconds, worker, Lost("its node went away"))
+        else:
+            self.worked += job.seconds
+            self.after(job.seconds, worker, Done(f"result of {job.name}"))
+
+    def receive(self, seconds):
+        self.now, _, worker, message = heapq.heappop(self.events)
+        return [(worker, message)]
+
+
+def simulate(workers, jobs):
+    """The results by name, and the seconds that the driver needed."""
+    begun = time.perf_counter()
+    run = dispatch(lambda: contextlib.nullcontext(workers), jobs, lambda job: ())
+    results = [(job.name, result) for job, result in run]
+    assert len(results) == len(dict(results))
+    return dict(results), time.perf_counter() - begun
+
+
+def test_ten_thousand_jobs_on_two_hundred_workers_that_fail():
+    draw = random.Random(1)
+    jobs = [Job(f"agent/{i}", draw.expovariate(1 / 60)) for i in range(10_000)]
+    workers = Simulated(200, lost=0.02, broken=frozenset({7, 8}))
+    results, seconds = simulate(workers, jobs)
+    assert results == {job.name: f"result of {job.name}" for job in jobs}
+    again = sum(workers.runs.values()) - len(jobs)
+    assert 100 < again < 400  # those of lost workers only
+    assert workers.starts == 200 + again + 2 * (ATTEMPTS - 1)
+    # All but the two broken places are busy, except for starts, losses and the last jobs.
+    assert workers.worked / (workers.now * 198) > 0.85
+    assert seconds / len(jobs) < 2e-3  # of the driver; about 0.05 ms on one core
+
+
+def test_a_longer_list_costs_no_more_for_each_job():
+    """Nothing that the driver does for a job depends on how many there are."""
+    costs = []
+    for count in (2000, 16_000):
+        _, seconds = simulate(Simulated(50), [Job(str(i)) for i in range(count)])
+        costs.append(seconds / count)
+    assert costs[1] < 4 * costs[0]
+
+
+def test_no_more_workers_than_jobs():
+    workers = Simulated(200)
+    simulate(workers, [Job("a"), Job("b")])
+    assert workers.starts == 2
+    assert simulate(Simulated(3), []) == ({}, pytest.approx(0, abs=1))
+
+
+def test_jobs_are_taken_when_a_worker_is_free():
+    taken = []
+
+    def jobs():
+        for i in range(10):
+            taken.append(i)
+            yield Job(str(i))
+
+    run = dispatch(lambda: contextlib.nullcontext(Slow(2)), jobs(), lambda job: ())
+    next(run)
+    assert len(taken) <= 5
+    assert len(list(run)) == 9
+
+
+class Slow(Simulated):
+    def receive(self, seconds):
+        time.sleep(0.05)
+        return super().receive(seconds)
+
+
+def test_a_worker_with_another_version_is_refused():
+    other = {**versions(), "qfolio": "0.0.9"}
+    message = r"^The worker worker 0 has qfolio 0\.0\.9, and this machine .*; install the same"
+    with pytest.raises(QfolioError, match=message):
+        simulate(Simulated(1, versions=other), [Job("a")])
+
+
+def test_no_worker_that_stays_alive():
+    with pytest.raises(QfolioError, match="No worker stays alive; the last one: no such node"):
+        simulate(Simulated(2, broken=frozenset({0, 1})), [Job("a"), Job("b")])
+
+
+def test_the_error_of_a_job_ends_the_run_behind_what_is_done():
+    class Failing(Simulated):
+        def send(self, worker, job):
+            if job.name == "bad":
+                self.after(job.seconds, worker, Failed("the loss is not finite.", plain=True))
+            else:
+                super().send(worker, job)
+
+    run = dispatch(
+        lambda: contextlib.nullcontext(Failing(2)),
+        [Job("good"), Job("bad", 5.0), Job("long", 50.0)],
+        lambda job: (),
+    )
+    assert next(run)[0].name == "good"
+    with pytest.raises(QfolioError, match=r"^the loss is not finite\.$"):
+        next(run)
+
+
+def test_stopping_gives_out_no_more_jobs():
+    stop, told = threading.Event(), []
+
+    def tell(job, said):
+        told.append(job.name)
+        stop.set()
+
+    drive(Simulated(1), [Job("a"), Job("b")], tell, stop)
+    assert told == ["a"]

@@ -1,0 +1,110 @@
+"""Jobs for tests of executors, in a module that workers can import."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.budget import Budget
+
+
+@dataclass(frozen=True)
+class Add:
+    """Adds a large array, which is the same object for several jobs, to a number."""
+
+    name: str
+    number: float
+    table: Any = field(default_factory=lambda: np.zeros(3))
+
+    def run(self, listeners):
+        return {"sum": self.table + self.number, "place": os.getpid(), "table": id(self.table)}
+
+
+@dataclass(frozen=True)
+class Fail:
+    """Raises an error."""
+
+    name: str
+    error: Exception = field(default_factory=lambda: QfolioError("the loss is not finite."))
+
+    def run(self, listeners):
+        raise self.error
+
+
+@dataclass(frozen=True)
+class Die:
+    """Kills its worker, some times; it counts them in a file."""
+
+    name: str
+    file: Path
+    times: int
+
+    def run(self, listeners):
+        with self.file.open("a+") as file:
+            file.write("x")
+        if len(self.file.read_text()) <= self.times:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return "alive"
+
+
+@dataclass(frozen=True)
+class Sleep:
+    """Says that it has begun, in a file with its process, and takes a while, the first time."""
+
+    name: str
+    folder: Path
+    seconds: float = 60.0
+
+    def run(self, listeners):
+        if (self.folder / self.name).exists():
+            return "begun before"
+        (self.folder / f"{self.name}.part").write_text(str(os.getpid()))
+        (self.folder / f"{self.name}.part").rename(self.folder / self.name)
+        time.sleep(self.seconds)
+        return "rested"
+
+
+@dataclass(frozen=True)
+class Tell:
+    """Trains nothing, but its listeners hear of a training."""
+
+    name: str
+
+    def run(self, listeners):
+        training = Pretended()
+        for listener in listeners:
+            listener.on_start(training)
+            training.left = 0
+            listener.on_chunk(training, [{"seed": 0, "episode": 1, "return": 2.5}])
+            listener.on_end(training)
+        return "told"
+
+
+class Pretended:
+    """What a listener reads of a training."""
+
+    def __init__(self):
+        self.budget, self.config, self.begun, self.left = Budget(episodes=4), {"job": "x"}, 0, 4
+        self.seconds, self.steps_per_second, self.seconds_left, self.members = 1.0, 7.0, 3.0, [0]
+
+    @property
+    def share(self):
+        return 1 - self.left / 4
+
+    @property
+    def finished(self):
+        return self.left == 0
+
+
+def alive(process: int) -> bool:
+    """Whether a process runs; a dead one that nobody has waited for does not."""
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"

@@ -1,0 +1,158 @@
+"""Backtests and studies on several workers equal those in one process, to the bit."""
+
+import multiprocessing
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from qfolio.experiments.executor import Here
+from qfolio.experiments.fit import Listener
+from qfolio.experiments.machines.processes import Processes
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.study.run import Study
+
+from listeners import Interrupt
+
+AGENTS = {
+    "pathwise": Preset(
+        "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (4,)},
+        episodes=8, seeds=2, task={"window": 10, "horizon": 20},
+    ),
+}  # fmt: skip
+DQN = {
+    "dqn": Preset(
+        "dqn",
+        {"network": "mlp", "hidden": (8,), "all_actions": True, "num_envs": 4,
+         "batch_size": 8, "learning_starts": 40, "replay_capacity": 400, "episode_steps": 0},
+        episodes=16, seeds=2, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
+    ),
+}  # fmt: skip
+
+
+def table(seed=0, rows=200):
+    rng = np.random.default_rng(seed)
+    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 30)), axis=0))
+    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    return Prices(dates, tuple(f"A{i}" for i in range(30)), values, source=f"made up {seed}")
+
+
+def create(folder, agents=AGENTS):
+    return Backtest.create(table(), agents, train="80d", test="40d", seeds=2, out=folder)
+
+
+def files(folder):
+    """The content of all files that hold results."""
+    kept = [path for path in folder.rglob("*") if path.suffix in (".safetensors", ".csv")]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in kept}
+
+
+class OneCore(Here):
+    """This process, on the first of its cores: programs that are hardly optimised, as those of the
+    quick tests, round differently on two."""
+
+    devices = 1
+
+    def map(self, jobs, listen):
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
+            yield from super().map(jobs, listen)
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    backtest = create(tmp_path_factory.mktemp("backtests") / "run")
+    backtest.run(executor=OneCore())
+    return files(backtest.folder)
+
+
+class Shares(Listener):
+    def __init__(self, job, into):
+        self.shares = into.setdefault(job.name, [])
+
+    def on_chunk(self, training, rows):
+        self.shares.append(training.share)
+
+
+def test_processes_equal_this_process(here, tmp_path):
+    heard: dict[str, list[float]] = {}
+    backtest = create(tmp_path / "run")
+    backtest.run(lambda job, done, share: [Shares(job, heard)], Processes(2, cores=1))
+    found = files(backtest.folder)
+    assert found.keys() == here.keys()
+    assert [name for name in here if found[name] != here[name]] == []
+    assert len(heard) == 4  # jobs, of which listeners heard until they were finished
+    assert all(shares[-1] == 1.0 for shares in heard.values())
+
+
+@pytest.mark.slow
+def test_stopped_and_resumed_elsewhere(here, tmp_path):
+    """Ctrl-C in the driver keeps what is done; a resumed run asks for the rest alone."""
+    backtest, jobs = create(tmp_path / "run"), []
+
+    def stop_at_the_third(job, done, share):
+        jobs.append(job.name)
+        return [Interrupt()] if len(jobs) == 3 else []
+
+    backtest.run(stop_at_the_third, Processes(1, cores=1))
+    assert backtest.interrupted
+    kept = {f"pathwise/{path.stem}" for path in (tmp_path / "run").rglob("policies/*/*")}
+    assert kept >= set(jobs[:2])
+    resumed, asked = Backtest.open(tmp_path / "run"), []
+
+    def note(job, done, share):
+        asked.append(job.name)
+        return []
+
+    resumed.run(note, Processes(2, cores=1))
+    assert not resumed.interrupted
+    assert set(asked) == {job.name for job in create(None).jobs(OneCore())} - kept
+    assert files(tmp_path / "run") == here
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed(here, tmp_path):
+    """Its job is trained again, by another worker."""
+    backtest, told = create(tmp_path / "run"), []
+
+    class Kill(Listener):
+        def on_start(self, training):
+            for child in multiprocessing.active_children():
+                child.kill()
+
+    def listen(job, done, share):
+        told.append(job.name)
+        return [Kill()] if len(told) == 2 else []
+
+    backtest.run(listen, Processes(1, cores=1))
+    assert len(told) == 5
+    assert told[1] == told[2]
+    assert files(tmp_path / "run") == here
+
+
+@pytest.mark.slow  # and optimised, see OneCore
+def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
+    """Groups of folds differ with the cores of a worker; what is learned does not."""
+    found: list[dict[str, bytes]] = []
+    for executor in (Here(), Processes(1), Processes(2, cores=1)):
+        backtest = create(tmp_path / f"{len(found)}", AGENTS | DQN)
+        backtest.run(executor=executor)
+        found.append(files(backtest.folder))
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.slow
+def test_a_study_on_processes(tmp_path):
+    done: list[Any] = []
+    for executor in (OneCore(), Processes(2, cores=1)):
+        study = Study.create(
+            {"one": table(0), "two": table(1)}, AGENTS, out=tmp_path / f"{len(done)}",
+            costs=(0.001, 0.005), train="80d", test="40d", seeds=2, baselines=[],
+        )  # fmt: skip
+        study.run(executor=executor)
+        assert len(study.config.looks) == 4
+        done.append((study.result(), files(study.folder)))
+    assert done[0] == done[1]
