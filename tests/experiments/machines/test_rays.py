@@ -3,6 +3,8 @@
 import importlib.util
 import os
 import signal
+import socket
+import subprocess
 import sys
 import threading
 import time
@@ -49,7 +51,11 @@ class Nodes:
         from ray.cluster_utils import Cluster
 
         self.ray = ray
-        self.cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        head = {"num_cpus": 0, "ray_client_server_port": self.port}
+        self.cluster = Cluster(initialize_head=True, head_node_args=head)
         self.nodes = [self.cluster.add_node(num_cpus=1) for _ in range(count)]
         ray.init(address=self.cluster.address, log_to_driver=False)
 
@@ -84,6 +90,35 @@ class TestRay:
         places = {place for place, _ in stored}
         assert len(stored) == len(places) > 1
         assert wait(lambda: not any(map(alive, places)))
+
+    @pytest.mark.skipif(
+        importlib.util.find_spec("grpc") is None, reason='needs pip install "ray[client]"'
+    )
+    def test_a_cluster_elsewhere(self, nodes):
+        code = (
+            "import numpy as np\n"
+            "from qfolio.experiments.machines.choice import on\n"
+            "from jobs import Add\n"
+            f"executor = on('ray://127.0.0.1:{nodes.port}')\n"
+            "work = [Add(str(i), i, np.arange(4000.0)) for i in range(9)]\n"
+            "done = {job.name: result for job, result in executor.map(work, lambda job: ())}\n"
+            "print(executor.workers, sum(result['sum'][1] for result in done.values()))\n"
+        )
+        environment = os.environ | {"PYTHONPATH": str(Path(jobs.__file__).parent)}
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True, text=True, timeout=120, env=environment, check=False,
+        )  # fmt: skip
+        assert done.stdout == "3 45.0\n", done.stderr
+
+    def test_a_cluster_that_is_not_there(self):
+        done = subprocess.run(
+            [sys.executable, "-m", "qfolio", "backtest", "--on", "ray://127.0.0.1:1"],
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+        assert done.returncode == 2
+        assert done.stderr.startswith("qfolio: The Ray cluster ray://127.0.0.1:1 cannot be reached")
+        assert len(done.stderr.splitlines()) == 1
 
     def test_a_killed_worker(self, nodes, tmp_path):
         work: list[Job] = [Die("a", tmp_path / "count", 1), Add("b", 1.0)]

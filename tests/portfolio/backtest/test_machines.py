@@ -1,5 +1,7 @@
 """Backtests and studies on several workers equal those in one process, to the bit."""
 
+import importlib
+import importlib.util
 import multiprocessing
 from typing import Any
 
@@ -7,11 +9,13 @@ import jax
 import numpy as np
 import pytest
 
+from qfolio.core.registry import trust
 from qfolio.experiments.executor import Here
 from qfolio.experiments.fit import Listener
+from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.processes import Processes
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.run import LATEST, Backtest
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.study.run import Study
 
@@ -145,6 +149,20 @@ def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # Ray's own
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason='needs pip install "ray"')
+def test_ray_equals_this_process(here, tmp_path):
+    ray = importlib.import_module("ray")
+    ray.init(num_cpus=2, log_to_driver=False)
+    try:
+        backtest = create(tmp_path / "run")
+        backtest.run(executor=on("ray"))
+    finally:
+        ray.shutdown()
+    assert files(backtest.folder) == here
+
+
+@pytest.mark.slow
 def test_a_study_on_processes(tmp_path):
     done: list[Any] = []
     for executor in (OneCore(), Processes(2, cores=1)):
@@ -156,3 +174,32 @@ def test_a_study_on_processes(tmp_path):
         assert len(study.config.looks) == 4
         done.append((study.result(), files(study.folder)))
     assert done[0] == done[1]
+
+
+OWN = """
+import jax.numpy as jnp
+from qfolio.portfolio.rewards import Log
+
+class Twice(Log):
+    def __call__(self, state, outcome):
+        reward, state = super().__call__(state, outcome)
+        return 2 * reward, state
+"""
+
+
+@pytest.mark.slow
+def test_workers_import_what_the_user_has_named(tmp_path, monkeypatch):
+    """A reward of the user's own, which the settings of the task name."""
+    (tmp_path / "own_reward_of_a_test.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    trust(["own_reward_of_a_test"])
+    preset = AGENTS["pathwise"]
+    task = {**preset.task, "reward": "own_reward_of_a_test:Twice"}
+    backtest = create(tmp_path / "run", {"pathwise": preset._replace(task=task)})
+    backtest.run(executor=Processes(1, cores=1))
+    policy = create(None)  # of the ordinary reward
+    policy.run(executor=Processes(1, cores=1))
+    rewards = [np.mean([row["return"] for row in made.records("pathwise", LATEST)])
+               for made in (backtest, policy)]  # fmt: skip
+    assert rewards[0] == pytest.approx(2 * rewards[1], rel=0.5)
+    assert rewards[0] != rewards[1]

@@ -8,6 +8,7 @@ import contextlib
 import logging
 import pickle
 import re
+import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -141,7 +142,9 @@ def _connected(address: str | None) -> Any:
         ) from None
     if not ray.is_initialized():
         try:
-            ray.init(address, logging_level=logging.ERROR, log_to_driver=False)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what matters becomes an exception
+                ray.init(address, logging_level=logging.ERROR, log_to_driver=False)
         except (ConnectionError, ValueError, RuntimeError) as error:
             (first, *_) = str(error).strip().splitlines() or [type(error).__name__]
             raise QfolioError(
