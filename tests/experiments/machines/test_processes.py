@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from qfolio.experiments.fit import Listener
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.processes import Processes
 
+import jobs
 from jobs import Add, Die, Fail, Sleep, Tell, alive
 
 
@@ -58,10 +60,10 @@ def test_texts_that_name_executors():
 
 def test_long_lived_workers_get_a_large_array_once():
     table = np.arange(4000.0)
-    jobs = [Add(str(i), i, table) for i in range(40)]
-    results = {job.name: result for job, result in Processes(1).map(jobs, silent)}
-    assert results.keys() == {job.name for job in jobs}
-    for i, result in enumerate(results[job.name] for job in jobs):
+    work = [Add(str(i), i, table) for i in range(40)]
+    results = {job.name: result for job, result in Processes(1).map(work, silent)}
+    assert results.keys() == {job.name for job in work}
+    for i, result in enumerate(results[job.name] for job in work):
         np.testing.assert_array_equal(result["sum"], table + i)
     assert len({(result["place"], result["table"]) for result in results.values()}) == 1
     assert results["0"]["place"] != os.getpid()
@@ -89,8 +91,8 @@ def test_listeners_hear_of_trainings_on_workers():
 
 
 def test_the_job_of_a_killed_worker_runs_again(tmp_path):
-    jobs: list[Job] = [Die("a", tmp_path / "count", 1), Add("b", 1.0)]
-    assert {job.name for job, _ in Processes(1).map(jobs, silent)} == {"a", "b"}
+    work: list[Job] = [Die("a", tmp_path / "count", 1), Add("b", 1.0)]
+    assert {job.name for job, _ in Processes(1).map(work, silent)} == {"a", "b"}
     assert (tmp_path / "count").read_text() == "xx"
 
 
@@ -115,7 +117,7 @@ def test_the_error_of_a_job(error, kind, message):
 def test_ctrl_c_ends_all_workers_and_keeps_what_is_done(tmp_path):
     names = ("a", "b")
     files = [tmp_path / name for name in names]
-    jobs: list[Job] = [Add("done", 1.0), *(Sleep(name, tmp_path) for name in names)]
+    work: list[Job] = [Add("done", 1.0), *(Sleep(name, tmp_path) for name in names)]
 
     def press():
         wait_for(*files)
@@ -123,7 +125,7 @@ def test_ctrl_c_ends_all_workers_and_keeps_what_is_done(tmp_path):
 
     threading.Thread(target=press).start()
     begun = time.perf_counter()
-    assert [job.name for job, _ in Processes(2).map(jobs, silent)] == ["done"]
+    assert [job.name for job, _ in Processes(2).map(work, silent)] == ["done"]
     assert time.perf_counter() - begun < 45
     assert not any(alive(int(file.read_text())) for file in files)
 
@@ -134,6 +136,24 @@ def test_a_reader_that_leaves_ends_all_workers(tmp_path):
     wait_for(tmp_path / "a")
     run.close()
     assert not alive(int((tmp_path / "a").read_text()))
+
+
+@pytest.mark.slow
+def test_a_script_that_its_workers_run_again(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys; sys.path[:0] = sys.argv[1:]\n"
+        "from qfolio.experiments.machines.processes import Processes\n"
+        "from jobs import Add\n"
+        "list(Processes(1).map([Add('a', 1.0)], lambda job: ()))\n"
+    )
+    command = [sys.executable, str(script), str(Path(jobs.__file__).parent)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    (*_, last) = done.stderr.splitlines()
+    assert last.endswith(
+        "QfolioError: No worker stays alive; the last one: its process ended with code 1 as it "
+        'started; a script needs if __name__ == "__main__": around the call.'
+    )
 
 
 def test_workers_end_with_a_driver_that_is_killed(tmp_path):

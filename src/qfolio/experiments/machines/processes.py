@@ -73,7 +73,7 @@ class _Pool:
         self._packer = Packer()
         self._processes: dict[int, SpawnProcess] = {}
         self._pipes: dict[int, connection.Connection] = {}
-        self._sent: dict[int, set[str]] = {}
+        self._sent: dict[int, set[str]] = {}  # arrays, by worker that has said something
 
     def start(self, worker: int) -> None:
         ours, theirs = _SPAWN.Pipe()
@@ -83,7 +83,6 @@ class _Pool:
         process.start()
         theirs.close()  # the worker's copy alone is left, so that its end is the pipe's
         self._processes[worker], self._pipes[worker] = process, ours
-        self._sent[worker] = set()
 
     def send(self, worker: int, job: Job) -> None:
         parcel = self._packer.pack(job)
@@ -101,6 +100,7 @@ class _Pool:
             worker = workers[pipe]
             try:
                 heard.append((worker, pickle.loads(pipe.recv_bytes())))
+                self._sent.setdefault(worker, set())
             except (EOFError, OSError):
                 heard.append((worker, Lost(self._bury(worker))))
         return heard
@@ -122,8 +122,12 @@ class _Pool:
         code = process.exitcode
         process.close()
         if code is not None and code < 0:
-            return f"signal {signal.Signals(-code).name} ended its process"
-        return f"its process ended with code {code}"
+            why = f"signal {signal.Signals(-code).name} ended its process"
+        else:
+            why = f"its process ended with code {code}"
+        if self._sent.pop(worker, None) is None:
+            why += ' as it started; a script needs if __name__ == "__main__": around the call'
+        return why
 
 
 @contextlib.contextmanager
