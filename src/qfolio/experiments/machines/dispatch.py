@@ -7,10 +7,9 @@ writes files or a report.
 import threading
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from itertools import chain, islice
 from queue import Empty, SimpleQueue
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.executor import Job
@@ -54,16 +53,17 @@ class Workers(Protocol):
         ...
 
 
-@dataclass
-class _Began:
-    job: Job
+class _Began(NamedTuple):
+    """A worker begins a job."""
 
 
-@dataclass
-class _Ended:
+class _Ended(NamedTuple):
     """The thread has ended, with an error or without."""
 
     error: BaseException | None
+
+
+News = _Began | Report | Done
 
 
 def dispatch(
@@ -75,7 +75,7 @@ def dispatch(
 
     Ctrl-C stops all workers at once; results that have arrived are still yielded.
     """
-    heard: SimpleQueue[tuple[Job | None, Any]] = SimpleQueue()
+    heard: SimpleQueue[tuple[Job[R], News] | _Ended] = SimpleQueue()
     stop = threading.Event()
 
     def talk() -> None:
@@ -85,7 +85,7 @@ def dispatch(
                 drive(workers, jobs, lambda job, said: heard.put((job, said)), stop)
         except BaseException as raised:
             error = raised
-        heard.put((None, _Ended(error)))
+        heard.put(_Ended(error))
 
     thread = threading.Thread(target=talk, daemon=True, name="qfolio-driver")
     listeners: dict[str, Sequence[Listener]] = {}
@@ -96,13 +96,14 @@ def dispatch(
                 if interrupted.is_set():
                     stop.set()
                 try:
-                    job, said = heard.get(timeout=PATIENCE)
+                    next_heard = heard.get(timeout=PATIENCE)
                 except Empty:
                     continue
-                if job is None:
-                    if said.error is not None:
-                        raise said.error
+                if isinstance(next_heard, _Ended):
+                    if next_heard.error is not None:
+                        raise next_heard.error
                     return
+                job, said = next_heard
                 if isinstance(said, Done):
                     listeners.pop(job.name, None)
                     yield job, said.result
@@ -119,8 +120,8 @@ def dispatch(
 
 def drive(
     workers: Workers,
-    jobs: Iterable[Job],
-    tell: Callable[[Job, _Began | Report | Done], None],
+    jobs: Iterable[Job[R]],
+    tell: Callable[[Job[R], News], None],
     stop: threading.Event,
 ) -> None:
     """Gives every job to a worker, and again if the worker is lost, until all are done.
@@ -165,7 +166,7 @@ def drive(
             if job is None:
                 break
             worker = idle.pop()
-            tell(job, _Began(job))
+            tell(job, _Began())
             workers.send(worker, job)
 
 

@@ -2,6 +2,7 @@
 
 from collections import Counter, deque
 from collections.abc import Iterable
+from typing import Generic, TypeVar
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.executor import Job
@@ -9,21 +10,23 @@ from qfolio.experiments.executor import Job
 ATTEMPTS = 3
 """Workers that may be lost to one job, and starts in a row that may fail in one place."""
 
+R = TypeVar("R")
 
-class Schedule:
+
+class Schedule(Generic[R]):
     """Gives jobs to workers in their order; the job of a lost worker is given out again, first.
 
     jobs: taken one by one, when a worker is free. Workers are numbers.
     """
 
-    def __init__(self, jobs: Iterable[Job]) -> None:
+    def __init__(self, jobs: Iterable[Job[R]]) -> None:
         self._jobs = iter(jobs)
-        self._again: deque[Job] = deque()
-        self._running: dict[int, Job] = {}
+        self._again: deque[Job[R]] = deque()
+        self._running: dict[int, Job[R]] = {}
         self._losses: Counter[str] = Counter()
         self._failed_starts: Counter[int] = Counter()
 
-    def give(self, worker: int) -> Job | None:
+    def give(self, worker: int) -> Job[R] | None:
         """The next job for a worker that is free; None if there is none at present."""
         job = self._again.popleft() if self._again else next(self._jobs, None)
         if job is not None:
@@ -35,7 +38,7 @@ class Schedule:
         """Whether a job is running or waits to run again."""
         return bool(self._running or self._again)
 
-    def of(self, worker: int) -> Job:
+    def of(self, worker: int) -> Job[R]:
         """The job that a worker runs."""
         return self._running[worker]
 
@@ -43,7 +46,7 @@ class Schedule:
         """A worker has started."""
         self._failed_starts[worker] = 0
 
-    def finish(self, worker: int) -> Job:
+    def finish(self, worker: int) -> Job[R]:
         """A worker has finished its job, which is returned."""
         return self._running.pop(worker)
 
