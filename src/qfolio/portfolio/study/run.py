@@ -8,8 +8,7 @@ trained, so that nothing is chosen after a result is known.
 import contextlib
 import itertools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.statistics import holm
-from qfolio.experiments.executor import Executor, Here, Job
-from qfolio.experiments.fit import Listener
+from qfolio.experiments.executor import Executor, Here
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.assessment import Assessment
@@ -32,7 +30,6 @@ from qfolio.portfolio.backtest.folds import require_fold
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe
-from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.study.folder import (
     NAME,
@@ -45,9 +42,9 @@ from qfolio.portfolio.study.folder import (
     VariantResult,
 )
 from qfolio.portfolio.study.pooling import AGAINST, Finding, Pooled, Pools, TableReturns, pool
+from qfolio.portfolio.study.training import Listen, Trainings, of_table
 from qfolio.portfolio.study.verdict import verdicts
 
-Listen = Callable[[Job, float, float], Sequence[Listener]]
 Report = Callable[[Backtest, dict[str, Entry], Assessment, list[str], Why | None], None]
 
 
@@ -125,7 +122,7 @@ class Study:
         with new_folder(Path(out)) as folder:
             files = StudyFolder(folder)
             for (name, table), variant in itertools.product(kept.items(), variants):
-                with _of(name):
+                with of_table(name):
                     Backtest.create(
                         table,
                         agents,
@@ -177,7 +174,7 @@ class Study:
 
     def run(
         self,
-        listen: Callable[[str, Variant, Backtest], Listen] | None = None,
+        listen: Listen | None = None,
         report: Report | None = None,
         executor: Executor | None = None,
     ) -> None:
@@ -195,36 +192,17 @@ class Study:
         """
         executor = executor or Here()
         missing = [place for place in self.places if not self.finished(*place)]
-        running: dict[str, _Running] = {}  # by the names of their jobs
-
-        def jobs() -> Iterator[PlacedJob]:
-            for table, variant in missing:
-                with _of(table):
-                    backtest = self.backtest(table, variant)
-                made = [PlacedJob(table, variant, job) for job in backtest.jobs(executor)]
-                place = _Running(table, variant, backtest, len(made))
-                running.update((job.name, place) for job in made)
-                yield from made
-
-        def listeners(job: Job[dict[str, TrainedFold]]) -> Sequence[Listener]:
-            assert isinstance(job, PlacedJob)
-            place = running[job.name]
-            if listen is not None and place.listen is None:
-                place.listen = listen(place.table, place.variant, place.backtest)
-            done, share = (place.count - place.left) / place.count, 1 / place.count
-            return [] if place.listen is None else place.listen(job.job, done, share)
-
+        trainings = Trainings(missing, self.backtest, executor, listen)
         with contextlib.ExitStack() as stack:
             stack.enter_context(locked(self.folder))
             for table, variant in missing:
                 stack.enter_context(locked(self._files.place(table, variant)))
             stop = stack.enter_context(interruptible())
-            finished = stack.enter_context(contextlib.closing(executor.map(jobs(), listeners)))
+            finished = stack.enter_context(
+                contextlib.closing(executor.map(trainings.jobs(), trainings.listeners))
+            )
             for job, trained in finished:
-                assert isinstance(job, PlacedJob)
-                place = running.pop(job.name)
-                place.backtest.store(job.job, trained)
-                place.left -= 1
+                place = trainings.store(job, trained)
                 if not (place.left or stop.is_set()):
                     self._conclude(place.table, place.variant, place.backtest, report)
             for table, variant in missing:  # those of which nothing but the end was missing
@@ -236,7 +214,7 @@ class Study:
         self, table: str, variant: Variant, backtest: Backtest, report: Report | None
     ) -> None:
         """Replays a backtest that has been trained, which is a look at its table."""
-        with _of(table):
+        with of_table(table):
             entries, notes = backtest.entries()
             assessment = backtest.assess(entries)
             why = explain(backtest, entries) if variant == self.config.variants[0] else None
@@ -290,38 +268,6 @@ class Study:
         looks.sort(key=lambda look: order.index((look.table, look.lag, look.cost)))
         self.config = msgspec.structs.replace(self.config, looks=looks)
         self._files.write(self.config)
-
-
-@dataclass(frozen=True)
-class PlacedJob:
-    """A job of one of the study's backtests."""
-
-    table: str
-    variant: Variant
-    job: FoldsJob
-
-    @property
-    def name(self) -> str:
-        return f"{self.table}/{self.variant.name}/{self.job.name}"
-
-    def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:
-        with _of(self.table):
-            return self.job.run(listeners)
-
-
-@dataclass
-class _Running:
-    """A backtest in training: its jobs, and those that are left."""
-
-    table: str
-    variant: Variant
-    backtest: Backtest
-    count: int
-    left: int = field(init=False)
-    listen: Listen | None = None
-
-    def __post_init__(self) -> None:
-        self.left = self.count
 
 
 def summarise(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]]) -> Result:
@@ -410,12 +356,3 @@ def _require_plan(tables: Mapping[str, Prices], variants: Sequence[Variant]) -> 
             raise QfolioError(
                 f"A lag of {variant.lag} with a cost of {variant.bps:g} bp is given twice."
             )
-
-
-@contextlib.contextmanager
-def _of(table: str) -> Iterator[None]:
-    """Errors in this block name the table."""
-    try:
-        yield
-    except QfolioError as error:
-        raise QfolioError(f"{table}: {error}") from None

@@ -1,0 +1,102 @@
+"""Training the backtests of a study: the jobs of one after another, as workers become free."""
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.executor import Executor, Job
+from qfolio.experiments.fit import Listener
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
+from qfolio.portfolio.study.folder import Variant
+
+ListenToJob = Callable[[Job, float, float], Sequence[Listener]]
+"""The ``listen`` of ``Backtest.run``."""
+
+Listen = Callable[[str, Variant, Backtest], ListenToJob]
+
+
+@dataclass(frozen=True)
+class PlacedJob:
+    """A job of the backtest of one table and variant."""
+
+    table: str
+    variant: Variant
+    job: FoldsJob
+
+    @property
+    def name(self) -> str:
+        return f"{self.table}/{self.variant.name}/{self.job.name}"
+
+    def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:
+        with of_table(self.table):
+            return self.job.run(listeners)
+
+
+@dataclass
+class Place:
+    """A backtest in training, with the number of its jobs, and of those that are left."""
+
+    table: str
+    variant: Variant
+    backtest: Backtest
+    count: int
+    left: int
+    listen: ListenToJob | None = None
+
+
+class Trainings:
+    """The training that backtests miss, for an executor.
+
+    places: tables and variants. open_backtest: called when a worker is free for its first job.
+    listen: called when that begins.
+    """
+
+    def __init__(
+        self,
+        places: Iterable[tuple[str, Variant]],
+        open_backtest: Callable[[str, Variant], Backtest],
+        executor: Executor,
+        listen: Listen | None,
+    ) -> None:
+        self._places, self._open, self._executor = list(places), open_backtest, executor
+        self._listen = listen
+        self._of: dict[str, Place] = {}  # the place of each job that is not finished
+
+    def jobs(self) -> Iterator[PlacedJob]:
+        """The jobs, of one backtest after another."""
+        for table, variant in self._places:
+            with of_table(table):
+                backtest = self._open(table, variant)
+            made = [PlacedJob(table, variant, job) for job in backtest.jobs(self._executor)]
+            place = Place(table, variant, backtest, len(made), len(made))
+            self._of.update((job.name, place) for job in made)
+            yield from made
+
+    def listeners(self, job: Job[dict[str, TrainedFold]]) -> Sequence[Listener]:
+        """The listeners of a job that begins."""
+        if self._listen is None:
+            return []
+        assert isinstance(job, PlacedJob)
+        place = self._of[job.name]
+        if place.listen is None:
+            place.listen = self._listen(place.table, place.variant, place.backtest)
+        return place.listen(job.job, 1 - place.left / place.count, 1 / place.count)
+
+    def store(self, job: Job[dict[str, TrainedFold]], trained: dict[str, TrainedFold]) -> Place:
+        """Keeps what a job has trained, and returns its backtest's place."""
+        assert isinstance(job, PlacedJob)
+        place = self._of.pop(job.name)
+        place.backtest.store(job.job, trained)
+        place.left -= 1
+        return place
+
+
+@contextlib.contextmanager
+def of_table(name: str) -> Iterator[None]:
+    """Errors in this block name the table."""
+    try:
+        yield
+    except QfolioError as error:
+        raise QfolioError(f"{name}: {error}") from None
