@@ -105,6 +105,10 @@ class Actor:
     def _run(self, parcel: "Parcel", arrays: dict[str, Any]) -> None:
         import ray
 
-        lacking = self._unpacker.lacks(parcel)
-        self._unpacker.keep({digest: ray.get(arrays[digest]) for digest in lacking})
+        try:
+            lacking = self._unpacker.lacks(parcel)
+            self._unpacker.keep({digest: ray.get(arrays[digest]) for digest in lacking})
+        except Exception:  # an answer is due, or the driver would wait for it forever
+            self._said.put(Failed(traceback.format_exc(), plain=False))
+            return
         work(self._unpacker, parcel, self._said.put)
