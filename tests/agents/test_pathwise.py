@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from equinox import filter_jit as jit
 
-from qfolio.agents.pathwise import Band, Pathwise, PathwiseState, Slopes
+from qfolio.agents.pathwise import Band, Paths, Pathwise, PathwiseState, Slopes
+from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.mdp import Position
 from qfolio.core.training import advance, begin, chunk_steps
@@ -86,6 +87,33 @@ def test_the_slopes_see_the_place_in_the_band():
     assert found[0] == found[1]
     assert found[4] == found[5]
     assert found[1] != found[2] != found[3]
+
+
+def test_paths_start_anywhere_and_in_the_band_and_so_do_their_images():
+    task, policy = NoTrade(), started(-1 / 16, 1 / 16).policy
+    market = jax.vmap(lambda key: 0.02 * jax.random.normal(key))(start_keys(90)).reshape(3, 30)
+    start = jax.vmap(task.draw_holding)(start_keys(30))
+    paths = Paths(market[:2], market[1:], jnp.ones((2, 30, 1, 1, 1)), start)
+    spread = paths.spread(task, policy, jax.random.key(0))
+    weights, before = spread.start.weights[:, 1], start.weights[:, 1]
+    np.testing.assert_array_equal(weights[::2], before[::2])
+    low, high = edges(policy, np.array([0.0, 1.0]))
+    assert np.all((weights[1::2] >= low.min()) & (weights[1::2] <= high.max()))
+    assert np.std(weights[1::2]) > (high - low).max() / 5
+    assert not np.all((before[1::2] >= low.min()) & (before[1::2] <= high.max()))
+    np.testing.assert_allclose(spread.start.weights.sum(1), 1, rtol=1e-6)
+
+    both = spread.with_images(task)
+    assert both.shape == (2, 60)
+    np.testing.assert_array_equal(both.start.weights[:30], both.start.weights[30:])
+    np.testing.assert_array_equal(both.market[1], both.next_market[0])
+    mean = (task.rate - task.volatility**2 / 2) * task.dt
+    np.testing.assert_allclose(both.next_market.mean(), mean, atol=1e-7)
+
+
+def test_a_rollout_needs_a_second_decision_to_learn_slopes():
+    with pytest.raises(QfolioError, match="must be 2 or more"):
+        Pathwise(bootstrap=True, rollout_length=20, tail=19)
 
 
 def _view(holdings):

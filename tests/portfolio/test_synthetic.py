@@ -6,11 +6,11 @@ import pytest
 from equinox import filter_jit as jit
 
 from qfolio.agents.dqn import DQN
-from qfolio.agents.pathwise import Pathwise
+from qfolio.agents.pathwise import Paths, Pathwise
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import evaluate, start_keys
-from qfolio.core.mdp import Agent, Position, Transition
+from qfolio.core.mdp import Agent, Position
 from qfolio.core.registry import TASKS, find
 from qfolio.portfolio.costs import remainder_factor
 from qfolio.portfolio.synthetic.ar1 import Ar1
@@ -181,6 +181,16 @@ def test_no_trade_pays_expected_growth():
     assert traded < jnp.log(cost) + 0.001
 
 
+def test_a_path_and_its_mirror_image_have_opposite_shocks():
+    task, start = NoTrade(dt=1 / 252), jnp.array(0.0)
+    moves = jax.vmap(lambda key: task.next_market(start, key))(start_keys(100))
+    images = jax.vmap(task.mirror)(moves)
+    np.testing.assert_allclose(jax.vmap(task.mirror)(images), moves, atol=1e-8)
+    mean = (task.rate - task.volatility**2 / 2) * task.dt
+    np.testing.assert_allclose((moves + images) / 2, mean, atol=1e-8)
+    assert Ar1().mirror(Ar1().reset_market(jax.random.key(0))) is None
+
+
 def test_the_stationary_signal():
     task = Ar1()
     signals = jax.vmap(task.reset_market)(start_keys(4000))
@@ -212,11 +222,9 @@ def test_gradient_of_a_rollout_against_finite_differences(tail):
         markets.append(after(markets[-1], jax.random.split(key, 3)))
     stack = lambda trees: jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *trees)  # noqa: E731
     holdings = stack([starts.holding] * 8)
-    states = Position(stack(markets[:-1]), holdings)
-    rollout = Transition(
-        states, jax.jit(jax.vmap(jax.vmap(task.observe)))(states), jnp.zeros(8), jnp.zeros(8),
-        Position(stack(markets[1:]), holdings), None, jnp.zeros(8), jnp.zeros(8),
-    )  # fmt: skip
+    now, after = stack(markets[:-1]), stack(markets[1:])
+    seen = jax.jit(jax.vmap(jax.vmap(task.observe)))(Position(now, holdings))
+    paths = Paths(now, after, seen.features, starts.holding)
 
     def with_linear(linear):
         return eqx.tree_at(lambda p: p.network.linear, policy, linear)
@@ -236,7 +244,7 @@ def test_gradient_of_a_rollout_against_finite_differences(tail):
 
     @jax.jit
     def loss(linear, nudges):
-        return agent._loss(with_linear(linear), nudges, None, task, rollout)[0]
+        return agent._loss(with_linear(linear), nudges, None, task, paths)[0]
 
     gradient, worth = jax.jit(jax.grad(loss, (0, 1)))(linear, zeros)
     assert abs(gradient).max() > 1e-4

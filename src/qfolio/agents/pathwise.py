@@ -8,7 +8,8 @@ previous weights is the holding here). docs/pathwise.md lists formulas and devia
 """
 
 import math
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -117,6 +118,59 @@ class PathwiseState(eqx.Module):
     slope_optimizer: Optimizer | None
 
 
+class Paths(NamedTuple):
+    """Paths of a market, and the holdings that they begin with."""
+
+    market: PyTree  # before each move: (time, path, …)
+    next_market: PyTree  # after it
+    features: Float[Array, "time path asset window channel"]
+    start: PyTree  # (path, …)
+
+    @staticmethod
+    def of(rollout: Transition) -> "Paths":
+        start = jax.tree.map(lambda x: x[0], rollout.state.holding)
+        markets = rollout.state.market, rollout.next_state.market
+        return Paths(*markets, rollout.observation.features, start)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Times and paths."""
+        time, paths, *_ = self.features.shape
+        return time, paths
+
+    def spread(self, task: ExogenousTask, policy: Band, key: PRNGKeyArray) -> "Paths":
+        """The paths, every second one beginning at a random place in the band.
+
+        From elsewhere the first trade leads to an edge. Few paths would cross a wide band, and the
+        slopes would be learned from little there.
+        """
+        market = jax.tree.map(lambda x: x[0], self.market)
+        view = jax.vmap(task.observe)(Position(market, self.start))
+        low, high = policy.edges(policy.network.read(view.features), view.holding)
+        inside = low + jax.random.uniform(key, low.shape) * (high - low)
+        inside = policy(view._replace(holding=inside))[..., -low.shape[-1] :]  # on the simplex
+        second = (jnp.arange(len(low)) % 2 == 1)[:, None]
+        by = jnp.where(second, inside - view.holding, 0.0)
+        return self._replace(start=jax.vmap(task.shift)(self.start, by))
+
+    def with_images(self, task: ExogenousTask) -> "Paths":
+        """The paths and, beside them, their mirror images, if the market has any.
+
+        These are antithetic paths (Hammersley & Morton 1956). A band adapts to the mean return of
+        the paths that it is learned from. Over 10,000 years at a volatility of 20 % this differs
+        from the true one by 0.2 % a year, and edges by .01; paths and images have the true one.
+        """
+        market, next_market = (jax.vmap(jax.vmap(task.mirror))(x) for x in self[:2])
+        if market is None:
+            return self
+        seen = jax.vmap(lambda now: jax.vmap(task.observe)(Position(now, self.start)))(market)
+        images = market, next_market, seen.features
+        beside = partial(jax.tree.map, lambda *pair: jnp.concatenate(pair, 1))
+        start = jax.tree.map(lambda x: jnp.concatenate([x, x]), self.start)
+        market, next_market, features = map(beside, self[:3], images)
+        return Paths(market, next_market, features, start)
+
+
 class Pathwise(OnPaths):
     """Gradient ascent on net growth through whole rollouts."""
 
@@ -151,6 +205,11 @@ class Pathwise(OnPaths):
         if self.tail >= self.rollout_length:
             raise QfolioError(
                 f"tail is {self.tail}; it must be less than rollout_length, {self.rollout_length}."
+            )
+        if self.bootstrap and self.rollout_length - self.tail < 2:
+            raise QfolioError(
+                "bootstrap learns from all decisions but the first; rollout_length less tail must "
+                "be 2 or more."
             )
 
     def init(self, task: Task, key: PRNGKeyArray) -> PathwiseState:
@@ -195,11 +254,16 @@ class Pathwise(OnPaths):
     ) -> tuple[PathwiseState, Metrics]:
         assert isinstance(task, ExogenousTask)
 
+        paths = Paths.of(rollout)
+        if state.slopes is not None:
+            paths = paths.spread(task, state.policy, key)
+        paths = paths.with_images(task)
+
         def update(state: PathwiseState, _: None) -> tuple[PathwiseState, Float[Array, ""]]:
-            nudges = jnp.zeros(rollout.observation.holding.shape)
+            nudges = jnp.zeros((*paths.shape, rollout.observation.holding.shape[-1]))
             differentiate = jax.value_and_grad(self._loss, (0, 1), has_aux=True)
             (loss, held), (gradient, worth) = differentiate(
-                state.policy, nudges, state.slopes, task, rollout
+                state.policy, nudges, state.slopes, task, paths
             )
             rate = self._schedule(state.optimizer.count + 1)
             gradient = optimizer.clip(gradient, self.max_grad_norm)
@@ -207,9 +271,10 @@ class Pathwise(OnPaths):
             slopes, slope_adam = state.slopes, state.slope_optimizer
             if slopes is not None and slope_adam is not None:
                 cut = len(held)
-                views = View(rollout.observation.features[:cut], held)
+                # Without the first holdings, which may be far from any that the policy leads to.
+                views = View(paths.features[1:cut], held[1:])
                 # Of the sum of a path's rewards; the loss is minus a mean.
-                worth = -worth[:cut] * rollout.reward.size
+                worth = -worth[1:cut] * math.prod(held.shape[:2])
 
                 def off(slopes: Slopes) -> Float[Array, ""]:
                     return ((slopes(state.policy, views) - worth) ** 2).mean()
@@ -229,9 +294,9 @@ class Pathwise(OnPaths):
         nudges: Float[Array, "time batch asset"],
         slopes: Slopes | None,
         task: ExogenousTask,
-        rollout: Transition,
+        paths: Paths,
     ) -> tuple[Float[Array, ""], Float[Array, "decision batch asset"]]:
-        """Minus the mean reward per step of ``policy`` along the rollout's market; the holdings.
+        """Minus the mean reward per step of ``policy`` along the paths; the holdings.
 
         Holdings are those before each decision that has a gradient. nudges: zeros, added to the
         holdings; their gradient says what more of an asset is worth.
@@ -248,15 +313,14 @@ class Pathwise(OnPaths):
                 reward, holding = jax.vmap(task.settle)(market, next_market, holding, action)
                 return holding, (reward, off, view.holding)
 
-            moves = (rollout.state.market, rollout.next_state.market, rollout.observation, nudges)
-            market, next_market, seen, nudge = jax.tree.map(lambda x: x[steps], moves)
+            moves = (paths.market, paths.next_market, paths.features, nudges)
+            market, next_market, features, nudge = jax.tree.map(lambda x: x[steps], moves)
             # All windows are read at once, before the scan over holdings.
-            reading = policy.network.read(seen.features)
+            reading = policy.network.read(features)
             return lax.scan(step, holding, (market, next_market, reading, nudge))
 
-        start = jax.tree.map(lambda x: x[0], rollout.state.holding)
         cut = self.rollout_length - self.tail
-        holding, (rewards, off, held) = follow(policy, start, slice(None, cut))
+        holding, (rewards, off, held) = follow(policy, paths.start, slice(None, cut))
         total = rewards.sum()
         if self.tail:
             # Without a tail, a trade near the end would pay its cost without earning its return.
@@ -264,7 +328,7 @@ class Pathwise(OnPaths):
             total += later.sum()
         total *= self.reward_scale
         if slopes is not None:
-            market = jax.tree.map(lambda x: x[-1], rollout.next_state.market)
+            market = jax.tree.map(lambda x: x[-1], paths.next_market)
             view = jax.vmap(task.observe)(Position(market, holding))
             total += (lax.stop_gradient(slopes(policy, view)) * view.holding).sum()
         return self.simplex_penalty * off.mean() - total / rewards.size, held

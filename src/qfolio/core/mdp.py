@@ -210,6 +210,13 @@ class ExogenousTask(Task):
         """The reward to compare a move's others with, if the task has one."""
         return None
 
+    def mirror(self, market: PyTree) -> PyTree | None:
+        """The state on the mirror image of a path, if each path is as likely as its mirror image.
+
+        Applied to every state of a path of the market.
+        """
+        return None
+
     @abc.abstractmethod
     def settle(
         self, market: PyTree, next_market: PyTree, holding: PyTree, action: Array

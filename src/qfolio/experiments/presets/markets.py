@@ -75,8 +75,8 @@ PRESETS: Presets = {
     # worth beyond the rollout. All gradients are cut, so that the long first ones, far from the
     # region, do not outweigh the later ones in Adam's mean of squares.
     ("market/no-trade", "pathwise"): _pathwise(
-        12_800,
-        num_envs=32,
+        6400,
+        num_envs=16,
         rollout_length=480,
         bootstrap=True,
         slope_learning_rate_ratio=40.0,

@@ -54,6 +54,10 @@ class NoTrade(OneAsset):
     def next_market(self, market: Array, key: PRNGKeyArray) -> Float[Array, ""]:
         return self._log_relative(jax.random.normal(key))
 
+    def mirror(self, market: Array) -> Float[Array, ""]:
+        """The log relative with the opposite shock."""
+        return 2 * self._log_relative(jnp.array(0.0)) - market
+
     def _log_relative(self, shock: Array) -> Array:
         mean = (self.rate - self.volatility**2 / 2) * self.dt
         return mean + self.volatility * self.dt**0.5 * shock
