@@ -28,7 +28,14 @@ def test_every_seed_is_within_a_percent_of_the_optimum(task, agent):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("fraction", "cost", "steps"),
-    [(0.15, 0.01, 12), (0.2, 0.01, 12), (0.8, 0.01, 12), (0.5, 0.01, 252), (0.1, 0.0025, 252)],
+    [
+        (0.1, 0.03, 252),
+        (0.9, 0.03, 252),
+        (0.1, 0.0025, 252),
+        (0.5, 0.01, 252),
+        (0.3, 0.01, 52),
+        (0.8, 0.01, 12),
+    ],
 )
 def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps):
     """The best weight without costs, the cost, and steps a year."""
@@ -50,9 +57,12 @@ def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps):
         ("0.9,0.98", "-0.004,0.001", 0.005),
         ("0.98,0.9", "-0.001,0.004", 0.005),
         ("0.8,0.95", "-0.01,0.002", 0.01),
+        ("0.95", "0.002", 0.01),
+        ("0.98,0.99", "-0.002,0.001", 0.01),
+        ("0.9,0.7", "-0.005,0.01", 0.0),
     ],
 )
-def test_asymmetric_regimes_are_found(agent, stay, mean, cost):
+def test_other_regimes_are_found(agent, stay, mean, cost):
     preset = PRESETS["market/regime", agent]["fast"]
     task = {**preset.task, "stay": stay, "mean": mean, "cost": cost}
     market = settings.build(find("task", "market/regime"), task)

@@ -176,7 +176,7 @@ class Pathwise(OnPaths):
 
     network: str = static("mlp")  # mlp, cnn or rnn, shared by all assets
     hidden: tuple[int, ...] = sizes(32, 32)
-    num_envs: int = static(64)  # paths in a batch
+    num_envs: int = static(64)  # paths in a batch, without mirror images
     rollout_length: int = static(50)  # steps of each path that a gradient goes through
     tail: int = static(0)  # of these, last steps without a gradient of their own
     bootstrap: bool = static(False)  # learn what the last holdings are worth after the rollout
