@@ -86,6 +86,9 @@ def test_active_rewards_are_those_over_the_anchors():
     held = total.settle(state.market, moved, anchor, anchor.weights)[0]
     assert active == pytest.approx(float(reward - held), abs=1e-7)
     np.testing.assert_array_equal(after.weights, same.weights)
+    averse = planted(tracking_aversion=200.0)
+    less = averse.settle(state.market, moved, state.holding, order)[0]
+    assert less == pytest.approx(float(active - 100 * active**2), abs=1e-7)
     assert abs(task.settle(state.market, moved, anchor, anchor.weights)[0]) < 1e-7
 
 

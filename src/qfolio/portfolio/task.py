@@ -53,6 +53,7 @@ class Portfolio(Market):
     anchor: str = static("")  # that agents may depart from, see portfolio.anchors
     reward: str = static("log")
     active: bool = static(False)  # rewards are those over the anchor's
+    tracking_aversion: float = number(0.0)  # half of it times the square of these is subtracted
     risk_aversion: float = number(3.0)
     sharpe_rate: float = number(0.01)
     horizon: int = static(50)
@@ -101,6 +102,7 @@ class Portfolio(Market):
         require(self, "lag", lambda x: 0 <= x <= 1000, "from 0 to 1000 rows")
         require(self, "max_weight", lambda x: 0 < x <= 1, "above 0 and at most 1")
         require(self, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
+        require(self, "tracking_aversion", lambda x: 0 <= x <= 1e4, "from 0 to 10,000")
         _ = self.parts  # which check their own settings
         if self.active and not self.anchor:
             raise QfolioError(
@@ -221,11 +223,15 @@ class Portfolio(Market):
         """As in any market; ``active`` subtracts what holding the anchor earns, free of cost.
 
         That depends on the market alone: the best policy stays the same, and the noise goes that
-        all policies share (input-dependent baselines, Mao et al. 2019).
+        all policies share (input-dependent baselines, Mao et al. 2019). ``tracking_aversion`` adds
+        a price of tracking error, as the mean of squares is nearly the variance.
         """
         reward, after = super().settle(market, next_market, holding, action)
         shared = self.reference(market, next_market) if self.active else None
-        return reward if shared is None else reward - shared, after
+        if shared is None:
+            return reward, after
+        over = reward - shared
+        return over - self.tracking_aversion / 2 * over**2, after
 
     def relatives(self, market: Row, next_market: Row) -> Relatives:
         # Rows up to market + lag + 1 exist for every decision that is settled.

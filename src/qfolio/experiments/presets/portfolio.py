@@ -23,6 +23,7 @@ _ON_SIGNALS = {
     "horizon": 50,
     "reward": "log",
     "active": True,
+    "tracking_aversion": 10.0,
     "signals": SIGNALS,
     "anchor": "equal-weight",
 }
