@@ -19,7 +19,7 @@ from qfolio.core.registry import trust, trusted
 class Parcel(NamedTuple):
     """A job without its large arrays.
 
-    arrays: their digests. modules: a user's own, which settings of the job may name.
+    arrays: their digests. modules: a user's own, which the job names.
     """
 
     job: bytes
@@ -49,7 +49,9 @@ class Packer:
                 return digest
 
         Pickler(file, protocol=5).dump(job)
-        return Parcel(file.getvalue(), tuple(needs), tuple(trusted()))
+        content = file.getvalue()
+        named = (module for module in trusted() if module.encode() in content)
+        return Parcel(content, tuple(needs), tuple(named))
 
     def _digest(self, array: Any) -> str:
         if id(array) not in self._known:

@@ -1,0 +1,27 @@
+"""Jobs as bytes: what travels with them."""
+
+import numpy as np
+
+from qfolio.core import registry
+from qfolio.core.population import LARGE
+from qfolio.experiments.machines.parcels import Packer, Unpacker
+
+
+def test_only_modules_that_a_job_names_travel_with_it(monkeypatch):
+    monkeypatch.setattr(registry, "_trusted", {"math", "elsewhere"})
+    packer = Packer()
+    assert packer.pack({"reward": "math:Mine"}).modules == ("math",)
+    assert packer.pack({"reward": "log"}).modules == ()
+
+
+def test_a_large_array_travels_beside_its_jobs_once():
+    packer, large = Packer(), np.arange(LARGE)
+    first, second = packer.pack((1, large)), packer.pack((2, large))
+    assert first.arrays == second.arrays == tuple(packer.arrays)
+    unpacker = Unpacker()
+    assert unpacker.lacks(first) == list(first.arrays)
+    unpacker.keep(packer.arrays)
+    (one, mine), (two, same) = unpacker.unpack(first), unpacker.unpack(second)
+    assert (one, two) == (1, 2)
+    assert mine is same
+    np.testing.assert_array_equal(mine, large)
