@@ -227,11 +227,12 @@ class Portfolio(Market):
         a price of tracking error, as the mean of squares is nearly the variance.
         """
         reward, after = super().settle(market, next_market, holding, action)
-        shared = self.reference(market, next_market) if self.active else None
-        if shared is None:
-            return reward, after
-        over = reward - shared
-        return over - self.tracking_aversion / 2 * over**2, after
+        if self.active:
+            shared = self.reference(market, next_market)
+            assert shared is not None  # there is an anchor
+            reward -= shared
+            reward -= self.tracking_aversion / 2 * reward**2
+        return reward, after
 
     def relatives(self, market: Row, next_market: Row) -> Relatives:
         # Rows up to market + lag + 1 exist for every decision that is settled.

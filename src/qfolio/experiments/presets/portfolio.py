@@ -18,6 +18,22 @@ SHORT_SIGNALS = "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,moving
 """Those that pay off within days: values of single moves are too noisy for slower ones."""
 
 
+_ON_ANCHOR = {"window": 1, "horizon": 84, "signals": SIGNALS, "anchor": "equal-weight"}
+
+
+_ON_MENU = {
+    "window": 1,
+    "horizon": 64,
+    "reward": "log",
+    "signals": SHORT_SIGNALS,
+    "anchor": "equal-weight",
+    "menu": "signals:2",
+}
+
+
+_ON_COVARIANCE = {"window": 504, "horizon": 63, "anchor": "equal-weight"}
+
+
 _ON_SIGNALS = {
     "window": 1,
     "horizon": 50,
@@ -64,9 +80,9 @@ _PATHWISE = {
 }
 
 
-# The agents below estimate gradients from the rewards of their own actions. They take few gradient
-# steps, because daily returns have far more noise than signal, discount strongly, because a trade
-# pays off within days, and explore near their holdings, because trades cost.
+# The agents below estimate gradients from the rewards of their own actions. They take small steps,
+# because daily returns have far more noise than signal, discount strongly, because a trade pays off
+# within days, and explore near their holdings, because trades cost.
 _ON_POLICY = {
     "network": "positions",
     "num_envs": 16,
@@ -121,17 +137,10 @@ _TD3 = {**_DDPG, "target_noise": 0.01, "target_noise_clip": 0.02}
 _SAC = {**_OFF_POLICY, "initial_temperature": 0.001}
 
 
-def _on_weights(agent: str, settings: dict[str, Any], episodes: int) -> dict[str, Preset]:
-    return {"fast": Preset(agent, settings, episodes, seeds=5, task=_TASK)}
-
-
-def _on_signals(agent: str, settings: dict[str, Any], episodes: int) -> dict[str, Preset]:
-    return {"fast": Preset(agent, settings, episodes, seeds=5, task=_ON_SIGNALS)}
-
-
-def _on_covariance(agent: str, episodes: int) -> dict[str, Preset]:
-    task = {"window": 504, "horizon": 63, "anchor": "equal-weight"}
-    return {"fast": Preset(agent, {}, episodes=episodes, seeds=5, task=task)}
+def _fast(
+    agent: str, settings: dict[str, Any], episodes: int, task: dict[str, Any]
+) -> dict[str, Preset]:
+    return {"fast": Preset(agent, settings, episodes, seeds=5, task=task)}
 
 
 def of_any(agent: str) -> Preset:
@@ -140,38 +149,17 @@ def of_any(agent: str) -> Preset:
 
 
 PRESETS: Presets = {
-    ("portfolio", "dqn"): {
-        "fast": Preset(
-            "dqn",
-            _DQN,
-            episodes=224,
-            seeds=5,
-            task={
-                "window": 1,
-                "horizon": 64,
-                "reward": "log",
-                "signals": SHORT_SIGNALS,
-                "anchor": "equal-weight",
-                "menu": "signals:2",
-            },
-        ),
-    },
-    ("portfolio", "pathwise"): _on_weights("pathwise", _PATHWISE, episodes=800),
-    ("portfolio", "tilts"): {
-        "fast": Preset(
-            "tilts",
-            {},
-            episodes=1920,
-            seeds=5,
-            task={"window": 1, "horizon": 84, "signals": SIGNALS, "anchor": "equal-weight"},
-        )
-    },
-    ("portfolio", "mean-variance-learned"): _on_covariance("mean-variance-learned", 640),
-    ("portfolio", "minimum-variance-learned"): _on_covariance("minimum-variance-learned", 1920),
-    ("portfolio", "ppo"): _on_signals("ppo", _PPO, episodes=4800),
-    ("portfolio", "a2c"): _on_signals("a2c", _A2C, episodes=4800),
-    ("portfolio", "reinforce"): _on_signals("reinforce", _REINFORCE, episodes=4800),
-    ("portfolio", "ddpg"): _on_signals("ddpg", _DDPG, episodes=800),
-    ("portfolio", "td3"): _on_signals("td3", _TD3, episodes=800),
-    ("portfolio", "sac"): _on_signals("sac", _SAC, episodes=800),
+    ("portfolio", "dqn"): _fast("dqn", _DQN, 224, _ON_MENU),
+    ("portfolio", "pathwise"): _fast("pathwise", _PATHWISE, 800, _TASK),
+    ("portfolio", "tilts"): _fast("tilts", {}, 1920, _ON_ANCHOR),
+    ("portfolio", "mean-variance-learned"): _fast("mean-variance-learned", {}, 640, _ON_COVARIANCE),
+    ("portfolio", "minimum-variance-learned"): _fast(
+        "minimum-variance-learned", {}, 1920, _ON_COVARIANCE
+    ),
+    ("portfolio", "ppo"): _fast("ppo", _PPO, 4800, _ON_SIGNALS),
+    ("portfolio", "a2c"): _fast("a2c", _A2C, 4800, _ON_SIGNALS),
+    ("portfolio", "reinforce"): _fast("reinforce", _REINFORCE, 4800, _ON_SIGNALS),
+    ("portfolio", "ddpg"): _fast("ddpg", _DDPG, 800, _ON_SIGNALS),
+    ("portfolio", "td3"): _fast("td3", _TD3, 800, _ON_SIGNALS),
+    ("portfolio", "sac"): _fast("sac", _SAC, 800, _ON_SIGNALS),
 }
