@@ -1,10 +1,11 @@
-"""Weights of least variance and of equal risk: optimality conditions, and skfolio's answers."""
+"""Least variance, equal risk, the highest ratio: optimality conditions, and skfolio's answers."""
 
 import numpy as np
 import pytest
-from skfolio.optimization import MeanRisk, RiskBudgeting
+from skfolio.optimization import MeanRisk, ObjectiveFunction, RiskBudgeting
 
 from qfolio.core.errors import QfolioError
+from qfolio.solvers.maximum_ratio import maximum_ratio
 from qfolio.solvers.minimum_variance import minimum_variance
 from qfolio.solvers.risk_budgeting import equal_risk
 
@@ -53,6 +54,49 @@ def test_equal_risk_is_equal_and_that_of_skfolio() -> None:
     w = equal_risk(few)
     np.testing.assert_allclose(w * (few @ w), w @ few @ w / len(w), rtol=1e-6)
     np.testing.assert_allclose(equal_risk(np.diag([1.0, 4.0])), [2 / 3, 1 / 3])
+
+
+def ratio(weights: np.ndarray, mean: np.ndarray, sigma: np.ndarray) -> float:
+    return float(mean @ weights / np.sqrt(weights @ sigma @ weights))
+
+
+@pytest.mark.parametrize("cap", [1.0, 0.4, 0.2, 0.1])
+def test_the_highest_ratio_is_no_lower_than_that_of_skfolio(cap: float) -> None:
+    rising = returns() + 0.001
+    mean, sigma = rising.mean(axis=0), np.cov(rising.T)
+    w = maximum_ratio(mean, sigma, cap)
+    assert w.sum() == pytest.approx(1, abs=1e-12)
+    assert w.min() >= 0
+    assert w.max() <= cap + 1e-15
+    goal = ObjectiveFunction.MAXIMIZE_RATIO
+    theirs = MeanRisk(objective_function=goal, max_weights=cap).fit(rising).weights_
+    np.testing.assert_allclose(w, theirs, atol=2e-3)
+    assert ratio(w, mean, sigma) >= ratio(theirs, mean, sigma) - 1e-9
+    # No shift of weight from an asset to another raises the ratio.
+    slope = mean / (mean @ w) - sigma @ w / (w @ sigma @ w)
+    takes, gives = slope[w < cap - 1e-12], slope[w > 0]
+    assert gives.min() >= takes.max() - 1e-6
+
+
+def test_the_highest_ratio_of_uncorrelated_assets() -> None:
+    found = maximum_ratio([4e-4, 4e-4, -1e-4], np.diag([1.0, 2.0, 4.0]) * 1e-4)
+    np.testing.assert_allclose(found, [2 / 3, 1 / 3, 0], rtol=1e-9)
+    np.testing.assert_allclose(maximum_ratio([1.0, 1.0], np.ones((2, 2))), 0.5)  # twins
+    np.testing.assert_array_equal(maximum_ratio([3.0], [[2.0]]), [1.0])
+    np.testing.assert_array_equal(maximum_ratio([1.0, 2.0], np.eye(2), 0.5), [0.5, 0.5])
+
+
+def test_ratios_without_a_highest() -> None:
+    with pytest.raises(QfolioError, match="no mean is positive"):
+        maximum_ratio([-1.0, 0.0], np.eye(2))
+    with pytest.raises(QfolioError, match="is there no risk at all"):
+        maximum_ratio([1.0, 1.0], np.array([[1.0, -1.0], [-1.0, 1.0]]))
+    with pytest.raises(QfolioError, match="do not fit"):
+        maximum_ratio([1.0, 1.0], np.eye(3))
+    with pytest.raises(QfolioError, match="finite"):
+        maximum_ratio([1.0, np.nan], np.eye(2))
+    with pytest.raises(QfolioError, match="too low for 3 assets"):
+        maximum_ratio([1.0, 1.0, 1.0], np.eye(3), 0.2)
 
 
 def test_covariances_that_cannot_be() -> None:

@@ -39,14 +39,13 @@ def prices(
         date: Column of dates (default: found by its name).
     """
     from qfolio.commands import console
-    from qfolio.portfolio.prices.table import check, describe, load
+    from qfolio.portfolio.prices.table import describe, inspect
 
-    options: dict[str, Any] = dict(missing=missing, late=late, features=features, date=date)
-    findings = check(file, **options)
+    table, findings = inspect(file, missing=missing, late=late, features=features, date=date)
     console.print_findings(findings)
-    if any(finding.severity == "error" for finding in findings):
+    if table is None:
         sys.exit(2)
-    console.print_prices(describe(load(file, **options)))
+    console.print_prices(describe(table))
 
 
 def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> None:

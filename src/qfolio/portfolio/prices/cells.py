@@ -152,9 +152,8 @@ def dates(cells: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
         codes, unique = pd.factorize(cells)
     except TypeError:  # lists and the like
         codes, unique = pd.factorize(np.array([str(cell) for cell in cells], dtype=object))
-    firsts = [int(m[1]) for m in map(_year_last, unique) if m]
-    seconds = [int(m[2]) for m in map(_year_last, unique) if m]
-    day_first, month_first = max(firsts, default=0) > 12, max(seconds, default=0) > 12
+    ends = [match for match in map(_year_last, unique) if match]
+    day_first, month_first = (any(int(match[k]) > 12 for match in ends) for k in (1, 2))
     order = None if day_first == month_first else "day" if day_first else "month"
     moments = [_moment(cell, order) for cell in unique]
     aware = [m for m in moments if isinstance(m, datetime) and m.tzinfo]

@@ -168,8 +168,9 @@ def _from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set
         raise QfolioError(f"{quote(name)} is not UTF-8 text; save the table as CSV (UTF-8).")
     if not text.strip():
         raise QfolioError(f"{quote(name)} is empty.")
-    separator = max(",;\t|", key=lambda mark: len(_records(text, mark, 1)[0][0]))
-    records, blank = _records(text, separator, 4)
+    lines = io.StringIO(text, newline="")
+    separator = max(",;\t|", key=lambda mark: len(_records(lines, mark, 1)[0][0]))
+    records, blank = _records(lines, separator, 4)
     header = parse_header(records)
     if len(header.names) < 2:
         raise QfolioError(
@@ -195,9 +196,10 @@ class _Layout(NamedTuple):
     width: int  # cells of the widest row
 
 
-def _records(text: str, separator: str, count: int) -> tuple[list[list[str]], int]:
+def _records(lines: io.StringIO, separator: str, count: int) -> tuple[list[list[str]], int]:
     """Up to ``count`` records from the first that is not blank, and how many were blank before."""
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+    lines.seek(0)
+    reader = csv.reader(lines, delimiter=separator)
     found: list[list[str]] = []
     blank = 0
     try:

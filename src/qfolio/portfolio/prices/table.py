@@ -189,9 +189,9 @@ def load(
     """
     if isinstance(source, Prices):
         return source
-    prices, findings = _read(source, missing, late, features, date)
-    errors = [finding for finding in findings if finding.severity == "error"]
-    if prices is None or errors:
+    prices, findings = inspect(source, missing=missing, late=late, features=features, date=date)
+    if prices is None:
+        errors = [finding for finding in findings if finding.severity == "error"]
         shown = "; ".join(str(finding) for finding in errors[:2])
         rest = sum(finding.count for finding in errors[2:])
         more = f"; and {rest:,} more" if rest else ""
@@ -201,23 +201,40 @@ def load(
     return prices
 
 
-def check(
+def check(source: Any = None, **options: Any) -> list[Finding]:
+    """All findings on a table; ``inspect`` without its prices."""
+    return inspect(source, **options)[1]
+
+
+def inspect(
     source: Any = None,
     *,
     missing: str = "error",
     late: str = "error",
     features: Sequence[str] = (),
     date: str | None = None,
-) -> list[Finding]:
-    """All errors, warnings and notes on a table, by row and column; the arguments are ``load``'s.
+) -> tuple[Prices | None, list[Finding]]:
+    """The prices, and all errors, warnings and notes on a table, by row and column.
 
-    At most five cells of one kind are named, the others are counted. ``load`` succeeds with the
-    same arguments exactly if no finding is an error.
+    The arguments are ``load``'s. At most five cells of one kind are named, the others are counted.
+
+    Returns:
+        The prices, which are None exactly if a finding is an error, and the findings.
 
     Raises:
         QfolioError: There is no table to check: no such file, not text, rows of unequal length.
     """
-    return _read(source, missing, late, features, date)[1]
+    label, note = "", ""
+    if source is None:
+        from skfolio.datasets import load_sp500_dataset
+
+        source, label, note = load_sp500_dataset(), DEFAULT_SOURCE, DEFAULT_NOTE
+    table = reading.read(source, lambda names: text_columns(names, date))
+    channels = (features,) if isinstance(features, str) else tuple(features)
+    content, findings = examine(table, missing, late, channels, date)
+    if not content:
+        return None, findings
+    return Prices(**content, source=label or table.source, note=note), findings
 
 
 def describe(prices: Prices) -> dict[str, Any]:
@@ -239,20 +256,3 @@ def describe(prices: Prices) -> dict[str, Any]:
 def trials_on(source: str) -> int:
     """Known earlier trials on prices from a source, for the deflated Sharpe ratio."""
     return DEFAULT_TRIALS if source == DEFAULT_SOURCE else 0
-
-
-def _read(
-    source: Any, missing: str, late: str, features: Sequence[str], date: str | None
-) -> tuple[Prices | None, list[Finding]]:
-    """The prices (None if the table has errors) and all findings."""
-    label, note = "", ""
-    if source is None:
-        from skfolio.datasets import load_sp500_dataset
-
-        source, label, note = load_sp500_dataset(), DEFAULT_SOURCE, DEFAULT_NOTE
-    table = reading.read(source, lambda names: text_columns(names, date))
-    channels = (features,) if isinstance(features, str) else tuple(features)
-    content, findings = examine(table, missing, late, channels, date)
-    if not content:
-        return None, findings
-    return Prices(**content, source=label or table.source, note=note), findings

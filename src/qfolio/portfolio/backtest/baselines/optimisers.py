@@ -4,23 +4,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.portfolio.backtest.baselines.base import Fitted, Floats
+from qfolio.solvers.maximum_ratio import maximum_ratio
 from qfolio.solvers.risk_budgeting import equal_risk
+
+ORDERED = 300
+"""Assets up to which the tree is ordered, which takes a time that grows with their fourth power."""
 
 
 class MaximumRatio(Fitted):
-    """The long-only portfolio of the highest Sharpe ratio, by skfolio."""
+    """The long-only portfolio of the highest Sharpe ratio."""
 
     def fit(self, returns: Floats, cap: float) -> Floats:
-        from skfolio.exceptions import SkfolioError
-        from skfolio.optimization import MeanRisk, ObjectiveFunction
-
-        goal = ObjectiveFunction.MAXIMIZE_RATIO
-        try:
-            # skfolio raises ValueError if no portfolio has a positive return or returns are few.
-            found = MeanRisk(objective_function=goal, max_weights=cap).fit(returns)
-        except SkfolioError as error:
-            raise ValueError(str(error)) from error
-        return np.asarray(found.weights_)
+        return maximum_ratio(returns.mean(axis=0), np.atleast_2d(np.cov(returns.T)), cap)
 
 
 class RiskBudgeting(Fitted):
@@ -36,7 +31,8 @@ class HierarchicalRiskParity(Fitted):
     M. López de Prado, "Building Diversified Portfolios that Outperform Out of Sample" (2016): a
     tree of their correlations orders the assets, and the order is halved again and again; the two
     halves of each cluster share its weight in inverse proportion to their variances, with weights
-    ∝ 1/σ² inside. The tree is Ward's and neighbours are as near as it allows, as in skfolio.
+    ∝ 1/σ² inside. The tree is Ward's and neighbours are as near as it allows, as in skfolio. Beyond
+    ``ORDERED`` assets the order is the tree's own, as in the paper.
     """
 
     def fit(self, returns: Floats, cap: float) -> Floats:
@@ -57,7 +53,7 @@ class HierarchicalRiskParity(Fitted):
         correlations = covariance / np.sqrt(np.outer(variances, variances))
         distances = np.sqrt(np.clip((1 - correlations) / 2, 0, 1))
         near = squareform(distances, checks=False)
-        clusters = [leaves_list(linkage(near, "ward", optimal_ordering=True))]
+        clusters = [leaves_list(linkage(near, "ward", optimal_ordering=len(weights) <= ORDERED))]
         while clusters:
             cluster = clusters.pop()
             left, right = np.array_split(cluster, [len(cluster) // 2])

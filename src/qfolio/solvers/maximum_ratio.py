@@ -1,0 +1,92 @@
+"""The long-only portfolio of the highest ratio of mean to deviation, with a cap on each weight."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qfolio.solvers.shared import require
+
+
+def maximum_ratio(
+    mean: ArrayLike, covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-10
+) -> NDArray[np.float64]:
+    """The weights w that maximise μ'w/√(w'Σw) with Σw = 1 and 0 ≤ w ≤ cap.
+
+    The ratio does not depend on the scale of w, so that w = y/Σy, where y minimises
+    ½ y'Σy − μ'y with 0 ≤ y ≤ cap Σy (cf. G. Cornuéjols and R. Tütüncü, "Optimization Methods in
+    Finance", 2006, section 8.2). A primal-dual interior-point method (Wright 1997, chapter 5)
+    finds y, with multipliers z of y ≥ 0 and v of cap Σy − y ≥ 0. An iteration solves one system.
+
+    Args:
+        mean: μ, shape (asset,); at least one is positive.
+        covariance: Σ, shape (asset, asset), positive semidefinite.
+        cap: Largest weight, at least 1/assets.
+        tol: Largest gap between the primal and the dual value that is accepted, relative to μ'y.
+
+    Returns:
+        Weights of shape (asset,); those that are zero or at the cap are so exactly.
+
+    Raises:
+        QfolioError: The arguments are invalid, no mean is positive, the cap is too low, or there is
+            no convergence, as without any risk.
+    """
+    mu, sigma = np.asarray(mean, dtype=float), np.asarray(covariance, dtype=float)
+    count = len(mu)
+    require(
+        mu.ndim == 1 and sigma.shape == (count, count),
+        f"means of shape {mu.shape} do not fit a covariance of shape {sigma.shape}",
+    )
+    require(
+        bool(np.isfinite(mu).all() and np.isfinite(sigma).all()),
+        "means and covariances must be finite numbers",
+    )
+    scale = float(np.trace(sigma)) / count
+    require(scale > 0, "a covariance needs some variance, else no ratio is the highest")
+    require(float(mu.max()) > 0, "no mean is positive, so that no ratio is")
+    require(cap * count >= 1 - 1e-12, f"a cap of {cap:g} is too low for {count} assets")
+    if cap * count <= 1 + 1e-9 or count == 1:
+        return np.full(count, 1 / count)
+    mu, sigma = mu / mu.max(), sigma / scale
+    capped, diagonal = cap < 1, np.diag_indices(count)
+
+    def room(y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The distance from the cap, and as a matrix its own transpose; free without a cap."""
+        return cap * y.sum() - y if capped else np.zeros(count)
+
+    y = np.full(count, max(mu.mean(), 0.1) * count / max(sigma.sum(), 1.0))
+    z, v = np.ones(count), np.full(count, 1.0 if capped else 0.0)
+    solved = False
+    for _ in range(100):
+        s = room(y) if capped else np.ones(count)
+        slope = sigma @ y - mu
+        size = float(mu @ y)
+        gap = float(y @ z + s @ v)
+        off = float(np.abs(slope - z - room(v)).max())
+        solved = gap <= tol * abs(size) and off <= tol
+        if solved:
+            break
+        target = 0.1 * gap / (count * (1 + capped))
+        pushed = target / s if capped else v
+        system = sigma.copy()
+        system[diagonal] += z / y
+        if capped:
+            ratio = v / s
+            system += cap * (cap * ratio.sum() - ratio[:, None] - ratio)
+            system[diagonal] += ratio
+        try:
+            step = np.linalg.solve(system, target / y + room(pushed) - slope)
+        except np.linalg.LinAlgError:
+            break
+        step_s = room(step)
+        step_z = target / y - z - z / y * step
+        step_v = pushed - v - v / s * step_s
+        length = 1.0
+        for value, change in ((y, step), (s, step_s), (z, step_z), (v, step_v)):
+            falling = change < 0
+            length = min(length, 0.99 * float(np.min(-value[falling] / change[falling], initial=2)))
+        y, z, v = y + length * step, z + length * step_z, v + length * step_v
+    require(solved, "the weights of the highest ratio were not found; is there no risk at all?")
+    full, empty = room(y) < v, y < z
+    w = np.where(full, cap, np.where(empty, 0, y / y.sum()))
+    inside = ~full & ~empty
+    w[inside] *= (1 - w[~inside].sum()) / w[inside].sum() if inside.any() else 1
+    return w
