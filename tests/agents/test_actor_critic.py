@@ -562,6 +562,27 @@ def test_an_actor_explores_by_noise_that_lasts():
     assert DDPG(hidden=(8,)).init(Aim(), jax.random.key(0)).noise is None
 
 
+def test_soft_actor_critic_explores_by_noise_that_lasts():
+    """Each draw alone is the policy's; 1 − θ = 0.6 of the last step's noise stays."""
+    task, n = Aim(), 20_000
+    agent = SAC(hidden=(8,), num_envs=n, noise_theta=0.4, replay_capacity=n, learning_starts=0)
+    state, observation = agent.init(task, jax.random.key(0)), jnp.ones((n, 1))
+    policy, draws = state.learned.actor(observation), []
+    assert isinstance(policy, Squashed)
+    for _ in range(8):
+        state = agent.observe(state, rollout_of(jnp.zeros((1, n))))
+        action = agent.explore(state, observation, jax.random.key(1))
+        draws.append(
+            (jnp.arctanh(action / 2) - policy.normal.mean) / jnp.exp(policy.normal.log_std)
+        )
+    before, last = np.asarray(draws[-2]), np.asarray(draws[-1])
+    np.testing.assert_allclose([last.mean(), last.std()], [0, 1], atol=0.02)
+    np.testing.assert_allclose((before * last).mean(), 0.6, atol=0.02)
+    numbered = SAC(noise_theta=0.4)
+    with pytest.raises(QfolioError, match="those of Pendulum are numbered"):
+        numbered.init(Pendulum(torques=3), jax.random.key(0))
+
+
 def test_warm_up_explores_at_random_and_learning_by_the_actor():
     agent = DDPG(hidden=(8,), num_envs=500, learning_starts=1000, exploration_noise=0.0)
     state = agent.init(Pendulum(torques=0), jax.random.key(0))

@@ -11,7 +11,7 @@ from equinox import filter_jit as jit
 from scipy import stats
 
 from qfolio.agents.a2c import A2C
-from qfolio.agents.on_policy import Batch, normalized
+from qfolio.agents.on_policy import Batch, standardized
 from qfolio.agents.ppo import PPO, clipped, minibatches, shuffled
 from qfolio.agents.reinforce import REINFORCE
 from qfolio.core.errors import QfolioError
@@ -109,9 +109,9 @@ def test_clipped_objective_by_hand():
 
 def test_normalized_by_hand():
     root = np.sqrt(1.5)
-    np.testing.assert_allclose(normalized(jnp.array([1.0, 2, 3])), [-root, 0, root], rtol=1e-6)
+    np.testing.assert_allclose(standardized(jnp.array([1.0, 2, 3])), [-root, 0, root], rtol=1e-6)
     counted = jnp.array([True, True, True, False])
-    some = normalized(jnp.array([1.0, 2, 3, 99]), counted)[:3]
+    some = standardized(jnp.array([1.0, 2, 3, 99]), counted)[:3]
     np.testing.assert_allclose(some, [-root, 0, root], rtol=1e-6)
 
 

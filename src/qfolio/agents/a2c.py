@@ -9,7 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from qfolio.agents.on_policy import OnPolicy, OnPolicyState
 from qfolio.core.fields import number, require, static
-from qfolio.core.mdp import Metrics, Task, Transition
+from qfolio.core.mdp import Metrics, Transition
 
 
 class A2C(OnPolicy):
@@ -23,7 +23,7 @@ class A2C(OnPolicy):
     def __check_init__(self) -> None:
         require(self, "gae_lambda", lambda x: 0 <= x <= 1, "between 0 and 1")
 
-    def learn(
-        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+    def improve(
+        self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
         return self.descend(state, self.judge(state.weights, rollout, self.gae_lambda))

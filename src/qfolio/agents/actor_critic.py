@@ -7,6 +7,7 @@ docs/actor_critic.md lists every formula and its place.
 """
 
 import abc
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -16,11 +17,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio.core.fields import number, require, sizes, static
+from qfolio.core.fields import constant, number, require, sizes, static
 from qfolio.core.mdp import Actions, Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning import networks, optimizer
-from qfolio.learning.exploration import uniform
+from qfolio.learning.exploration import OrnsteinUhlenbeck, uniform
 from qfolio.learning.networks import Flat, LateAction, Network, NetworkConfig
+from qfolio.learning.normalization import Moments, NormalizationConfig, Normalizer, normalized
 from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.positions import OrderValue, Values
 from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
@@ -98,6 +100,11 @@ class Actor(eqx.Module):
 
     network: Callable[[PyTree], Array]
     actions: Actions
+    observations: Moments | None = None  # those it normalises by; None while it learns
+
+    def seen(self, observation: PyTree) -> PyTree:
+        """Observations as the network reads them."""
+        return normalized(self.observations, observation)
 
 
 class Learned(eqx.Module):
@@ -116,10 +123,12 @@ L = TypeVar("L", bound=Learned)
 class ActorCriticState(eqx.Module, Generic[L]):
     """The state of an agent."""
 
-    learned: L
-    replay: Replay
+    learned: L  # of normalised observations and rewards
+    replay: Replay  # of those before
     steps: Int[Array, ""]  # of each environment
     rewards: Float[Array, "2"]  # the lowest and the highest so far
+    normalizer: Normalizer
+    noise: OrnsteinUhlenbeck | None  # of exploration; None: independent at each step
 
 
 State = TypeVar("State", bound=ActorCriticState)
@@ -145,6 +154,9 @@ class ActorCritic(Agent, Generic[L]):
     actor_learning_rate_ratio: float = number(0.3)  # the actor's, as a share of the critics'
     reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, on inputs scaled to ±1; 0: unscaled
+    normalize_observations: bool = static(False)  # to mean 0 and deviation 1, as seen so far
+    normalize_rewards: bool = static(False)  # by the deviation of discounted returns so far
+    noise_theta: float = constant(1.0)  # mean reversion of the noise; 1: independent at each step
     huber_delta: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
     value_rescaling: bool = static(False)  # critics learn roots of values: small ones weigh more
     clip_bootstrap: bool = static(True)  # to the range of values possible with the rewards so far
@@ -152,12 +164,13 @@ class ActorCritic(Agent, Generic[L]):
     def __check_init__(self) -> None:
         self._replay.check()
         self._networks.check()
+        self._normalization.check(self.input_gain)
         self._schedule.check()
         require(self, "gradient_steps", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
         require(self, "actor_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
-        require(self, "discount tau", lambda x: 0 <= x <= 1, "between 0 and 1")
+        require(self, "discount tau noise_theta", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
 
     @property
@@ -169,6 +182,10 @@ class ActorCritic(Agent, Generic[L]):
     @property
     def _networks(self) -> NetworkConfig:
         return NetworkConfig(self.network, self.hidden, self.input_gain)
+
+    @property
+    def _normalization(self) -> NormalizationConfig:
+        return NormalizationConfig(self.normalize_observations, self.normalize_rewards)
 
     @property
     def _schedule(self) -> CosineSchedule:
@@ -194,7 +211,13 @@ class ActorCritic(Agent, Generic[L]):
         row = Experience.like(observation, action, with_last=self.n_steps > 1)
         learned = self.begin(task, observation, key)
         none = jnp.array([jnp.inf, -jnp.inf])
-        return ActorCriticState(learned, self._replay.empty(row), jnp.array(0, jnp.int32), none)
+        noise = None
+        if self.noise_theta < 1:
+            shape = (self.num_envs, action.size)
+            noise = OrnsteinUhlenbeck.begin(jax.random.split(key, 3)[2], shape)
+        normalizer = self._normalization.begin(task, observation, self.num_envs)
+        zero = jnp.array(0, jnp.int32)
+        return ActorCriticState(learned, self._replay.empty(row), zero, none, normalizer, noise)
 
     def warm_up(self) -> int:
         return self._replay.warm_up
@@ -202,7 +225,7 @@ class ActorCritic(Agent, Generic[L]):
     def act(self, state: ActorCriticState[L], observation: PyTree, key: PRNGKeyArray) -> Array:
         random_key, key = jax.random.split(key)
         random = uniform(state.learned.actor.actions, random_key, self.num_envs)
-        action = self.explore(state, observation, key)
+        action = self.explore(state, state.normalizer.observation(observation), key)
         return jnp.where(state.steps < self.warm_up(), random, action)
 
     def observe(self, state: State, rollout: Transition) -> State:
@@ -211,9 +234,16 @@ class ActorCritic(Agent, Generic[L]):
         rewards = jnp.stack(
             [jnp.minimum(lowest, step.reward.min()), jnp.maximum(highest, step.reward.max())]
         )
-        replay = state.replay.add(self.row(state, step))
-        return eqx.tree_at(
-            lambda s: (s.replay, s.steps, s.rewards), state, (replay, state.steps + 1, rewards)
+        noise = state.noise
+        if noise is not None:
+            noise = noise.step(self.noise_theta, (rollout.terminated | rollout.truncated)[-1])
+        return dataclasses.replace(
+            state,
+            replay=state.replay.add(self.row(state, step)),
+            steps=state.steps + 1,
+            rewards=rewards,
+            normalizer=state.normalizer.update(rollout, self.discount),
+            noise=noise,
         )
 
     def row(self, state: ActorCriticState[L], step: Experience) -> PyTree:
@@ -224,13 +254,20 @@ class ActorCritic(Agent, Generic[L]):
         self, task: Task, state: ActorCriticState[L], rollout: Transition, key: PRNGKeyArray
     ) -> tuple[ActorCriticState[L], Metrics]:
         state = self.observe(state, rollout)
-        replay = state.replay
+        replay, now = state.replay, state.normalizer
 
         def draw(key: PRNGKeyArray) -> tuple[Experience, Discount]:
-            return join(replay, replay.draw(key, self.batch_size), self.discount)
+            steps, discount = join(replay, replay.draw(key, self.batch_size), self.discount)
+            steps = steps._replace(
+                observation=now.observation(steps.observation),
+                next_observation=now.observation(steps.next_observation),
+                reward=now.reward(steps.reward),
+            )
+            return steps, discount
 
-        learned, metrics = self.practise(state.learned, draw, state.rewards, key)
-        return eqx.tree_at(lambda s: s.learned, state, learned), metrics
+        learned, metrics = self.practise(state.learned, draw, now.reward(state.rewards), key)
+        metrics["q"] *= now.unit
+        return dataclasses.replace(state, learned=learned), metrics
 
     def practise(
         self, learned: L, draw: Draw, rewards: Float[Array, "2"], key: PRNGKeyArray
@@ -248,7 +285,7 @@ class ActorCritic(Agent, Generic[L]):
         return eqx.tree_at(lambda s: (s.replay, s.rewards), state, (fresh.replay, fresh.rewards))
 
     def weights(self, state: ActorCriticState[L]) -> PyTree:
-        return state.learned.actor
+        return state.normalizer.attached(state.learned.actor)
 
     def target(
         self,

@@ -21,15 +21,13 @@ from qfolio.agents.actor_critic import (
     ActorCriticState,
     Batch,
     Critics,
-    State,
     critic_loss,
 )
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
-from qfolio.core.mdp import Box, Discrete, Metrics, Simplex, Task, Transition
+from qfolio.core.mdp import Box, Discrete, Metrics, Simplex, Task
 from qfolio.learning import optimizer
-from qfolio.learning.exploration import OrnsteinUhlenbeck
 from qfolio.learning.networks import outputs_of, saturation, with_last_layer
 from qfolio.learning.replay import Experience
 from qfolio.learning.targets import Scalar, follow, smallest
@@ -86,15 +84,10 @@ def actor_loss(
     return saturation_penalty * saturation(actor.actions, output, REACH).mean() - value, {}
 
 
-class DDPGState(ActorCriticState[Learned]):
-    noise: OrnsteinUhlenbeck | None  # correlated over time; None: independent at each step
-
-
 class DDPG(ActorCritic[Learned]):
     """A deterministic actor and a critic, both with targets that follow them."""
 
     exploration_noise: float = number(0.1)  # standard deviation of the noise, in units of the bound
-    noise_theta: float = constant(1.0)  # mean reversion of the noise; 1: independent at each step
     saturation_penalty: float = number(0.1)  # on outputs where tanh is flat; 0: none
     late_action: bool = static(False)  # the action enters the critic at its second layer
     critic_weight_decay: float = constant(0.0)  # coefficient of the critic's L2 penalty
@@ -105,14 +98,6 @@ class DDPG(ActorCritic[Learned]):
     def __check_init__(self) -> None:
         scales = "exploration_noise saturation_penalty critic_weight_decay last_layer_bound"
         require(self, scales, lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "noise_theta", lambda x: 0 <= x <= 1, "between 0 and 1")
-
-    def init(self, task: Task, key: PRNGKeyArray) -> DDPGState:
-        start, noise = super().init(task, key), None
-        if self.noise_theta < 1:
-            shape = (self.num_envs, *start.replay.like.action.shape)
-            noise = OrnsteinUhlenbeck.begin(jax.random.split(key, 3)[2], shape)
-        return DDPGState(start.learned, start.replay, start.steps, start.rewards, noise)
 
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
         if isinstance(task.actions, Discrete):
@@ -134,25 +119,16 @@ class DDPG(ActorCritic[Learned]):
         return Learned(actor, critics, critics, begin(actor), begin(critics), actor)
 
     def policy(self, weights: Actor, observation: PyTree) -> Float[Array, "batch entry"]:
-        return weights(observation)
+        return weights(weights.seen(observation))
 
     def explore(
         self, state: ActorCriticState[Learned], observation: PyTree, key: PRNGKeyArray
     ) -> Float[Array, "batch entry"]:
-        assert isinstance(state, DDPGState)
         actor = state.learned.actor
         action = actor(observation)
         process = state.noise
         noise = jax.random.normal(key, action.shape) if process is None else process.value
         return actor.perturb(action, self.exploration_noise * noise)
-
-    def observe(self, state: State, rollout: Transition) -> State:
-        state = super().observe(state, rollout)
-        if isinstance(state, DDPGState) and state.noise is not None:
-            finished = (rollout.terminated | rollout.truncated)[-1]
-            noise = state.noise.step(self.noise_theta, finished)
-            state = eqx.tree_at(lambda s: s.noise, state, noise)
-        return state
 
     def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
         learned, metrics = self.evaluate(learned, batch, key)

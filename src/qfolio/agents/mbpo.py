@@ -8,6 +8,7 @@ counts a real transition 0, 1, 2, … times (on-line bootstrap, Oza & Russell 20
 docs/model_based.md lists formulas and deviations.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -180,6 +181,9 @@ class MBPO(SAC):
         require(self, "elites", lambda x: 0 <= x <= self.ensemble_size, wanted)
         require(self, "real_ratio", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "n_steps", lambda x: x == 1, "1: imagined steps are single")
+        require(self, "noise_theta", lambda x: x == 1, "1: imagined steps have no order")
+        for name in ("normalize_observations", "normalize_rewards"):
+            require(self, name, lambda x: not x, "false: a model imagines steps as they are")
         require_sizes(self, "model_hidden")
 
     def init(self, task: Task, key: PRNGKeyArray) -> MBPOState:
@@ -210,6 +214,8 @@ class MBPO(SAC):
             replay=Replay.empty(rows, self.replay_capacity, self.num_envs),
             steps=start.steps,
             rewards=start.rewards,
+            normalizer=start.normalizer,
+            noise=start.noise,
             model=model,
             model_adam=optimizer.begin(model.members),
             imagined=Replay.empty(step, self.model_replay_capacity, width),
@@ -232,10 +238,9 @@ class MBPO(SAC):
         imagined = self._imagine(model, now, imagine_key)
         draw = partial(self._draw, now.replay, imagined)
         learned, more = self.practise(now.learned, draw, now.rewards, key)
-        now = MBPOState(
-            learned, now.replay, now.steps, now.rewards, model, model_adam, imagined,
-            now.bootstrap_key,
-        )  # fmt: skip
+        now = dataclasses.replace(
+            now, learned=learned, model=model, model_adam=model_adam, imagined=imagined
+        )
         return now, metrics | more
 
     def _study(

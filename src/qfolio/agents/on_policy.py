@@ -6,6 +6,8 @@ better, and the estimate towards the returns. ``reinforce.py``, ``a2c.py`` and `
 how. docs/policy_gradients.md has the formulas.
 """
 
+import abc
+import dataclasses
 from functools import partial
 from typing import NamedTuple
 
@@ -19,6 +21,7 @@ from qfolio.core.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transit
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
 from qfolio.learning.networks import Network, NetworkConfig, Outputs, outputs_of, saturation
+from qfolio.learning.normalization import Moments, NormalizationConfig, Normalizer, normalized
 from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.targets import Scalar, advantages
 
@@ -33,18 +36,21 @@ class PolicyAndValue(eqx.Module):
     log_std: Float[Array, " coordinate"]  # the same in all states; one for all assets of a market
     critic: Network
     actions: Actions = eqx.field(static=True)
+    observations: Moments | None = None  # those it normalises by; None while it learns
 
     def policy(self, observation: PyTree) -> Distribution:
-        return policy_of(self.actions, self.actor(observation), self.log_std)
+        seen = normalized(self.observations, observation)
+        return policy_of(self.actions, self.actor(seen), self.log_std)
 
     def value(self, observation: PyTree) -> Float[Array, " batch"]:
         """V(s) in units of scaled rewards."""
-        return self.critic(observation)[:, 0]
+        return self.critic(normalized(self.observations, observation))[:, 0]
 
 
 class OnPolicyState(eqx.Module):
-    weights: PolicyAndValue
+    weights: PolicyAndValue  # of normalised observations
     optimizer: optimizer.Optimizer
+    normalizer: Normalizer
 
 
 class Batch(NamedTuple):
@@ -59,7 +65,7 @@ class Batch(NamedTuple):
 
 
 class OnPolicy(Agent):
-    """Acting, the networks and the optimiser's step; subclasses define ``learn``."""
+    """Acting, the networks and the optimiser's step; subclasses define ``improve``."""
 
     network: str = static("flat")  # over everything observed; or one of networks.KINDS
     hidden: tuple[int, ...] = sizes(64, 64)  # of the actor, and of the critic
@@ -84,6 +90,8 @@ class OnPolicy(Agent):
     saturation_penalty: float = number(0.1)  # on means far beyond the bounds; 0: none
     reward_scale: float = number(1.0)  # the critic learns values of scaled rewards
     input_gain: float = number(0.0)  # of the first layer, on inputs scaled to ±1; 0: unscaled
+    normalize_observations: bool = static(False)  # to mean 0 and deviation 1, as seen so far
+    normalize_rewards: bool = static(False)  # by the deviation of discounted returns so far
 
     def __check_init__(self) -> None:
         require(self, "num_envs rollout_length", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
@@ -97,6 +105,7 @@ class OnPolicy(Agent):
         self._schedule.check()
         self._optimizer.check()
         self._networks.check()
+        self._normalization.check(self.input_gain)
 
     @property
     def _networks(self) -> NetworkConfig:
@@ -113,6 +122,10 @@ class OnPolicy(Agent):
         return CosineSchedule(
             self.learning_rate, self.learning_rate_final, self.learning_rate_steps
         )
+
+    @property
+    def _normalization(self) -> NormalizationConfig:
+        return NormalizationConfig(self.normalize_observations, self.normalize_rewards)
 
     @property
     def rollout_steps(self) -> int:
@@ -133,22 +146,42 @@ class OnPolicy(Agent):
             critic=build(Outputs(1), critic_key),
             actions=task.actions,
         )
-        return OnPolicyState(weights, optimizer.begin(weights, self._optimizer))
+        normalizer = self._normalization.begin(task, observation, self.num_envs)
+        return OnPolicyState(weights, optimizer.begin(weights, self._optimizer), normalizer)
 
     def warm_up(self) -> int:
         return 0
 
     def weights(self, state: OnPolicyState) -> PolicyAndValue:
-        return state.weights
+        return state.normalizer.attached(state.weights)
 
     def policy(self, weights: PolicyAndValue, observation: PyTree) -> Array:
         return weights.policy(observation).mode()
 
     def act(self, state: OnPolicyState, observation: PyTree, key: PRNGKeyArray) -> Array:
-        return state.weights.policy(observation).sample(key)
+        return self.weights(state).policy(observation).sample(key)
 
     def observe(self, state: OnPolicyState, rollout: Transition) -> OnPolicyState:
         return state
+
+    def learn(
+        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[OnPolicyState, Metrics]:
+        # Observations are normalised as they were when the policy acted on them.
+        before, after = state.normalizer, state.normalizer.update(rollout, self.discount)
+        rollout = rollout._replace(
+            observation=before.observation(rollout.observation),
+            next_observation=before.observation(rollout.next_observation),
+            reward=after.reward(rollout.reward),
+        )
+        state, metrics = self.improve(state, rollout, key)
+        return dataclasses.replace(state, normalizer=after), metrics
+
+    @abc.abstractmethod
+    def improve(
+        self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+    ) -> tuple[OnPolicyState, Metrics]:
+        """Learns from a rollout of normalised observations and rewards."""
 
     def judge(self, weights: PolicyAndValue, rollout: Transition, gae_lambda: Scalar) -> Batch:
         """A rollout of these weights with its advantages and targets.
@@ -186,7 +219,7 @@ class OnPolicy(Agent):
         """The advantages in the objective, normalised if so set."""
         if not self.normalize_advantages:
             return batch.advantage
-        return normalized(batch.advantage, batch.counted)
+        return standardized(batch.advantage, batch.counted)
 
     def loss(self, weights: PolicyAndValue, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
         """Minus the objective and the weighted entropy, plus the weighted critic's error."""
@@ -206,10 +239,10 @@ class OnPolicy(Agent):
         gradient = optimizer.clip(gradient, self.max_grad_norm)
         rate = self._schedule(state.optimizer.count + 1)
         weights, adam = optimizer.descend(state.weights, gradient, state.optimizer, rate)
-        return OnPolicyState(weights, adam), metrics
+        return dataclasses.replace(state, weights=weights, optimizer=adam), metrics
 
 
-def normalized(
+def standardized(
     advantage: Float[Array, " batch"], counted: Bool[Array, " batch"] | None = None
 ) -> Float[Array, " batch"]:
     """Advantages with mean 0 and standard deviation 1 over those that count."""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, static
-from qfolio.core.mdp import Metrics, Task, Transition
+from qfolio.core.mdp import Metrics, Transition
 from qfolio.learning.targets import Scalar
 
 
@@ -41,8 +41,8 @@ class PPO(OnPolicy):
     def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
         return clipped(jnp.exp(log_prob - batch.log_prob), self.weighed(batch), self.clip_range)
 
-    def learn(
-        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+    def improve(
+        self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
         batch = self.judge(state.weights, rollout, self.gae_lambda)
 

@@ -31,8 +31,8 @@ class REINFORCE(OnPolicy):
             )
         return super().init(task, key)
 
-    def learn(
-        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+    def improve(
+        self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
         batch = self.judge(state.weights, rollout, gae_lambda=1.0)
         return self.descend(state, batch._replace(counted=finished(rollout).reshape(-1)))

@@ -23,6 +23,7 @@ from qfolio.agents.actor_critic import (
     Critics,
     critic_loss,
 )
+from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require
 from qfolio.core.mdp import Actions, Discrete, Metrics, Simplex, Task
 from qfolio.learning import optimizer
@@ -123,9 +124,17 @@ class SAC(ActorCritic[Learned]):
     initial_temperature: float = number(1.0)
 
     def __check_init__(self) -> None:
-        require(
-            self, "spread initial_temperature", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30"
-        )
+        scales = "spread initial_temperature"
+        require(self, scales, lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        require(self, "noise_theta", lambda x: 0 < x <= 1, "above 0 and at most 1")
+
+    def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState[Learned]:
+        if isinstance(task.actions, Discrete) and self.noise_theta < 1:
+            raise QfolioError(
+                f"noise_theta is {self.noise_theta}, for continuous actions, but those of "
+                f"{task.name} are numbered; set noise_theta=1."
+            )
+        return super().init(task, key)
 
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
         actor_key, critic_key = jax.random.split(key)
@@ -146,24 +155,34 @@ class SAC(ActorCritic[Learned]):
         )  # fmt: skip
 
     def weights(self, state: ActorCriticState[Learned]) -> Policy:
-        actor, critics = state.learned.actor, state.learned.critics
+        actor, critics = super().weights(state), state.learned.critics
         return Policy(actor, critics if isinstance(actor.actions, Discrete) else None)
 
     def policy(self, weights: Policy, observation: PyTree) -> Array:
-        return weights.actor(observation).mode()
+        return weights.actor(weights.actor.seen(observation)).mode()
 
     def action_values(
         self, weights: Policy, observation: PyTree
     ) -> Float[Array, "batch action"] | None:
-        """Q(s, ·) in units of reward, if actions are numbered; includes later entropy."""
-        if weights.critics is None:
+        """Q(s, ·) in units of reward, if actions are numbered; includes later entropy.
+
+        None if they are in units of normalised rewards.
+        """
+        if weights.critics is None or self.normalize_rewards:
             return None
-        return smallest(weights.critics.every(observation)) / self.reward_scale
+        seen = weights.actor.seen(observation)
+        return smallest(weights.critics.every(seen)) / self.reward_scale
 
     def explore(
         self, state: ActorCriticState[Learned], observation: PyTree, key: PRNGKeyArray
     ) -> Array:
-        return state.learned.actor(observation).sample(key)
+        policy, process = state.learned.actor(observation), state.noise
+        if process is None or isinstance(policy, Categorical):
+            return policy.sample(key)
+        # Scaled to a variance of 1, so that each draw alone is the policy's.
+        theta = self.noise_theta
+        noise = math.sqrt(theta * (2 - theta)) * process.value
+        return policy.at(noise[:, : policy.coordinates])
 
     def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
         next_key, key = jax.random.split(key)

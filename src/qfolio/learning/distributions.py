@@ -40,9 +40,17 @@ class Gaussian(eqx.Module):
     mean: Float[Array, "*batch n"]
     log_std: Float[Array, "*#batch n"]
 
-    def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch n"]:
-        noise = jax.random.normal(key, self.mean.shape)
+    @property
+    def coordinates(self) -> int:
+        """How many normal numbers make an action."""
+        return self.mean.shape[-1]
+
+    def at(self, noise: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """The action of standard normal numbers."""
         return self.mean + jnp.exp(self.log_std) * noise
+
+    def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch n"]:
+        return self.at(jax.random.normal(key, self.mean.shape))
 
     def log_prob(self, action: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
         z = (action - self.mean) * jnp.exp(-self.log_std)
@@ -61,6 +69,13 @@ class Squashed(eqx.Module):
 
     normal: Gaussian
     bound: float = eqx.field(static=True)
+
+    @property
+    def coordinates(self) -> int:
+        return self.normal.coordinates
+
+    def at(self, noise: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        return self.bound * jnp.tanh(self.normal.at(noise))
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch n"]:
         return self.sample_and_log_prob(key)[0]
@@ -82,6 +97,13 @@ class LogisticNormal(eqx.Module):
     """Weights softmax(0, y) of cash and assets, with normal y (Aitchison & Shen 1980)."""
 
     normal: Gaussian
+
+    @property
+    def coordinates(self) -> int:
+        return self.normal.coordinates
+
+    def at(self, noise: Float[Array, "*batch asset"]) -> Float[Array, "*batch entry"]:
+        return self._weights(self.normal.at(noise))
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "*batch entry"]:
         return self._weights(self.normal.sample(key))
