@@ -97,6 +97,10 @@ class Pretended:
         return 1 - self.left / 4
 
     @property
+    def steps(self):
+        return 100 * (4 - self.left)
+
+    @property
     def finished(self):
         return self.left == 0
 

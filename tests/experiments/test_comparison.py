@@ -219,7 +219,9 @@ def finished(tmp_path_factory):
 
 def test_a_comparison_in_its_folder(finished):
     run, content = finished
-    assert {path.name for path in run.folder.iterdir()} == {"comparison.json", "agents"}
+    assert {path.name for path in run.folder.iterdir()} == {
+        "comparison.json", "events.jsonl", "agents",
+    }  # fmt: skip
     for name in ("slow", "quick"):
         measured, kept = content["results"][name], Run.open(run.place(name))
         assert kept.grade()["return_per_seed"] == pytest.approx(measured["returns"])
@@ -361,7 +363,7 @@ def test_the_command(presets, monkeypatch, capsys, tmp_path):
     assert "two agents cannot be told apart" in printed.replace("\n", " ")
     assert f"Report: {folder / 'report.html'}" in printed.replace("\n", "").replace("R", "\nR")
     assert {path.name for path in folder.iterdir()} == {
-        "comparison.json", "agents", "report.html", "learning_curves.png",
+        "comparison.json", "events.jsonl", "agents", "report.html", "learning_curves.png",
     }  # fmt: skip
     assert {path.name for path in (folder / "agents").iterdir()} == {"dqn", "dqn-bold"}
     content = json.loads((folder / "comparison.json").read_text())

@@ -141,7 +141,8 @@ def test_an_interrupted_comparison_goes_on_as_if_it_never_was(content, way, tmp_
             name: {**course, "seconds": 0.0} for name, course in courses.items()}}  # fmt: skip
 
     assert lasting(found) == lasting(content)
-    assert [path.name for path in (tmp_path / "stopped").iterdir()] == ["continual.json"]
+    names = {path.name for path in (tmp_path / "stopped").iterdir()}
+    assert names == {"continual.json", "events.jsonl"}
 
 
 @pytest.mark.parametrize(
@@ -182,7 +183,7 @@ def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
     assert f"continue with --resume {folder}" in capsys.readouterr().err
     assert qfolio(monkeypatch, "continual", "--resume", folder) == 0
     assert {path.name for path in folder.iterdir()} == {
-        "continual.json", "report.html", "recovery.png",
+        "continual.json", "events.jsonl", "report.html", "recovery.png",
     }  # fmt: skip
     content = json.loads((folder / "continual.json").read_text())
     assert content["changes"] == {"mass": [1.0, 1.5]}

@@ -33,6 +33,7 @@ from qfolio.core.training import TrainingState
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.ranking import middle_steps, regret, steps_within
 from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.events import JobLog, Log, seed_names
 from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.learning.optimizer import Optimizer
 
@@ -232,12 +233,19 @@ def compare(folder: Path, listen: Callable[[str], Listener] | None = None) -> di
     if not (folder / FILE).is_file():
         read_config(folder / FILE, ContinualConfig)  # raises: this is not such a folder
     with locked(folder):
-        return _compare(folder, listen)
+        state = read_config(folder / FILE, ContinualConfig)
+        about = {"kind": state.kind, "task": state.task, "agents": [state.agent]}
+        with Log(folder).opened(**about, seeds=state.seeds) as log:
+            result = _compare(folder, state, listen, log)
+            log.settle(result is not None)
+            return result
 
 
-def _compare(folder: Path, listen: Callable[[str], Listener] | None) -> dict[str, Any] | None:
-    state = read_config(folder / FILE, ContinualConfig)
+def _compare(
+    folder: Path, state: ContinualConfig, listen: Callable[[str], Listener] | None, log: Log
+) -> dict[str, Any] | None:
     plan = state.plan()
+    seeds = seed_range(plan.seeds, plan.seed)
 
     def keep(**results: Any) -> None:
         nonlocal state
@@ -246,14 +254,14 @@ def _compare(folder: Path, listen: Callable[[str], Listener] | None) -> dict[str
 
     def learn(name: str, population: Population, episodes: int, points: int) -> Course | None:
         worlds = grades if name == FIRST else grades[::-1]
-        return _learn(
-            population, episodes, points, worlds, [] if listen is None else [listen(name)]
-        )
+        listeners = [] if listen is None else [listen(name)]
+        job = log.job(name, seed_names(seeds))
+        return _learn(population, episodes, points, worlds, job, listeners)
 
     grades = Grades(plan.task), Grades(plan.changed)
-    seeds = seed_range(plan.seeds, plan.seed)
     first = Population(plan.task, plan.agent, seeds)
     missing = [way for way in WAYS if way not in state.courses]
+    log.queue([*([FIRST] if state.training is None else []), *missing])
     if state.training is None:
         training = learn(FIRST, first, plan.episodes, 1)
         if training is None:
@@ -335,14 +343,16 @@ class Grades:
 class _Curve(Listener):
     """Grades the policies after each chunk."""
 
-    def __init__(self, world: Grades) -> None:
-        self.world = world
+    def __init__(self, world: Grades, job: JobLog) -> None:
+        self.world, self.job = world, job
         self.steps: list[int] = []
         self.regrets: list[list[float]] = []
 
     def add(self, population: Population, steps: int) -> None:
         self.steps.append(steps * population.agent.num_envs)
         self.regrets.append(self.world.regrets(population, population.curve_starts))
+        done = population.steps * population.agent.num_envs
+        self.job.record(done, {"greedy regret": self.regrets[-1]})
 
     def on_chunk(self, training: Training, rows: list[Row]) -> None:
         self.add(training.population, training.population.steps - training.begun)
@@ -353,6 +363,7 @@ def _learn(
     episodes: int,
     points: int,
     worlds: tuple[Grades, Grades],
+    job: JobLog,
     listeners: list[Listener],
 ) -> Course | None:
     """Learns ``episodes`` more, with regular grading; None if Ctrl-C stopped it.
@@ -360,15 +371,17 @@ def _learn(
     worlds: this one and the other one.
     """
     here, there = worlds
-    curve = _Curve(here)
+    curve = _Curve(here, job)
     curve.add(population, 0)
     seconds = 0.0
     if episodes:
         budget = Budget(population.episodes + episodes)
         chunk = -(-budget.left(population) // points)
-        training = fit(population, budget, [curve, *listeners], chunk=chunk)
+        training = fit(population, budget, [job, curve, *listeners], chunk=chunk)
         seconds = training.seconds
         if training.interrupted:
             return None
+    else:
+        job.log.write("done", job=job.name, step=0)
     final, other = (world.regrets(population, population.starts) for world in (here, there))
     return Course(curve.steps, curve.regrets, final, other, seconds)

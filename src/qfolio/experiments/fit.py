@@ -34,6 +34,7 @@ class Training:
         seconds: Time spent on training, without compiling.
         members: The member of each row of the last chunk.
         interrupted: Whether Ctrl-C asked it to stop.
+        where: The worker that it runs on; empty in this process.
     """
 
     population: Population
@@ -44,6 +45,7 @@ class Training:
     seconds: float = 0.0
     members: Sequence[int] = ()
     interrupted: bool = False
+    where: str = ""
     _learned: int = 0  # steps of each environment that learned, and their time
     _learning_seconds: float = 0.0
 
@@ -51,6 +53,11 @@ class Training:
     def finished(self) -> bool:
         """Whether the budget is used up."""
         return self.left == 0
+
+    @property
+    def steps(self) -> int:
+        """Steps of all environments of a member so far, earlier training included."""
+        return self.population.steps * self.population.agent.num_envs
 
     @property
     def share(self) -> float:

@@ -16,8 +16,10 @@ from qfolio.core.files import locked, new_folder, require_new
 from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.population import Population
+from qfolio.core.registry import short
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.events import JobLog, Log, add_result, seed_names
 from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.experiments.grading import grade
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder
@@ -44,6 +46,7 @@ class Run:
         self.evaluations: list[Row] = []
         self.seconds_train = 0.0
         self.interrupted = False
+        self._log: JobLog | None = None  # while it trains
 
     @classmethod
     def create(
@@ -138,17 +141,24 @@ class Run:
             return self.population.steps * self.agent.num_envs
         return self.episodes
 
-    def train(self, budget: Budget | None = None, listeners: Sequence[Listener] = ()) -> None:
+    def train(
+        self,
+        budget: Budget | None = None,
+        listeners: Sequence[Listener] = (),
+        log: JobLog | None = None,
+    ) -> None:
         """Trains until each seed has used its budget (default: the configured one).
 
         A first Ctrl-C stops after the current chunk, sets ``interrupted`` and leaves a checkpoint.
         Raises QfolioError if a loss is not finite (the last good checkpoint stays) or if another
         process trains in the folder.
+
+        log: of the experiment that the run is a part of (default: the folder's own).
         """
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
-            self._train(budget or self.budget, listeners)
+            self._train(budget or self.budget, listeners, log)
 
-    def _train(self, budget: Budget, listeners: Sequence[Listener]) -> None:
+    def _train(self, budget: Budget, listeners: Sequence[Listener], log: JobLog | None) -> None:
         self.interrupted = False
         if not self.evaluations and self.population.steps:
             self.evaluate()  # the run's table was lost
@@ -162,9 +172,30 @@ class Run:
         if self._folder is not None:
             self._folder.write_config(self.config)
             self._folder.tidy({METRICS: self.metrics, EVALUATION: self.evaluations})
-        own = [_Metrics(self), _Curve(self), *listeners, _Checkpoints(self)]
-        config = msgspec.to_builtins(self.config)
-        self.interrupted = fit(self.population, budget, own, config=config).interrupted
+        with contextlib.ExitStack() as stack:
+            if log is None:
+                own = stack.enter_context(Log(self.folder).opened(**self._about))
+                log = own.job(members=seed_names(self.config.seed_range))
+            self._log = log
+            stack.callback(setattr, self, "_log", None)
+            hooks = [log, _Metrics(self), _Curve(self), *listeners, _Checkpoints(self)]
+            config = msgspec.to_builtins(self.config)
+            training = fit(self.population, budget, hooks, config=config)
+            self.interrupted = training.interrupted
+            log.log.settle(training.finished)
+
+    @property
+    def _about(self) -> dict[str, Any]:
+        """What the log says of the run."""
+        config = self.config
+        return {
+            "kind": "run",
+            "task": config.task,
+            "agents": [config.agent],
+            "preset": config.preset,
+            "seeds": config.seeds,
+            self.budget.unit: self.budget.amount,
+        }
 
     def first_weights(self) -> Any:
         """The first seed's learned weights."""
@@ -191,6 +222,10 @@ class Run:
         }
         if self._folder is not None:
             self._folder.write_summary(summary)
+            regrets = summary["regret_per_seed"]
+            known = {"return": summary["return_mean"], "optimum": summary["optimum"]}
+            known["regret"] = None if regrets is None else float(np.mean(regrets))
+            add_result(self.folder, {short(config.agent): known})
         return summary
 
     def evaluate(self) -> None:
@@ -208,6 +243,10 @@ class Run:
             for seed, episode, returns, overestimation in members
         ]
         self._record(EVALUATION, self.evaluations, rows)
+        if self._log is not None:
+            names = {"greedy return": "return", "overestimation": "overestimation"}
+            columns = {name: [row[key] for row in rows] for name, key in names.items()}
+            self._log.record(self.done("steps"), columns)
 
     def _record(self, name: str, table: list[Row], rows: list[Row]) -> None:
         table += rows

@@ -10,6 +10,7 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES
+from qfolio.experiments.events import read
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.replay import Stretch, decide
@@ -60,6 +61,20 @@ def finished(tmp_path_factory):
     backtest = create(folder)
     backtest.run()
     return backtest
+
+
+def test_the_log_names_every_job_and_member(finished):
+    events, _ = read(finished.folder / "events.jsonl")
+    jobs = {job for event in events if event["event"] == "queued" for job in event["jobs"]}
+    assert {job.partition("/")[0] for job in jobs} == {"dqn", "pathwise"}
+    for state in ("running", "done"):
+        assert {event["job"] for event in events if event["event"] == state} == jobs
+    members = [name for e in events if e["event"] == "running" for name in e["members"]]
+    folds = [*(fold.name for fold in finished.folds), "latest"]
+    assert sorted(members) == sorted(
+        f"{fold}, seed {seed}" for fold in folds for seed in range(2) for _ in finished.agents
+    )
+    assert events[-1]["event"] == "end"
 
 
 def test_all_strategies_are_replayed_on_the_same_days(finished):

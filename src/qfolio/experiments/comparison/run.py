@@ -30,6 +30,7 @@ from qfolio.experiments.comparison.conclusion import conclusion, listed
 from qfolio.experiments.comparison.operations import operations_per_step
 from qfolio.experiments.comparison.ranking import Result, rank
 from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.events import Log, add_result, seed_names
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.run import Run
 
@@ -179,20 +180,36 @@ class Comparison:
 
         listen: called with an agent's name before it trains; returns the listener of its training.
         """
+        missing = [name for name in self.entrants if name not in self.results]
         with locked(self.folder):
-            self._run(listen)
+            if missing:
+                with Log(self.folder).opened(**self._about) as log:
+                    log.queue(missing)
+                    self._run(missing, listen, log)
+                    log.settle(not self.interrupted)
 
-    def _run(self, listen: Callable[[str], Listener] | None) -> None:
+    @property
+    def _about(self) -> dict[str, Any]:
+        """What the log says of the comparison."""
+        config = self.config
+        return {
+            "kind": "comparison",
+            "task": config.task,
+            "agents": list(config.agents),
+            "seeds": config.seeds,
+        }
+
+    def _run(self, missing: list[str], listen: Callable[[str], Listener] | None, log: Log) -> None:
         self.interrupted = False
-        for name in self.entrants:
-            if name in self.results:
-                continue
+        for name in missing:
             listeners = [] if listen is None else [listen(name)]
+            job = log.job(name, seed_names(seed_range(self.config.seeds, self.config.seed)))
             try:
                 run = self._open(name)
-                run.train(listeners=listeners)
+                run.train(listeners=listeners, log=job)
             except QfolioError as error:
                 self.failures[name] = str(error)
+                log.write("failed", job=name, error=str(error))
                 continue
             if run.interrupted:
                 self.interrupted = True
@@ -206,6 +223,7 @@ class Comparison:
             reasons = "; ".join(f"{name}: {why}" for name, why in self.failures.items())
             raise QfolioError(f"There are fewer than two agents to compare. {reasons}")
         self._write()
+        add_result(self.folder, {name: _measures(one) for name, one in self.results.items()})
         return read_json(self.folder / FILE)
 
     def notes(self) -> list[str]:
@@ -344,6 +362,14 @@ def _result(run: Run) -> Result:
         policy_bytes=_bytes(weights),
         parameters=sum(x.size for x in weights if jnp.issubdtype(x.dtype, jnp.floating)),
     )
+
+
+def _measures(result: Result) -> dict[str, float | None]:
+    """What the log says of a result."""
+    final = float(np.mean(result.returns))
+    optimum = result.optimum
+    gap = None if optimum is None else (optimum - final) / abs(optimum)
+    return {"return": final, "optimum": optimum, "regret": gap}
 
 
 def _bytes(leaves: list[Any]) -> int:

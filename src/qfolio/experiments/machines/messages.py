@@ -21,10 +21,12 @@ class Report(NamedTuple):
     """What the listeners of a training hear, as values."""
 
     hook: Literal["on_start", "on_chunk", "on_end"]
+    where: str  # the worker
     budget: Budget
     config: Mapping[str, Any]
     begun: int
     left: int
+    steps: int
     seconds: float
     share: float
     steps_per_second: float

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.fit import Listener, Row, Training
-from qfolio.experiments.machines.messages import Report
+from qfolio.experiments.machines.messages import Report, place
 
 EVERY = 0.5
 """Seconds between two reports: chunks may be shorter, and workers many."""
@@ -37,10 +37,12 @@ class Reporter(Listener):
         self.send(
             Report(
                 hook,
+                place(),
                 training.budget,
                 training.config,
                 training.begun,
                 training.left,
+                training.steps,
                 training.seconds,
                 training.share,
                 training.steps_per_second,
@@ -58,8 +60,12 @@ class RemoteTraining(Training):
     def __init__(self, report: Report) -> None:
         self.budget, self.config, self.begun = report.budget, report.config, report.begun
         self.left, self.seconds, self.members = report.left, report.seconds, report.members
-        self.interrupted = False
+        self.interrupted, self.where = False, report.where
         self._report = report
+
+    @property
+    def steps(self) -> int:
+        return self._report.steps
 
     @property
     def share(self) -> float:

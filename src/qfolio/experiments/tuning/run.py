@@ -6,9 +6,10 @@ the end, summary.json. Any number of processes may work on one folder at once; o
 later, or again, continues from the journal.
 """
 
+import contextlib
 import math
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -30,6 +31,7 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
+from qfolio.experiments.events import Log
 from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
@@ -215,22 +217,32 @@ class Tuning:
         preset = {dim.name: search.own_value(self.agent, dim) for dim in self.space}
         batch, total = self.config.batch, self.config.trials
         self.interrupted = False
-        with self.journal.at_work():
+        with self._log() as log, self.journal.at_work():
             while not self.interrupted and (asked := self.journal.ask(batch, total, preset)):
                 try:
-                    now = self._train(asked, chunk_listener)
+                    now = self._train(asked, log, chunk_listener)
                 except KeyboardInterrupt:
                     self.interrupted = True
-                    return
+                    break
                 if listener is not None:
                     listener(now)
+                found = {"best": now.best, "preset": now.preset}
+                values = {name: {"return": trial.value} for name, trial in found.items() if trial}
+                log.write("result", values=values)
                 self.interrupted &= now.done < total
+            log.settle(not self.interrupted)
+
+    def _log(self) -> contextlib.AbstractContextManager[Log]:
+        config = self.config
+        about = {"kind": config.kind, "task": config.task, "agents": [config.agent]}
+        return Log(self.folder).opened(**about, trials=config.trials, seeds=config.seeds)
 
     def trained(
         self,
-        agents: Sequence[Agent],
+        agents: Mapping[str, Agent],
         seeds: Sequence[int],
         keys: Key[Array, " start"],
+        log: Log | None = None,
         listener: Callable[[float], None] | None = None,
     ) -> tuple[Float[np.ndarray, "agent seed"], float]:
         """Mean greedy returns of each agent and seed, NaN if the loss did not stay finite.
@@ -239,17 +251,24 @@ class Tuning:
         program form one population. All its members take as many steps as the episodes would if
         none ended early, so that an agent's result does not depend on the others. Raises
         KeyboardInterrupt if Ctrl-C stops it before the end.
+
+        agents: by the names that the log has for them.
         """
-        groups = defaultdict(list)
-        for index, agent in enumerate(agents):
+        groups, names, log = defaultdict(list), list(agents), log or Log(None)
+        for index, agent in enumerate(agents.values()):
             groups[jax.tree.structure(agent)].append(index)
+        jobs = [_job_name([names[index] for index in group]) for group in groups.values()]
+        log.queue(jobs)
         result = np.full((len(agents), len(seeds)), np.nan)
         seconds_compile = 0.0
         for number, indices in enumerate(groups.values()):
-            members = [agents[index] for index in indices for _ in seeds]
+            members = [agents[names[index]] for index in indices for _ in seeds]
+            labels = [f"{names[index]}, seed {seed}" for index in indices for seed in seeds]
             population = population_of(self.task, members, [*seeds] * len(indices))
             steps = self.config.budget.left(population) * population.agent.num_envs
-            listeners = [] if listener is None else [_Share(listener, number, len(groups))]
+            listeners: list[Listener] = [log.job(jobs[number], labels)]
+            if listener is not None:
+                listeners.append(_Share(listener, number, len(groups)))
             training = fit(population, Budget(steps=steps), listeners, strict=False)
             if not training.finished:
                 raise KeyboardInterrupt
@@ -279,8 +298,9 @@ class Tuning:
         if path.exists() and (summary := read_json(path)).get("best") == found.values:
             return summary
         seeds = range(FRESH, FRESH + self.config.fresh_seeds)
-        agents = [self.configured(found.values), self.agent]
-        returns, _ = self.trained(agents, seeds, start_keys(), listener)
+        agents = {"best": self.configured(found.values), "preset": self.agent}
+        with self._log() as log:
+            returns, _ = self.trained(agents, seeds, start_keys(), log, listener)
         solution = self.task.optimum()
 
         def optimum(keys: Key[Array, " start"]) -> float | None:
@@ -300,14 +320,17 @@ class Tuning:
         return summary
 
     def _train(
-        self, asked: Sequence[Asked], listener: Callable[[float], None] | None = None
+        self,
+        asked: Sequence[Asked],
+        log: Log | None = None,
+        listener: Callable[[float], None] | None = None,
     ) -> Progress:
         """Trains a batch and records its returns."""
         start = perf_counter()
         try:
-            agents = [self.configured(one.values) for one in asked]
+            agents = {f"trial {one.trial.number}": self.configured(one.values) for one in asked}
             seeds = range(self.config.seeds)
-            returns, seconds_compile = self.trained(agents, seeds, tuning_keys(), listener)
+            returns, seconds_compile = self.trained(agents, seeds, tuning_keys(), log, listener)
         except BaseException:
             for one in asked:
                 self.journal.give_up(one)
@@ -326,6 +349,10 @@ class Tuning:
             seconds_compile=seconds_compile,
             trials=len(asked),
         )
+
+
+def _job_name(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
 
 
 def _require_counts(**counts: int) -> None:

@@ -21,6 +21,7 @@ from qfolio.core.mdp import Agent
 from qfolio.core.registry import BASELINES, short
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
+from qfolio.experiments.events import Log, add_result
 from qfolio.experiments.executor import Executor, Here, Job
 from qfolio.experiments.fit import Listener, Row
 from qfolio.experiments.interrupts import interruptible
@@ -211,20 +212,38 @@ class Backtest:
         """
         executor = executor or Here()
         jobs, done = self.jobs(executor), 0
+        self.interrupted = False
+        if not jobs:
+            return
+        with contextlib.ExitStack() as stack:
+            if self.folder is not None:
+                stack.enter_context(locked(self.folder))
+            log = stack.enter_context(Log(self.folder).opened(**self._about))
+            log.queue([job.name for job in jobs])
+            members = {job.name: job.members for job in jobs}
 
-        def listeners(job: Job[dict[str, TrainedFold]]) -> Sequence[Listener]:
-            return listen(job, done / len(jobs), 1 / len(jobs))
+            def listeners(job: Job[dict[str, TrainedFold]]) -> Sequence[Listener]:
+                own = listen(job, done / len(jobs), 1 / len(jobs))
+                return [log.job(job.name, members[job.name]), *own]
 
-        lock = contextlib.nullcontext() if self.folder is None else locked(self.folder)
-        with (
-            lock,
-            interruptible() as stop,
-            contextlib.closing(executor.map(jobs, listeners)) as finished,
-        ):
+            stop = stack.enter_context(interruptible())
+            finished = stack.enter_context(contextlib.closing(executor.map(jobs, listeners)))
             for job, trained in finished:
                 self.store(job, trained)
                 done += 1
             self.interrupted = stop.is_set()
+            log.settle(done == len(jobs))
+
+    @property
+    def _about(self) -> dict[str, Any]:
+        """What the log says of the backtest."""
+        config = self.config
+        return {
+            "kind": config.kind,
+            "task": f"{len(self.prices.assets)} assets, {len(self.folds)} folds",
+            "agents": list(self.agents),
+            "seeds": config.seeds,
+        }
 
     def jobs(self, executor: Executor) -> list[FoldsJob]:
         """The training that is missing, in jobs that fill a worker; each goes to ``store``."""
@@ -361,6 +380,14 @@ class Backtest:
             self._folder.write_why(why.to_json())
             summary["diagnosis"] = why.diagnosis
         self._folder.write_summary(summary)
+        add_result(
+            self.folder,
+            {
+                name: {key: measure.mean for key, measure in strategy.measures.items()}
+                for name, strategy in assessed.strategies.items()
+                if strategy.kind != "rebalancing"
+            },
+        )
 
     def _name(self, agent: str | None) -> str:
         """An agent's name (default: the first); raises QfolioError if it is unknown."""

@@ -48,6 +48,11 @@ class FoldsJob:
     def name(self) -> str:
         return f"{self.agent_name}/{self.folds[0]}"
 
+    @property
+    def members(self) -> list[str]:
+        """The names of its members for the log: a seed of a fold each."""
+        return [f"{fold}, seed {seed}" for fold in self.folds for seed in self.seeds]
+
     def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:
         """The trained folds by name; None if Ctrl-C stopped it."""
         tasks = [task for task in self.tasks for _ in self.seeds]

@@ -19,6 +19,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.statistics import holm
+from qfolio.experiments.events import Log
 from qfolio.experiments.executor import Executor, Here
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.presets import Preset
@@ -192,9 +193,12 @@ class Study:
         """
         executor = executor or Here()
         missing = [place for place in self.places if not self.finished(*place)]
-        trainings = Trainings(missing, self.backtest, executor, listen)
+        if not missing:
+            return
         with contextlib.ExitStack() as stack:
             stack.enter_context(locked(self.folder))
+            log = stack.enter_context(Log(self.folder).opened(**self._about))
+            trainings = Trainings(missing, self.backtest, executor, listen, log)
             for table, variant in missing:
                 stack.enter_context(locked(self._files.place(table, variant)))
             stop = stack.enter_context(interruptible())
@@ -209,6 +213,15 @@ class Study:
                 if not (self.finished(table, variant) or stop.is_set()):
                     self._conclude(table, variant, self.backtest(table, variant), report)
             self.interrupted = stop.is_set() and not self._complete
+            log.settle(self._complete)
+
+    @property
+    def _about(self) -> dict[str, Any]:
+        """What the log says of the study."""
+        config = self.config
+        tables, variants = len(config.tables), len(config.variants)
+        about = f"{tables} table{'s' * (tables > 1)}, {variants} variant{'s' * (variants > 1)}"
+        return {"kind": config.kind, "task": about, "agents": config.agents}
 
     def _conclude(
         self, table: str, variant: Variant, backtest: Backtest, report: Report | None

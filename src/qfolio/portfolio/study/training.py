@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from qfolio.core.errors import QfolioError
+from qfolio.experiments.events import Log
 from qfolio.experiments.executor import Executor, Job
 from qfolio.experiments.fit import Listener
 from qfolio.portfolio.backtest.run import Backtest
@@ -50,7 +51,7 @@ class Trainings:
     """The training that backtests miss, for an executor.
 
     places: tables and variants. open_backtest: called when a worker is free for its first job.
-    listen: called when that begins.
+    listen: called when that begins. log: of the study.
     """
 
     def __init__(
@@ -59,9 +60,10 @@ class Trainings:
         open_backtest: Callable[[str, Variant], Backtest],
         executor: Executor,
         listen: Listen | None,
+        log: Log,
     ) -> None:
         self._places, self._open, self._executor = list(places), open_backtest, executor
-        self._listen = listen
+        self._listen, self._log = listen, log
         self._of: dict[str, Place] = {}  # the place of each job that is not finished
 
     def jobs(self) -> Iterator[PlacedJob]:
@@ -72,17 +74,19 @@ class Trainings:
             made = [PlacedJob(table, variant, job) for job in backtest.jobs(self._executor)]
             place = Place(table, variant, backtest, len(made), len(made))
             self._of.update((job.name, place) for job in made)
+            self._log.queue([job.name for job in made])
             yield from made
 
     def listeners(self, job: Job[dict[str, TrainedFold]]) -> Sequence[Listener]:
         """The listeners of a job that begins."""
-        if self._listen is None:
-            return []
         assert isinstance(job, PlacedJob)
+        log = self._log.job(job.name, job.job.members)
+        if self._listen is None:
+            return [log]
         place = self._of[job.name]
         if place.listen is None:
             place.listen = self._listen(place.table, place.variant, place.backtest)
-        return place.listen(job.job, 1 - place.left / place.count, 1 / place.count)
+        return [log, *place.listen(job.job, 1 - place.left / place.count, 1 / place.count)]
 
     def store(self, job: Job[dict[str, TrainedFold]], trained: dict[str, TrainedFold]) -> Place:
         """Keeps what a job has trained, and returns its backtest's place."""

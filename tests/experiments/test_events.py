@@ -1,0 +1,189 @@
+"""The log of an experiment: what it says, and that nothing counts twice."""
+
+import json
+import os
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments import events
+from qfolio.experiments.budget import Budget
+from qfolio.experiments.events import EVENTS, Log, Tracker, means, read, tracked
+from qfolio.experiments.machines.messages import Report
+from qfolio.experiments.machines.remote import RemoteTraining, hear
+from qfolio.experiments.run import Run
+
+from listeners import Interrupt
+from probes import Explosive
+
+
+def logged(folder, kind=None):
+    found, _ = read(folder / EVENTS)
+    return found if kind is None else [event for event in found if event["event"] == kind]
+
+
+def test_a_run_logs_its_beginning_its_records_and_its_end(task, agent, tmp_path):
+    run = Run.create(task, agent, episodes=40, seeds=2, seed=3, out=tmp_path / "run")
+    run.train()
+    first, second, *_, last = logged(tmp_path / "run")
+    assert (first["event"], first["kind"], first["task"], first["agents"], first["episodes"]) == (
+        "start", "run", "pendulum", ["dqn"], 40,
+    )  # fmt: skip
+    assert (second["event"], second["step"], second["members"]) == (
+        "running", 0, ["seed 3", "seed 4"],
+    )  # fmt: skip
+    assert (last["event"], last["state"]) == ("end", "done")
+    records = logged(tmp_path / "run", "record")
+    trained = [record for record in records if "return" in record["values"]]
+    assert trained[-1]["step"] == run.done("steps")
+    assert trained[-1]["share"] == 1.0
+    assert {"loss", "max_q", "epsilon"} <= trained[-1]["values"].keys()
+    graded = [record["values"] for record in records if "greedy return" in record["values"]]
+    assert np.ravel([values["greedy return"] for values in graded]).tolist() == [
+        row["return"] for row in run.evaluations
+    ]
+
+
+def test_records_are_means_of_all_episodes(task, agent, tmp_path, monkeypatch):
+    monkeypatch.setattr(events, "SHORTEST", 0.0)  # a record for every chunk
+    monkeypatch.setattr(events, "SHARE", 0.0)
+    run = Run.create(task, agent, episodes=200, seeds=2, out=tmp_path / "run")
+    run.train()
+    records = [r for r in logged(tmp_path / "run", "record") if "return" in r["values"]]
+    assert len(records) > 2
+    before = 0.0
+    for record in records:
+        until = record["values"]["episode"][1]
+        rows = [row for row in run.metrics if row["seed"] == 1 and before < row["episode"] <= until]
+        expected = np.mean([row["return"] for row in rows])
+        assert record["values"]["return"][1] == pytest.approx(expected, rel=1e-5)
+        before = until
+    assert before == run.population.member_episodes[1]
+
+
+def test_a_stopped_run_says_so_and_where_it_goes_on(task, agent, tmp_path):
+    run = Run.create(task, agent, episodes=400, seeds=1, out=tmp_path / "run")
+    run.train(listeners=[Interrupt()])
+    *_, job, end = logged(tmp_path / "run")
+    assert (job["event"], end["event"], end["state"]) == ("stopped", "end", "stopped")
+    Run.open(tmp_path / "run").train(Budget(400))
+    begun = [event["step"] for event in logged(tmp_path / "run", "running")]
+    assert begun == [0, job["step"]]
+    assert logged(tmp_path / "run")[-1]["state"] == "done"
+
+
+def test_an_error_ends_the_log(tmp_path, agent):
+    run = Run.create(Explosive(), agent, episodes=400, out=tmp_path / "run")
+    with pytest.raises(QfolioError) as raised:
+        run.train()
+    last = logged(tmp_path / "run")[-1]
+    assert (last["state"], last["error"]) == ("failed", str(raised.value))
+
+
+def test_a_cut_line_is_left_until_it_is_whole_and_skipped_if_never(tmp_path):
+    path = tmp_path / EVENTS
+    with Log(tmp_path).opened(kind="run"):
+        pass
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"event":"rec')
+    found, offset = read(path)
+    assert ([event["event"] for event in found], offset) == (["start", "end"], len(whole))
+    path.write_bytes(whole + b'{"event":"record","step":1}\n')
+    assert read(path, offset)[0] == [{"event": "record", "step": 1}]
+    path.write_bytes(whole + b'{"event":"rec')
+    with Log(tmp_path).opened(kind="run"):
+        pass
+    assert [event["event"] for event in logged(tmp_path)] == ["start", "end"] * 2
+
+
+@pytest.mark.parametrize("line", [b"[1]", b"{}", b'{"event":3}', b"\xff\xfe", b"[" * 10_000, b""])
+def test_damaged_lines_are_skipped(tmp_path, line):
+    (tmp_path / EVENTS).write_bytes(line + b'\n{"event":"start"}\n')
+    assert logged(tmp_path) == [{"event": "start"}]
+
+
+def test_a_member_without_an_episode_has_no_mean():
+    rows = [{"seed": 7, "episode": 4, "return": 2.0, "loss": np.nan},
+            {"seed": 7, "episode": 5, "return": 4.0, "loss": 1.0}]  # fmt: skip
+    assert means(rows, [1, 1], 3) == {
+        "episode": [None, 5.0, None],
+        "return": [None, 3.0, None],
+        "loss": [None, 1.0, None],
+    }
+
+
+def report(hook, seconds=1.0, left=0, rows=(), members=()):
+    """What a worker says of a training."""
+    share, where = 1.0 if not left else 0.5, "process 7 on far"
+    return Report(hook, where, Budget(4), {}, 0, left, 100, seconds, share, 7.0, 3.0, [*rows],
+                  [*members])  # fmt: skip
+
+
+def test_jobs_on_workers_are_logged_by_the_driver(tmp_path):
+    with Log(tmp_path).opened(kind="backtest") as log:
+        log.queue(["a"])
+        job = log.job("a", ["seed 0"])
+        hear(report("on_start", left=2), job)
+        hear(report("on_chunk", rows=[{"seed": 0, "episode": 1, "return": 2.5}], members=[0]), job)
+        hear(report("on_end"), job)
+    names = [event["event"] for event in logged(tmp_path)]
+    assert names == ["start", "queued", "running", "record", "done", "end"]
+    assert logged(tmp_path, "running")[0]["worker"] == "process 7 on far"
+    assert logged(tmp_path, "record")[0]["values"] == {"episode": [1.0], "return": [2.5]}
+    assert logged(tmp_path, "done")[0]["step"] == 100
+
+
+def test_the_file_is_touched_while_a_process_works(tmp_path, monkeypatch):
+    monkeypatch.setattr(events, "BEAT", 0.01)
+    with Log(tmp_path).opened(kind="run"):
+        os.utime(tmp_path / EVENTS, (1, 1))
+        started = perf_counter()
+        while (tmp_path / EVENTS).stat().st_mtime < 1000:
+            assert perf_counter() - started < 10
+
+
+def test_trackers_hear_means_over_members(tmp_path):
+    heard: list[object] = []
+
+    class Listening(Tracker):
+        def start(self, name, about):
+            heard.append((name, about["kind"]))
+
+        def log(self, values, step):
+            heard.append((step, dict(values)))
+
+        def finish(self):
+            heard.append("finished")
+
+    (tmp_path / "mine").mkdir()
+    with tracked(Listening()), Log(tmp_path / "mine").opened(kind="run") as log:
+        log.job("dqn", ["a", "b", "c"]).record(5, {"loss": [1.0, None, 3.0], "q": [None] * 3})
+    with Log(tmp_path / "mine").opened(kind="run") as log:
+        log.job().record(6, {"loss": [1.0]})  # nobody follows
+    assert heard == [("mine", "run"), (5, {"dqn/loss": 2.0}), "finished"]
+
+
+def test_a_log_without_a_folder_writes_nothing(task, agent, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Run.create(task, agent, episodes=4).train()
+    assert not list(tmp_path.iterdir())
+
+
+def test_logging_takes_less_than_a_hundredth_of_a_training(tmp_path, monkeypatch):
+    """Chunks of a millisecond, with ten episodes of eight members each: the clock is pretended."""
+    now = [0.0]
+    monkeypatch.setattr(events, "perf_counter", lambda: now[0])
+    members = [i % 8 for i in range(10)]
+    training = RemoteTraining(report("on_chunk", left=2, members=members))
+    rows = [dict.fromkeys(("seed", "episode", "return", "loss", "q"), 1.0) for _ in range(10)]
+    begun, chunks = perf_counter(), 20_000
+    with Log(tmp_path).opened(kind="run") as log:
+        job = log.job("", [f"seed {i}" for i in range(8)])
+        for _ in range(chunks):
+            now[0] += 1e-3
+            training.seconds = now[0]
+            job.on_chunk(training, rows)
+    assert perf_counter() - begun < 0.02 * now[0]  # twice the promise, for a busy machine
+    assert len(json.dumps(logged(tmp_path))) < 1e6
