@@ -1,6 +1,7 @@
 """Jobs for tests of executors, in a module that workers can import."""
 
 import os
+import pickle
 import signal
 import time
 from dataclasses import dataclass, field
@@ -11,6 +12,8 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.budget import Budget
+from qfolio.experiments.interrupts import interruptible
+from qfolio.experiments.machines.parcels import Packer, Unpacker
 
 
 @dataclass(frozen=True)
@@ -112,3 +115,29 @@ def alive(process: int) -> bool:
     except OSError:
         return False
     return state != "Z"
+
+
+class Elsewhere:
+    """Runs jobs in this process, one after another, but as a worker gets them: as bytes.
+
+    ran: the names of the jobs.
+    """
+
+    devices, lockstep = 1, False
+
+    def __init__(self):
+        self.ran: list[str] = []
+
+    def map(self, jobs, listen):
+        packer, unpacker = Packer(), Unpacker()
+        with interruptible() as stop:
+            for job in jobs:
+                if stop.is_set():
+                    return
+                self.ran.append(job.name)
+                parcel = packer.pack(job)
+                unpacker.keep({digest: packer.arrays[digest] for digest in parcel.arrays})
+                result = unpacker.unpack(parcel).run(listen(job))
+                if result is None:
+                    return
+                yield job, pickle.loads(pickle.dumps(result))

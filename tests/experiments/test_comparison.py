@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
-from qfolio.commands.progress import BarProgress
+from qfolio.commands.progress import JobsProgress
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.comparison import run as comparing
@@ -25,7 +25,6 @@ from qfolio.experiments.comparison.ranking import (
     steps_within,
 )
 from qfolio.experiments.comparison.run import Comparison, Entrant
-from qfolio.experiments.fit import Listener
 from qfolio.experiments.presets import PRESETS, Preset
 from qfolio.experiments.run import Run
 from qfolio.portfolio.synthetic.kelly import Kelly
@@ -35,6 +34,7 @@ from qfolio.report.figures.style import percent_tick
 from qfolio.report.rendering import THIN_SPACE
 from qfolio.tasks.pendulum import Pendulum
 
+from jobs import Elsewhere
 from listeners import Interrupt, Tell
 from shell import qfolio
 
@@ -72,6 +72,12 @@ def short_chunks():
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr("qfolio.core.training.CHUNK", 20)
         yield
+
+
+@pytest.fixture
+def one_core(monkeypatch):
+    """The programs of these tests are hardly optimised, and round differently on two."""
+    monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
 
 
 GOOD, ALIKE, BAD = np.arange(8) / 8 - 102, np.arange(8) / 8 - 102.05, np.arange(8) - 140.0
@@ -208,8 +214,8 @@ def finished(tmp_path_factory):
     run = Comparison.create(tiny(), seeds=3, out=tmp_path_factory.mktemp("whole") / "run")
     seen = []
 
-    def listen(name):
-        return Tell(lambda training, rows: seen.append((name, training.population.episodes)))
+    def listen(job, done, share):
+        return [Tell(lambda training, rows: seen.append((job.name, training.population.episodes)))]
 
     run.run(listen)
     episodes = [0, 2, 4, 6]  # warm-up first
@@ -252,21 +258,52 @@ def test_resuming_gives_the_same(finished, tmp_path, stop):
 
     at = {"crash": Tell(crash), "ctrl-c": Interrupt(lambda now: now.population.episodes == 2)}
     with pytest.raises(RuntimeError) if stop == "crash" else contextlib.nullcontext():
-        run.run(lambda name: at[stop] if name == "quick" else Listener())
+        run.run(lambda job, done, share: [at[stop]] if job.name == "quick" else [])
     assert run.interrupted == (stop == "ctrl-c")
     run = Comparison.open(tmp_path / "run")
     assert list(run.results) == ["slow"]
     trained = []
 
-    def listener(name):
-        trained.append(name)
-        return Listener()
+    def listen(job, done, share):
+        trained.append((job.name, done, share))
+        return []
 
-    run.run(listener)
-    assert trained == ["quick"]
+    run.run(listen)
+    assert trained == [("quick", 0.0, 1.0)]
     for name, expected in finished[0].results.items():
         assert run.results[name].returns == expected.returns
         assert run.results[name].env_steps == expected.env_steps
+
+
+def test_on_workers_it_is_the_same(tmp_path, one_core):
+    """Also for an agent that diverges, and for one whose seeds were trained in part."""
+    rates, made = {"slow": 1e-3, "wild": 1e29, "quick": 1e-2}, list[Comparison]()
+    for name in ("here", "stopped"):
+        made.append(Comparison.create(tiny(**rates), seeds=3, out=tmp_path / name))
+    here, stopped = made
+    here.run()
+    elsewhere = Elsewhere()
+
+    def stop_in_the_last(job, done, share):
+        return [Interrupt()] if job.name == "quick/2" else []
+
+    stopped.run(stop_in_the_last, elsewhere)
+    assert stopped.interrupted
+    assert list(stopped.results) == ["slow"]
+    assert elsewhere.ran == [f"{name}/{seed}" for name in rates for seed in range(3)]
+    resumed, elsewhere = Comparison.open(tmp_path / "stopped"), Elsewhere()
+    resumed.run(executor=elsewhere)
+    assert elsewhere.ran == ["wild/0", "wild/1", "wild/2", "quick/2"]
+    assert resumed.failures.keys() == {"wild"}
+    assert re.match("The loss of seed 2 is no longer finite", resumed.failures["wild"])
+    timeless = {name: strip(result) for name, result in here.results.items()}
+    assert {name: strip(result) for name, result in resumed.results.items()} == timeless
+    assert resumed.finish()["ranking"]["order"] == here.finish()["ranking"]["order"]
+
+
+def strip(result):
+    """A result without the times that were measured."""
+    return {name: value for name, value in vars(result).items() if "second" not in name}
 
 
 def test_an_agent_that_diverges_does_not_stop_the_others(tmp_path):
@@ -359,7 +396,8 @@ def test_the_command(presets, monkeypatch, capsys, tmp_path):
     arguments = ["compare", "pendulum", "--agents", "dqn,dqn:bold", "--seeds", 3, "--out", folder]
     assert qfolio(monkeypatch, *arguments, "--episodes", 4) == 0
     printed = capsys.readouterr().out
-    assert "1 of 2: dqn\n2 of 2: dqn:bold\n" in printed
+    assert "\n1 of 2: dqn\n" in printed
+    assert "\n2 of 2: dqn:bold\n" in printed
     assert "two agents cannot be told apart" in printed.replace("\n", " ")
     assert f"Report: {folder / 'report.html'}" in printed.replace("\n", "").replace("R", "\nR")
     assert {path.name for path in folder.iterdir()} == {
@@ -381,7 +419,7 @@ def test_the_command(presets, monkeypatch, capsys, tmp_path):
 
 
 def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(BarProgress, "on_chunk", Interrupt().on_chunk)
+    monkeypatch.setattr(JobsProgress, "__call__", lambda *job: [Interrupt()])
     arguments = ["compare", "--agents", "dqn,dqn:bold", "--out", tmp_path / "run"]
     assert qfolio(monkeypatch, *arguments) == 130
     printed = capsys.readouterr().out.replace("\n", "")
@@ -400,7 +438,7 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
         (["--agents", "dqn,dqn:bold", "--episodes", 4, "--steps", 9], "give one of them"),
         (["--agents", "dqn,dqn:bold", "--episodes", 0], "episodes is 0"),
         (["--resume", "nowhere"], "no comparison"),
-        (["--resume", ".", "--seeds", 3], "add only --trust"),
+        (["--resume", ".", "--seeds", 3], "add only --on and --trust"),
     ],
 )  # fmt: skip
 def test_comparisons_that_are_refused(presets, monkeypatch, capsys, tmp_path, options, message):

@@ -16,6 +16,8 @@ from qfolio.core.errors import QfolioError
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
     from qfolio.experiments.comparison.run import Comparison, Entrant
+    from qfolio.experiments.executor import Executor, Job
+    from qfolio.experiments.fit import Listener
 
 
 def compare(
@@ -29,6 +31,7 @@ def compare(
     seed: Count = None,
     out: Folder = None,
     resume: Folder = None,
+    on: str = "here",
     trust: Modules = (),
 ) -> None:
     """Train several agents on one task, with the same seeds, and write a report that compares them.
@@ -45,11 +48,12 @@ def compare(
         seed: First seed; the others follow it (default: 0).
         out: New folder for the comparison (default: one in runs/).
         resume: Folder of a comparison to resume.
+        on: Where agents train: here, processes:4 (or another number), ray or ray://HOST:10001.
         trust: Modules of your own code that the folder may name (default: none).
     """
     given = (task, agents, preset, episodes, steps, seeds, seed, out)
     if resume is not None and any(option is not None for option in given):
-        raise QfolioError("--resume keeps the comparison's settings; add only --trust.")
+        raise QfolioError("--resume keeps the comparison's settings; add only --on and --trust.")
     budget = budget_of(episodes, steps)
     from qfolio.core import devices
 
@@ -58,7 +62,9 @@ def compare(
     from qfolio.commands import console
     from qfolio.commands.progress import stop
     from qfolio.experiments.comparison.run import Comparison
+    from qfolio.experiments.machines.choice import on as executor_of
 
+    executor = executor_of(on)
     if resume is None:
         task = task or "pendulum"
         now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
@@ -81,10 +87,10 @@ def compare(
         f"{len(run.entrants)} agents on {run.config.task} · {seeds} seed{'s' * (seeds > 1)} "
         f"each · {run.config.device}"
     )
-    _train(run)
+    _train(run, executor)
     if run.interrupted:
         parts = [part for one in run.entrants.values() for part in (one.task, one.agent)]
-        stop(again("qfolio compare --resume", run.folder, *parts))
+        stop(again("qfolio compare --resume", run.folder, *parts, on=on))
     _finish(run)
 
 
@@ -127,19 +133,23 @@ def _parts(entry: str) -> tuple[str, str]:
     return ":".join(parts[:count]), ":".join(parts[count:])
 
 
-def _train(run: "Comparison") -> None:
+def _train(run: "Comparison", executor: "Executor") -> None:
     """Trains with a bar, and a line for each agent that starts."""
     from qfolio.commands import console
-    from qfolio.commands.progress import BarProgress
+    from qfolio.commands.progress import JobsProgress
 
-    names = list(run.entrants)
+    names, begun = list(run.entrants), set[str]()
     with console.bar("") as update:
+        progress = JobsProgress(update)
 
-        def listen(name: str) -> BarProgress:
-            console.say(f"{names.index(name) + 1} of {len(names)}: {name}")
-            return BarProgress(update, name)
+        def listen(job: "Job", done: float, share: float) -> "list[Listener]":
+            name = job.name.partition("/")[0]
+            if name not in begun:
+                begun.add(name)
+                console.say(f"{names.index(name) + 1} of {len(names)}: {name}")
+            return progress(job, done, share)
 
-        run.run(listen)
+        run.run(listen, executor)
 
 
 def _finish(run: "Comparison") -> None:

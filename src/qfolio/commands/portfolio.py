@@ -60,7 +60,7 @@ def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> No
     devices.configure()
     registry.trust(options.trust)
     from qfolio.commands import console
-    from qfolio.commands.progress import BacktestProgress, stop
+    from qfolio.commands.progress import JobsProgress, stop
     from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.backtest.attribution.explain import explain
     from qfolio.portfolio.backtest.run import Backtest
@@ -82,7 +82,7 @@ def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> No
         raise QfolioError("--resume keeps the backtest's settings; add only --on and --trust.")
     console.say(console.describe_backtest(run))
     with console.bar("compiling") as update:
-        run.run(BacktestProgress(update), executor)
+        run.run(JobsProgress(update), executor)
     if run.interrupted:
         stop(again("qfolio backtest --resume", folder, *run.parts, on=options.on))
     with console.console.status("Replaying all strategies, drawing histories, writing the report"):

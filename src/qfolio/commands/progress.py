@@ -80,8 +80,8 @@ class BarProgress(Listener):
         self.update(completed=training.share, description=status)
 
 
-class BacktestProgress:
-    """A bar over all jobs of a backtest, or a line for each tenth without a terminal.
+class JobsProgress:
+    """A bar over all jobs of an experiment, or a line for each tenth without a terminal.
 
     Called before each job, it returns the listener of that job's training. Jobs may run side by
     side.
@@ -113,7 +113,7 @@ class BacktestProgress:
 
 
 class _JobProgress(Listener):
-    def __init__(self, whole: BacktestProgress, job: str, share: float) -> None:
+    def __init__(self, whole: JobsProgress, job: str, share: float) -> None:
         self.whole, self.job, self.share = whole, job, share
 
     def on_start(self, training: Training) -> None:

@@ -45,7 +45,7 @@ def study(
     devices.configure()
     registry.trust(options.trust)
     from qfolio.commands import console
-    from qfolio.commands.progress import BacktestProgress, stop
+    from qfolio.commands.progress import JobsProgress, stop
     from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.study.run import Study
     from qfolio.report.study import write_study_report
@@ -73,7 +73,7 @@ def study(
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1
             console.say(f"{place} of {len(run.places)}: {table}, {console.spell(variant)}")
-            return BacktestProgress(update)
+            return JobsProgress(update)
 
         run.run(listen, write_report, executor)
     if run.interrupted:

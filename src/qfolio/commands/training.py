@@ -25,6 +25,7 @@ from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
+    from qfolio.experiments.executor import Executor
     from qfolio.experiments.run import Run
 
 
@@ -40,6 +41,7 @@ def train(
     out: Folder = None,
     assignments: Assignments = (),
     resume: Folder = None,
+    on: str = "here",
     trust: Modules = (),
     compare: bool = True,
     live: bool = False,
@@ -66,6 +68,7 @@ def train(
         assignments: Settings of agent and task, for example --set discount=0.98 hidden=256,256; a
             report and docs/dqn.md list them.
         resume: Folder of a run to resume, up to --episodes or --steps if given.
+        on: Where seeds train: here, processes:4 (or another number), ray or ray://HOST:10001.
         trust: Modules of your own code that the folder may name (default: none).
         compare: Train two more agents with one thing changed, for the report (DQN: double DQN; in
             markets: one action at a time instead of all at once).
@@ -78,9 +81,13 @@ def train(
     from qfolio.commands import console
     from qfolio.commands.progress import stop
     from qfolio.experiments import presets
+    from qfolio.experiments.machines.choice import on as executor_of
     from qfolio.experiments.run import Run
 
     budget = budget_of(episodes, steps)
+    if live and on != "here":
+        raise QfolioError("--live shows a training in this process; leave out --on, or --live.")
+    executor = executor_of(on)
     if live and task not in (None, "pendulum"):
         raise QfolioError(f"--live shows the pendulum; there is nothing to see of {task}.")
     with _window(live) as show:
@@ -98,14 +105,14 @@ def train(
             run, folder = Run.open(resume), resume
         budget = budget or run.budget
         console.say(console.describe_run(run, budget))
-        _train(run, budget, show)
+        _train(run, budget, executor, show)
     if run.interrupted:
-        stop(_resume(run, folder))
+        stop(_resume(run, folder, on))
     contrast = None
     if compare:
-        contrast = _contrast(run, folder)
+        contrast = _contrast(run, folder, executor)
     if contrast is not None and contrast.interrupted:
-        stop(_resume(run, folder))
+        stop(_resume(run, folder, on))
     _finish(run, folder, contrast)
 
 
@@ -213,11 +220,22 @@ def _new_run(
     )
 
 
-def _train(run: "Run", budget: "Budget", show: Callable[["Run"], None] | None = None) -> None:
-    """Trains with live progress and the optimum."""
+def _train(
+    run: "Run",
+    budget: "Budget",
+    executor: "Executor",
+    show: Callable[["Run"], None] | None = None,
+) -> None:
+    """Trains with live progress; in this process, beside the optimum."""
     from qfolio.commands import console
-    from qfolio.commands.progress import RunProgress
+    from qfolio.commands.progress import JobsProgress, RunProgress
     from qfolio.core.evaluation import start_keys
+    from qfolio.experiments.executor import Here
+
+    if not isinstance(executor, Here):
+        with console.bar("") as update:
+            run.train(budget, executor=executor, listen=JobsProgress(update))
+        return
 
     solution, optimum = run.task.optimum(), None
     if solution is not None:
@@ -227,7 +245,7 @@ def _train(run: "Run", budget: "Budget", show: Callable[["Run"], None] | None = 
     run.train(budget, [RunProgress(run, optimum, show)])
 
 
-def _contrast(run: "Run", folder: Path) -> "Run | None":
+def _contrast(run: "Run", folder: Path, executor: "Executor") -> "Run | None":
     """The training of the report's variant, with one setting changed; resumable, too."""
     from qfolio.commands.console import say
     from qfolio.experiments.run import Run
@@ -252,7 +270,7 @@ def _contrast(run: "Run", folder: Path) -> "Run | None":
         )
     if run.budget.left(contrast.population):
         say(f"\nFor contrast, {variant.variant_name} ({contrast.config.seeds} of the seeds):")
-        _train(contrast, run.budget)
+        _train(contrast, run.budget, executor)
     return contrast
 
 
@@ -276,9 +294,9 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
     say(f"Report: {folder / 'report.html'}")
 
 
-def _resume(run: "Run", folder: Path | None) -> str:
+def _resume(run: "Run", folder: Path | None, on: str = "here") -> str:
     assert folder is not None
-    return again("qfolio train --resume", folder, run.task, run.agent)
+    return again("qfolio train --resume", folder, run.task, run.agent, on=on)
 
 
 def _command(run: "Run") -> str:

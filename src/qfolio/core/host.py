@@ -311,10 +311,12 @@ class HostPopulation(Population):
         return jax.jit(one, donate_argnums=0 if donate else ()).lower(*args).compile()
 
 
-def population_of(task: Task, agents: Agent | Sequence[Agent], seeds: Sequence[int]) -> Population:
+def population_of(
+    task: Task, agents: Agent | Sequence[Agent], seeds: Sequence[int], room: int = 0
+) -> Population:
     """A population on a task, compiled or stepped from Python as the task requires."""
     kind = HostPopulation if isinstance(task, HostTask) else Population
-    return kind(task, agents, seeds)
+    return kind(task, agents, seeds, room)
 
 
 def _stack(members: Sequence[PyTree]) -> PyTree:

@@ -1,11 +1,13 @@
 """Executors of jobs: in this process, one after another; on many workers, see ``machines``."""
 
+import contextlib
 from collections.abc import Callable, Generator, Iterable, Sequence
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 
 from qfolio.core.devices import LOCKSTEP
+from qfolio.experiments.events import Log
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
 
@@ -27,6 +29,16 @@ class Job(Protocol[R_co]):
 
     def run(self, listeners: Sequence[Listener]) -> R_co | None:
         """The result; None if Ctrl-C stopped it."""
+        ...
+
+
+@runtime_checkable
+class MembersJob(Job[R_co], Protocol[R_co]):
+    """A job that trains several members."""
+
+    @property
+    def members(self) -> Sequence[str]:
+        """Their names, for the log."""
         ...
 
 
@@ -74,3 +86,38 @@ class Here:
                 if result is None:
                     return
                 yield job, result
+
+
+ListenToJob = Callable[[Job, float, float], Sequence[Listener]]
+"""Called before each job, with the finished share of all jobs and the share of this job; returns
+the listeners of its training."""
+
+
+def carry_out(
+    executor: Executor,
+    jobs: Sequence[MembersJob],
+    listen: ListenToJob,
+    store: Callable[[Any, Any], None],
+    log: Log,
+) -> bool:
+    """Runs jobs; returns whether Ctrl-C stopped it.
+
+    store: called with each finished job and its result. log: of the experiment; its listener of a
+    job is the first.
+    """
+    done = 0
+    log.queue([job.name for job in jobs])
+
+    def listeners(job: Job) -> Sequence[Listener]:
+        assert isinstance(job, MembersJob)
+        return [log.job(job.name, job.members), *listen(job, done / len(jobs), 1 / len(jobs))]
+
+    with (
+        interruptible() as stop,
+        contextlib.closing(executor.map(jobs, listeners)) as finished,
+    ):
+        for job, result in finished:
+            store(job, result)
+            done += 1
+        log.settle(done == len(jobs))
+        return stop.is_set()

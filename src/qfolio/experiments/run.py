@@ -20,9 +20,11 @@ from qfolio.core.registry import short
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.events import JobLog, Log, add_result, seed_names
+from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.experiments.grading import grade
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder
+from qfolio.experiments.seed_groups import SeedGroups, SeedsJob, TrainedSeeds
 
 EVALUATIONS = 20
 """Approximate number of points on the learning curve."""
@@ -34,19 +36,22 @@ class Run:
     """Seeds of one agent on one task; make it with ``Run.create``, ``Run.open`` or ``train``.
 
     metrics: a row for each finished training episode. evaluations: a row for each seed and point of
-    the learning curve. interrupted: whether Ctrl-C stopped the last training.
+    the learning curve. interrupted: whether Ctrl-C stopped the last training. groups: of the seeds,
+    for executors that train them as jobs.
     """
 
     def __init__(
-        self, task: Task, agent: Agent, config: RunConfig, folder: RunFolder | None
+        self, task: Task, agent: Agent, config: RunConfig, folder: RunFolder | None, room: int = 0
     ) -> None:
+        """room: seeds of the largest run that shares the programs, if more than its own."""
         self.task, self.agent, self.config, self._folder = task, agent, config, folder
-        self.population: Population = population_of(task, agent, config.seed_range)
+        self.population: Population = population_of(task, agent, config.seed_range, room)
         self.metrics: list[Row] = []
         self.evaluations: list[Row] = []
         self.seconds_train = 0.0
         self.interrupted = False
         self._log: JobLog | None = None  # while it trains
+        self.groups = SeedGroups(self)
 
     @classmethod
     def create(
@@ -145,18 +150,39 @@ class Run:
         self,
         budget: Budget | None = None,
         listeners: Sequence[Listener] = (),
+        *,
+        executor: Executor | None = None,
+        listen: ListenToJob | None = None,
         log: JobLog | None = None,
     ) -> None:
         """Trains until each seed has used its budget (default: the configured one).
 
-        A first Ctrl-C stops after the current chunk, sets ``interrupted`` and leaves a checkpoint.
-        Raises QfolioError if a loss is not finite (the last good checkpoint stays) or if another
-        process trains in the folder.
+        A first Ctrl-C stops after the current chunk, sets ``interrupted`` and leaves a checkpoint;
+        with an executor, it leaves the finished groups of seeds. Raises QfolioError if a loss is
+        not finite (the last good checkpoint stays) or if another process trains in the folder.
 
-        log: of the experiment that the run is a part of (default: the folder's own).
+        Args:
+            budget: The budget of each seed, including earlier training.
+            listeners: Hear of the training.
+            executor: Where groups of seeds train (default: all side by side in this process); see
+                ``qfolio.on``.
+            listen: Called before each group, with the finished share of all groups and the share of
+                this one; returns its listeners (default: ``listeners``).
+            log: Of the experiment that the run is a part of (default: the folder's own).
         """
+        budget, executor = budget or self.budget, executor or Here()
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
-            self._train(budget or self.budget, listeners, log)
+            if isinstance(executor, Here) and not self.groups.begun:
+                self._train(budget, listeners, log)
+            else:
+                each = listen or (lambda job, done, share: listeners)
+                self._train_groups(self.groups.jobs(executor, budget), executor, each)
+
+    def _train_groups(self, jobs: list[SeedsJob], executor: Executor, listen: ListenToJob) -> None:
+        self.interrupted = False
+        if jobs:
+            with Log(self.folder).opened(**self._about) as log:
+                self.interrupted = carry_out(executor, jobs, listen, self.groups.store, log)
 
     def _train(self, budget: Budget, listeners: Sequence[Listener], log: JobLog | None) -> None:
         self.interrupted = False
@@ -164,14 +190,7 @@ class Run:
             self.evaluate()  # the run's table was lost
         if not budget.left(self.population):
             return
-        self.config = msgspec.structs.replace(
-            self.config, episodes=budget.episodes, steps=budget.steps
-        )
-        if not self.population.steps:
-            self.evaluations = []  # left by a process that was killed before its first checkpoint
-        if self._folder is not None:
-            self._folder.write_config(self.config)
-            self._folder.tidy({METRICS: self.metrics, EVALUATION: self.evaluations})
+        self.aim_at(budget)
         with contextlib.ExitStack() as stack:
             if log is None:
                 own = stack.enter_context(Log(self.folder).opened(**self._about))
@@ -196,6 +215,28 @@ class Run:
             "seeds": config.seeds,
             self.budget.unit: self.budget.amount,
         }
+
+    def aim_at(self, budget: Budget) -> None:
+        """Makes a budget the configured one, before its training begins."""
+        self.config = msgspec.structs.replace(
+            self.config, episodes=budget.episodes, steps=budget.steps
+        )
+        if not self.population.steps:
+            self.evaluations = []  # left by a process that was killed before its first checkpoint
+        if self._folder is not None:
+            self._folder.write_config(self.config)
+            self._folder.tidy({METRICS: self.metrics, EVALUATION: self.evaluations})
+
+    def adopt(self, trained: TrainedSeeds) -> None:
+        """Makes training that was done elsewhere, from this run's state, its own."""
+        before = self.done("steps")
+        self.population.restore(trained.state["training"])
+        self.population.seconds_compile += trained.seconds_compile
+        self.seconds_train += float(trained.state["seconds_train"])
+        new = [row for row in trained.evaluations if not before or row["env_steps"] > before]
+        self._record(METRICS, self.metrics, trained.metrics)
+        self._record(EVALUATION, self.evaluations, new)
+        self._write_checkpoint()
 
     def first_weights(self) -> Any:
         """The first seed's learned weights."""
@@ -255,12 +296,12 @@ class Run:
 
     def _write_checkpoint(self) -> None:
         if self._folder is not None:
-            state = self._snapshot()
+            state = self.state()
             self._folder.write_checkpoint(state, self.agent.weights(state["training"].agent))
 
     def _read_checkpoint(self) -> None:
         assert self._folder is not None
-        state = self._folder.read_checkpoint(self._snapshot())
+        state = self._folder.read_checkpoint(self.state())
         self.seconds_train = float(state["seconds_train"])
         self.population.restore(state["training"])
         members = zip(self.population.seeds, self.population.member_episodes, strict=True)
@@ -272,7 +313,8 @@ class Run:
         whole = [rows for rows in points.values() if len(rows) == self.config.seeds]
         self.evaluations = [row for rows in whole for row in rows]
 
-    def _snapshot(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds, with a leading seed axis."""
         return {"training": self.population.fetch(), "seconds_train": np.array(self.seconds_train)}
 
 
@@ -332,13 +374,15 @@ def train(
     seed: int = 0,
     out: Path | str | None = None,
     listeners: Sequence[Listener] = (),
+    executor: Executor | None = None,
 ) -> Run:
     """Trains ``seeds`` agents side by side, from seeds ``seed``, ``seed + 1``, …
 
     episodes, steps: the budget of each; one of the two. out: a new folder for the run; without it
-    nothing is written. ``run.summary()`` grades it.
+    nothing is written. executor: where groups of seeds train (default: all in this process); see
+    ``qfolio.on``. ``run.summary()`` grades it.
     """
     devices.configure()
     run = Run.create(task, agent, episodes=episodes, steps=steps, seeds=seeds, seed=seed, out=out)
-    run.train(listeners=listeners)
+    run.train(listeners=listeners, executor=executor)
     return run

@@ -6,7 +6,8 @@ is finished; and the ranking), a run folder for each agent in agents/ (for ``qfo
 agent that was training.
 """
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,17 +23,18 @@ from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, read_json
-from qfolio.core.host import HostPopulation
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.conclusion import conclusion, listed
-from qfolio.experiments.comparison.operations import operations_per_step
+from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.ranking import Result, rank
 from qfolio.experiments.described import agent_of, describe, task_of
-from qfolio.experiments.events import Log, add_result, seed_names
+from qfolio.experiments.events import JobLog, Log, add_result, seed_names
+from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.run import Run
+from qfolio.experiments.seed_groups import SeedsJob, TrainedSeeds
 
 FILE = "comparison.json"
 
@@ -51,6 +53,25 @@ class Entrant:
     agent: Agent
     preset: str | None
     budget: Budget
+
+
+@dataclass(frozen=True)
+class _AgentJob:
+    """Trains all seeds of an agent in this process, from the last checkpoint in its folder."""
+
+    name: str
+    members: Sequence[str]
+    open: Callable[[str], Run]
+
+    def run(self, listeners: Sequence[Listener]) -> Run | QfolioError | None:
+        log, *others = listeners
+        assert isinstance(log, JobLog)
+        try:
+            run = self.open(self.name)
+            run.train(listeners=others, log=log)
+        except QfolioError as error:
+            return error
+        return None if run.interrupted else run
 
 
 class EntrantConfig(msgspec.Struct, kw_only=True):
@@ -172,21 +193,27 @@ class Comparison:
         """The run folder of an agent."""
         return self.folder / "agents" / _folder_name(name)
 
-    def run(self, listen: Callable[[str], Listener] | None = None) -> None:
+    def run(self, listen: ListenToJob | None = None, executor: Executor | None = None) -> None:
         """Trains and grades every agent that has no result yet.
 
-        A first Ctrl-C stops after the current chunk and sets ``interrupted``. An agent that
-        diverges is left out and noted in ``failures``.
+        A first Ctrl-C stops after the current chunk and sets ``interrupted``; with an executor,
+        finished groups of seeds are kept. An agent that diverges is left out and noted in
+        ``failures``.
 
-        listen: called with an agent's name before it trains; returns the listener of its training.
+        Args:
+            listen: Called before each job, which is an agent or a group of its seeds, with the
+                finished share of all jobs and the share of this job; returns its listeners.
+            executor: Where groups of seeds train (default: one agent after another in this
+                process); see ``qfolio.on``.
         """
+        listen, executor = listen or (lambda job, done, share: ()), executor or Here()
         missing = [name for name in self.entrants if name not in self.results]
-        with locked(self.folder):
-            if missing:
-                with Log(self.folder).opened(**self._about) as log:
-                    log.queue(missing)
-                    self._run(missing, listen, log)
-                    log.settle(not self.interrupted)
+        self.interrupted = False
+        if not missing:
+            return
+        with locked(self.folder), Log(self.folder).opened(**self._about) as log:
+            run = self._run_here if isinstance(executor, Here) else self._run_groups
+            self.interrupted = run(missing, executor, listen, log)
 
     @property
     def _about(self) -> dict[str, Any]:
@@ -199,23 +226,53 @@ class Comparison:
             "seeds": config.seeds,
         }
 
-    def _run(self, missing: list[str], listen: Callable[[str], Listener] | None, log: Log) -> None:
-        self.interrupted = False
-        for name in missing:
-            listeners = [] if listen is None else [listen(name)]
-            job = log.job(name, seed_names(seed_range(self.config.seeds, self.config.seed)))
+    def _run_here(
+        self, missing: list[str], executor: Executor, listen: ListenToJob, log: Log
+    ) -> bool:
+        """Trains one agent after another; returns whether Ctrl-C stopped it."""
+        members = seed_names(seed_range(self.config.seeds, self.config.seed))
+        jobs = [_AgentJob(name, members, self._open) for name in missing]
+
+        def store(job: _AgentJob, trained: Run | QfolioError) -> None:
+            if isinstance(trained, QfolioError):
+                self._fail(job, job.name, trained, log)
+            else:
+                self._keep(job.name, trained, executor)
+
+        return carry_out(executor, jobs, listen, store, log)
+
+    def _run_groups(
+        self, missing: list[str], executor: Executor, listen: ListenToJob, log: Log
+    ) -> bool:
+        """Trains all agents' groups of seeds; returns whether Ctrl-C stopped it."""
+        runs, jobs = dict[str, Run](), list[SeedsJob]()
+
+        def store(job: SeedsJob, trained: TrainedSeeds | QfolioError) -> None:
             try:
-                run = self._open(name)
-                run.train(listeners=listeners, log=job)
+                runs[job.label].groups.store(job, trained)
             except QfolioError as error:
-                self.failures[name] = str(error)
-                log.write("failed", job=name, error=str(error))
-                continue
-            if run.interrupted:
-                self.interrupted = True
-                return
-            self.results[name] = _result(run)
-            self._write()
+                self._fail(job, job.label, error, log)
+            keep_if_finished(job.label)
+
+        def keep_if_finished(name: str) -> None:
+            if not runs[name].budget.left(runs[name].population):
+                self._keep(name, runs.pop(name), executor)
+
+        with contextlib.ExitStack() as stack:
+            for name in missing:
+                runs[name] = self._open(name)
+                stack.enter_context(locked(self.place(name)))
+                jobs += runs[name].groups.jobs(executor, label=name)
+                keep_if_finished(name)  # if nothing but the result was missing
+            return carry_out(executor, jobs, listen, store, log)
+
+    def _fail(self, job: Job, name: str, error: QfolioError, log: Log) -> None:
+        self.failures[name] = str(error)
+        log.write("failed", job=job.name, error=str(error))
+
+    def _keep(self, name: str, run: Run, executor: Executor) -> None:
+        self.results[name] = measure(run, executor.devices)
+        self._write()
 
     def finish(self) -> dict[str, Any]:
         """The content of comparison.json, with the ranking of all finished agents."""
@@ -331,49 +388,12 @@ def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
     return f"{key} is {', '.join(groups)}" if len(values) > 1 else None
 
 
-def _result(run: Run) -> Result:
-    """Grades a finished run and measures its cost."""
-    summary = run.summary()
-    seeds = len(run.population.seeds)
-    solution, curve_optimum = run.task.optimum(), None
-    if solution is not None:
-        curve_optimum = float(solution.returns(start_keys())[: run.population.curve_starts].mean())
-    rows = run.evaluations
-    members = jax.eval_shape(partial(begin, run.task, run.agent), jnp.uint32(0))
-    weights = jax.tree.leaves(jax.eval_shape(run.agent.weights, members.agent))
-    at_once = 1 if isinstance(run.population, HostPopulation) else min(len(jax.devices()), seeds)
-    return Result(
-        returns=summary["return_per_seed"],
-        optimum=summary["optimum"],
-        starts=run.population.starts,
-        curve_starts=run.population.curve_starts,
-        curve_steps=[int(row["env_steps"]) for row in rows[::seeds]],
-        curve_returns=np.reshape([row["return"] for row in rows], (-1, seeds)).tolist(),
-        curve_optimum=curve_optimum,
-        episodes=summary["episodes"],
-        env_steps=summary["env_steps"],
-        seconds_train=summary["seconds_train"],
-        seconds_compile=summary["seconds_compile"],
-        # The members of a device take turns, or share it.
-        seconds_per_seed=summary["seconds_train"] / -(-seeds // at_once),
-        steps_per_second=summary["steps_per_second"],
-        operations_per_step=operations_per_step(run.task, run.agent),
-        state_bytes=_bytes(jax.tree.leaves(members)),
-        policy_bytes=_bytes(weights),
-        parameters=sum(x.size for x in weights if jnp.issubdtype(x.dtype, jnp.floating)),
-    )
-
-
 def _measures(result: Result) -> dict[str, float | None]:
     """What the log says of a result."""
     final = float(np.mean(result.returns))
     optimum = result.optimum
     gap = None if optimum is None else (optimum - final) / abs(optimum)
     return {"return": final, "optimum": optimum, "regret": gap}
-
-
-def _bytes(leaves: list[Any]) -> int:
-    return int(sum(leaf.size * leaf.dtype.itemsize for leaf in leaves))
 
 
 def _same(first: Any, second: Any) -> bool:

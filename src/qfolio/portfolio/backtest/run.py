@@ -7,7 +7,7 @@ float64, beside classical allocators under the same rules.
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,8 @@ from qfolio.core.registry import BASELINES, short
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.events import Log, add_result
-from qfolio.experiments.executor import Executor, Here, Job
-from qfolio.experiments.fit import Listener, Row
-from qfolio.experiments.interrupts import interruptible
+from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
+from qfolio.experiments.fit import Row
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest import assessment
 from qfolio.portfolio.backtest.attribution.why import Why
@@ -197,7 +196,7 @@ class Backtest:
 
     def run(
         self,
-        listen: Callable[[Job, float, float], Sequence[Listener]] = lambda job, done, share: (),
+        listen: ListenToJob = lambda job, done, share: (),
         executor: Executor | None = None,
     ) -> None:
         """Trains every fold of every agent that is not trained yet.
@@ -211,28 +210,13 @@ class Backtest:
             executor: Where the jobs run (default: in this process); see ``qfolio.on``.
         """
         executor = executor or Here()
-        jobs, done = self.jobs(executor), 0
+        jobs = self.jobs(executor)
         self.interrupted = False
         if not jobs:
             return
-        with contextlib.ExitStack() as stack:
-            if self.folder is not None:
-                stack.enter_context(locked(self.folder))
-            log = stack.enter_context(Log(self.folder).opened(**self._about))
-            log.queue([job.name for job in jobs])
-            members = {job.name: job.members for job in jobs}
-
-            def listeners(job: Job[dict[str, TrainedFold]]) -> Sequence[Listener]:
-                own = listen(job, done / len(jobs), 1 / len(jobs))
-                return [log.job(job.name, members[job.name]), *own]
-
-            stop = stack.enter_context(interruptible())
-            finished = stack.enter_context(contextlib.closing(executor.map(jobs, listeners)))
-            for job, trained in finished:
-                self.store(job, trained)
-                done += 1
-            self.interrupted = stop.is_set()
-            log.settle(done == len(jobs))
+        lock = contextlib.nullcontext() if self.folder is None else locked(self.folder)
+        with lock, Log(self.folder).opened(**self._about) as log:
+            self.interrupted = carry_out(executor, jobs, listen, self.store, log)
 
     @property
     def _about(self) -> dict[str, Any]:

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.events import Log
-from qfolio.experiments.executor import Executor, Job
+from qfolio.experiments.executor import Executor, Job, ListenToJob
 from qfolio.experiments.fit import Listener
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.study.folder import Variant
-
-ListenToJob = Callable[[Job, float, float], Sequence[Listener]]
-"""The ``listen`` of ``Backtest.run``."""
 
 Listen = Callable[[str, Variant, Backtest], ListenToJob]
 

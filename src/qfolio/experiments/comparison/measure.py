@@ -1,0 +1,52 @@
+"""What a comparison measures of a finished run: its grades, its curve and its cost."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from qfolio.core.evaluation import start_keys
+from qfolio.core.host import HostPopulation
+from qfolio.core.training import begin
+from qfolio.experiments.comparison.operations import operations_per_step
+from qfolio.experiments.comparison.ranking import Result
+from qfolio.experiments.run import Run
+
+
+def measure(run: Run, devices: int) -> Result:
+    """Grades a run and measures its cost; devices: that trained its seeds side by side."""
+    summary = run.summary()
+    seeds = len(run.population.seeds)
+    solution, curve_optimum = run.task.optimum(), None
+    if solution is not None:
+        curve_optimum = float(solution.returns(start_keys())[: run.population.curve_starts].mean())
+    rows = run.evaluations
+    members = jax.eval_shape(partial(begin, run.task, run.agent), jnp.uint32(0))
+    weights = jax.tree.leaves(jax.eval_shape(run.agent.weights, members.agent))
+    at_once = 1 if isinstance(run.population, HostPopulation) else min(devices, seeds)
+    return Result(
+        returns=summary["return_per_seed"],
+        optimum=summary["optimum"],
+        starts=run.population.starts,
+        curve_starts=run.population.curve_starts,
+        curve_steps=[int(row["env_steps"]) for row in rows[::seeds]],
+        curve_returns=np.reshape([row["return"] for row in rows], (-1, seeds)).tolist(),
+        curve_optimum=curve_optimum,
+        episodes=summary["episodes"],
+        env_steps=summary["env_steps"],
+        seconds_train=summary["seconds_train"],
+        seconds_compile=summary["seconds_compile"],
+        # The members of a device take turns, or share it.
+        seconds_per_seed=summary["seconds_train"] / -(-seeds // at_once),
+        steps_per_second=summary["steps_per_second"],
+        operations_per_step=operations_per_step(run.task, run.agent),
+        state_bytes=_bytes(jax.tree.leaves(members)),
+        policy_bytes=_bytes(weights),
+        parameters=sum(x.size for x in weights if jnp.issubdtype(x.dtype, jnp.floating)),
+    )
+
+
+def _bytes(leaves: list[Any]) -> int:
+    return int(sum(leaf.size * leaf.dtype.itemsize for leaf in leaves))

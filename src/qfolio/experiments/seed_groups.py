@@ -1,0 +1,242 @@
+"""Training the seeds of a run in groups: each group is a job, wherever it runs.
+
+The groups that are finished wait in the folder seeds/ of the run, each a run folder of its own,
+until the last one is there and all of them become the run.
+"""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import msgspec
+import numpy as np
+from jaxtyping import PyTree
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import new_folder
+from qfolio.core.mdp import Agent, Task
+from qfolio.core.registry import short
+from qfolio.experiments.budget import Budget
+from qfolio.experiments.events import Log, seed_names
+from qfolio.experiments.executor import Executor, Job
+from qfolio.experiments.fit import Listener, Row
+from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder
+
+if TYPE_CHECKING:
+    from qfolio.experiments.run import Run
+
+FOLDER = "seeds"
+
+AT_ONCE = 32
+"""Seeds of a group if members advance in lockstep."""
+
+
+class TrainedSeeds(NamedTuple):
+    """Seeds that have been trained.
+
+    config: of these seeds alone. state: what a checkpoint holds of them, with a leading seed axis.
+    """
+
+    config: RunConfig
+    state: PyTree
+    metrics: list[Row]
+    evaluations: list[Row]
+    seconds_compile: float = 0.0
+
+
+@dataclass(frozen=True)
+class SeedsJob:
+    """Trains some seeds of a run, as one population.
+
+    label: of the run. config: of these seeds alone. most: seeds of the run's largest group; all
+    share its programs. start: the states to continue from (default: before the first step).
+    """
+
+    label: str
+    task: Task
+    agent: Agent
+    config: RunConfig
+    most: int
+    start: PyTree | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.label}/{self.config.seed}"
+
+    @property
+    def members(self) -> list[str]:
+        return seed_names(self.config.seed_range)
+
+    def run(self, listeners: Sequence[Listener]) -> TrainedSeeds | QfolioError | None:
+        """The trained seeds, or why they could not be trained; None if Ctrl-C stopped it."""
+        from qfolio.experiments.run import Run  # which makes these jobs
+
+        try:
+            run = Run(self.task, self.agent, self.config, None, self.most)
+            if self.start is not None:
+                run.population.restore(self.start)
+            run.train(listeners=listeners, log=Log(None).job(members=self.members))
+        except QfolioError as error:
+            return error
+        if run.interrupted and self.config.budget.left(run.population):
+            return None
+        compiling = run.population.seconds_compile
+        return TrainedSeeds(self.config, run.state(), run.metrics, run.evaluations, compiling)
+
+
+class SeedGroups:
+    """The groups of a run's seeds; ``jobs`` trains those that are missing."""
+
+    def __init__(self, run: "Run") -> None:
+        self._run = run
+        self._done: dict[int, TrainedSeeds] = {}  # by the first seed
+
+    @property
+    def begun(self) -> bool:
+        """Whether there are finished groups that are not in the run yet."""
+        return bool(self._done) or (self._place is not None and self._place.exists())
+
+    def jobs(
+        self, executor: Executor, budget: Budget | None = None, label: str | None = None
+    ) -> list[SeedsJob]:
+        """The groups that are missing; each goes to ``store``.
+
+        Each seed takes as many steps as its episodes would if none ended early, so that it does not
+        depend on seeds of other groups.
+
+        budget: of each seed (default: the run's). label: begins the names of the jobs (default: the
+        agent's name).
+        """
+        run, budget = self._run, budget or self._run.budget
+        if not budget.left(run.population):
+            self._clear()
+            return []
+        steps, state = budget.planned(run.population), run.state()
+        if self._place is not None:
+            self._done = {part.config.seed: part for part in _read(self._place, state)}
+        for part in self._done.values():
+            if part.config.steps != steps:
+                raise QfolioError(
+                    f"Some seeds of the run have been trained for {part.config.steps:,} steps, and "
+                    f"not for {steps:,}; finish the training that was begun first."
+                )
+        run.aim_at(budget)
+        if not (missing := self.missing):
+            self._join()
+        groups = _groups(missing, executor)
+        first, start = run.config.seed, state["training"] if run.population.steps else None
+        return [
+            SeedsJob(
+                label or short(run.config.agent),
+                run.task,
+                run.agent,
+                msgspec.structs.replace(
+                    run.config, seed=group.start, seeds=len(group), episodes=None, steps=steps
+                ),
+                max(map(len, groups)),
+                _members(start, group.start - first, group.stop - first),
+            )
+            for group in groups
+        ]
+
+    def store(self, job: Job, trained: TrainedSeeds | QfolioError) -> None:
+        """Keeps what a job has trained; after the last one, all of them become the run.
+
+        Raises QfolioError if the job could not train its seeds.
+        """
+        if isinstance(trained, QfolioError):
+            raise trained
+        self._done[trained.config.seed] = trained
+        if self._place is not None:
+            _write(self._place, trained, self._run.agent)
+        if not self.missing:
+            self._join()
+
+    @property
+    def missing(self) -> list[int]:
+        """The seeds of which no group is there."""
+        there = {seed for part in self._done.values() for seed in part.config.seed_range}
+        return [seed for seed in self._run.config.seed_range if seed not in there]
+
+    @property
+    def _place(self) -> Path | None:
+        return None if self._run.folder is None else self._run.folder / FOLDER
+
+    def _join(self) -> None:
+        self._run.adopt(_joined(list(self._done.values()), self._run))
+        self._clear()
+
+    def _clear(self) -> None:
+        self._done = {}
+        if self._place is not None:
+            shutil.rmtree(self._place, ignore_errors=True)
+
+
+def _groups(seeds: Sequence[int], executor: Executor) -> list[range]:
+    """Ascending seeds in groups of consecutive ones that fill a worker's devices."""
+    size = max(executor.devices, AT_ONCE if executor.lockstep else 1)
+    groups: list[range] = []
+    for seed in seeds:
+        if groups and groups[-1].stop == seed and len(groups[-1]) < size:
+            groups[-1] = range(groups[-1].start, seed + 1)
+        else:
+            groups.append(range(seed, seed + 1))
+    return groups
+
+
+def _joined(parts: Sequence[TrainedSeeds], run: "Run") -> TrainedSeeds:
+    """All seeds in one; times are added up.
+
+    Rows come as those of one population do: by time, then by seed.
+    """
+    parts = sorted(parts, key=lambda part: part.config.seed)
+    states = [part.state["training"] for part in parts]
+    count = run.agent.num_envs
+    return TrainedSeeds(
+        run.config,
+        {
+            "training": jax.tree.map(lambda *x: np.concatenate(x), *states),
+            "seconds_train": sum(part.state["seconds_train"] for part in parts),
+        },
+        sorted(
+            (row for part in parts for row in part.metrics),
+            # Environments finish their episodes at the same time, unless some end early.
+            key=lambda row: ((row["episode"] - 1) // count, row["seed"], row["episode"]),
+        ),
+        sorted(
+            (row for part in parts for row in part.evaluations),
+            key=lambda row: (row["env_steps"], row["seed"]),
+        ),
+        sum(part.seconds_compile for part in parts),
+    )
+
+
+def _members(state: PyTree, first: int, last: int) -> PyTree:
+    return jax.tree.map(lambda x: x[first:last], state)
+
+
+def _write(place: Path, part: TrainedSeeds, agent: Agent) -> None:
+    """Writes finished seeds into the folder of a run's seeds."""
+    with new_folder(place / str(part.config.seed)) as unfinished:
+        files = RunFolder(unfinished)
+        files.write_config(part.config)
+        files.append(METRICS, part.metrics)
+        files.append(EVALUATION, part.evaluations)
+        files.write_checkpoint(part.state, agent.weights(part.state["training"].agent))
+
+
+def _read(place: Path, state: PyTree) -> Iterator[TrainedSeeds]:
+    """The finished seeds in such a folder; state: that of the whole run, as a template."""
+    for path in place.glob("[0-9]*"):
+        files = RunFolder(path)
+        config = files.read_config()
+        template = {**state, "training": _members(state["training"], 0, config.seeds)}
+        kept = files.read_checkpoint(template)
+        episodes = kept["training"].episodes.tolist()
+        most = dict(zip(config.seed_range, episodes, strict=True))
+        steps = config.budget.amount
+        metrics, evaluations = (files.rows(n, most, steps) for n in (METRICS, EVALUATION))
+        yield TrainedSeeds(config, kept, metrics, evaluations)
