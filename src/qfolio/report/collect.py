@@ -92,7 +92,7 @@ def backtest_data(
                 entry.simulation.returns,
                 entry.simulation.turnover,
                 entry.simulation.cost,
-                entry.simulation.weights.mean(0),
+                entry.mean_weights,
             )
             for name, entry in entries.items()
         },

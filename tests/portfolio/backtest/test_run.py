@@ -14,7 +14,7 @@ from qfolio.experiments.events import read
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.replay import Stretch, decide
-from qfolio.portfolio.backtest.run import LATEST, Backtest
+from qfolio.portfolio.backtest.run import LATEST, MOST_WEIGHTS, Backtest, _rows_kept
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.following import follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices
@@ -242,6 +242,8 @@ def test_tables_say_what_was_replayed(finished):
     assert len(lines) == 161
     assert float(lines[1].split(",")[1]) == entries["dqn"].simulation.returns[0, 0]
     assert (finished.folder / "weights.csv").read_text().startswith("date,strategy,cash,A,B,'=<b>C")
+    weights = (finished.folder / "weights.csv").read_text().splitlines()
+    assert len(weights) - 1 == 160 * sum(e.kind != "rebalancing" for e in entries.values())
     summary = json.loads((finished.folder / "summary.json").read_text())
     assert summary["strategies"]["pathwise"]["kind"] == "agent"
     assert list(summary["verdicts"]) == ["dqn", "dqn-together", "pathwise", "pathwise-together"]
@@ -252,6 +254,18 @@ def test_tables_say_what_was_replayed(finished):
                if n == "equal-weight" or x["kind"] == "rebalancing")  # fmt: skip
     assert summary["strategies"][summary["rebalanced"]]["measures"]["growth"]["mean"] == best
     assert summary["bound"] > summary["strategies"]["buy-and-hold"]["measures"]["growth"]["mean"]
+
+
+def test_large_tables_of_weights_have_the_last_row_of_each_day_or_month():
+    hours = np.arange("2020-01-01", "2020-03-02", dtype="datetime64[h]").astype("datetime64[s]")
+    most = MOST_WEIGHTS // len(hours)
+    np.testing.assert_array_equal(_rows_kept(hours, most), np.arange(len(hours)))
+    last = hours[_rows_kept(hours, most + 1)]
+    np.testing.assert_array_equal(last, hours.reshape(-1, 24)[:, -1])
+    last = hours[_rows_kept(hours, 24 * (most + 1))]
+    assert last.astype("datetime64[h]").astype(str).tolist() == [
+        "2020-01-31T23", "2020-02-29T23", "2020-03-01T23",
+    ]  # fmt: skip
 
 
 def test_looks_at_the_default_table_count_as_trials(finished):

@@ -6,9 +6,11 @@ from dataclasses import replace
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.attribution.decomposition import AssetPart
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.report.backtest.page import render_backtest
 from qfolio.report.backtest.why import headline, why_sections
+from qfolio.report.rendering import percent
 
 from backtests import Page, made_up_why, usual
 
@@ -32,6 +34,24 @@ def test_the_page_says_where_the_return_came_from(explained):
         "volatility:21 shared by all assets",
     ):
         assert sentence in text, sentence
+
+
+def test_of_many_assets_the_largest_parts_are_listed_and_the_rest_added_up(explained):
+    names = tuple(f"A{j}" for j in range(100))
+    why = made_up_why(assets=names)
+    parts = why.agents["DQN-together"].decomposition.assets
+    parts[60] = AssetPart("A59", 0.1, -0.2, 0.0)
+    (section,) = why_sections(replace(explained, why=why))
+    rows = section["assets"]
+    assert [row["name"] for row in rows[:2]] == ["cash", "A59"]
+    assert (len(rows), rows[-1]["name"]) == (22, "80 others")
+    assert rows[-1]["cells"] == [
+        percent(16),
+        percent(2.4, 2, sign=True),
+        percent(0.16, 2, sign=True),
+    ]
+    assert "and the sum of all others" in Page(render_backtest(replace(explained, why=why))).text
+    assert len(why_sections(explained)[0]["assets"]) == 5  # a small table has all
 
 
 def test_without_attributions_there_is_no_such_section():

@@ -202,16 +202,20 @@ class BacktestFolder:
         return [row[0] for row in rows], columns
 
     def write_weights(
-        self, days: Sequence[str], assets: Sequence[str], weights: dict[str, np.ndarray]
+        self,
+        days: Sequence[str],
+        assets: Sequence[str],
+        weights: dict[str, np.ndarray],
+        rows: Sequence[int] | np.ndarray,
     ) -> None:
-        """weights.csv: after each day's trade, cash first, of each strategy."""
-        rows = (
-            (day, name, *row)
+        """weights.csv: after the trades of these rows, cash first, of each strategy."""
+        lines = (
+            (days[row], name, *table[row].round(6))
             for name, table in weights.items()
-            for day, row in zip(days, table.round(6), strict=True)
+            for row in rows
         )
         header = ["date", "strategy", "cash", *assets]
-        write_csv(self.path / "weights.csv", header, rows)
+        write_csv(self.path / "weights.csv", header, lines)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         write_json(self.path / "summary.json", summary)

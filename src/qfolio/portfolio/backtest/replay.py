@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,12 @@ class Entry:
     kind: str  # one of assessment.KINDS
     decisions: np.ndarray  # (seed, day, entry), cash first
     simulation: Simulation  # of shape (seed, day)
+
+    @cached_property
+    def mean_weights(self) -> np.ndarray:
+        """Weights after each trade, cash first, the mean over the seeds, shape (day, entry)."""
+        weights = self.simulation.weights
+        return weights[0] if len(weights) == 1 else np.asarray(weights.mean(0))
 
 
 class Stretch(NamedTuple):

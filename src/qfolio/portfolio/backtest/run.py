@@ -44,7 +44,7 @@ from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.backtest.verdict import verdicts
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
-from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.findings import day, listing
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
 
@@ -52,6 +52,9 @@ LATEST = "latest"
 """Name of the policies trained on the last rows of the table."""
 
 EQUAL_WEIGHT = "equal-weight"
+
+MOST_WEIGHTS = 10_000_000
+"""Numbers in weights.csv, about 80 MB, beyond which it has fewer rows."""
 
 FOLDS_AT_ONCE = 8
 """Folds that train at once if members advance in lockstep; results are kept after each group."""
@@ -90,9 +93,11 @@ class Backtest:
         self.interrupted = False
         self._policies: dict[tuple[str, str], Any] = {}  # without a folder
         self._records: dict[tuple[str, str], list[Row]] = {}  # likewise
-        for task in self.tasks.values():
-            for job in self._jobs:
-                self._part(task, job)
+        self._parts = {
+            (name, fold.name): self._part(task, fold)
+            for name, task in self.tasks.items()
+            for fold in self._jobs
+        }
 
     @classmethod
     def create(
@@ -248,7 +253,7 @@ class Backtest:
     def policy(self, agent: str | None = None) -> Policy:
         """The policy for tomorrow of an agent (default: the first)."""
         name = self._name(agent)
-        task, trained = self._part(self.tasks[name], self._jobs[-1]), self.agents[name]
+        task, trained = self._parts[name, LATEST], self.agents[name]
         state = state_template(task, trained, self.config.seeds)
         kept = self._load(name, LATEST, _learning(state, 0, self.prices.dates[-1]))
         return Policy(
@@ -272,7 +277,7 @@ class Backtest:
         task, trained = self.tasks[agent], self.agents[agent]
         members = trained.weights(state_template(task, trained, self.config.seeds))
         return [
-            Stretch(self._part(task, fold), self._load(agent, fold.name, members), fold)
+            Stretch(self._parts[agent, fold.name], self._load(agent, fold.name, members), fold)
             for fold in self.folds
         ]
 
@@ -285,9 +290,9 @@ class Backtest:
     def entries(self) -> tuple[dict[str, Entry], list[str]]:
         """Every strategy replayed over all folds, and notes on problems."""
         notes = [
-            f"Fold {fold.name} leaves out {', '.join(self._late(fold))}, which started too late."
+            f"Fold {fold.name} leaves out {listing(late)}, which started too late."
             for fold in self.folds
-            if self._late(fold)
+            if (late := self._late(fold))
         ]
         entries = {}
         for name in self.agents:
@@ -343,7 +348,8 @@ class Backtest:
     ) -> None:
         """returns.csv (a column per strategy and seed), weights.csv (means) and summary.json.
 
-        With attributions, why.json as well, and the diagnosis in summary.json.
+        With attributions, why.json as well, and the diagnosis in summary.json. weights.csv has
+        every row, or, where that would be too much, the last one of each day or month.
         """
         assert self._folder is not None
         days = [spell(date, self.prices.dates) for date in self.dates]
@@ -354,11 +360,12 @@ class Backtest:
         }
         self._folder.write_returns(days, columns)
         weights = {
-            name: entry.simulation.weights.mean(0)
+            name: entry.mean_weights
             for name, entry in entries.items()
             if entry.kind != "rebalancing"
         }
-        self._folder.write_weights(days, self.prices.assets, weights)
+        rows = _rows_kept(self.dates, len(weights) * (1 + len(self.prices.assets)))
+        self._folder.write_weights(days, self.prices.assets, weights, rows)
         summary = {**assessed.to_json(), "verdicts": verdicts(assessed)}
         if why is not None:
             self._folder.write_why(why.to_json())
@@ -411,7 +418,7 @@ class Backtest:
             name,
             self.agents[name],
             tuple(fold.name for fold in folds),
-            tuple(self._part(self.tasks[name], fold) for fold in folds),
+            tuple(self._parts[name, fold.name] for fold in folds),
             tuple(seed_range(self.config.seeds, self.config.seed)),
             Budget(self.config.agents[name].episodes),
             LATEST,
@@ -464,6 +471,17 @@ class Backtest:
             lag=self.config.lag,
         )
         return Entry(kind, decisions, simulation)
+
+
+def _rows_kept(dates: np.ndarray, numbers: int) -> np.ndarray:
+    """The rows of weights.csv: all, or the last of each day or month; numbers: those in a row."""
+    last = np.arange(len(dates))
+    for unit in ("D", "M"):
+        if len(last) * numbers <= MOST_WEIGHTS:
+            break
+        units = dates.astype(f"datetime64[{unit}]")
+        last = np.flatnonzero(np.append(units[1:] > units[:-1], True))
+    return last
 
 
 def _learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, Any]:

@@ -11,13 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from qfolio.portfolio.backtest.attribution.decomposition import Decomposition
+from qfolio.portfolio.backtest.attribution.decomposition import AssetPart, Decomposition
 from qfolio.portfolio.backtest.attribution.factors import Exposures
 from qfolio.portfolio.backtest.attribution.importance import Worth
 from qfolio.portfolio.backtest.attribution.slices import Slice, Slices
 from qfolio.portfolio.backtest.attribution.why import AgentWhy
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import number, percent
+
+LISTED = 20
+"""Assets, beside cash, whose parts of the return are listed; the others are added up."""
 
 SIGNIFICANT = 1.96
 """The t-statistic beyond which a figure is in bold: 5 % of those without any meaning."""
@@ -34,6 +37,7 @@ def why_sections(data: BacktestData) -> list[dict[str, Any]]:
             "parts": _parts(why.decomposition),
             "folds": _folds(why.decomposition),
             "assets": _assets(why.decomposition),
+            "others": len(why.decomposition.assets) > LISTED + 2,
             "exposures": _exposures(why.exposures, data.why.reference),
             "signals": _signals(why),
             "told": _told(why),
@@ -108,16 +112,25 @@ def _folds(parts: Decomposition) -> list[dict[str, Any]]:
 
 
 def _assets(parts: Decomposition) -> list[dict[str, Any]]:
+    """Cash and the assets in order; of very many, those with the largest parts and the rest."""
+    cash, *assets = parts.assets
+    rest: list[AssetPart] = []
+    if len(assets) > LISTED + 1:  # a single other would need a row as well
+        assets.sort(key=lambda asset: -abs(asset.static + asset.timing))
+        assets, rest = assets[:LISTED], assets[LISTED:]
+    rows = [(asset.name, [asset]) for asset in (cash, *assets)]
+    if rest:
+        rows.append((f"{number(len(rest), 0)} others", rest))
     return [
         {
-            "name": asset.name,
+            "name": name,
             "cells": [
-                percent(asset.weight),
-                percent(asset.static, 2, sign=True),
-                percent(asset.timing, 2, sign=True),
+                percent(sum(asset.weight for asset in group)),
+                percent(sum(asset.static for asset in group), 2, sign=True),
+                percent(sum(asset.timing for asset in group), 2, sign=True),
             ],
         }
-        for asset in parts.assets
+        for name, group in rows
     ]
 
 

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from qfolio.portfolio.backtest.attribution import importance as module
+from qfolio.portfolio.backtest.attribution import replays
 from qfolio.portfolio.backtest.attribution.importance import importance
-from qfolio.portfolio.backtest.attribution.replays import Shuffles
+from qfolio.portfolio.backtest.attribution.replays import Shuffle, Shuffles, replay
 from qfolio.portfolio.backtest.replay import decide
 
 from planted import NAMES, Known, four_folds, planted
@@ -17,7 +18,7 @@ def found(rule, stretches, prices):
 
 
 def test_a_planted_signal_is_found_and_nothing_else(stretches, prices):
-    worth, replays = found("momentum", stretches, prices)
+    worth, _ = found("momentum", stretches, prices)
     by_name = {each.name: each for each in worth.signals}
     momentum = by_name.pop("momentum:20")
     assert momentum.lost > 0.05
@@ -27,16 +28,31 @@ def test_a_planted_signal_is_found_and_nothing_else(stretches, prices):
     assert worth.everything.lost == pytest.approx(momentum.lost, rel=0.5)
     assert not worth.ignored
     assert (worth.draws, worth.seeds, worth.replays) == (3, 2, 1 + 3 * 5)
-    # The first replay is the policy itself.
-    decided = decide(Known("momentum"), stretches, 1, together=True)
-    np.testing.assert_allclose(replays.targets[:1], decided, atol=1e-6)
+
+
+def test_replays_in_groups_are_those_of_one(stretches, monkeypatch):
+    shuffles = Shuffles.drawn(stretches, 1, 63, 0)
+    wanted = [Shuffle(mask, 1, 1) for mask in np.tri(5, 4, -1, dtype=int)]
+    policy = Known("momentum")
+
+    def replayed():
+        groups = [group.targets for group in replay(policy, stretches, shuffles, wanted)]
+        return [len(group) for group in groups], np.concatenate(groups)
+
+    whole, targets = replayed()
+    monkeypatch.setattr(replays, "AT_ONCE", 2)
+    parts, again = replayed()
+    assert (whole, parts) == ([5], [2, 2, 1])
+    np.testing.assert_allclose(again, targets, atol=1e-6)
+    # The first replay shuffles nothing: it is the policy itself.
+    decided = decide(policy, stretches, 1, together=True)
+    np.testing.assert_allclose(targets[:1], decided, atol=1e-6)
 
 
 def test_a_shared_signal_is_shuffled_in_time(stretches, prices):
-    worth, replays = found("market", stretches, prices)
+    worth, _ = found("market", stretches, prices)
     assert [each.shared for each in worth.signals] == [False, False, False, True]
-    moved = abs(replays.targets[1:-3] - replays.targets[0]).max((1, 2))
-    assert (moved > 0).tolist() == 9 * [False] + 3 * [True]
+    assert [each.high > each.low for each in worth.signals] == [False, False, False, True]
 
 
 def test_an_agent_that_sees_nothing_is_told(stretches, prices):
@@ -94,8 +110,8 @@ def test_a_menu_tilts_by_the_shuffled_signals(prices):
     task = {"signals": "momentum:20,reversal:3", "menu": "signals:1"}
     stretches = four_folds(prices, **task)
     names = ["log return", "momentum:20", "reversal:3"]
-    worth, replays = importance(FirstTilt("none"), stretches, names, prices.values, 252)
-    assert replays.targets[0].std() > 0.01
-    moved = abs(replays.targets[1:-3] - replays.targets[0]).max((1, 2)).reshape(3, 3).max(1)
-    assert (moved > 1e-3).tolist() == [False, True, False]
+    worth, held = importance(FirstTilt("none"), stretches, names, prices.values, 252)
+    assert held.std() > 0.01
+    changed = [each.high - each.low > 1e-4 for each in worth.signals]  # from shuffle to shuffle
+    assert changed == [False, True, False]
     assert not worth.ignored

@@ -15,6 +15,9 @@ from qfolio.portfolio.backtest.attribution.hac import Floats
 _LEAST = 1e-6
 """Smaller active weights are rounding errors."""
 
+BLOCK = 1_000_000
+"""Numbers that are factorised together."""
+
 
 class Term(msgspec.Struct, frozen=True):
     """A signal of the rule."""
@@ -50,25 +53,31 @@ def distil(
         tradable: 1 for assets that may be held on a day, else 0, shape (D, N).
         fitted: Whether a row fits the rule (else it tests it), shape (D,).
     """
-    count = np.maximum(tradable.sum(1, keepdims=True), 1)
 
-    def centred(values: np.ndarray) -> Floats:
-        mean = (values * tradable).sum(1, keepdims=True) / count
-        return (values - mean) * tradable
+    def triangle(days: np.ndarray) -> Floats:
+        """R of the QR factorisation of [signals, weights]: as good as all rows, and small."""
+        found = np.zeros((0, len(names) + 1))
+        for some in np.array_split(days, max(1, days.size * signals[:1].size // BLOCK)):
+            open_to = tradable[some, :, None]
+            active = targets[some].astype(float) - anchor[some]
+            table = np.concatenate([signals[some], active[..., None]], -1)
+            mean = (table * open_to).sum(1, keepdims=True)
+            mean /= np.maximum(open_to.sum(1, keepdims=True), 1)
+            rows = ((table - mean) * open_to).reshape(-1, table.shape[-1])
+            found = np.asarray(np.linalg.qr(np.concatenate([found, rows]), mode="r"))
+        return found
 
-    y = centred(targets.astype(float) - anchor)
-    x = np.stack([centred(signals[..., c]) for c in range(len(names))], -1)
-    spread = np.sqrt((x**2).sum((0, 1)) / max(1.0, float(tradable.sum())))
-    used = spread > 1e-9
-    scaled = x[..., used] / spread[used]
-    seen = scaled[fitted].reshape(y[fitted].size, int(used.sum()))
-    solved = np.linalg.lstsq(seen, y[fitted].ravel(), rcond=None)[0]
-    total = float((y[~fitted] ** 2).sum())
-    left = float(((y[~fitted] - scaled[~fitted] @ solved) ** 2).sum())
-    known = [name for name, yes in zip(names, used, strict=True) if yes]
-    terms = zip(known, (solved / spread[used]).tolist(), solved.tolist(), strict=True)
+    seen, tested = triangle(np.flatnonzero(fitted)), triangle(np.flatnonzero(~fitted))
+    square = (seen[:, :-1] ** 2).sum(0) + (tested[:, :-1] ** 2).sum(0)
+    spread = np.sqrt(square / max(1.0, float(tradable.sum())))
+    used = np.append(spread > 1e-9, False)
+    solved = np.linalg.lstsq(seen[:, used] / spread[used[:-1]], seen[:, -1], rcond=None)[0]
+    total = float((tested[:, -1] ** 2).sum())
+    left = float(((tested[:, -1] - tested[:, used] / spread[used[:-1]] @ solved) ** 2).sum())
+    known = [name for name, yes in zip(names, used[:-1], strict=True) if yes]
+    terms = zip(known, (solved / spread[used[:-1]]).tolist(), solved.tolist(), strict=True)
     return Rule(
         terms=[Term(*each) for each in terms],
-        r2=1 - left / total if total > _LEAST**2 * y[~fitted].size else None,
-        shared=[name for name, yes in zip(names, used, strict=True) if not yes],
+        r2=1 - left / total if total > _LEAST**2 * targets[~fitted].size else None,
+        shared=[name for name, yes in zip(names, used[:-1], strict=True) if not yes],
     )

@@ -42,8 +42,8 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
         entry, stretches = entries[traded], backtest.stretches(name)
         net = entry.simulation.returns[0]
         names = channel_names(backtest.tasks[name], prices.feature_names)
-        worth, replays = importance(agent, stretches, names, prices.values, year)
-        held, few = replays.held[0], of_seeds(stretches, worth.seeds)
+        worth, held = importance(agent, stretches, names, prices.values, year)
+        few = of_seeds(stretches, worth.seeds)
         shared = [each.shared for each in worth.signals] or [False] * len(names)
         agents[traded] = AgentWhy(
             decomposition=decompose(
@@ -90,5 +90,5 @@ def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> 
     if len(stretches) == 1:
         fitted[days // 2 :] = False
     anchor = np.asarray(task.anchors)[begin:end] if task.anchor else np.zeros_like(tradable)
-    seen = np.asarray(channels(task))[begin:end].astype(float)
+    seen = np.asarray(channels(task))[begin:end]
     return distil(decisions[:, 1:], anchor, seen, names, tradable, fitted)

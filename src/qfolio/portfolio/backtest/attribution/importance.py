@@ -15,7 +15,6 @@ import numpy as np
 from qfolio.core.mdp import Agent
 from qfolio.portfolio.backtest.attribution.hac import Floats, mean_t
 from qfolio.portfolio.backtest.attribution.replays import (
-    Replays,
     Shuffle,
     Shuffles,
     channels,
@@ -67,7 +66,7 @@ def importance(
     names: Sequence[str],
     values: Floats,
     periods_per_year: float,
-) -> tuple[Importance, Replays]:
+) -> tuple[Importance, np.ndarray]:
     """Replay an agent's policy, the mean of its seeds, without each of its signals.
 
     Args:
@@ -77,7 +76,7 @@ def importance(
         periods_per_year: It sets the length of blocks, a quarter of a year.
 
     Returns:
-        The worth of each channel, and the replays; the first of these is not shuffled.
+        The worth of each channel, and the weights held when deciding, shape (D, entry).
     """
     signals, draws, seeds = _affordable(stretches, len(names))
     stretches = of_seeds(stretches, seeds)
@@ -90,13 +89,21 @@ def importance(
     for mask, in_time in zip(np.eye(len(names), dtype=int)[:count], shared, strict=True):
         wanted += [Shuffle(mask, draw * in_time, draw * (1 - in_time)) for draw in each_draw]
     wanted += [Shuffle(np.ones(len(names), int), draw, draw) for draw in each_draw]
-    found = replay(agent, stretches, shuffles, wanted)
 
     task, first = stretches[0].task, stretches[0].fold.decisions.start
-    weights = found.targets.astype(float)
-    weights /= weights.sum(-1, keepdims=True)
-    logs = simulate(values, weights, first=first, cost=task.costs, lag=task.lag).growth
-    lost = (logs[0] - logs[1:]).reshape(count + 1, draws, -1)
+    logs: list[Floats] = []
+    moved: list[float] = []
+    for group in replay(agent, stretches, shuffles, wanted):
+        if not logs:
+            targets, held = group.targets[0], group.held[0]
+        for each in group.targets:
+            moved.append(float(abs(each - targets).max()))
+            weights = each.astype(float)
+            weights /= weights.sum(-1, keepdims=True)
+            logs.append(
+                simulate(values, weights, first=first, cost=task.costs, lag=task.lag).growth
+            )
+    lost = (logs[0] - np.array(logs[1:])).reshape(count + 1, draws, -1)
     each = periods_per_year * lost.mean(2)
     worth = [
         Worth(
@@ -109,9 +116,8 @@ def importance(
         )
         for i, name in enumerate([*names[:count], EVERYTHING])
     ]
-    moved = abs(found.targets[-draws:] - found.targets[0]).max()
-    ignored = bool(moved < UNMOVED)
-    return Importance(worth[:-1], worth[-1], ignored, draws, seeds, len(wanted)), found
+    ignored = bool(max(moved[-draws:]) < UNMOVED)
+    return Importance(worth[:-1], worth[-1], ignored, draws, seeds, len(wanted)), held
 
 
 def of_seeds(stretches: Sequence[Stretch], count: int) -> list[Stretch]:

@@ -7,7 +7,7 @@ would be confused with that of trading less. All else is as it was: prices, hold
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,7 +25,7 @@ from qfolio.portfolio.market import Signalled
 from qfolio.portfolio.task import Portfolio
 
 AT_ONCE = 16
-"""Replays in one vectorised loop; their inputs are in memory together."""
+"""Most replays in one vectorised loop; their inputs and weights are in memory together."""
 
 
 class Observed(Portfolio):
@@ -113,8 +113,23 @@ def channels(task: Portfolio) -> Float[Array, "row asset channel"]:
 
 def replay(
     agent: Agent, stretches: Sequence[Stretch], shuffles: Shuffles, wanted: Sequence[Shuffle]
+) -> Iterator[Replays]:
+    """Follow the mean of all seeds over all folds, once for each of some shuffles.
+
+    The replays come in groups of at most ``AT_ONCE``, so that not all weights are in memory.
+    """
+    groups = -(-len(wanted) // AT_ONCE)
+    size = -(-len(wanted) // groups)  # the same for all, so that one program serves them
+    for first in range(0, len(wanted), size):
+        given = list(wanted[first : first + size])
+        padded = given + given[-1:] * (size - len(given))
+        found = _replay(agent, stretches, shuffles, padded)
+        yield Replays(*(each[: len(given)] for each in found))
+
+
+def _replay(
+    agent: Agent, stretches: Sequence[Stretch], shuffles: Shuffles, wanted: Sequence[Shuffle]
 ) -> Replays:
-    """Follow the mean of all seeds over all folds, once for each of some shuffles."""
     raw = channels(stretches[0].task)
     masks, rows, assets = (jnp.asarray(np.array(x)) for x in zip(*wanted, strict=True))
     counts = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
@@ -161,5 +176,5 @@ def _paths(
         targets, after = paths(blind, agent, members, first, held[None], count)
         return targets[0], after[0]
 
-    found: tuple[Array, Array] = lax.map(one, (held, masks, *draws), batch_size=AT_ONCE)
+    found: tuple[Array, Array] = jax.vmap(one)((held, masks, *draws))
     return found
