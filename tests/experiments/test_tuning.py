@@ -18,6 +18,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.population import Population
 from qfolio.experiments.budget import Budget
+from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import Run
 from qfolio.experiments.tuning import search
@@ -25,8 +26,10 @@ from qfolio.experiments.tuning.journal import Trial, best_of
 from qfolio.experiments.tuning.run import Progress, Tuning, tuning_keys
 from qfolio.experiments.tuning.search import dimension
 from qfolio.experiments.tuning.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
+from qfolio.experiments.tuning.trials import trials_jobs
 from qfolio.report.tuning import Sweep, render_page, write_tuning_report
 
+from jobs import Elsewhere
 from shell import TINY, qfolio
 
 EPISODES = 4
@@ -329,6 +332,45 @@ def test_processes_share_a_search(tmp_path, task, agent):
         other._train(asked)
         assert (len(mine.journal.trials()), mine.journal.in_hand()) == (4, 0)
         assert not ask(mine)
+
+
+def test_on_workers_a_search_is_the_same(tmp_path, task, agent, monkeypatch):
+    """A configuration is a job there; what is proposed next follows from all of a batch."""
+    monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
+    here, there = (start(tmp_path / name, task, agent) for name in ("here", "there"))
+    here.run()
+    elsewhere, shares = Elsewhere(), list[float]()
+    there.run(chunk_listener=shares.append, executor=elsewhere)
+    assert elsewhere.ran == [f"trial {number}" for number in range(4)]
+    assert shares.count(1.0) == 2
+    timeless = [[trial._replace(seconds=0.0) for trial in work.journal.trials()]
+                for work in (here, there)]  # fmt: skip
+    assert timeless[0] == timeless[1]
+    assert here.conclude() == there.conclude(executor=elsewhere)
+    assert elsewhere.ran[4:] == ["best", "preset"]
+
+
+def test_a_search_that_is_stopped_on_workers(tmp_path, task, agent):
+    work = start(tmp_path / "s", task, agent)
+
+    def press(share):
+        os.kill(os.getpid(), signal.SIGINT)
+
+    work.run(chunk_listener=press, executor=Elsewhere())
+    assert work.interrupted
+    assert (work.journal.trials(), work.journal.in_hand()) == ([], 0)
+
+
+def test_jobs_fill_a_worker(tmp_path, task, agent):
+    agents = {f"{i}": agent for i in range(5)}
+    agents["other"] = settings.build(DQN, settings.describe(agent) | {"hidden": (8,)})
+    executor, starts = Elsewhere(), np.zeros((4, 2), np.uint32)
+    executor.devices = 4
+    made = trials_jobs(task, agents, [0, 1], Budget(4), starts, executor)
+    assert [job.name for job in made] == ["0 to 1", "2 to 3", "4", "other"]
+    assert [job.most for job in made] == [2, 2, 2, 1]
+    whole = trials_jobs(task, agents, [0, 1], Budget(4), starts, Here())
+    assert [job.name for job in whole] == ["0 to 4", "other"]
 
 
 def test_an_error_gives_the_batch_back(tmp_path, task, agent, monkeypatch):

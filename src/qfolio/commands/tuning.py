@@ -14,6 +14,7 @@ from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
+    from qfolio.experiments.executor import Executor
     from qfolio.experiments.tuning.run import Tuning
 
 Ranges = Annotated[tuple[str, ...], arg(metavar="NAME=RANGE …", help_behavior_hint="")]
@@ -33,6 +34,7 @@ def tune(
     assignments: Assignments = (),
     out: Folder = None,
     join: Folder = None,
+    on: str = "here",
     trust: Modules = (),
 ) -> None:
     """Search an agent's hyperparameters and report which of them matter.
@@ -57,6 +59,8 @@ def tune(
         out: New folder for the search (default: runs/…).
         join: Folder of a search to continue, also while other processes work on it; --trials
             raises its number of trials.
+        on: Where configurations train: here, processes:4 (or another number), ray or
+            ray://HOST:10001. A batch should have several for each worker.
         trust: Modules of your own code that the folder may name (default: none).
     """
     from qfolio.core import devices
@@ -67,7 +71,9 @@ def tune(
     from qfolio.commands import console
     from qfolio.commands.progress import SearchProgress, stop
     from qfolio.experiments import presets
+    from qfolio.experiments.machines.choice import on as executor_of
 
+    executor = executor_of(on)
     given: list[Any] = [task, agent, preset, seeds, episodes, steps, out]
     budget = budget_of(episodes, steps)
     if join is None:
@@ -77,14 +83,14 @@ def tune(
                     assignments, out)  # fmt: skip
     elif search or assignments or any(x is not None for x in given):
         raise QfolioError(
-            "--join keeps the settings of the search; add only --trials, --batch or --trust."
+            "--join keeps the settings of the search; add only --trials, --batch, --on or --trust."
         )
     else:
         work = tuning.Tuning.open(join, trials=trials, batch=batch)
-    resume = again("qfolio tune --join", work.folder, work.task, work.agent)
+    resume = again("qfolio tune --join", work.folder, work.task, work.agent, on=on)
     console.say(console.describe_search(work))
     with SearchProgress() as progress:
-        work.run(progress.batch, progress.chunk)
+        work.run(progress.batch, progress.chunk, executor)
     if work.interrupted:
         stop(resume)
     if count := work.journal.in_hand():
@@ -93,7 +99,7 @@ def tune(
         )
         return
     try:
-        _conclude(work, resume)
+        _conclude(work, resume, executor)
     except KeyboardInterrupt:
         stop(resume)
 
@@ -157,12 +163,12 @@ def _new(
     )
 
 
-def _conclude(work: "Tuning", resume: str) -> None:
+def _conclude(work: "Tuning", resume: str, executor: "Executor") -> None:
     from qfolio.commands.console import console, print_search, say
     from qfolio.report.tuning import sweep, write_tuning_report
 
     with console.status("Training the best configuration and the preset with fresh seeds"):
-        summary = work.conclude()
+        summary = work.conclude(executor=executor)
     train = command(work, summary["best"])
     with console.status("Writing the report"):
         data = sweep(work, summary, f"{train}\n{resume}")

@@ -1,7 +1,9 @@
 """Executors of jobs: in this process, one after another; on many workers, see ``machines``."""
 
 import contextlib
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from itertools import islice
+from queue import Empty, SimpleQueue
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
@@ -57,11 +59,11 @@ class Executor(Protocol):
         ...
 
     def map(
-        self, jobs: Iterable[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
+        self, jobs: Iterable[Job[R] | None], listen: Callable[[Job[R]], Sequence[Listener]]
     ) -> Generator[tuple[Job[R], R], None, None]:
         """Each finished job with its result; ``listen`` returns the listeners of a job.
 
-        ``jobs`` are taken one by one, when a worker is free.
+        ``jobs`` are taken one by one, when a worker is free; None if there is none at present.
         """
         ...
 
@@ -78,12 +80,12 @@ class Here:
         return jax.devices()[0].platform in LOCKSTEP
 
     def map(
-        self, jobs: Iterable[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
+        self, jobs: Iterable[Job[R] | None], listen: Callable[[Job[R]], Sequence[Listener]]
     ) -> Generator[tuple[Job[R], R], None, None]:
         with interruptible() as stop:
             for job in jobs:
-                result = None if stop.is_set() else job.run(listen(job))
-                if result is None:
+                result = None if stop.is_set() or job is None else job.run(listen(job))
+                if job is None or result is None:
                     return
                 yield job, result
 
@@ -121,3 +123,40 @@ def carry_out(
             done += 1
         log.settle(done == len(jobs))
         return stop.is_set()
+
+
+class _Kept:
+    """An executor whose workers stay from one ``map`` to the next."""
+
+    def __init__(self, executor: Executor) -> None:
+        self.devices, self.lockstep = executor.devices, executor.lockstep
+        self._waiting = SimpleQueue[Job]()
+        self._listen: Callable[[Job], Sequence[Listener]] = lambda job: ()
+        self.results = executor.map(self._jobs(), lambda job: self._listen(job))
+
+    def map(
+        self, jobs: Iterable[Job[R] | None], listen: Callable[[Job[R]], Sequence[Listener]]
+    ) -> Generator[tuple[Job[R], R], None, None]:
+        self._listen = listen
+        given = [job for job in jobs if job is not None]
+        for job in given:
+            self._waiting.put(job)
+        yield from islice(self.results, len(given))
+
+    def _jobs(self) -> Iterator[Job | None]:
+        while True:
+            try:
+                yield self._waiting.get_nowait()
+            except Empty:
+                yield None
+
+
+@contextlib.contextmanager
+def kept(executor: Executor) -> Iterator[Executor]:
+    """An executor whose workers stay from one ``map`` to the next; ``Here`` has none to keep."""
+    if isinstance(executor, Here):
+        yield executor
+        return
+    workers = _Kept(executor)
+    with contextlib.closing(workers.results):
+        yield workers

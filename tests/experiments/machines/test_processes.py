@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.executor import Executor, Here, Job
+from qfolio.experiments.executor import Executor, Here, Job, kept
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.processes import Processes
@@ -67,6 +67,19 @@ def test_long_lived_workers_get_a_large_array_once():
         np.testing.assert_array_equal(result["sum"], table + i)
     assert len({(result["place"], result["table"]) for result in results.values()}) == 1
     assert results["0"]["place"] != os.getpid()
+
+
+def test_workers_are_kept_between_maps():
+    with kept(Processes(1)) as executor:
+        places = set[int]()
+        for number in range(3):
+            work = [Add(f"{number}{name}", number) for name in "ab"]
+            done = {job.name: result for job, result in executor.map(work, silent)}
+            assert [done[job.name]["sum"][0] for job in work] == [number, number]
+            places |= {result["place"] for result in done.values()}
+        (place,) = places
+        assert alive(place)
+    assert not alive(place)
 
 
 def test_listeners_hear_of_trainings_on_workers():

@@ -35,9 +35,20 @@ def test_jobs_go_out_in_order_and_a_lost_one_first():
     assert schedule.lose(0, "x")
     assert [given(schedule, worker) for worker in (2, 3, 4)] == ["a", "c", None]
     assert [schedule.finish(worker).name for worker in (1, 3)] == ["b", "c"]
-    assert schedule.under_way
+    assert not schedule.finished
     assert schedule.finish(2).name == "a"
-    assert not schedule.under_way
+    assert schedule.finished
+
+
+def test_jobs_that_are_not_known_yet():
+    come = iter([Job("a"), None, None, Job("b")])
+    schedule = Schedule(come)
+    assert [given(schedule, worker) for worker in (0, 1, 1)] == ["a", None, None]
+    schedule.finish(0)
+    assert not schedule.finished
+    assert [given(schedule, worker) for worker in (1, 0)] == ["b", None]
+    schedule.finish(1)
+    assert schedule.finished
 
 
 def test_a_job_that_ends_every_worker_is_given_up():

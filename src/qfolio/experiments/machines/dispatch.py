@@ -7,7 +7,7 @@ writes files or a report.
 import threading
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import AbstractContextManager
-from itertools import chain, islice
+from itertools import chain, islice, takewhile
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -68,7 +68,7 @@ News = _Began | Report | Done
 
 def dispatch(
     open_workers: Callable[[], AbstractContextManager[Workers]],
-    jobs: Iterable[Job[R]],
+    jobs: Iterable[Job[R] | None],
     listen: Callable[[Job[R]], Sequence[Listener]],
 ) -> Generator[tuple[Job[R], R], None, None]:
     """Runs jobs on workers and yields each with its result, in the order in which they finish.
@@ -120,7 +120,7 @@ def dispatch(
 
 def drive(
     workers: Workers,
-    jobs: Iterable[Job[R]],
+    jobs: Iterable[Job[R] | None],
     tell: Callable[[Job[R], News], None],
     stop: threading.Event,
 ) -> None:
@@ -132,13 +132,14 @@ def drive(
         QfolioError: A job failed or lost too many workers, or no worker starts.
     """
     jobs = iter(jobs)
-    first = list(islice(jobs, workers.count))
+    first = list(takewhile(lambda job: job is not None, islice(jobs, workers.count)))
+    if not first:
+        return
     schedule, idle, there = Schedule(chain(first, jobs)), list[int](), set(range(len(first)))
     for worker in there:
         workers.start(worker)
     wanted = versions()
-    more = bool(first)  # whether there may be jobs that nobody has begun
-    while (more or schedule.under_way) and not stop.is_set():
+    while not (schedule.finished or stop.is_set()):
         for worker, said in workers.receive(PATIENCE):
             if isinstance(said, Ready):
                 _require_same(said, wanted)
@@ -161,9 +162,7 @@ def drive(
                     if not there:
                         raise QfolioError(f"No worker stays alive; the last one: {said.why}.")
         while idle and not stop.is_set():
-            job = schedule.give(idle[-1])
-            more = job is not None
-            if job is None:
+            if (job := schedule.give(idle[-1])) is None:
                 break
             worker = idle.pop()
             tell(job, _Began())

@@ -58,7 +58,7 @@ class Processes:
         return self.cores or max(1, len(_cores()) // self.count)
 
     def map(
-        self, jobs: Iterable[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
+        self, jobs: Iterable[Job[R] | None], listen: Callable[[Job[R]], Sequence[Listener]]
     ) -> Generator[tuple[Job[R], R], None, None]:
         _require_cores()
         return dispatch(lambda: _opened(self), jobs, listen)

@@ -8,6 +8,7 @@ import contextlib
 import logging
 import pickle
 import re
+import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -60,7 +61,7 @@ class Ray:
         return 1 if self.lockstep else self.cpus
 
     def map(
-        self, jobs: Iterable[Job[R]], listen: Callable[[Job[R]], Sequence[Listener]]
+        self, jobs: Iterable[Job[R] | None], listen: Callable[[Job[R]], Sequence[Listener]]
     ) -> Generator[tuple[Job[R], R], None, None]:
         return dispatch(lambda: _opened(self), jobs, listen)
 
@@ -98,6 +99,9 @@ class _Actors:
 
     def receive(self, seconds: float) -> list[tuple[int, Message]]:
         awaited = list(self._answers)
+        if not awaited:  # all workers wait for jobs
+            time.sleep(seconds)
+            return []
         if not self._ray.wait(awaited, timeout=seconds)[0]:
             return []
         answered, _ = self._ray.wait(awaited, num_returns=len(awaited), timeout=0)

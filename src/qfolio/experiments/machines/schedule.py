@@ -16,11 +16,12 @@ R = TypeVar("R")
 class Schedule(Generic[R]):
     """Gives jobs to workers in their order; the job of a lost worker is given out again, first.
 
-    jobs: taken one by one, when a worker is free. Workers are numbers.
+    jobs: taken one by one, when a worker is free; None if there is none at present. Workers are
+    numbers.
     """
 
-    def __init__(self, jobs: Iterable[Job[R]]) -> None:
-        self._jobs = iter(jobs)
+    def __init__(self, jobs: Iterable[Job[R] | None]) -> None:
+        self._jobs, self._exhausted = iter(jobs), False
         self._again: deque[Job[R]] = deque()
         self._running: dict[int, Job[R]] = {}
         self._losses: Counter[str] = Counter()
@@ -28,15 +29,21 @@ class Schedule(Generic[R]):
 
     def give(self, worker: int) -> Job[R] | None:
         """The next job for a worker that is free; None if there is none at present."""
-        job = self._again.popleft() if self._again else next(self._jobs, None)
+        if self._again:
+            job: Job[R] | None = self._again.popleft()
+        else:
+            try:
+                job = next(self._jobs)
+            except StopIteration:
+                self._exhausted, job = True, None
         if job is not None:
             self._running[worker] = job
         return job
 
     @property
-    def under_way(self) -> bool:
-        """Whether a job is running or waits to run again."""
-        return bool(self._running or self._again)
+    def finished(self) -> bool:
+        """Whether no job is running, waits to run again, or may still come."""
+        return self._exhausted and not (self._running or self._again)
 
     def of(self, worker: int) -> Job[R]:
         """The job that a worker runs."""

@@ -8,7 +8,6 @@ later, or again, continues from the journal.
 
 import contextlib
 import math
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,16 +25,17 @@ from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import new_folder, read_json, write_json
-from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.events import Log
-from qfolio.experiments.fit import Listener, Row, Training, fit
+from qfolio.experiments.executor import Executor, Here, Job, carry_out, kept
+from qfolio.experiments.fit import Listener, Row, Training
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
 from qfolio.experiments.tuning.search import Value
+from qfolio.experiments.tuning.trials import TrainedTrials, TrialsJob, trials_jobs
 
 STUDY = "study.json"
 """The name of the file that holds the settings."""
@@ -76,13 +76,19 @@ class Progress:
 
 
 class _Share(Listener):
-    """Reports the finished share of several trainings in sequence."""
+    """Reports the finished share of jobs that may run side by side.
 
-    def __init__(self, tell: Callable[[float], None], number: int, count: int) -> None:
-        self.tell, self.number, self.count = tell, number, count
+    shares: what each job has done of all work. share: of this job.
+    """
+
+    def __init__(
+        self, tell: Callable[[float], None], shares: dict[str, float], job: str, share: float
+    ) -> None:
+        self.tell, self.shares, self.job, self.share = tell, shares, job, share
 
     def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        self.tell((self.number + training.share) / self.count)
+        self.shares[self.job] = training.share * self.share
+        self.tell(sum(self.shares.values()))
 
 
 class Study(Config, kw_only=True, frozen=True):
@@ -207,20 +213,22 @@ class Tuning:
         self,
         listener: Callable[[Progress], None] | None = None,
         chunk_listener: Callable[[float], None] | None = None,
+        executor: Executor | None = None,
     ) -> None:
         """Trains batch after batch until the configured number of trials is reached.
 
         Ctrl-C stops after the current chunk and sets ``interrupted``; an unfinished batch is
         proposed again when the search is resumed. chunk_listener: called with the finished share of
-        a batch.
+        a batch. executor: where parts of a batch train (default: all in this process); see
+        ``qfolio.on``.
         """
         preset = {dim.name: search.own_value(self.agent, dim) for dim in self.space}
         batch, total = self.config.batch, self.config.trials
         self.interrupted = False
-        with self._log() as log, self.journal.at_work():
+        with self._log() as log, self.journal.at_work(), kept(executor or Here()) as workers:
             while not self.interrupted and (asked := self.journal.ask(batch, total, preset)):
                 try:
-                    now = self._train(asked, log, chunk_listener)
+                    now = self._train(asked, log, chunk_listener, workers)
                 except KeyboardInterrupt:
                     self.interrupted = True
                     break
@@ -244,47 +252,44 @@ class Tuning:
         keys: Key[Array, " start"],
         log: Log | None = None,
         listener: Callable[[float], None] | None = None,
+        executor: Executor | None = None,
     ) -> tuple[Float[np.ndarray, "agent seed"], float]:
         """Mean greedy returns of each agent and seed, NaN if the loss did not stay finite.
 
-        Also returns the seconds spent on compiling. Agents that share all settings which shape the
-        program form one population. All its members take as many steps as the episodes would if
-        none ended early, so that an agent's result does not depend on the others. Raises
-        KeyboardInterrupt if Ctrl-C stops it before the end.
+        Also returns the seconds spent on compiling. Raises KeyboardInterrupt if Ctrl-C stops it
+        before the end.
 
         agents: by the names that the log has for them.
         """
-        groups, names, log = defaultdict(list), list(agents), log or Log(None)
-        for index, agent in enumerate(agents.values()):
-            groups[jax.tree.structure(agent)].append(index)
-        jobs = [_job_name([names[index] for index in group]) for group in groups.values()]
-        log.queue(jobs)
-        result = np.full((len(agents), len(seeds)), np.nan)
-        seconds_compile = 0.0
-        for number, indices in enumerate(groups.values()):
-            members = [agents[names[index]] for index in indices for _ in seeds]
-            labels = [f"{names[index]}, seed {seed}" for index in indices for seed in seeds]
-            population = population_of(self.task, members, [*seeds] * len(indices))
-            steps = self.config.budget.left(population) * population.agent.num_envs
-            listeners: list[Listener] = [log.job(jobs[number], labels)]
-            if listener is not None:
-                listeners.append(_Share(listener, number, len(groups)))
-            training = fit(population, Budget(steps=steps), listeners, strict=False)
-            if not training.finished:
-                raise KeyboardInterrupt
-            self.interrupted |= training.interrupted
-            played = population.evaluate(keys[: population.starts], tail=0)
-            returns = np.asarray(played.returns).mean(1)
-            finite = np.array(population.healthy) & np.isfinite(returns)
-            result[indices] = np.where(finite, returns, np.nan).reshape(len(indices), len(seeds))
-            seconds_compile += population.seconds_compile
-        return result, seconds_compile
+        executor, config = executor or Here(), self.config
+        starts = np.asarray(jax.random.key_data(keys))
+        jobs = trials_jobs(self.task, agents, seeds, config.budget, starts, executor)
+        found, seconds_compile = dict[str, np.ndarray](), 0.0
+        shares: dict[str, float] = {}
 
-    def conclude(self, listener: Callable[[float], None] | None = None) -> dict[str, Any]:
+        def listen(job: Job, done: float, share: float) -> list[Listener]:
+            return [] if listener is None else [_Share(listener, shares, job.name, share)]
+
+        def store(job: TrialsJob, trained: TrainedTrials) -> None:
+            nonlocal seconds_compile
+            found.update(zip(job.names, trained.returns, strict=True))
+            seconds_compile += trained.seconds_compile
+
+        self.interrupted |= carry_out(executor, jobs, listen, store, log or Log(None))
+        if len(found) < len(agents):
+            raise KeyboardInterrupt
+        return np.array([found[name] for name in agents]), seconds_compile
+
+    def conclude(
+        self,
+        listener: Callable[[float], None] | None = None,
+        executor: Executor | None = None,
+    ) -> dict[str, Any]:
         """Trains the best configuration and the preset with fresh seeds, and grades both.
 
         They are graded on the fixed start states, which the search never used. The result is cached
-        in summary.json for as long as the best configuration is the same.
+        in summary.json for as long as the best configuration is the same. listener: called with the
+        finished share. executor: as for ``run``.
         """
         trials = self.journal.trials()
         found = best_of(trials)
@@ -300,7 +305,7 @@ class Tuning:
         seeds = range(FRESH, FRESH + self.config.fresh_seeds)
         agents = {"best": self.configured(found.values), "preset": self.agent}
         with self._log() as log:
-            returns, _ = self.trained(agents, seeds, start_keys(), log, listener)
+            returns, _ = self.trained(agents, seeds, start_keys(), log, listener, executor)
         solution = self.task.optimum()
 
         def optimum(keys: Key[Array, " start"]) -> float | None:
@@ -324,13 +329,16 @@ class Tuning:
         asked: Sequence[Asked],
         log: Log | None = None,
         listener: Callable[[float], None] | None = None,
+        executor: Executor | None = None,
     ) -> Progress:
         """Trains a batch and records its returns."""
         start = perf_counter()
         try:
             agents = {f"trial {one.trial.number}": self.configured(one.values) for one in asked}
             seeds = range(self.config.seeds)
-            returns, seconds_compile = self.trained(agents, seeds, tuning_keys(), log, listener)
+            returns, seconds_compile = self.trained(
+                agents, seeds, tuning_keys(), log, listener, executor
+            )
         except BaseException:
             for one in asked:
                 self.journal.give_up(one)
@@ -349,10 +357,6 @@ class Tuning:
             seconds_compile=seconds_compile,
             trials=len(asked),
         )
-
-
-def _job_name(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
 
 
 def _require_counts(**counts: int) -> None:
