@@ -168,11 +168,15 @@ def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
 
 
 def describe_backtest(backtest: "Backtest") -> str:
-    config = backtest.config
+    from qfolio.portfolio.backtest import memory
+
+    config, size = backtest.config, memory.needed(backtest.prices, backtest.config)
+    large = f" It needs about {size / 2**30:.1f} GiB of memory, beside what training takes."
     return (
         f"{len(backtest.folds)} folds ({backtest.folds[0].name} to {str(backtest.dates[-1])[:10]}) "
         f"· {len(backtest.prices.assets)} assets · {' and '.join(backtest.agents)} · "
         f"{config.seeds} seeds · {config.cost * 1e4:g} bp · lag {config.lag} · {config.device}"
+        + (f".{large}" if size > memory.MENTIONED else "")
     )
 
 

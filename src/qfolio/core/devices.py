@@ -67,17 +67,19 @@ def circumstances(*programs: str) -> dict[str, Any]:
     }
 
 
+def host_memory() -> int | None:
+    """The machine's memory in bytes; None where the system does not say."""
+    if not hasattr(os, "sysconf"):
+        return None
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
 def require_memory(tree: Any, count: int) -> None:
     """Raises QfolioError if ``count`` members shaped like ``tree`` exceed the memory."""
     needed = count * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
     stats = jax.devices()[0].memory_stats()
-    if stats:
-        there = stats["bytes_limit"] * len(jax.devices())
-    elif hasattr(os, "sysconf"):
-        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    else:
-        return
-    if needed > there:
+    there = stats["bytes_limit"] * len(jax.devices()) if stats else host_memory()
+    if there is not None and needed > there:
         raise QfolioError(
             f"These settings need {needed / 2**30:,.1f} GiB of memory, but there are only "
             f"{there / 2**30:,.1f}; lower hidden, replay_capacity or the number of seeds."

@@ -13,8 +13,9 @@ from qfolio.core.registry import BASELINES
 from qfolio.experiments.events import read
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.folder import MOST_WEIGHTS, rows_written
 from qfolio.portfolio.backtest.replay import Stretch, decide
-from qfolio.portfolio.backtest.run import LATEST, MOST_WEIGHTS, Backtest, _rows_kept
+from qfolio.portfolio.backtest.run import LATEST, Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.following import follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices
@@ -259,10 +260,10 @@ def test_tables_say_what_was_replayed(finished):
 def test_large_tables_of_weights_have_the_last_row_of_each_day_or_month():
     hours = np.arange("2020-01-01", "2020-03-02", dtype="datetime64[h]").astype("datetime64[s]")
     most = MOST_WEIGHTS // len(hours)
-    np.testing.assert_array_equal(_rows_kept(hours, most), np.arange(len(hours)))
-    last = hours[_rows_kept(hours, most + 1)]
+    np.testing.assert_array_equal(rows_written(hours, most), np.arange(len(hours)))
+    last = hours[rows_written(hours, most + 1)]
     np.testing.assert_array_equal(last, hours.reshape(-1, 24)[:, -1])
-    last = hours[_rows_kept(hours, 24 * (most + 1))]
+    last = hours[rows_written(hours, 24 * (most + 1))]
     assert last.astype("datetime64[h]").astype(str).tolist() == [
         "2020-01-31T23", "2020-02-29T23", "2020-03-01T23",
     ]  # fmt: skip

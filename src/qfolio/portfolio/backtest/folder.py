@@ -41,10 +41,25 @@ TOGETHER = "-together"
 AgentName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")]
 
 
+MOST_WEIGHTS = 10_000_000
+"""Numbers in weights.csv, about 80 MB, beyond which it has fewer rows."""
+
+
 def followed(agent: str, names: Container[str]) -> str:
     """The strategy that ``allocate`` follows: all seeds of an agent together, or its only one."""
     together = f"{agent}{TOGETHER}"
     return together if together in names else agent
+
+
+def rows_written(dates: np.ndarray, numbers: int) -> np.ndarray:
+    """The rows of weights.csv: all, or the last of each day or month; numbers: those in a row."""
+    last = np.arange(len(dates))
+    for unit in ("D", "M"):
+        if len(last) * numbers <= MOST_WEIGHTS:
+            break
+        units = dates.astype(f"datetime64[{unit}]")
+        last = np.flatnonzero(np.append(units[1:] > units[:-1], True))
+    return last
 
 
 class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
@@ -203,12 +218,17 @@ class BacktestFolder:
 
     def write_weights(
         self,
+        dates: np.ndarray,
         days: Sequence[str],
         assets: Sequence[str],
         weights: dict[str, np.ndarray],
-        rows: Sequence[int] | np.ndarray,
     ) -> None:
-        """weights.csv: after the trades of these rows, cash first, of each strategy."""
+        """weights.csv: after each row's trade, cash first, of each strategy.
+
+        Where that would be too much, after the last trade of each day or month. days: the dates as
+        text.
+        """
+        rows = rows_written(dates, len(weights) * (1 + len(assets)))
         lines = (
             (days[row], name, *table[row].round(6))
             for name, table in weights.items()

@@ -25,7 +25,7 @@ from qfolio.experiments.events import Log, add_result
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Row
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio.backtest import assessment
+from qfolio.portfolio.backtest import assessment, memory
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
@@ -52,9 +52,6 @@ LATEST = "latest"
 """Name of the policies trained on the last rows of the table."""
 
 EQUAL_WEIGHT = "equal-weight"
-
-MOST_WEIGHTS = 10_000_000
-"""Numbers in weights.csv, about 80 MB, beyond which it has fewer rows."""
 
 FOLDS_AT_ONCE = 8
 """Folds that train at once if members advance in lockstep; results are kept after each group."""
@@ -167,6 +164,7 @@ class Backtest:
             },
             **devices.circumstances("python", "jax", "equinox", "numpy", "skfolio"),
         )
+        memory.require(prices, config)
         own = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
         backtest = cls(prices, config, None, own)
         if out is not None:
@@ -348,8 +346,7 @@ class Backtest:
     ) -> None:
         """returns.csv (a column per strategy and seed), weights.csv (means) and summary.json.
 
-        With attributions, why.json as well, and the diagnosis in summary.json. weights.csv has
-        every row, or, where that would be too much, the last one of each day or month.
+        With attributions, why.json as well, and the diagnosis in summary.json.
         """
         assert self._folder is not None
         days = [spell(date, self.prices.dates) for date in self.dates]
@@ -364,8 +361,7 @@ class Backtest:
             for name, entry in entries.items()
             if entry.kind != "rebalancing"
         }
-        rows = _rows_kept(self.dates, len(weights) * (1 + len(self.prices.assets)))
-        self._folder.write_weights(days, self.prices.assets, weights, rows)
+        self._folder.write_weights(self.dates, days, self.prices.assets, weights)
         summary = {**assessed.to_json(), "verdicts": verdicts(assessed)}
         if why is not None:
             self._folder.write_why(why.to_json())
@@ -471,17 +467,6 @@ class Backtest:
             lag=self.config.lag,
         )
         return Entry(kind, decisions, simulation)
-
-
-def _rows_kept(dates: np.ndarray, numbers: int) -> np.ndarray:
-    """The rows of weights.csv: all, or the last of each day or month; numbers: those in a row."""
-    last = np.arange(len(dates))
-    for unit in ("D", "M"):
-        if len(last) * numbers <= MOST_WEIGHTS:
-            break
-        units = dates.astype(f"datetime64[{unit}]")
-        last = np.flatnonzero(np.append(units[1:] > units[:-1], True))
-    return last
 
 
 def _learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, Any]:

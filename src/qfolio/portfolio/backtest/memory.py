@@ -1,0 +1,69 @@
+"""An estimate of the memory that a backtest's arrays need, before any of them is made.
+
+Training has a check of its own, ``devices.require_memory``.
+"""
+
+from collections.abc import Sequence
+
+from qfolio.core import devices, settings
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.attribution.replays import AT_ONCE
+from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS
+from qfolio.portfolio.backtest.folder import BacktestConfig
+from qfolio.portfolio.backtest.folds import walk_forward
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+
+MENTIONED = 2**30
+"""Bytes from which a user is told beforehand."""
+
+
+def needed(prices: Prices, config: BacktestConfig) -> int:
+    """About the bytes that a backtest has in memory at once, beside what training takes."""
+    folds = walk_forward(prices.dates, config.train, config.test, config.lag, config.expanding)
+    days = folds[-1].decisions.stop - folds[0].decisions.start
+    channels = [
+        Portfolio.blank(
+            len(prices.assets),
+            len(prices.feature_names),
+            **settings.convert(Portfolio, dict(entry.task)),
+        ).center.size
+        for entry in config.agents.values()
+    ]
+    others = len(config.baselines) + len(SPEEDS)
+    return total(len(prices), days, len(prices.assets), channels, config.seeds, others)
+
+
+def total(
+    rows: int, days: int, assets: int, channels: Sequence[int], seeds: int, others: int
+) -> int:
+    """The bytes, from the sizes of everything.
+
+    Args:
+        rows: Of the price table.
+        days: Of the test.
+        assets: In the table.
+        channels: That each agent observes of an asset, by agent.
+        seeds: Agents of each kind.
+        others: Strategies that are not trained.
+    """
+    table, path = rows * assets, days * (assets + 1)
+    values = 3 * 8 * table  # prices as read, as relatives, and as baselines see them
+    observed = 4 * table * sum(channels)  # float32, on the device
+    made = 3 * 8 * table * max(channels)  # float64, while signals are computed
+    followed = len(channels) * (seeds + (seeds > 1)) + others
+    replayed = 2 * 8 * path * (followed + len(channels))  # decisions, weights, and their means
+    explained = 2 * 4 * 2 * path * AT_ONCE  # targets and holdings of replays, and joined ones
+    return values + observed + max(made, replayed + explained)
+
+
+def require(prices: Prices, config: BacktestConfig) -> None:
+    """Raises QfolioError if the machine has less memory than is needed."""
+    there, wanted = devices.host_memory(), needed(prices, config)
+    if there is not None and wanted > there:
+        raise QfolioError(
+            f"A backtest of {len(prices.assets):,} assets on {len(prices):,} rows with "
+            f"{config.seeds} seeds needs about {wanted / 2**30:,.1f} GiB of memory, but there are "
+            f"only {there / 2**30:,.1f}; give fewer assets, rows, agents, signals, baselines or "
+            "seeds."
+        )
