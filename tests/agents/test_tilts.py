@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qfolio.agents import paths
 from qfolio.agents.tilts import (
     Tilt,
     TiltPolicy,
@@ -17,7 +18,7 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
 from qfolio.core.mdp import Simplex
-from qfolio.core.population import Population
+from qfolio.core.population import Population, programs_of
 from qfolio.learning.evidence import Evidence, left_out
 from qfolio.learning.trading import Trading
 from qfolio.portfolio.prices.table import Prices
@@ -154,6 +155,19 @@ def test_stays_at_the_anchor_where_prices_hold_nothing():
     states = trained(*(walk(1500, 8, seed) for seed in range(3)))
     assert states.evidence.steps.min() > 0
     assert (states.policy.share == 0).sum() >= 2
+
+
+def test_many_assets_learn_as_few_do(monkeypatch):
+    """Targets of a step at a time, as among many assets, are those of all steps at once."""
+    table = walk(300, 3, seed=3)
+    found = [trained(table, rounds=2).policy]
+    monkeypatch.setattr(paths, "AT_ONCE", 0)
+    programs_of.cache_clear()
+    found.append(trained(table, rounds=2).policy)
+    programs_of.cache_clear()
+    for one, other in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+    assert np.abs(found[0].members.linear).min() > 1e-3
 
 
 def test_finds_momentum():

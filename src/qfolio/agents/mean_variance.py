@@ -244,9 +244,8 @@ class MeanVariance(OnPaths):
         self, task: ExogenousTask, rollout: Transition, trading: Trading, target: Array
     ) -> tuple[Float[Array, "time path"], Float[Array, "time path"]]:
         """Rewards net of costs and before them, from the first target on."""
-        view: View = rollout.observation
-        assert view.anchor is not None
-        (net,), (gross,) = self._followed(task, rollout, ((trading, target),), view.anchor)
+        given = lambda view, target: (target,)  # noqa: E731
+        (net,), (gross,) = self._followed(task, rollout, (trading,), given, target)
         return net, gross
 
 

@@ -5,6 +5,7 @@ nothing, and estimate no values. ``pathwise.py``, ``tilts.py`` and ``mean_varian
 the policy and the loss.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
 import equinox as eqx
@@ -23,6 +24,12 @@ from qfolio.learning.trading import Trading
 State = TypeVar("State")
 
 Rewards = tuple[Float[Array, "time path"], ...]
+
+Targets = Callable[[View, PyTree], tuple[Float[Array, "path entry"], ...]]
+
+AT_ONCE = 2**21
+"""Most numbers in the features of a rollout from which all targets are computed at once. Those of
+more leave the processor's cache, and each step's targets are computed when it is taken."""
 
 
 class OnPaths(Agent):
@@ -80,35 +87,41 @@ class OnPaths(Agent):
         self,
         task: ExogenousTask,
         rollout: Transition,
-        followers: tuple[tuple[Trading, Float[Array, "time path entry"]], ...],
-        anchor: Float[Array, "time path asset"],
+        trades: tuple[Trading, ...],
+        targets: Targets,
+        given: PyTree = None,
     ) -> tuple[Rewards, Rewards]:
-        """Rewards of each follower of targets along the rollout's market, and those without costs.
+        """Rewards of following targets along the rollout's market, and those without costs.
 
-        Each begins at its first target. anchor: says which assets can be traded.
+        Each of ``trades`` follows one of the targets and begins there. targets: maps a step's view
+        and its part of ``given``, which has a leading time axis, to them.
         """
+        if rollout.observation.features.size <= AT_ONCE:
+            given = targets(rollout.observation, given)
+            targets = lambda _, given: given  # noqa: E731
 
         def step(holdings: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
-            market, next_market, first, weights, targets = moves
+            market, next_market, first, anchor, given = moves
+            settle, shift = jax.vmap(task.settle), jax.vmap(task.shift)
+            views = [jax.vmap(task.observe)(Position(market, holding)) for holding in holdings]
 
-            def settled(trade: Trading, holding: PyTree, target: Array) -> tuple:
-                held = jax.vmap(task.observe)(Position(market, holding)).holding
-                action = jnp.where(first, target, trade(held, target, weights))
-                settle = jax.vmap(task.settle)
+            def settled(trade: Trading, holding: PyTree, held: Array, target: Array) -> tuple:
+                action = jnp.where(first, target, trade(held, target, anchor))
                 reward, after = settle(market, next_market, holding, action)
-                there = jax.vmap(task.shift)(holding, action[..., 1:] - held)
+                there = shift(holding, action[..., 1:] - held)
                 without, _ = settle(market, next_market, there, action)
                 return reward, without, after
 
-            each = zip(trades, holdings, targets, strict=True)
+            held = [view.holding for view in views]
+            wanted = targets(views[0]._replace(anchor=anchor), given)
+            each = zip(trades, holdings, held, wanted, strict=True)
             rewards, without, after = zip(*(settled(*one) for one in each), strict=True)
             return after, (rewards, without)
 
-        trades, targets = zip(*followers, strict=True)
         start = jax.tree.map(lambda x: x[0], rollout.state.holding)
         first = jnp.arange(self.rollout_length) == 0
         market, next_market = rollout.state.market, rollout.next_state.market
-        moves = (market, next_market, first, anchor, targets)
+        moves = (market, next_market, first, rollout.observation.anchor, given)
         return lax.scan(jax.checkpoint(step), (start,) * len(trades), moves)[1]
 
 

@@ -28,9 +28,6 @@ from qfolio.learning.evidence import Evidence, blocks_of, left_out, require_memb
 from qfolio.learning.scores import NETWORKS, Attention, Hidden
 from qfolio.learning.trading import Trading, ratio
 
-PASSES = 8
-"""Passes that look for the assets which a target holds."""
-
 LARGEST = 3.0
 """Inputs are clipped to ± this many standard deviations of the training data."""
 
@@ -107,16 +104,23 @@ def _nearest(
 ) -> Float[Array, "*batch asset"]:
     """The weights nearest to those wanted that are not negative and have a given sum.
 
-    They are what exceeds a level, which rises as assets below it drop out (Michelot 1986). Few
-    passes find it almost always; what is missing then is made up in proportion.
+    They are what exceeds a level, which rises as assets below it drop out (Michelot 1986).
     """
-    above, level = open_to, jnp.zeros_like(total)
-    for _ in range(PASSES):
-        level = ratio(jnp.where(above, wanted, 0.0).sum(-1, keepdims=True) - total,
-                      above.sum(-1, keepdims=True))  # fmt: skip
-        above = above & (wanted > level)
-    kept = jnp.where(above, wanted - level, 0.0)
-    return kept * ratio(total, kept.sum(-1, keepdims=True))
+
+    def level(above: Array, wanted: Array, total: Array) -> Array:
+        excess = jnp.where(above, wanted, 0.0).sum(-1, keepdims=True) - total
+        return ratio(excess, above.sum(-1, keepdims=True))
+
+    fixed, of = lax.stop_gradient((wanted, total))
+
+    def fewer(found: tuple[Array, Array]) -> tuple[Array, Array]:
+        above, _ = found
+        left = above & (fixed > level(above, fixed, of))
+        return left, (left != above).any()
+
+    # Which assets are above has no gradient; the level that follows from them has one.
+    above, _ = lax.while_loop(lambda found: found[1], fewer, (open_to, jnp.array(True)))
+    return jnp.where(above, wanted - level(above, wanted, total), 0.0)
 
 
 class TiltsState(eqx.Module):
@@ -230,11 +234,14 @@ class Tilts(OnPaths):
 
         Both begin at their own targets. The anchor is followed at the member's rate and band.
         """
-        view: View = rollout.observation
-        assert view.anchor is not None
-        assert isinstance(task.actions, Simplex)
-        target = tilted(view.anchor, member.scores(view.features), task.actions)
-        anchor = jnp.concatenate([1 - view.anchor.sum(-1, keepdims=True), view.anchor], -1)
-        followers = (member.trading, target), (lax.stop_gradient(member.trading), anchor)
-        (rewards, anchored), _ = self._followed(task, rollout, followers, view.anchor)
+        actions = task.actions
+        assert isinstance(actions, Simplex)
+
+        def targets(view: View, _: None) -> tuple[Array, Array]:
+            assert view.anchor is not None
+            anchor = jnp.concatenate([1 - view.anchor.sum(-1, keepdims=True), view.anchor], -1)
+            return tilted(view.anchor, member.scores(view.features), actions), anchor
+
+        trades = member.trading, lax.stop_gradient(member.trading)
+        (rewards, anchored), _ = self._followed(task, rollout, trades, targets)
         return rewards, anchored
