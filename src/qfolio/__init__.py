@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from qfolio.core.errors import QfolioError as QfolioError
     from qfolio.experiments.budget import Budget as Budget
     from qfolio.experiments.fit import Listener as Listener
+    from qfolio.experiments.log import Tracker as Tracker
+    from qfolio.experiments.log import tracked as tracked
     from qfolio.experiments.machines.choice import on as on
     from qfolio.experiments.presets import preset as preset
     from qfolio.experiments.run import Run as Run
@@ -63,9 +65,11 @@ _HOMES = {
     "Study": "qfolio.portfolio.study.run:Study",
     "TD3": "qfolio.agents.td3:TD3",
     "Tilts": "qfolio.agents.tilts:Tilts",
+    "Tracker": "qfolio.experiments.log:Tracker",
     "load_prices": "qfolio.portfolio.prices.table:load",
     "on": "qfolio.experiments.machines.choice:on",
     "preset": "qfolio.experiments.presets:preset",
+    "tracked": "qfolio.experiments.log:tracked",
     "train": "qfolio.experiments.run:train",
 }
 

@@ -21,6 +21,7 @@ def run() -> NoReturn:
     """Runs the command line; a QfolioError becomes one sentence and exit code 2."""
     import tyro
 
+    from qfolio.commands.board import board
     from qfolio.commands.comparison import compare
     from qfolio.commands.continual import continual
     from qfolio.commands.portfolio import allocate, backtest, prices
@@ -32,7 +33,7 @@ def run() -> NoReturn:
     commands: dict[str, Callable[..., Any]] = {
         "backtest": backtest, "allocate": allocate, "prices": prices, "study": study,
         "train": train, "compare": compare, "evaluate": evaluate, "watch": watch, "tune": tune,
-        "continual": continual,
+        "continual": continual, "board": board,
     }  # fmt: skip
     try:
         try:

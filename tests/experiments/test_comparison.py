@@ -438,7 +438,7 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
         (["--agents", "dqn,dqn:bold", "--episodes", 4, "--steps", 9], "give one of them"),
         (["--agents", "dqn,dqn:bold", "--episodes", 0], "episodes is 0"),
         (["--resume", "nowhere"], "no comparison"),
-        (["--resume", ".", "--seeds", 3], "add only --on and --trust"),
+        (["--resume", ".", "--seeds", 3], "add only --on, --track and --trust"),
     ],
 )  # fmt: skip
 def test_comparisons_that_are_refused(presets, monkeypatch, capsys, tmp_path, options, message):

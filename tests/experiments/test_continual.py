@@ -195,8 +195,8 @@ def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
     ("options", "message"),
     [
         (["--resume", "nowhere"], "no continual"),
-        (["--resume", ".", "--change", "mass=2"], "add only --trust"),
-        (["--resume", ".", "--rate", 0.5], "add only --trust"),
+        (["--resume", ".", "--change", "mass=2"], "add only --track and --trust"),
+        (["--resume", ".", "--rate", 0.5], "add only --track and --trust"),
     ],
 )
 def test_resume_refuses_what_it_would_ignore(monkeypatch, capsys, options, message):

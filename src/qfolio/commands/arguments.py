@@ -15,6 +15,9 @@ Folder = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 Names = Annotated[tuple[str, ...], arg(metavar="NAME …", help_behavior_hint="")]
 Modules = Annotated[tuple[str, ...], arg(metavar="MODULE …", help_behavior_hint="")]
+Trackers = Annotated[
+    tuple[str, ...], arg(metavar="tensorboard|wandb|trackio …", help_behavior_hint="")
+]
 Assignments = Annotated[
     tuple[str, ...], arg(name="set", metavar="NAME=VALUE …", help_behavior_hint="")
 ]

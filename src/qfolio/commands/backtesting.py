@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Names
+from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Names, Trackers
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
@@ -57,6 +57,8 @@ class Options:
         out: New folder (default: one in runs/).
         resume: Folder to resume.
         on: Where agents train: here, processes:4 (or another number), ray or ray://HOST:10001.
+        track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
+            module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
         missing: How to treat missing prices.
         late: How to treat assets that start later than the table.
@@ -83,6 +85,7 @@ class Options:
     out: Folder = None
     resume: Folder = None
     on: str = "here"
+    track: Trackers = ()
     trust: Modules = ()
     missing: Missing = "error"
     late: Late = "error"
@@ -91,8 +94,9 @@ class Options:
 
     @property
     def only_resumes(self) -> bool:
-        """Whether nothing but ``resume``, ``on`` and ``trust`` is given."""
-        return dataclasses.replace(self, resume=None, on=DEFAULTS.on, trust=()) == DEFAULTS
+        """Whether nothing but ``resume``, ``on``, ``track`` and ``trust`` is given."""
+        rest = dataclasses.replace(self, resume=None, on=DEFAULTS.on, track=(), trust=())
+        return rest == DEFAULTS
 
     def folder(self, kind: str) -> Path:
         """The new folder."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Count, Folder, Modules, Name, again, budget_of
+from qfolio.commands.arguments import Count, Folder, Modules, Name, Trackers, again, budget_of
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
@@ -32,6 +32,7 @@ def compare(
     out: Folder = None,
     resume: Folder = None,
     on: str = "here",
+    track: Trackers = (),
     trust: Modules = (),
 ) -> None:
     """Train several agents on one task, with the same seeds, and write a report that compares them.
@@ -49,22 +50,28 @@ def compare(
         out: New folder for the comparison (default: one in runs/).
         resume: Folder of a comparison to resume.
         on: Where agents train: here, processes:4 (or another number), ray or ray://HOST:10001.
+        track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
+            module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
     """
     given = (task, agents, preset, episodes, steps, seeds, seed, out)
     if resume is not None and any(option is not None for option in given):
-        raise QfolioError("--resume keeps the comparison's settings; add only --on and --trust.")
+        raise QfolioError(
+            "--resume keeps the comparison's settings; add only --on, --track and --trust."
+        )
     budget = budget_of(episodes, steps)
     from qfolio.core import devices
 
     devices.configure()
     registry.trust(trust)
+    from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import stop
     from qfolio.experiments.comparison.run import Comparison
+    from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on as executor_of
 
-    executor = executor_of(on)
+    executor, following = executor_of(on), trackers(track)
     if resume is None:
         task = task or "pendulum"
         now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
@@ -87,7 +94,8 @@ def compare(
         f"{len(run.entrants)} agents on {run.config.task} · {seeds} seed{'s' * (seeds > 1)} "
         f"each · {run.config.device}"
     )
-    _train(run, executor)
+    with tracked(*following):
+        _train(run, executor)
     if run.interrupted:
         parts = [part for one in run.entrants.values() for part in (one.task, one.agent)]
         stop(again("qfolio compare --resume", run.folder, *parts, on=on))

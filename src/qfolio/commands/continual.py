@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name
+from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Trackers
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
@@ -35,6 +35,7 @@ def continual(
     assignments: Assignments = (),
     out: Folder = None,
     resume: Folder = None,
+    track: Trackers = (),
     trust: Modules = (),
 ) -> None:
     """Change a task after training and compare how soon each way to go on recovers, at what cost.
@@ -53,22 +54,27 @@ def continual(
         assignments: Settings of the agent, and of the task before the change.
         out: New folder for the report (default: one in runs/).
         resume: Folder to resume; only the training that was stopped is done again.
+        track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
+            module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
     """
     given = (task, agent, preset, episodes, seeds, seed, rate, renewal, epsilon, out)
     if resume is not None and (
         change or assignments or any(option is not None for option in given)
     ):
-        raise QfolioError("--resume keeps the experiment's settings; add only --trust.")
+        raise QfolioError("--resume keeps the experiment's settings; add only --track and --trust.")
     from qfolio.core import devices
 
     devices.configure()
     registry.trust(trust)
+    from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import BarProgress, stop
     from qfolio.experiments import continual, presets
+    from qfolio.experiments.log import tracked
     from qfolio.report.continual import verdict, write_continual_report
 
+    following = trackers(track)
     if resume is None:
         task, preset = task or "pendulum", preset or "fast"
         agent = agent or presets.default_agent(task)
@@ -81,7 +87,7 @@ def continual(
         continual.create(plan, folder, shlex.join(["qfolio", *sys.argv[1:]]))
     else:
         folder = resume
-    with console.bar("compiling") as update:
+    with console.bar("compiling") as update, tracked(*following):
         content = continual.compare(folder, lambda name: BarProgress(update, name))
     if content is None:
         stop(f"qfolio continual --resume {folder}")

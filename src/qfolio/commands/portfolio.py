@@ -59,13 +59,15 @@ def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> No
 
     devices.configure()
     registry.trust(options.trust)
+    from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import JobsProgress, stop
+    from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.backtest.attribution.explain import explain
     from qfolio.portfolio.backtest.run import Backtest
 
-    executor = on(options.on)
+    executor, following = on(options.on), trackers(options.track)
     if options.resume is None:
         folder = options.folder("backtest")
         run = Backtest.create(
@@ -79,9 +81,11 @@ def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> No
     elif file is None and options.only_resumes:
         run, folder = Backtest.open(options.resume), options.resume
     else:
-        raise QfolioError("--resume keeps the backtest's settings; add only --on and --trust.")
+        raise QfolioError(
+            "--resume keeps the backtest's settings; add only --on, --track and --trust."
+        )
     console.say(console.describe_backtest(run))
-    with console.bar("compiling") as update:
+    with console.bar("compiling") as update, tracked(*following):
         run.run(JobsProgress(update), executor)
     if run.interrupted:
         stop(again("qfolio backtest --resume", folder, *run.parts, on=options.on))

@@ -44,13 +44,15 @@ def study(
 
     devices.configure()
     registry.trust(options.trust)
+    from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import JobsProgress, stop
+    from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.study.run import Study
     from qfolio.report.study import write_study_report
 
-    executor = on(options.on)
+    executor, following = on(options.on), trackers(options.track)
     if options.resume is None:
         basis_points("--cost-bps", options.cost_bps)  # refuses a wrong one by its own name
         costs = _numbers("--costs-bps", costs_bps, options.cost_bps)
@@ -66,9 +68,11 @@ def study(
     elif options.only_resumes and not (sets or lags or costs_bps or after):
         run = Study.open(options.resume)
     else:
-        raise QfolioError("--resume keeps the study's settings; add only --on and --trust.")
+        raise QfolioError(
+            "--resume keeps the study's settings; add only --on, --track and --trust."
+        )
     console.say(console.describe_study(run))
-    with console.bar("") as update:
+    with console.bar("") as update, tracked(*following):
 
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1

@@ -17,6 +17,7 @@ from qfolio.commands.arguments import (
     Folder,
     Modules,
     Name,
+    Trackers,
     again,
     budget_of,
 )
@@ -42,6 +43,7 @@ def train(
     assignments: Assignments = (),
     resume: Folder = None,
     on: str = "here",
+    track: Trackers = (),
     trust: Modules = (),
     compare: bool = True,
     live: bool = False,
@@ -69,6 +71,8 @@ def train(
             report and docs/dqn.md list them.
         resume: Folder of a run to resume, up to --episodes or --steps if given.
         on: Where seeds train: here, processes:4 (or another number), ray or ray://HOST:10001.
+        track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
+            module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
         compare: Train two more agents with one thing changed, for the report (DQN: double DQN; in
             markets: one action at a time instead of all at once).
@@ -78,12 +82,15 @@ def train(
 
     devices.configure()
     registry.trust(trust)
+    from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import stop
     from qfolio.experiments import presets
+    from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on as executor_of
     from qfolio.experiments.run import Run
 
+    following = trackers(track)
     budget = budget_of(episodes, steps)
     if live and on != "here":
         raise QfolioError("--live shows a training in this process; leave out --on, or --live.")
@@ -105,7 +112,8 @@ def train(
             run, folder = Run.open(resume), resume
         budget = budget or run.budget
         console.say(console.describe_run(run, budget))
-        _train(run, budget, executor, show)
+        with tracked(*following):
+            _train(run, budget, executor, show)
     if run.interrupted:
         stop(_resume(run, folder, on))
     contrast = None

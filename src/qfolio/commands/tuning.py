@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, again, budget_of
+from qfolio.commands.arguments import (
+    Assignments,
+    Count,
+    Folder,
+    Modules,
+    Name,
+    Trackers,
+    again,
+    budget_of,
+)
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
@@ -35,6 +44,7 @@ def tune(
     out: Folder = None,
     join: Folder = None,
     on: str = "here",
+    track: Trackers = (),
     trust: Modules = (),
 ) -> None:
     """Search an agent's hyperparameters and report which of them matter.
@@ -61,6 +71,8 @@ def tune(
             raises its number of trials.
         on: Where configurations train: here, processes:4 (or another number), ray or
             ray://HOST:10001. A batch should have several for each worker.
+        track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
+            module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
     """
     from qfolio.core import devices
@@ -68,12 +80,14 @@ def tune(
     devices.configure()
     registry.trust(trust)
     tuning = _tuning()
+    from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import SearchProgress, stop
     from qfolio.experiments import presets
+    from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on as executor_of
 
-    executor = executor_of(on)
+    executor, following = executor_of(on), trackers(track)
     given: list[Any] = [task, agent, preset, seeds, episodes, steps, out]
     budget = budget_of(episodes, steps)
     if join is None:
@@ -83,13 +97,14 @@ def tune(
                     assignments, out)  # fmt: skip
     elif search or assignments or any(x is not None for x in given):
         raise QfolioError(
-            "--join keeps the settings of the search; add only --trials, --batch, --on or --trust."
+            "--join keeps the settings of the search; add only --trials, --batch, --on, --track or "
+            "--trust."
         )
     else:
         work = tuning.Tuning.open(join, trials=trials, batch=batch)
     resume = again("qfolio tune --join", work.folder, work.task, work.agent, on=on)
     console.say(console.describe_search(work))
-    with SearchProgress() as progress:
+    with SearchProgress() as progress, tracked(*following):
         work.run(progress.batch, progress.chunk, executor)
     if work.interrupted:
         stop(resume)

@@ -2,10 +2,10 @@
 
 A user's own class is named ``module:Name``; the module may lie in the current directory. An
 installed package offers its classes as entry points in the groups ``qfolio.tasks``,
-``qfolio.agents``, ``qfolio.baselines``, ``qfolio.rewards``, ``qfolio.costs`` and
-``qfolio.signals``. Names that a user
-types are imported (``find``). Names in a folder may come from someone else: they must be in modules
-that have already been imported (``imported``, ``build``).
+``qfolio.agents``, ``qfolio.baselines``, ``qfolio.rewards``, ``qfolio.costs``, ``qfolio.signals``
+and ``qfolio.trackers``. Names that a user types are imported (``find``). Names in a folder may come
+from someone else: they must be in modules that have already been imported (``imported``,
+``build``).
 """
 
 import difflib
@@ -98,8 +98,13 @@ SIGNALS = {
     "market-volatility": "qfolio.portfolio.signals:MarketVolatility",
 }
 COSTS = {"proportional": "qfolio.portfolio.costs:Proportional"}
+TRACKERS = {
+    "tensorboard": "qfolio.adapters.trackers:TensorBoard",
+    "wandb": "qfolio.adapters.trackers:WeightsAndBiases",
+    "trackio": "qfolio.adapters.trackers:Trackio",
+}
 
-Kind = Literal["task", "agent", "baseline", "reward", "cost", "signal"]
+Kind = Literal["task", "agent", "baseline", "reward", "cost", "signal", "tracker"]
 
 
 class Entries(NamedTuple):
@@ -121,6 +126,7 @@ ENTRIES: dict[Kind, Entries] = {
     "reward": Entries(REWARDS, "qfolio.portfolio.rewards:Reward"),
     "cost": Entries(COSTS, "qfolio.portfolio.costs:CostModel"),
     "signal": Entries(SIGNALS, "qfolio.portfolio.signals:Signal"),
+    "tracker": Entries(TRACKERS, "qfolio.experiments.log:Tracker"),
 }
 
 GYM = "gym:"

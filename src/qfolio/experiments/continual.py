@@ -33,8 +33,8 @@ from qfolio.core.training import TrainingState
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.ranking import middle_steps, regret, steps_within
 from qfolio.experiments.described import agent_of, describe, task_of
-from qfolio.experiments.events import JobLog, Log, seed_names
 from qfolio.experiments.fit import Listener, Row, Training, fit
+from qfolio.experiments.log import JobLog, Log, seed_names
 from qfolio.learning.optimizer import Optimizer
 
 FILE, LEARNED = "continual.json", "learned.safetensors"

@@ -9,9 +9,9 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import jax
 
 from qfolio.core.devices import LOCKSTEP
-from qfolio.experiments.events import Log
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
+from qfolio.experiments.log import Log
 
 R_co = TypeVar("R_co", covariant=True)
 R = TypeVar("R")

@@ -19,10 +19,10 @@ from qfolio.core.population import Population
 from qfolio.core.registry import short
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.described import agent_of, describe, task_of
-from qfolio.experiments.events import JobLog, Log, add_result, seed_names
 from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.experiments.grading import grade
+from qfolio.experiments.log import JobLog, Log, add_result, seed_names
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder
 from qfolio.experiments.seed_groups import SeedGroups, SeedsJob, TrainedSeeds
 

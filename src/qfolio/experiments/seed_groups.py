@@ -20,9 +20,9 @@ from qfolio.core.files import new_folder
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.registry import short
 from qfolio.experiments.budget import Budget
-from qfolio.experiments.events import Log, seed_names
 from qfolio.experiments.executor import Executor, Job
 from qfolio.experiments.fit import Listener, Row
+from qfolio.experiments.log import Log, seed_names
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder
 
 if TYPE_CHECKING:

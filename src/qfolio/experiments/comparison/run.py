@@ -30,9 +30,9 @@ from qfolio.experiments.comparison.conclusion import conclusion, listed
 from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.ranking import Result, rank
 from qfolio.experiments.described import agent_of, describe, task_of
-from qfolio.experiments.events import JobLog, Log, add_result, seed_names
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener
+from qfolio.experiments.log import JobLog, Log, add_result, seed_names
 from qfolio.experiments.run import Run
 from qfolio.experiments.seed_groups import SeedsJob, TrainedSeeds
 

@@ -29,9 +29,9 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
-from qfolio.experiments.events import Log
 from qfolio.experiments.executor import Executor, Here, Job, carry_out, kept
 from qfolio.experiments.fit import Listener, Row, Training
+from qfolio.experiments.log import Log
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
 from qfolio.experiments.tuning.search import Value

@@ -21,9 +21,9 @@ from qfolio.core.mdp import Agent
 from qfolio.core.registry import BASELINES, short
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
-from qfolio.experiments.events import Log, add_result
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Row
+from qfolio.experiments.log import Log, add_result
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest import assessment, memory
 from qfolio.portfolio.backtest.attribution.why import Why

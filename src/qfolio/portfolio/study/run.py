@@ -19,9 +19,9 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.statistics import holm
-from qfolio.experiments.events import Log
 from qfolio.experiments.executor import Executor, Here
 from qfolio.experiments.interrupts import interruptible
+from qfolio.experiments.log import Log
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.explain import explain

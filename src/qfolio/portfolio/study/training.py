@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.events import Log
 from qfolio.experiments.executor import Executor, Job, ListenToJob
 from qfolio.experiments.fit import Listener
+from qfolio.experiments.log import Log
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.study.folder import Variant

@@ -1,0 +1,33 @@
+"""The command that shows in a browser what is trained."""
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+
+def board(
+    runs: Annotated[Positional[Path], arg(metavar="RUNS")] = Path("runs"),
+    *,
+    port: int = 8642,
+    open: bool = True,
+) -> None:
+    """Show all runs below a folder in the browser, live; Ctrl-C ends it.
+
+    The page is for this machine alone and changes nothing.
+
+    Args:
+        runs: Folder of runs.
+        port: Port on 127.0.0.1; 0 takes a free one.
+        open: Open the page in a browser.
+    """
+    import webbrowser
+
+    from qfolio.commands.console import say
+    from qfolio.report.board.server import Board
+
+    with Board(runs, port) as server:
+        say(f"The board of {runs} is at {server.url}")
+        if open:
+            webbrowser.open(server.url)
+        server.serve_forever()

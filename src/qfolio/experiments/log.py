@@ -1,0 +1,256 @@
+"""Writing the log of an experiment, which ``events.py`` describes."""
+
+import contextlib
+import math
+import os
+import platform
+import threading
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from qfolio.core.errors import QfolioError, one_line
+from qfolio.experiments.events import BEAT, EVENTS
+from qfolio.experiments.fit import Listener, Row, Training
+
+SHARE, SHORTEST, LONGEST = 0.05, 0.05, 1.0
+"""Records are so far apart, as a share of the training so far; and at least and at most so many
+seconds."""
+
+PARTS = 50
+"""Least records of a training, if it has so many episodes: long chunks are split."""
+
+RECENT = 500
+"""A record's means are those of at most so many episodes, or four a member: the latest ones."""
+
+
+class Tracker:
+    """Something that follows a log, such as TensorBoard; a tracker overrides what it needs."""
+
+    def start(self, folder: Path | None, about: Mapping[str, Any]) -> None:
+        """Work begins in a folder, or in none; about: what the ``start`` event says."""
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Numbers by name, ``job/metric`` if there are several jobs; step: of the job's members."""
+
+    def finish(self) -> None:
+        """The work has ended, in whatever way."""
+
+
+_trackers: ContextVar[tuple[Tracker, ...]] = ContextVar("trackers", default=())
+
+
+@contextlib.contextmanager
+def tracked(*trackers: Tracker) -> Iterator[None]:
+    """Trackers that follow all work that begins in this block."""
+    token = _trackers.set((*_trackers.get(), *trackers))
+    try:
+        yield
+    finally:
+        _trackers.reset(token)
+
+
+class Log:
+    """The log of an experiment; use it within ``opened``.
+
+    folder: of the experiment; without one, only trackers hear of it.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder, self._file = folder, -1
+        self._trackers: list[Tracker] = []
+        self.state = "done"  # how the work ends, unless an error ends it
+
+    @contextlib.contextmanager
+    def opened(self, **about: Any) -> Iterator["Log"]:
+        """Logs the start, and the end however it comes; about: what is done."""
+        trackers = _trackers.get()
+        with contextlib.ExitStack() as stack:
+            if self.folder is not None:
+                self._file = _open(self.folder / EVENTS)
+                stack.callback(self._close)
+                stack.enter_context(_heartbeat(self.folder / EVENTS))
+            here = {"pid": os.getpid(), "host": platform.node()}
+            self.write("start", **about, **here)
+            for tracker in trackers:
+                tracker.start(self.folder, about)
+                stack.callback(tracker.finish)
+            self._trackers = list(trackers)
+            try:
+                yield self
+            except BaseException as error:
+                failed = isinstance(error, Exception)
+                why = {"error": str(error)} if isinstance(error, QfolioError) else {}
+                self.write("end", state="failed" if failed else "stopped", **why, **here)
+                raise
+            self.write("end", state=self.state, **here)
+
+    def write(self, event: str, **values: Any) -> None:
+        """Appends an event in one piece, so that several processes may share a log."""
+        if self._file >= 0:
+            content = {"event": event, "time": round(time.time(), 3), **values}
+            os.write(self._file, msgspec.json.encode(content) + b"\n")
+
+    def settle(self, finished: bool) -> None:
+        """Says whether the work is finished, or was stopped before."""
+        self.state = "done" if finished else "stopped"
+
+    def queue(self, jobs: Sequence[str]) -> None:
+        """Jobs that will run."""
+        if jobs:
+            self.write("queued", jobs=list(jobs))
+
+    def job(self, name: str = "", members: Sequence[str] = ()) -> "JobLog":
+        """The listener of a job's training; members: their names, such as seeds."""
+        return JobLog(self, name, members)
+
+    def track(self, job: str, step: int, values: Mapping[str, Sequence[float | None]]) -> None:
+        """Tells trackers the means over members."""
+        if self._trackers:
+            prefix = f"{job}/" if job else ""
+            known = {
+                name: [x for x in each if x is not None and math.isfinite(x)]
+                for name, each in values.items()
+            }
+            means = {f"{prefix}{k}": sum(x) / len(x) for k, x in known.items() if x}
+            for tracker in list(self._trackers):
+                try:
+                    tracker.log(means, step)
+                except Exception as error:  # which is no reason to lose a training
+                    self._trackers.remove(tracker)
+                    name = type(tracker).__name__
+                    warnings.warn(f"{name} is left out: {one_line(error)}", stacklevel=2)
+
+    def _close(self) -> None:
+        os.close(self._file)
+        self._file, self._trackers = -1, []
+
+
+class JobLog(Listener):
+    """Logs the training of a job."""
+
+    def __init__(self, log: Log, name: str, members: Sequence[str]) -> None:
+        self.log, self.name, self.members = log, name, list(members)
+        self._rows: list[Row] = []
+        self._of: list[int] = []  # the member of each row
+        self._due = 0.0
+        self._step, self._share = 0, 0.0  # of the record before
+
+    def on_start(self, training: Training) -> None:
+        self._step, self._share = training.steps, training.share
+        self.log.write(
+            "running",
+            job=self.name,
+            step=training.steps,
+            worker=training.where,
+            members=self.members,
+            share=training.share,
+        )
+
+    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+        self._rows += rows
+        self._of += training.members
+        if perf_counter() >= self._due:
+            self._flush(training)
+            apart = min(max(SHORTEST, SHARE * training.seconds), LONGEST)
+            self._due = perf_counter() + apart
+
+    def on_end(self, training: Training) -> None:
+        if self._rows:
+            self._flush(training)
+        state = "done" if training.finished else "stopped"
+        self.log.write(state, job=self.name, step=training.steps)
+
+    def record(self, step: int, values: Mapping[str, Sequence[float | None]], **more: Any) -> None:
+        """Logs numbers of each member by name."""
+        self.log.write("record", job=self.name, step=step, **more, values=values)
+        self.log.track(self.name, step, values)
+
+    def _flush(self, training: Training) -> None:
+        rows, members, most = self._rows, self._of, max(RECENT, 4 * len(self.members))
+        step, share = training.steps, training.share
+        parts = max(1, min(math.ceil(PARTS * (share - self._share)), len(rows)))
+        for part in range(parts):  # in order of time, as the rows are
+            last, done = len(rows) * (part + 1) // parts, (part + 1) / parts
+            some = slice(max(len(rows) * part // parts, last - most), last)
+            self.record(
+                self._step + round((step - self._step) * done),
+                means(rows[some], members[some], len(self.members)),
+                share=round(self._share + (share - self._share) * done, 4),
+                rate=round(training.steps_per_second, 1),
+                left=round(training.seconds_left, 1),
+            )
+        self._rows, self._of, self._step, self._share = [], [], step, share
+
+
+def means(rows: Sequence[Row], members: Sequence[int], count: int) -> dict[str, list[float | None]]:
+    """The mean of each number over each member's rows; None if a member has no row."""
+    if not rows:
+        return {}
+    of, result = np.asarray(members), {}
+    for name in rows[-1]:
+        if name != "seed":
+            column = np.array([row.get(name, np.nan) for row in rows], float)
+            known = np.isfinite(column)  # before learning begins, its numbers are not
+            weights = np.bincount(of[known], minlength=count)
+            if name == "episode":  # counted from 1, in order
+                mean = np.zeros(count)
+                mean[of] = column
+            else:
+                mean = np.bincount(of[known], column[known], count) / np.maximum(weights, 1)
+            result[name] = [
+                float(f"{x:.6g}") if yes else None
+                for x, yes in zip(mean.tolist(), (weights > 0).tolist(), strict=True)
+            ]
+    return result
+
+
+def seed_names(seeds: Iterable[int]) -> list[str]:
+    """The members of a population of seeds."""
+    return [f"seed {seed}" for seed in seeds]
+
+
+def add_result(folder: Path | None, values: Mapping[str, Mapping[str, float | None]]) -> None:
+    """Appends the measures of what was trained, by name, to a folder's log if it has one."""
+    if folder is not None and (folder / EVENTS).exists():
+        log = Log(folder)
+        log._file = _open(folder / EVENTS)
+        try:
+            log.write("result", values=values)
+        finally:
+            log._close()
+
+
+def _open(path: Path) -> int:
+    """Opens a log to append; ends a line that a killed process left."""
+    file = os.open(path, os.O_APPEND | os.O_CREAT | os.O_RDWR | getattr(os, "O_BINARY", 0), 0o666)
+    if os.fstat(file).st_size:
+        os.lseek(file, -1, os.SEEK_END)
+        if os.read(file, 1) != b"\n":
+            os.write(file, b"\n")
+    return file
+
+
+@contextlib.contextmanager
+def _heartbeat(path: Path) -> Iterator[None]:
+    stop = threading.Event()
+
+    def beat() -> None:
+        while not stop.wait(BEAT):
+            with contextlib.suppress(OSError):
+                os.utime(path)
+
+    thread = threading.Thread(target=beat, daemon=True, name="qfolio-heartbeat")
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()

@@ -1,0 +1,260 @@
+"""What the log of one experiment says, kept small however long the log grows.
+
+A log may come from a stranger: events of another form than ``log.py`` writes are skipped.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from qfolio.experiments.events import SILENT, Event, read
+
+POINTS = 400
+"""Most points of a curve; then every other one is dropped, and from then on every other record."""
+
+JOBS = 20_000
+"""Most jobs of an experiment that are kept."""
+
+REPORT = "report.html"
+
+SHARED = "search"
+"""The kind of experiment that several processes may work on at once."""
+
+State = Literal["queued", "running", "done", "stopped", "failed"]
+
+
+class Start(msgspec.Struct):
+    time: float
+    kind: str = ""
+    task: str = ""
+    agents: list[str] = []
+    seeds: int | None = None
+    pid: int | None = None
+    host: str = ""
+
+
+class End(msgspec.Struct):
+    time: float
+    state: State
+    error: str = ""
+    pid: int | None = None
+    host: str = ""
+
+
+class Queued(msgspec.Struct):
+    jobs: list[str]
+
+
+class JobEvent(msgspec.Struct):
+    event: State
+    time: float
+    job: str
+    step: float | None = None
+    worker: str = ""
+    members: list[str] = []
+    error: str = ""
+
+
+class Record(msgspec.Struct):
+    time: float
+    job: str
+    step: float
+    values: dict[str, list[float | None]]
+    share: float | None = None
+    rate: float | None = None
+    left: float | None = None
+
+
+class Result(msgspec.Struct):
+    values: dict[str, dict[str, float | None]]
+
+
+KINDS: dict[str, type[msgspec.Struct]] = {
+    "start": Start, "end": End, "queued": Queued, "record": Record, "result": Result,
+    **dict.fromkeys(("running", "done", "stopped", "failed"), JobEvent),
+}  # fmt: skip
+
+
+class Curve:
+    """A number over a job's steps: the mean, the lowest and the highest of its members."""
+
+    def __init__(self) -> None:
+        self.points: list[tuple[float, float, float, float]] = []
+        self._every, self._skipped = 1, 0
+
+    def add(self, step: float, values: Sequence[float | None]) -> None:
+        known = [x for x in values if x is not None and math.isfinite(x)]
+        self._skipped += 1
+        if not known or (self._skipped < self._every and self.points):
+            return
+        self._skipped = 0
+        self.points.append((step, sum(known) / len(known), min(known), max(known)))
+        if len(self.points) > POINTS:
+            self.points, self._every = self.points[::2], 2 * self._every
+
+    def cut(self, step: float) -> None:
+        """Drops the points beyond a step."""
+        self.points = [point for point in self.points if point[0] <= step]
+
+
+class Job:
+    """A job's state and curves. version: of the board when it last changed."""
+
+    def __init__(self) -> None:
+        self.state: State = "queued"
+        self.worker = ""
+        self.members: list[str] = []
+        self.step, self.share = 0.0, 0.0
+        self.rate: float | None = None
+        self.left: float | None = None
+        self.begun: float | None = None
+        self.ended: float | None = None
+        self.curves: dict[str, Curve] = {}
+        self.version = 0
+
+    def change(self, said: JobEvent) -> None:
+        self.state = said.event
+        if said.event == "running":
+            self.worker, self.members, self.begun = said.worker, said.members, said.time
+            self.ended, self.step = None, said.step or 0.0
+            for curve in self.curves.values():
+                curve.cut(self.step)
+        else:
+            self.ended, self.left = said.time, None
+            if said.event == "done":
+                self.share = 1.0
+
+    def record(self, said: Record) -> None:
+        self.step = max(self.step, said.step)
+        if said.share is not None:
+            self.share, self.rate, self.left = said.share, said.rate, said.left
+        for name, values in said.values.items():
+            if name != "episode":
+                self.curves.setdefault(name, Curve()).add(said.step, values)
+
+    def to_json(self, name: str) -> dict[str, Any]:
+        return {
+            "name": name, "state": self.state, "worker": self.worker, "share": self.share,
+            "members": len(self.members), "rate": self.rate, "left": self.left, "step": self.step,
+            "begun": self.begun, "ended": self.ended,
+            "curves": {name: curve.points for name, curve in self.curves.items()},
+        }  # fmt: skip
+
+
+class Experiment:
+    """A folder with a log. version: of the board when anything changed."""
+
+    def __init__(self, name: str, log: Path) -> None:
+        self.name, self.log, self.version = name, log, 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._offset, self._inode, self._touched = 0, -1, 0.0
+        self.about = Start(0.0)
+        self.begun: float | None = None  # the first time
+        self.last = 0.0  # time of the last event
+        self.end: End | None = None  # of the work that ended last
+        self._working: set[tuple[int | None, str]] = set()  # processes that have not ended
+        self.jobs: dict[str, Job] = {}
+        self.results: dict[str, dict[str, float | None]] = {}
+        self._seen: tuple[Any, ...] = ()
+
+    def refresh(self, version: int) -> None:
+        """Reads what the log says since the last time; changes get this version."""
+        try:
+            status = self.log.stat()
+            if status.st_ino != self._inode or status.st_size < self._offset:
+                self._forget()
+                self._inode, self.version = status.st_ino, version
+            self._touched = status.st_mtime
+            if status.st_size > self._offset:
+                events, self._offset = read(self.log, self._offset)
+                for event in events:
+                    self._take(event, version)
+        except OSError:  # deleted, or on a disk that is gone
+            return
+        seen = (self.state, (self.log.parent / REPORT).exists())
+        if seen != self._seen:
+            self._seen, self.version = seen, version
+
+    @property
+    def state(self) -> State:
+        if self._working and time.time() - self._touched < SILENT:
+            return "running"
+        return "stopped" if self.end is None else self.end.state
+
+    def _take(self, event: Event, version: int) -> None:
+        try:
+            said = msgspec.convert(event, KINDS[event["event"]])
+        except (msgspec.ValidationError, KeyError, RecursionError):
+            return
+        self.version = version
+        if isinstance(said, Start):
+            self.about, self.last = said, said.time
+            self.begun = said.time if self.begun is None else self.begun
+            if said.kind != SHARED:
+                self.end = None
+                self._working.clear()
+            self._working.add((said.pid, said.host))
+        elif isinstance(said, End):
+            self.end, self.last = said, said.time
+            self._working.discard((said.pid, said.host))
+        elif isinstance(said, Result):
+            self.results.update(said.values)
+        elif isinstance(said, Queued):
+            for name in said.jobs:
+                self._job(name, version).state = "queued"
+        elif isinstance(said, JobEvent):
+            self.last = said.time
+            self._job(said.job, version).change(said)
+        elif isinstance(said, Record):
+            self.last = said.time
+            self._job(said.job, version).record(said)
+
+    def _job(self, name: str, version: int) -> Job:
+        job = self.jobs.get(name)
+        if job is None:
+            job = Job()
+            if len(self.jobs) < JOBS:
+                self.jobs[name] = job
+        job.version = version
+        return job
+
+    @property
+    def share(self) -> float:
+        """Of all jobs that it knows of, what is done."""
+        return sum(job.share for job in self.jobs.values()) / max(len(self.jobs), 1)
+
+    def summary(self, key: str) -> dict[str, Any]:
+        """A line of the list of experiments; key: how the page asks for it."""
+        states = [job.state for job in self.jobs.values()]
+        running = [job for job in self.jobs.values() if job.state == "running"]
+        first = next((job for job in self.jobs.values() if job.curves), None)
+        spark = _spark(first) if first else []
+        return {
+            "key": key, "name": self.name, "state": self.state, "kind": self.about.kind,
+            "task": self.about.task, "agents": self.about.agents, "seeds": self.about.seeds,
+            "share": self.share, "begun": self.begun, "last": self.last,
+            "rate": sum(job.rate or 0.0 for job in running) or None,
+            "jobs": {state: states.count(state) for state in sorted(set(states))},
+            "workers": len({job.worker for job in running if job.worker}),
+            "host": self.about.host, "error": self.end.error if self.end else "",
+            "report": (self.log.parent / REPORT).is_file(), "spark": spark,
+        }  # fmt: skip
+
+    def detail(self, since: int) -> dict[str, Any]:
+        """All results, and the jobs that have changed after a version of the board."""
+        return {
+            "results": self.results,
+            "jobs": [job.to_json(name) for name, job in self.jobs.items() if job.version > since],
+        }
+
+
+def _spark(job: Job) -> list[float]:
+    """About 40 means of the curve that says most."""
+    curve = job.curves.get("return") or next(iter(job.curves.values()))
+    return [point[1] for point in curve.points[:: max(1, len(curve.points) // 40)]]

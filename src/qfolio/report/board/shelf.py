@@ -1,0 +1,111 @@
+"""All experiments below a folder, found and read again when the page asks."""
+
+import hashlib
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from qfolio.experiments.events import EVENTS
+from qfolio.report.board.experiment import REPORT, Experiment
+
+DEPTH = 4
+"""How deep folders are searched; what lies within an experiment belongs to it."""
+
+FRESH = 0.3
+"""Seconds for which what was read serves further requests."""
+
+
+class Shelf:
+    """The experiments below a folder by key, which says nothing about where they lie.
+
+    Each answer has a version; a page that names the last one it saw gets what has changed since.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+        self._experiments: dict[str, Experiment] = {}
+        self._version, self._read = 0, -FRESH
+        self._lock = threading.Lock()
+
+    def runs(self, since: int) -> dict[str, Any]:
+        """The summaries of experiments that have changed, and the keys of all."""
+        with self._lock:
+            self._refresh()
+            return {
+                "version": self._version,
+                "root": self.root.name,
+                "keys": list(self._experiments),
+                "runs": [
+                    experiment.summary(key)
+                    for key, experiment in self._experiments.items()
+                    if experiment.version > since
+                ],
+            }
+
+    def run(self, key: str, since: int) -> dict[str, Any] | None:
+        """The jobs of an experiment that have changed; None if there is none of this key."""
+        with self._lock:
+            self._refresh()
+            experiment = self._experiments.get(key)
+            if experiment is None:
+                return None
+            return {"version": self._version, **experiment.detail(since)}
+
+    def report(self, key: str, name: str) -> bytes | None:
+        """A report in an experiment's folder: its own, or that of one of its parts.
+
+        ``name`` is compared with the names of those that there are, and never becomes a path.
+        """
+        with self._lock:
+            experiment = self._experiments.get(key)
+        if experiment is None:
+            return None
+        folder = experiment.log.parent
+        there = [folder / REPORT, *folder.glob(f"tables/*/*/{REPORT}")]
+        for path in there:
+            if path.relative_to(folder).as_posix() == name and _is_plain(path, self.root):
+                return path.read_bytes()
+        return None
+
+    def _refresh(self) -> None:
+        if perf_counter() - self._read < FRESH:
+            return
+        self._version += 1
+        found = {}
+        for log in _logs(str(self.root), DEPTH):
+            path = Path(log)
+            name = path.parent.relative_to(self.root).as_posix()
+            name = self.root.name if name == "." else name
+            key = hashlib.sha256(log.encode(errors="surrogateescape")).hexdigest()[:16]
+            found[key] = self._experiments.get(key) or Experiment(name, path)
+        self._experiments = found
+        for experiment in found.values():
+            experiment.refresh(self._version)
+        self._read = perf_counter()
+
+
+def _logs(folder: str, depth: int) -> Iterator[str]:
+    """The logs below a folder; links are not followed."""
+    try:
+        with os.scandir(folder) as entries:
+            inside = [entry for entry in entries if not entry.name.startswith(".")]
+            if any(e.name == EVENTS and e.is_file(follow_symlinks=False) for e in inside):
+                yield os.path.join(folder, EVENTS)
+                return
+            folders = [entry.path for entry in inside if entry.is_dir(follow_symlinks=False)]
+    except OSError:
+        return
+    if depth:
+        for path in folders:
+            yield from _logs(path, depth - 1)
+
+
+def _is_plain(path: Path, root: Path) -> bool:
+    """Whether a path is a file that lies where it seems to, and no link leads elsewhere."""
+    try:
+        return path.is_file() and path.resolve() == path and path.is_relative_to(root)
+    except OSError:
+        return False

@@ -1,0 +1,500 @@
+// The board: asks the server again and again for what has changed, and draws it.
+// What comes from a log is set as text, never as markup.
+"use strict";
+
+const EVERY = 700; // milliseconds between two questions
+const COLOURS = 6; // then they come again, dashed
+const STATES = ["running", "done", "stopped", "failed"];
+const NAMES = { // what curves show, the most telling first
+  "return": "Return in training", "greedy return": "Greedy return", "greedy regret": "Greedy regret",
+  "growth": "Growth in training", "held-out growth": "Held-out growth", "loss": "Loss",
+  "max_q": "Largest action value", "q": "Action value", "value_loss": "Loss of the critic",
+  "explained_variance": "Explained variance", "overestimation": "Overestimation",
+  "entropy": "Entropy of the policy", "kl": "KL divergence", "clip_fraction": "Clip fraction",
+  "gradient_norm": "Gradient norm", "epsilon": "Exploration ε", "temperature": "Temperature",
+  "turnover": "Turnover", "cost": "Cost", "cash": "Cash", "assets": "Effective number of assets",
+  "distance": "Distance from the anchor",
+};
+
+const find = (id) => document.getElementById(id);
+const runs = new Map(); // key → what the list says
+const details = new Map(); // key → {version, jobs, results}
+const items = new Map(); // key → its place in the list
+let version = 0, chosen = [], following = true, connected = true, hovered = null;
+
+// Elements ------------------------------------------------------------------------------------
+
+function element(name, properties = {}, ...children) {
+  const made = document.createElement(name);
+  Object.assign(made, properties);
+  made.append(...children);
+  return made;
+}
+
+function drawn(name, attributes = {}) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  return made;
+}
+
+function say(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+// Words ---------------------------------------------------------------------------------------
+
+const THIN = "\u202f";
+
+function number(x) {
+  if (x === null || x === undefined || !Number.isFinite(x)) return "–";
+  const size = Math.abs(x);
+  let text;
+  if (size >= 1e6) text = x.toExponential(2);
+  else if (size >= 1000) text = Math.round(x).toString().replace(/\B(?=(\d{3})+$)/g, THIN);
+  else if (size >= 100) text = x.toFixed(1);
+  else if (size >= 1 || size === 0) text = x.toFixed(2);
+  else text = size < 1e-3 ? x.toExponential(1) : x.toPrecision(3);
+  return text.replace("-", "−");
+}
+
+function short(x) { // of an axis
+  const size = Math.abs(x);
+  const cut = (y) => String(+y.toPrecision(3));
+  const text = size >= 1e6 ? `${cut(x / 1e6)}M` : size >= 1e4 ? `${cut(x / 1e3)}k` : cut(x);
+  return text.replace("-", "−");
+}
+
+function span(seconds) {
+  if (seconds === null || !Number.isFinite(seconds)) return "–";
+  const s = Math.round(Math.max(seconds, 0));
+  if (s < 90) return `${s}${THIN}s`;
+  if (s < 5400) return `${Math.round(s / 60)}${THIN}min`;
+  if (s < 172800) return `${Math.floor(s / 3600)}${THIN}h ${Math.round(s / 60) % 60}${THIN}min`;
+  return `${Math.round(s / 86400)} days`;
+}
+
+const ago = (time) => `${span(Date.now() / 1000 - time)} ago`;
+const percent = (x) => `${Math.floor(100 * x)}${THIN}%`;
+const plural = (count, noun) => `${number(count).replace(/[.].*/, "")} ${noun}${count === 1 ? "" : "s"}`;
+const tail = (name) => name.split(":").pop();
+
+function what(run) {
+  const seeds = run.seeds ? plural(run.seeds, "seed") : "";
+  return [run.kind, run.agents.map(tail).join(", "), run.task, seeds].filter(Boolean).join(" · ");
+}
+
+// The list ------------------------------------------------------------------------------------
+
+function item(run) {
+  let place = items.get(run.key);
+  if (!place) {
+    place = element("li");
+    const pick = element("button", { className: "pick", title: "Compare" }, element("span"));
+    const open = element("button", { className: "item" });
+    const spark = drawn("svg", { viewBox: "0 0 60 16", preserveAspectRatio: "none", "aria-hidden": "true" });
+    spark.append(drawn("path"));
+    open.append(element("span", { className: "name" }), spark, element("span", { className: "what" }),
+      element("span", { className: "when" }), element("span", { className: "bar" }, element("i")));
+    pick.addEventListener("click", () => choose(chosen.includes(run.key)
+      ? chosen.filter((key) => key !== run.key) : [...chosen, run.key]));
+    open.addEventListener("click", (event) => choose(event.ctrlKey || event.metaKey
+      ? [...new Set([...chosen, run.key])] : [run.key]));
+    place.append(pick, open);
+    items.set(run.key, place);
+  }
+  const get = (name) => place.querySelector(name);
+  say(get(".name"), run.name);
+  get(".name").title = run.name;
+  say(get(".what"), what(run));
+  get(".pick").setAttribute("aria-label", `Compare ${run.name}`);
+  get("i").style.transform = `scaleX(${run.share})`;
+  get("path").setAttribute("d", line(run.spark));
+  return place;
+}
+
+function line(values) {
+  if (values.length < 2) return "";
+  const low = Math.min(...values), high = Math.max(...values);
+  const y = (v) => (15 - 14 * (v - low) / (high - low || 1)).toFixed(1);
+  return "M" + values.map((v, i) => `${(60 * i / (values.length - 1)).toFixed(1)},${y(v)}`).join("L");
+}
+
+function list() {
+  const wanted = find("filter").value.toLowerCase().split(/\s+/).filter(Boolean);
+  const sorted = [...runs.values()].sort((a, b) =>
+    (b.state === "running") - (a.state === "running") || b.begun - a.begun || (a.name < b.name ? -1 : 1));
+  sorted.forEach((run, i) => {
+    const place = items.get(run.key), colour = chosen.indexOf(run.key);
+    const text = `${run.name} ${what(run)} ${run.state}`.toLowerCase();
+    place.hidden = !wanted.every((word) => text.includes(word));
+    place.className = `${run.state}${colour < 0 ? "" : " chosen"}`;
+    place.style.setProperty("--line", colour < 0 ? "" : `var(--agent-${colour % COLOURS + 1})`);
+    place.querySelector(".pick").setAttribute("aria-pressed", colour >= 0);
+    say(place.querySelector(".when"), run.state === "running" ? percent(run.share)
+      : run.state === "done" ? ago(run.last) : run.state);
+    if (find("runs").children[i] !== place) find("runs").insertBefore(place, find("runs").children[i] || null);
+  });
+  const counts = STATES.map((state) => [state, sorted.filter((run) => run.state === state).length]);
+  const text = counts.filter(([, n]) => n).map(([state, n]) => `${n} ${state}`).join(" · ");
+  say(find("counts"), connected ? text || "No runs yet" : "The board’s server has stopped.");
+  document.title = counts[0][1] ? `${counts[0][1]} running · qfolio` : "qfolio board";
+  find("none").hidden = sorted.length > 0;
+  if (following && sorted.length && chosen[0] !== sorted[0].key) {
+    chosen = [sorted[0].key];
+    draw();
+    list();
+  }
+}
+
+function choose(keys) {
+  following = false;
+  chosen = keys;
+  for (const key of details.keys()) if (!keys.includes(key)) details.delete(key);
+  list();
+  draw();
+  look();
+}
+
+// What is chosen ------------------------------------------------------------------------------
+
+function groupOf(run, job) {
+  const parts = job.name.split("/");
+  if (run.kind === "backtest") return parts[0];
+  if (run.kind === "study") return parts[parts.length - 2];
+  return job.name;
+}
+
+function groups() {
+  const found = [];
+  for (const key of chosen) {
+    const run = runs.get(key), detail = details.get(key);
+    if (!run || !detail) continue;
+    const byName = new Map();
+    for (const job of detail.jobs.values()) {
+      const name = groupOf(run, job);
+      if (!byName.has(name)) byName.set(name, []);
+      byName.get(name).push(job);
+    }
+    for (const [name, jobs] of byName) {
+      const labels = [chosen.length > 1 ? run.name : "", name || (chosen.length > 1 ? "" : run.agents.map(tail).join(", "))];
+      found.push({ run, name, jobs, label: labels.filter(Boolean).join(" · ") });
+    }
+  }
+  found.forEach((group, i) => {
+    group.colour = `var(--agent-${i % COLOURS + 1})`;
+    group.dash = ["", "5 3", "1.5 2.5"][Math.floor(i / COLOURS) % 3];
+  });
+  return found;
+}
+
+const stateOf = (run, job) => job.state === "running" && run.state !== "running" ? "stopped" : job.state;
+
+function draw() {
+  const shown = chosen.map((key) => runs.get(key)).filter(Boolean);
+  find("shown").hidden = !shown.length;
+  if (!shown.length) return;
+  const found = groups(), single = shown.length === 1 ? shown[0] : null;
+  header(shown, single);
+  matrix(single, found);
+  legend(found);
+  charts(found);
+  workers(shown);
+  results(shown);
+}
+
+function header(shown, single) {
+  const over = single ? [single.kind, single.task, single.agents.map(tail).join(", ")] : ["comparison of runs"];
+  find("over").replaceChildren(...over.filter(Boolean).map((text) => element("span", { textContent: text })));
+  say(find("title"), single ? single.name : `${shown.length} runs side by side`);
+  const lede = find("lede");
+  const running = shown.filter((run) => run.state === "running");
+  const facts = [];
+  if (single) {
+    const done = single.state === "done", begun = single.begun;
+    const until = single.state === "running" ? Date.now() / 1000 : single.last;
+    const jobs = Object.values(single.jobs).reduce((a, b) => a + b, 0);
+    const detail = details.get(single.key);
+    const left = detail ? remaining(single, detail) : null;
+    const text = { running: "Running", done: "Done", stopped: "Stopped", failed: "Failed" }[single.state];
+    const also = single.error ? `: ${single.error}` : single.state === "running" ? "." : ` ${ago(single.last)}.`;
+    const words = [element("span", { textContent: text + also, className: single.error ? "bad" : "" })];
+    if (single.report) {
+      words.push(" ", element("a", { textContent: "Open the report", target: "_blank", rel: "noopener",
+        href: `/reports/${single.key}/report.html` }), ".");
+    }
+    if (lede.dataset.said !== text + also + single.report) lede.replaceChildren(...words);
+    lede.dataset.said = text + also + single.report;
+    facts.push(["done", percent(single.share)], [done ? "took" : "so far", span(until - begun)]);
+    if (single.state === "running") facts.push(["left", span(left)], ["steps a second", single.rate ? number(Math.round(single.rate)) : "–"]);
+    if (single.seeds) facts.push(["seeds", String(single.seeds)]);
+    if (jobs > 1) facts.push(["jobs", `${single.jobs.done || 0} of ${jobs}`]);
+    if (single.workers) facts.push(["workers", String(single.workers)]);
+  } else {
+    lede.dataset.said = "";
+    say(lede, running.length ? `${running.length} of them ${running.length > 1 ? "are" : "is"} running.` : "None of them is running.");
+  }
+  const place = find("facts");
+  while (place.children.length > facts.length) place.lastChild.remove();
+  facts.forEach(([name, value], i) => {
+    const pair = place.children[i] || place.appendChild(element("div", {}, element("dt"), element("dd")));
+    say(pair.children[0], name);
+    say(pair.children[1], value);
+  });
+}
+
+function remaining(run, detail) { // jobs say what is left of them; others take as long as they did
+  const jobs = [...detail.jobs.values()];
+  if (jobs.length === 1) return jobs[0].left;
+  const spent = Date.now() / 1000 - run.begun;
+  return run.share > .01 ? spent * (1 / run.share - 1) : null;
+}
+
+function matrix(single, found) {
+  const jobs = single ? found.flatMap((group) => group.jobs) : [];
+  find("jobs").hidden = jobs.length < 2;
+  if (jobs.length < 2) return;
+  const place = find("matrix"), rows = found.length > 12 ? [{ name: "", jobs }] : found;
+  while (place.children.length > 2 * rows.length) place.lastChild.remove();
+  rows.forEach((group, i) => {
+    if (!place.children[2 * i]) place.append(element("span"), element("div", { className: "cells" }));
+    say(place.children[2 * i], group.name);
+    const cells = place.children[2 * i + 1];
+    while (cells.children.length > group.jobs.length) cells.lastChild.remove();
+    group.jobs.forEach((job, j) => {
+      const cell = cells.children[j] || cells.appendChild(element("div", { className: "cell" }, element("i")));
+      const state = stateOf(single, job);
+      cell.className = `cell ${state}`;
+      cell.title = [job.name, state, state === "running" ? percent(job.share) : "", job.worker].filter(Boolean).join(" · ");
+      cell.firstChild.style.transform = `scaleY(${job.share})`;
+    });
+  });
+}
+
+function stroke(node, group) {
+  node.style.stroke = group.colour;
+  node.style.strokeDasharray = group.dash;
+  return node;
+}
+
+function legend(found) {
+  const text = found.map((group) => group.label + group.colour).join("\n");
+  const place = find("legend");
+  place.hidden = found.length < 2 && chosen.length < 2;
+  if (place.dataset.said === text) return;
+  place.dataset.said = text;
+  place.replaceChildren(...found.map((group) => {
+    const mark = drawn("svg", { viewBox: "0 0 24 8" });
+    mark.append(stroke(drawn("path", { d: "M1,4H23", "stroke-width": 2.4 }), group));
+    return element("li", {}, mark, element("span", { textContent: group.label }));
+  }));
+}
+
+function workers(shown) {
+  const rows = [];
+  for (const run of shown) {
+    for (const job of details.get(run.key)?.jobs.values() || []) {
+      if (stateOf(run, job) === "running" && job.worker) {
+        rows.push([job.worker, job.name, job.rate === null ? "–" : number(Math.round(job.rate)), percent(job.share), span(job.left)]);
+      }
+    }
+  }
+  find("workers").hidden = !rows.length;
+  rows.sort((a, b) => (a[0] < b[0] ? -1 : 1));
+  table(find("workers-rows"), rows, "td");
+}
+
+function results(shown) {
+  const rows = [], columns = [];
+  for (const run of shown) {
+    for (const [name, values] of Object.entries(details.get(run.key)?.results || {})) {
+      for (const key of Object.keys(values)) if (!columns.includes(key)) columns.push(key);
+      rows.push([shown.length > 1 ? `${run.name} · ${name}` : name, values]);
+    }
+  }
+  find("results").hidden = !rows.length;
+  table(find("results-head"), [["", ...columns.map((key) => key.replaceAll("_", " "))]], "th");
+  table(find("results-rows"), rows.map(([name, values]) => [name, ...columns.map((key) => number(values[key]))]), "td");
+}
+
+function table(body, rows, kind) {
+  const text = JSON.stringify(rows);
+  if (body.dataset.said === text) return;
+  body.dataset.said = text;
+  body.replaceChildren(...rows.map((row) =>
+    element("tr", {}, ...row.map((cell) => element(kind, { textContent: cell })))));
+}
+
+// Curves --------------------------------------------------------------------------------------
+
+const LEFT = 46, RIGHT = 6, TOP = 12, BOTTOM = 22, HEIGHT = 208;
+
+function charts(found) {
+  const metrics = new Set(found.flatMap((group) => group.jobs.flatMap((job) => Object.keys(job.curves))));
+  const order = Object.keys(NAMES), place = find("charts");
+  const rank = (name) => (order.includes(name) ? order.indexOf(name) : order.length);
+  const names = [...metrics].sort((a, b) => rank(a) - rank(b) || (a < b ? -1 : 1));
+  find("curves").hidden = !names.length;
+  for (const old of [...place.children]) if (!metrics.has(old.dataset.name)) old.remove();
+  names.forEach((name, i) => {
+    let chart = [...place.children].find((old) => old.dataset.name === name);
+    if (!chart) {
+      chart = element("div", { className: "chart" }, element("h3", {}, element("span"), element("output")));
+      chart.dataset.name = name;
+      chart.append(drawn("svg", { role: "img" }), element("div", { className: "tip", hidden: true }));
+      const svg = chart.querySelector("svg");
+      svg.addEventListener("pointermove", (event) => { hovered = { name, x: event.offsetX }; draw(); });
+      svg.addEventListener("pointerleave", () => { hovered = null; draw(); });
+    }
+    if (place.children[i] !== chart) place.insertBefore(chart, place.children[i] || null);
+    plot(chart, name, found);
+  });
+}
+
+function plot(chart, name, found) {
+  const svg = chart.querySelector("svg"), width = svg.clientWidth || 340;
+  const title = NAMES[name] || name.replaceAll("_", " ").replace(/^./, (c) => c.toUpperCase());
+  say(chart.querySelector("h3 span"), title);
+  svg.setAttribute("viewBox", `0 0 ${width} ${HEIGHT}`);
+  svg.setAttribute("aria-label", title);
+  const lines = found.flatMap((group) => group.jobs.filter((job) => job.curves[name]?.length).map((job) => ({
+    group, job, points: job.curves[name], alone: group.jobs.length === 1,
+    now: stateOf(group.run, job) === "running",
+  })));
+  const points = lines.flatMap((one) => one.points);
+  const steps = extent([0, ...points.map((p) => p[0])]), values = range(points.map((p) => p[1]));
+  const x = (v) => LEFT + (width - LEFT - RIGHT) * (v - steps[0]) / (steps[1] - steps[0] || 1);
+  const y = (v) => HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * (Math.max(values[0], Math.min(values[1], v)) - values[0]) / (values[1] - values[0]);
+  const parts = [];
+  for (const tick of ticks(values, 4)) {
+    parts.push(drawn("line", { class: "grid", x1: LEFT, x2: width - RIGHT, y1: y(tick), y2: y(tick) }));
+    const text = drawn("text", { x: LEFT - 8, y: y(tick) + 4, "text-anchor": "end" });
+    text.textContent = short(tick);
+    parts.push(text);
+  }
+  for (const tick of ticks(steps, width > 420 ? 5 : 4)) {
+    const text = drawn("text", { x: x(tick), y: HEIGHT - 4, "text-anchor": x(tick) > width - 30 ? "end" : x(tick) < LEFT + 12 ? "start" : "middle" });
+    text.textContent = short(tick);
+    parts.push(text);
+  }
+  for (const one of lines) {
+    const at = (k) => one.points.map((p) => `${x(p[0]).toFixed(1)},${y(p[k]).toFixed(1)}`);
+    if (one.alone && one.job.members > 1 && one.points.length > 1) {
+      const band = drawn("path", { class: "band", d: `M${at(3).join("L")}L${at(2).reverse().join("L")}Z` });
+      band.style.fill = one.group.colour;
+      parts.push(band);
+    }
+  }
+  for (const one of lines.sort((a, b) => a.now - b.now)) {
+    const d = one.points.length > 1 ? "M" + one.points.map((p) => `${x(p[0]).toFixed(1)},${y(p[1]).toFixed(1)}`).join("L")
+      : `M${x(one.points[0][0]) - 2},${y(one.points[0][1])}h4`;
+    parts.push(stroke(drawn("path", { d, class: `line${one.alone ? "" : " thin"}${one.now ? " now" : ""}` }), one.group));
+  }
+  const last = lines.filter((one) => one.alone);
+  say(chart.querySelector("output"), last.length === 1 ? number(last[0].points.at(-1)[1]) : "");
+  tip(chart, name, lines, steps, width, parts, x);
+  svg.replaceChildren(...parts);
+}
+
+function tip(chart, name, lines, steps, width, parts, x) {
+  const place = chart.querySelector(".tip");
+  place.hidden = hovered?.name !== name || !lines.length;
+  if (place.hidden) return;
+  const step = steps[0] + (steps[1] - steps[0]) * Math.max(0, Math.min(1, (hovered.x - LEFT) / (width - LEFT - RIGHT)));
+  parts.push(drawn("line", { class: "cursor", x1: x(step), x2: x(step), y1: TOP, y2: HEIGHT - BOTTOM }));
+  place.classList.toggle("left", hovered.x > width / 2);
+  const near = lines.map((one) => ({ one, point: nearest(one.points, step) }));
+  near.sort((a, b) => b.point[1] - a.point[1]);
+  const label = (one) => (one.alone ? one.group.label : `${chosen.length > 1 ? one.group.run.name + " · " : ""}${one.job.name}`);
+  place.replaceChildren(element("div", {}, element("span", { textContent: `step ${number(Math.round(step))}` })),
+    ...near.slice(0, 8).map(({ one, point }) => {
+      const row = element("div", {}, element("span", { textContent: label(one) }), element("span", { textContent: number(point[1]) }));
+      row.style.color = one.group.colour;
+      return row;
+    }), ...(near.length > 8 ? [element("div", { textContent: `and ${near.length - 8} more` })] : []));
+}
+
+function nearest(points, step) {
+  let low = 0, high = points.length - 1;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (points[middle][0] < step) low = middle; else high = middle;
+  }
+  return step - points[low][0] < points[high][0] - step ? points[low] : points[high];
+}
+
+function extent(values) {
+  let low = Infinity, high = -Infinity;
+  for (const v of values) { if (v < low) low = v; if (v > high) high = v; }
+  return low <= high ? [low, high] : [0, 1];
+}
+
+function range(values) { // without the most extreme hundredth, which would flatten all else
+  const sorted = Float64Array.from(values).sort();
+  const cut = sorted.length >= 200 ? Math.floor(sorted.length / 100) : 0;
+  let [low, high] = extent([sorted[cut], sorted[sorted.length - 1 - cut]].filter(Number.isFinite));
+  if (low === high) { const pad = Math.abs(low) / 10 || 1; low -= pad; high += pad; }
+  const pad = (high - low) * .04;
+  return [low - pad, high + pad];
+}
+
+function ticks([low, high], count) {
+  const raw = (high - low) / count || 1, power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 2.5, 5, 10].find((m) => m * power >= raw) * power;
+  const found = [];
+  for (let t = Math.ceil(low / step) * step; t <= high + step * 1e-9 && found.length < 12; t += step) found.push(Math.abs(t) < step * 1e-9 ? 0 : t);
+  return found;
+}
+
+// Asking --------------------------------------------------------------------------------------
+
+async function ask(path) {
+  const answer = await fetch(path, { cache: "no-store" });
+  return answer.ok ? answer.json() : null;
+}
+
+async function look() {
+  try {
+    const news = await ask(`/runs?since=${version}`);
+    if (!news) throw new Error("no answer");
+    if (news.version < version) { // the server is another one
+      version = 0;
+      runs.clear(); details.clear();
+      return;
+    }
+    connected = true;
+    version = news.version;
+    say(find("root"), news.root);
+    for (const run of news.runs) { runs.set(run.key, run); item(run); }
+    const keys = new Set(news.keys);
+    for (const key of [...runs.keys()]) {
+      if (!keys.has(key)) { runs.delete(key); items.get(key).remove(); items.delete(key); details.delete(key); }
+    }
+    list();
+    const told = await Promise.all(chosen.map(refresh));
+    if (told.some(Boolean) || news.runs.some((run) => chosen.includes(run.key))) draw();
+    else if (chosen.some((key) => runs.get(key)?.state === "running")) header(chosen.map((key) => runs.get(key)).filter(Boolean), chosen.length === 1 ? runs.get(chosen[0]) : null);
+  } catch {
+    connected = false;
+    list();
+  }
+}
+
+async function refresh(key) {
+  const known = details.get(key) || { version: 0, jobs: new Map(), results: {} };
+  const news = await ask(`/runs/${key}?since=${known.version}`);
+  if (!news || !chosen.includes(key)) return false;
+  details.set(key, known);
+  known.version = news.version;
+  known.results = news.results;
+  for (const job of news.jobs) known.jobs.set(job.name, job);
+  return news.jobs.length > 0;
+}
+
+async function forever() {
+  await look();
+  setTimeout(forever, document.hidden ? 4 * EVERY : EVERY);
+}
+
+find("filter").addEventListener("input", list);
+addEventListener("resize", draw);
+forever();

@@ -1,0 +1,265 @@
+"""The board's reading of logs, and its server."""
+
+import http.client
+import json
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.events import EVENTS, SILENT
+from qfolio.experiments.log import Log
+from qfolio.report.board import shelf as shelves
+from qfolio.report.board.experiment import POINTS, Experiment
+from qfolio.report.board.server import Board
+from qfolio.report.board.shelf import Shelf
+
+
+def write(folder, *events):
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / EVENTS).open("a") as file:
+        file.writelines(json.dumps({"time": time.time(), **event}) + "\n" for event in events)
+
+
+def start(**about):
+    return {"event": "start", "kind": "run", "agents": ["dqn"], "pid": 1, "host": "h", **about}
+
+
+def record(step, value, job=""):
+    return {"event": "record", "job": job, "step": step, "share": 0.5,
+            "values": {"return": [value, value + 2]}}  # fmt: skip
+
+
+RUNNING = {"event": "running", "job": "", "step": 0, "members": ["a", "b"]}
+END = {"event": "end", "state": "done", "pid": 1, "host": "h"}
+
+
+def read_again(folder):
+    experiment = Experiment(folder.name, folder / EVENTS)
+    experiment.refresh(1)
+    return experiment
+
+
+def test_states_follow_from_the_log_and_its_touch(tmp_path):
+    write(tmp_path, start(), RUNNING)
+    assert read_again(tmp_path).state == "running"
+    silent = time.time() - SILENT - 1
+    os.utime(tmp_path / EVENTS, (silent, silent))  # killed
+    assert read_again(tmp_path).state == "stopped"
+    write(tmp_path, start(pid=2), {**END, "pid": 2})  # resumed
+    assert read_again(tmp_path).state == "done"
+
+
+def test_a_search_runs_as_long_as_one_of_its_processes_does(tmp_path):
+    write(tmp_path, start(kind="search"), start(kind="search", pid=2), END)
+    assert read_again(tmp_path).state == "running"
+    write(tmp_path, {**END, "pid": 2, "state": "stopped"})
+    assert read_again(tmp_path).state == "stopped"
+
+
+def test_a_resumed_job_counts_nothing_twice(tmp_path):
+    write(tmp_path, start(), RUNNING, *(record(step, step) for step in (10, 20, 30)))
+    write(tmp_path, start(), {**RUNNING, "step": 20}, *(record(step, -step) for step in (30, 40)))
+    curve = read_again(tmp_path).jobs[""].curves["return"]
+    assert [point[:2] for point in curve.points] == [(10, 11), (20, 21), (30, -29), (40, -39)]
+
+
+def test_it_reads_on_where_it_stopped(tmp_path):
+    write(tmp_path, start(), RUNNING, record(1, 1.0))
+    experiment = read_again(tmp_path)
+    content = (tmp_path / EVENTS).read_bytes()
+    (tmp_path / EVENTS).write_bytes(b"?" * (len(content) - 1) + b"\n")  # is not read again
+    write(tmp_path, record(2, 2.0))
+    experiment.refresh(2)
+    assert [point[0] for point in experiment.jobs[""].curves["return"].points] == [1, 2]
+
+
+def test_long_logs_are_kept_short(tmp_path):
+    write(tmp_path, start(), RUNNING, *(record(step, step) for step in range(20_000)))
+    points = read_again(tmp_path).jobs[""].curves["return"].points
+    assert POINTS / 3 < len(points) <= POINTS
+    assert points[0][0] == 0
+    assert points[-1][0] > 19_000
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"event":"record","job":[],"step":0,"values":{}}',
+        '{"event":"record","job":"","step":1,"values":{"return":"<b>"}}',
+        '{"event":"record","time":1,"job":"","step":1e999,"values":{"return":[null]}}',
+        '{"event":"start","time":"now"}',
+        '{"event":"__class__"}',
+        '{"event":"end","time":1,"state":"<script>"}',
+    ],
+)
+def test_hostile_lines_do_no_harm(tmp_path, line):
+    (tmp_path / EVENTS).write_text(line + "\n")
+    write(tmp_path, start(), RUNNING, record(1, 1.0))
+    experiment = read_again(tmp_path)
+    assert experiment.summary("key")["state"] == "running"
+    assert [point[:2] for point in experiment.jobs[""].curves["return"].points] == [(1, 2)]
+
+
+def test_hundreds_of_runs_that_write(tmp_path, monkeypatch):
+    monkeypatch.setattr(shelves, "FRESH", 0.0)
+    folders = [tmp_path / f"group-{i % 7}" / f"run-{i}" for i in range(300)]
+    for folder in folders:
+        write(folder, start(), RUNNING, *(record(step, step) for step in range(50)))
+    shelf = Shelf(tmp_path)
+    version = shelf.runs(0)["version"]
+    for folder in folders[:100]:
+        write(folder, record(60, 60))
+    begun = time.perf_counter()
+    news = shelf.runs(version)
+    assert len(news["runs"]) == 100
+    assert len(news["keys"]) == 300
+    assert time.perf_counter() - begun < 1
+    assert shelf.runs(news["version"])["runs"] == []
+
+
+def test_only_jobs_that_changed_are_told_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(shelves, "FRESH", 0.0)
+    jobs = [{**RUNNING, "job": name} for name in ("a", "b")]
+    write(tmp_path / "run", start(), *jobs, record(1, 1, "a"), record(1, 1, "b"))
+    shelf = Shelf(tmp_path)
+    (key,) = shelf.runs(0)["keys"]
+    told = shelf.run(key, 0)
+    assert told is not None
+    assert [job["name"] for job in told["jobs"]] == ["a", "b"]
+    write(tmp_path / "run", record(2, 2, "b"))
+    again = shelf.run(key, told["version"])
+    assert again is not None
+    assert [job["name"] for job in again["jobs"]] == ["b"]
+
+
+def test_what_lies_in_an_experiment_belongs_to_it(tmp_path):
+    write(tmp_path / "comparison", start())
+    write(tmp_path / "comparison" / "agents" / "dqn", start())
+    write(tmp_path / ".hidden", start())
+    (tmp_path / "link").symlink_to(tmp_path / "comparison")
+    assert [run["name"] for run in Shelf(tmp_path).runs(0)["runs"]] == ["comparison"]
+
+
+def test_the_log_of_a_training_is_understood(tmp_path):
+    with Log(tmp_path).opened(kind="run", agents=["dqn"]) as log:
+        log.queue(["a"])
+        log.job("a", ["x"]).record(3, {"loss": [float("nan")], "return": [1.0]})
+        log.write("failed", job="a", error="why")
+    experiment = read_again(tmp_path)
+    assert (experiment.state, experiment.jobs["a"].state) == ("done", "failed")
+    assert experiment.jobs["a"].curves["loss"].points == []
+    assert experiment.jobs["a"].curves["return"].points == [(3, 1, 1, 1)]
+
+
+# The server --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def board(tmp_path):
+    root = tmp_path / "runs"
+    write(root / "mine", start(), RUNNING, record(1, 1))
+    (root / "mine" / "report.html").write_text("<script>1</script>")
+    (root / "mine" / "config.json").write_text("secret")
+    part = root / "mine" / "tables" / "us" / "lag1-10bp"
+    part.mkdir(parents=True)
+    (part / "report.html").write_text("part")
+    (root / "mine" / "tables" / "us" / "linked").mkdir()
+    (root / "mine" / "tables" / "us" / "linked" / "report.html").symlink_to("/etc/hostname")
+    (tmp_path / "report.html").write_text("outside")
+    with Board(root, 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+def ask(board, path, method="GET", host=None):
+    connection = http.client.HTTPConnection("127.0.0.1", board.server_port, timeout=10)
+    connection.putrequest(method, path, skip_host=True)
+    if host != "":
+        connection.putheader("Host", host or f"127.0.0.1:{board.server_port}")
+    connection.endheaders()
+    answer = connection.getresponse()
+    content = answer.read()
+    connection.close()
+    return answer, content
+
+
+def key_of(board):
+    (key,) = json.loads(ask(board, "/runs")[1])["keys"]
+    return key
+
+
+def test_it_listens_to_this_machine_alone(board):
+    assert board.server_address[0] == "127.0.0.1"
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "localhost:1", "127.0.0.1.evil", ""])
+def test_other_names_of_this_machine_are_refused(board, host):
+    for path in ("/", "/runs", "/board.js"):
+        assert ask(board, path, host=host)[0].status == 403
+    assert ask(board, "/runs", host=f"localhost:{board.server_port}")[0].status == 200
+
+
+def test_every_answer_forbids_what_it_does_not_need(board):
+    for path in ("/", "/runs", "/board.css", "/none", f"/reports/{key_of(board)}/report.html"):
+        answer, _ = ask(board, path)
+        headers = {name.lower(): value for name, value in answer.getheaders()}
+        assert not any(name.startswith("access-control") for name in headers)
+        assert "default-src 'none'" in headers["content-security-policy"]
+        assert "frame-ancestors 'none'" in headers["content-security-policy"]
+        assert headers["cross-origin-resource-policy"] == "same-origin"
+        assert headers["x-content-type-options"] == "nosniff"
+
+
+def test_reports_have_no_origin(board):
+    answer, content = ask(board, f"/reports/{key_of(board)}/report.html")
+    policy = answer.getheader("Content-Security-Policy")
+    assert content == b"<script>1</script>"
+    assert policy.startswith("sandbox allow-scripts;")
+    assert "allow-same-origin" not in policy
+    assert "connect-src" not in policy  # so that default-src forbids it
+
+
+def test_parts_have_reports_too(board):
+    place = f"/reports/{key_of(board)}/tables/us/lag1-10bp/report.html"
+    assert ask(board, place)[1] == b"part"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["config.json", "events.jsonl", "../report.html", "%2e%2e/report.html", "..%2freport.html",
+     "../../report.html", "//etc/hostname", "tables/us/linked/report.html", "tables/../report.html",
+     "tables/us/lag1-10bp/../../../../../report.html", "report.html%00", "*"],
+)  # fmt: skip
+def test_only_known_names_are_served(board, name):
+    assert ask(board, f"/reports/{key_of(board)}/{name}")[0].status == 404
+
+
+@pytest.mark.parametrize("path", ["/../x", "/runs/0123456789abcdef", "/runs/x", "/style.css"])
+def test_other_paths_are_not_there(board, path):
+    assert ask(board, path)[0].status == 404
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "PATCH"])
+def test_it_is_read_only(board, method):
+    answer, _ = ask(board, "/runs", method)
+    assert answer.status == 501
+    assert answer.getheader("Access-Control-Allow-Origin") is None
+
+
+def test_a_number_that_is_none_is_the_beginning(board):
+    for since in ("x", "-1", "", "9" * 5000, "%C2%B2"):
+        answer, content = ask(board, f"/runs?since={since}")
+        assert answer.status == 200
+        assert len(json.loads(content)["runs"]) == 1
+
+
+def test_a_folder_that_is_none_and_a_port_that_is_taken(board, tmp_path):
+    with pytest.raises(QfolioError, match="is no folder"):
+        Board(Path("/nowhere"), 0)
+    with pytest.raises(QfolioError, match="choose another one with --port"):
+        Board(tmp_path, board.server_port)

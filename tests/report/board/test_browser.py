@@ -1,0 +1,180 @@
+"""The board in a real browser: it moves, hostile names stay text, other pages see nothing."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+
+from qfolio.experiments.events import EVENTS
+from qfolio.report.board.server import Board
+
+from browser import Browser
+
+ELSEWHERE = """
+import sys, time
+from pathlib import Path
+from qfolio.experiments.log import Log
+folder = Path(sys.argv[1])
+print("ready", flush=True)
+sys.stdin.readline()
+folder.mkdir()
+with Log(folder).opened(kind="run", task="pendulum", agents=["dqn"], seeds=2) as log:
+    job = log.job(members=["seed 0", "seed 1"])
+    log.write("running", job="", step=0, members=job.members)
+    for step in range(1, 60):
+        job.record(100 * step, {"return": [-100.0 / step, -90.0 / step]}, share=step / 60)
+        time.sleep(0.2)
+"""
+
+HOSTILE = "<img src=x onerror=document.body.remove()>"
+
+
+@pytest.fixture
+def board(tmp_path: Path) -> Iterator[Board]:
+    (tmp_path / "runs").mkdir()
+    with Board(tmp_path / "runs", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+def write(folder: Path, **about: object) -> None:
+    folder.mkdir(parents=True)
+    start = {"event": "start", "time": time.time(), "kind": "run", "pid": 1, "host": "h", **about}
+    values = {HOSTILE: [1.0, 2.0], "return": [3.0, 4.0]}
+    events = [
+        start,
+        {"event": "running", "time": 1, "job": HOSTILE, "worker": HOSTILE, "members": ["a", "b"]},
+        *(
+            {"event": "record", "time": 1, "job": HOSTILE, "step": k, "values": values}
+            for k in "12"
+        ),
+        *(
+            {"event": "record", "time": 1, "job": HOSTILE, "step": k, "values": values}
+            for k in (1, 2)
+        ),
+        {"event": "result", "values": {HOSTILE: {HOSTILE: 1.0}}},
+    ]
+    (folder / EVENTS).write_text("".join(json.dumps(event) + "\n" for event in events))
+
+
+def test_a_run_started_elsewhere_appears_and_moves(
+    board: Board,
+    browser: Browser,
+    tmp_path: Path,
+) -> None:
+    browser.complaints.clear()
+    with subprocess.Popen(
+        [sys.executable, "-c", ELSEWHERE, str(tmp_path / "runs" / "elsewhere")],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ,
+    ) as process:  # fmt: skip
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdout.readline()
+        browser.show(board.url, 1280, "!document.getElementById('none').hidden")
+        process.stdin.write("go\n")
+        process.stdin.flush()
+        begun = time.monotonic()
+        browser.wait("document.querySelectorAll('#charts .line').length === 1")
+        assert time.monotonic() - begun < 2
+        assert browser.evaluate("document.querySelector('#title').textContent") == "elsewhere"
+        drawn = "document.querySelector('#charts .line').getAttribute('d')"
+        for _ in range(3):
+            before, begun = browser.evaluate(drawn), time.monotonic()
+            browser.wait(f"{drawn} !== {json.dumps(before)}")
+            assert time.monotonic() - begun < 2
+        process.kill()
+    assert browser.complaints == []
+
+
+def test_hostile_names_stay_text(
+    board: Board,
+    browser: Browser,
+    tmp_path: Path,
+) -> None:
+    browser.complaints.clear()
+    write(tmp_path / "runs" / HOSTILE, task=HOSTILE, agents=[HOSTILE])
+    write(tmp_path / "runs" / "other", task="<script>", agents=["</script>"])
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length > 0")
+    browser.evaluate("document.querySelectorAll('.pick').forEach((pick) => pick.click())")
+    browser.evaluate("document.querySelectorAll('.pick').forEach((pick) => pick.click())")
+    browser.evaluate("document.querySelectorAll('.item').forEach((item) => item.click())")
+    browser.wait("document.querySelectorAll('#charts .chart').length === 2")
+    text = browser.evaluate("document.body.innerText")
+    assert HOSTILE in text
+    assert browser.evaluate("document.querySelectorAll('img, script:not([src])').length") == 0
+    assert browser.complaints == []
+
+
+def test_runs_are_compared(board: Board, browser: Browser, tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        write(tmp_path / "runs" / name, agents=["dqn"])
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length > 0")
+    browser.click("#runs li:not(.chosen) .pick")
+    browser.wait("document.querySelectorAll('#charts .chart:first-child .line').length === 2")
+    lines = "[...document.querySelectorAll('#charts .chart:first-child .line')]"
+    colours = browser.evaluate(f"{lines}.map((line) => getComputedStyle(line).stroke)")
+    assert len(set(colours)) == 2
+    names = browser.evaluate("document.getElementById('legend').innerText")
+    assert "first" in names
+    assert "second" in names
+
+
+EVIL = """<!doctype html><script>
+const target = "%s";
+const tries = {
+  read: () => fetch(target + "runs").then((answer) => answer.text()),
+  opaque: () => fetch(target + "runs", {mode: "no-cors"}).then((answer) => answer.text()),
+  script: () => new Promise((done, fail) => {
+    const made = document.createElement("script");
+    Object.assign(made, {src: target + "board.js", onload: done, onerror: fail});
+    document.head.append(made);
+  }),
+  frame: () => new Promise((done, fail) => {
+    const made = document.createElement("iframe");
+    made.src = target;
+    made.onload = () => {
+      try { done(made.contentWindow.document.body.innerHTML); } catch (error) { fail(error); }
+    };
+    document.documentElement.append(made);
+  }),
+};
+window.outcome = Promise.all(Object.entries(tries).map(([name, attempt]) =>
+  attempt().then((found) => [name, "got " + found], () => [name, "failed"])
+)).then(Object.fromEntries);
+</script>"""
+
+
+def test_another_page_cannot_read_it(
+    board: Board,
+    browser: Browser,
+    tmp_path: Path,
+) -> None:
+    write(tmp_path / "runs" / "secret")
+
+    class Evil(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            content = (EVIL % board.url).encode()
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *args: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Evil) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        browser.show(f"http://127.0.0.1:{server.server_port}/", 800)
+        outcome = browser.evaluate("window.outcome")
+        server.shutdown()
+    assert outcome.keys() == {"read", "opaque", "script", "frame"}
+    assert set(outcome.values()) == {"failed"}
