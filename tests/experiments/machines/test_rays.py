@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -9,15 +10,20 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.experiments.budget import Budget
 from qfolio.experiments.executor import Executor, Job
-from qfolio.experiments.machines import dispatch
+from qfolio.experiments.machines import dispatch, rays
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.rays import Ray
+from qfolio.experiments.machines.schedule import ATTEMPTS
+from qfolio.experiments.run import Run
 
 import jobs
 from jobs import Add, Die, Fail, Sleep, alive
@@ -67,7 +73,7 @@ class Nodes:
 @pytest.fixture(scope="module")
 def nodes():
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setenv("PYTHONPATH", str(Path(jobs.__file__).parent))
+        monkeypatch.setenv("PYTHONPATH", str(Path(jobs.__file__).parent), prepend=os.pathsep)
         started = Nodes(3)
     yield started
     started.close()
@@ -104,7 +110,7 @@ class TestRay:
             "done = {job.name: result for job, result in executor.map(work, lambda job: ())}\n"
             "print(executor.workers, sum(result['sum'][1] for result in done.values()))\n"
         )
-        environment = os.environ | {"PYTHONPATH": str(Path(jobs.__file__).parent)}
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
         done = subprocess.run(
             [sys.executable, "-c", code],
             capture_output=True, text=True, timeout=120, env=environment, check=False,
@@ -115,19 +121,80 @@ class TestRay:
         done = subprocess.run(
             [sys.executable, "-m", "qfolio", "backtest", "--on", "ray://127.0.0.1:1"],
             capture_output=True, text=True, timeout=120, check=False,
+            env=os.environ | {"RAY_CLIENT_INITIAL_CONNECTION_TIMEOUT_S": "1"},
         )  # fmt: skip
         assert done.returncode == 2
         assert done.stderr.startswith("qfolio: The Ray cluster ray://127.0.0.1:1 cannot be reached")
         assert len(done.stderr.splitlines()) == 1
 
-    def test_a_killed_worker(self, nodes, tmp_path):
-        work: list[Job] = [Die("a", tmp_path / "count", 1), Add("b", 1.0)]
-        assert {job.name for job, _ in on("ray").map(work, silent)} == {"a", "b"}
-        assert (tmp_path / "count").read_text() == "xx"
-
     def test_a_job_that_kills_every_worker(self, nodes, tmp_path):
         with pytest.raises(QfolioError, match=r"^a was given up, because 3 workers ended"):
             list(on("ray").map([Die("a", tmp_path / "count", 9)], silent))
+
+    def test_workers_killed_twenty_times(self, nodes, tmp_path):
+        """At random; each job runs again as often as it lost its worker, and no other does."""
+        draw, times = random.Random(0), [0] * 30
+        while sum(times) < 20:
+            chosen = draw.randrange(30)
+            times[chosen] = min(times[chosen] + 1, ATTEMPTS - 1)
+        work = [Die(str(i), tmp_path / str(i), often) for i, often in enumerate(times)]
+        done = [(job.name, result) for job, result in on("ray").map(work, silent)]
+        assert sorted(done) == sorted((job.name, "alive") for job in work)
+        ran = [len((tmp_path / job.name).read_text()) for job in work]
+        assert ran == [often + 1 for often in times]
+
+    def test_no_place_for_a_worker(self, nodes, monkeypatch):
+        with pytest.raises(QfolioError, match="has no node with 2 cores, so no worker can start"):
+            Ray(cpus=2)
+        monkeypatch.setattr(rays, "PLACE", 3.0)
+
+        class Busy:
+            def ready(self):
+                return True
+
+        busy: Any = nodes.ray.remote(num_cpus=1)(Busy)
+        others = [busy.remote() for _ in nodes.nodes]
+        assert all(nodes.ray.get([other.ready.remote() for other in others]))
+        message = "No worker has got a place for 3 seconds: each asks for 1 core, and of the Ray "
+        with pytest.raises(QfolioError, match=f"{message}cluster's 3 cores 0 are free; end"):
+            list(on("ray").map([Add("a", 1.0)], silent))
+        for other in others:
+            nodes.ray.kill(other)
+
+    def test_a_driver_that_is_killed(self, nodes, tmp_path, task, agent, monkeypatch):
+        """What it has is kept; resumed, the run equals that of one process to the bit."""
+        folder, budget = tmp_path / "run", Budget(400)
+        Run.create(task, agent, budget=budget, seeds=4, out=folder)
+        code = (
+            "import sys\n"
+            "from qfolio.experiments.machines.choice import on\n"
+            "from qfolio.experiments.run import Run\n"
+            "Run.open(sys.argv[1]).train(executor=on('ray'))\n"
+        )
+        environment = os.environ | {"RAY_ADDRESS": nodes.cluster.address}
+        driver = subprocess.Popen([sys.executable, "-c", code, str(folder)], env=environment)
+        try:
+            wait(lambda: any((folder / "seeds").glob("[0-9]")))
+        finally:
+            driver.kill()
+            driver.wait()
+        kept = {path.name for path in (folder / "seeds").glob("[0-9]")}
+        resumed, asked = Run.open(folder), set[str]()
+
+        def listen(job, done, share):
+            asked.add(job.name)
+            return []
+
+        resumed.train(executor=on("ray"), listen=listen)
+        assert 0 < len(kept) < 4
+        assert asked == {f"dqn/{seed}" for seed in range(4)} - {f"dqn/{seed}" for seed in kept}
+        monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
+        alone = Run.create(task, agent, budget=budget, seeds=4)
+        alone.train()
+        jax.tree.map(
+            np.testing.assert_array_equal, alone.population.fetch(), resumed.population.fetch()
+        )
+        assert (alone.metrics, alone.evaluations) == (resumed.metrics, resumed.evaluations)
 
     def test_the_error_of_a_job(self, nodes):
         with pytest.raises(QfolioError, match="the loss is not finite"):
@@ -180,7 +247,7 @@ class TestRay:
 
 
 def wait(condition):
-    end = time.perf_counter() + 60
+    end = time.perf_counter() + 240  # on a busy machine
     while not condition():
         assert time.perf_counter() < end
         time.sleep(0.05)

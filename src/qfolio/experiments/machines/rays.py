@@ -24,6 +24,9 @@ from qfolio.experiments.machines.worker import Actor, environment
 
 R = TypeVar("R")
 
+PLACE = 30.0
+"""Seconds in which a first worker has to get a place, if the cluster seemed to have room for it."""
+
 
 class Ray:
     """Runs jobs on a Ray cluster, with Ray's own connection if there is one.
@@ -45,12 +48,14 @@ class Ray:
         gpus: bool | None = None,
     ) -> None:
         ray = _connected(address)
-        there = ray.cluster_resources()
-        self.lockstep = bool(there.get("GPU")) if gpus is None else gpus
-        room = int(there.get("GPU", 0) if self.lockstep else there.get("CPU", 0) // max(cpus, 1))
+        there = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        self.lockstep = any("GPU" in node for node in there) if gpus is None else gpus
+        kind, asked = ("GPU", 1) if self.lockstep else ("CPU", max(cpus, 1))
+        room = sum(int(node.get(kind, 0)) // asked for node in there)
         self.workers, self.cpus = room if workers is None else workers, cpus
+        self.waits = workers is not None  # for machines that come later
         if self.workers < 1 or cpus < 1:
-            what = "GPU" if self.lockstep else f"node with {cpus} cores"
+            what = "GPU" if self.lockstep else f"node with {_cores(max(cpus, 1))}"
             raise QfolioError(
                 f"The Ray cluster has no {what}, so no worker can start; add one, or give workers, "
                 "which then wait for it."
@@ -72,7 +77,8 @@ class _Actors:
     def __init__(self, executor: Ray) -> None:
         import ray
 
-        self._ray, self.count = ray, executor.workers
+        self._ray, self._executor, self.count = ray, executor, executor.workers
+        self._opened, self._placed = time.monotonic(), executor.waits
         # Ray gives an actor without a GPU no GPU, but does not hide those of its machine.
         hidden = {} if executor.lockstep else {"JAX_PLATFORMS": "cpu"}
         self._environment = environment(executor.devices) | hidden
@@ -86,7 +92,7 @@ class _Actors:
 
     def start(self, worker: int) -> None:
         self._actors[worker] = self._actor.remote(self._environment)
-        self._answers[self._actors[worker].ready.remote()] = worker
+        self._answers[self._actors[worker].placed.remote()] = worker
 
     def send(self, worker: int, job: Job) -> None:
         parcel = self._packer.pack(job)
@@ -103,6 +109,8 @@ class _Actors:
             time.sleep(seconds)
             return []
         if not self._ray.wait(awaited, timeout=seconds)[0]:
+            if not self._placed and time.monotonic() - self._opened > PLACE:
+                raise self._no_place()
             return []
         answered, _ = self._ray.wait(awaited, num_returns=len(awaited), timeout=0)
         heard: list[tuple[int, Message]] = []
@@ -113,7 +121,10 @@ class _Actors:
             except self._ray.exceptions.RayError as error:
                 said = [Lost(_reason(error))]
                 self._ray.kill(self._actors.pop(worker))
-            if isinstance(said[-1], Report):
+            if not said:
+                self._placed = True
+                self._answers[self._actors[worker].ready.remote()] = worker
+            elif isinstance(said[-1], Report):
                 self._listen(worker)
             heard += [(worker, message) for message in said]
         return heard
@@ -122,6 +133,18 @@ class _Actors:
         """Ends all actors."""
         for actor in self._actors.values():
             self._ray.kill(actor)
+
+    def _no_place(self) -> QfolioError:
+        kind = "GPU" if self._executor.lockstep else "CPU"
+        what = {"GPU": "GPUs", "CPU": "cores"}[kind]
+        free = int(self._ray.available_resources().get(kind, 0))
+        there = int(self._ray.cluster_resources().get(kind, 0))
+        asked = "a GPU" if self._executor.lockstep else _cores(self._executor.cpus)
+        return QfolioError(
+            f"No worker has got a place for {PLACE:.0f} seconds: each asks for {asked}, and of the "
+            f"Ray cluster's {there} {what} {free} are free; end what else runs there, or add a "
+            "machine."
+        )
 
     def _listen(self, worker: int) -> None:
         self._answers[self._actors[worker].listen.remote()] = worker
@@ -156,6 +179,10 @@ def _connected(address: str | None) -> Any:
                 f"({first.rstrip('.')}); check its address, and that it is running."
             ) from None
     return ray
+
+
+def _cores(count: int) -> str:
+    return f"{count} core" + "s" * (count > 1)
 
 
 def _reason(error: Exception) -> str:

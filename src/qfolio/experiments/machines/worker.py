@@ -82,13 +82,18 @@ class Actor:
     """A worker that Ray keeps alive; its answers are messages as bytes."""
 
     def __init__(self, environment: dict[str, str]) -> None:
-        self._ready = prepare(environment)
-        from qfolio.experiments.machines.parcels import Unpacker
+        self._environment, self._said = environment, SimpleQueue[Message]()
 
-        self._unpacker, self._said = Unpacker(), SimpleQueue[Message]()
+    def placed(self) -> bytes:
+        """Nothing, as soon as the actor has a place in the cluster."""
+        return pickle.dumps([])
 
     def ready(self) -> bytes:
-        return pickle.dumps([self._ready])
+        ready = prepare(self._environment)
+        from qfolio.experiments.machines.parcels import Unpacker
+
+        self._unpacker = Unpacker()
+        return pickle.dumps([ready])
 
     def begin(self, parcel: bytes, arrays: dict[str, Any]) -> None:
         """Begins a job, which runs beside ``listen``; arrays: references to those that it needs."""
