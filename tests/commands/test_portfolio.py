@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
 def test_backtest_writes_the_whole_folder(folder):
     assert {path.name for path in folder.iterdir()} == {
         "config.json", "prices.safetensors", "policies", "returns.csv", "weights.csv",
-        "summary.json", "why.json", "training", "wealth.png", "report.html",
+        "summary.json", "why.json", "training", "wealth.png", "report.html", "events.jsonl",
     }  # fmt: skip
     config = json.loads((folder / "config.json").read_text())
     assert config["cost"] == pytest.approx(0.001)

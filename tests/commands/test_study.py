@@ -33,7 +33,7 @@ def place(tmp_path_factory):
 def test_the_command_writes_the_whole_folder(place):
     folder = place / "run"
     assert {path.name for path in folder.iterdir()} == {
-        "study.json", "study.csv", "report.html", "tables",
+        "study.json", "study.csv", "report.html", "tables", "events.jsonl",
     }  # fmt: skip
     study = Study.open(folder)
     assert list(study.config.tables) == ["one", "other"]

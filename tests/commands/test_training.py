@@ -40,7 +40,7 @@ def test_train_writes_the_whole_folder(run):
     assert {path.name for path in folder.iterdir()} == {
         "config.json", "metrics.csv", "evaluation.csv", "checkpoint.safetensors",
         "policy.safetensors", "summary.json", "learning_curve.png", "value.png", "episode.gif",
-        "report.html", "contrast",
+        "report.html", "contrast", "events.jsonl",
     }  # fmt: skip
     header, *rows = (folder / "metrics.csv").read_text().splitlines()
     assert header == "seed,episode,return,epsilon,loss,max_q"
