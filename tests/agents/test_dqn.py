@@ -537,7 +537,7 @@ def test_targets_are_without_noise(task, agent):
     quiet = jit(agent.init)(task, jax.random.key(0)).online
     noisier = dataclasses.replace(agent, noise_scale=5.0)
     loud = jit(noisier.init)(task, jax.random.key(0)).online
-    row = Experience.like(jnp.ones(3), jnp.array(0))
+    row = Experience.like((), jnp.ones(3), jnp.array(0))
     batch = jax.tree.map(lambda x: np.ones((4, *x.shape), x.dtype), row)
     batch = jax.tree.map(jnp.asarray, batch._replace(terminal=np.zeros(4, bool)))
 

@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +9,9 @@ from qfolio.core.mdp import Transition
 from qfolio.learning.priorities import FAN, Priorities
 from qfolio.learning.replay import Experience, Replay, join
 from qfolio.learning.targets import n_step
+from qfolio.portfolio.task import Portfolio
+
+from planted import ASSETS, planted
 
 
 def filled(capacity, writes, width=2, **options):
@@ -88,7 +92,7 @@ def test_returns_over_steps_by_hand():
 
 def test_steps_are_joined_up_to_the_end_of_their_episode():
     """A termination leaves nothing to follow; a truncation leads to its own next observation."""
-    row = Experience.like(jnp.zeros(1), jnp.array(0), with_last=True)
+    row = Experience.like((), jnp.zeros(1), jnp.array(0), with_last=True)
     replay = Replay.empty(row, 6, 2, steps=3)
     ends = [[False, False], [True, True], [False, False]]
     terminal = [[False, False], [True, False], [False, True]]
@@ -124,6 +128,26 @@ def test_the_last_step_is_kept_where_it_is_asked_for():
     kept = Experience.of(rollout, with_last=True)
     assert kept.last is not None
     assert (kept.last.tolist(), kept.terminal.tolist()) == ([True, True], [True, False])
+
+
+def test_positions_are_stored_and_recalled_as_the_views_that_were_seen():
+    """A view of 40 rows and 6 assets has 240 numbers and more, a position far fewer."""
+    task = Portfolio.of(
+        planted(200), window=40, horizon=8, anchor="equal-weight", signals="high:20"
+    )
+    states = jax.vmap(task.reset)(jax.random.split(jax.random.key(0), 5))
+    seen = jax.vmap(task.observe)(states)
+    action = jnp.full((5, ASSETS + 1), 1 / (ASSETS + 1))
+    after = jax.vmap(task.step)(states, action, jax.random.split(jax.random.key(1), 5))
+    no = jnp.zeros(5, bool)
+    following = jax.vmap(task.observe)(after.state)
+    step = Transition(states, seen, action, after.reward, after.state, following, no, no)
+    rows = Experience.of(jax.tree.map(lambda x: x[None], step))
+    replay = jit(Replay.empty(jax.tree.map(lambda x: x[0], rows), 10, 5).add)(rows)
+    assert replay.rows.shape[1] < 40
+    again = replay.at(jnp.arange(5)).recalled(task)
+    assert eqx.tree_equal(again.observation, seen)
+    assert eqx.tree_equal(again.next_observation, following)
 
 
 def priorities_of(values):

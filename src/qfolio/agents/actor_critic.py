@@ -206,9 +206,10 @@ class ActorCritic(Agent, Generic[L]):
         """One gradient step of all that learns."""
 
     def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState[L]:
-        observation = task.observe(task.reset(key))
+        state = task.reset(key)
+        observation = task.observe(state)
         action = uniform(task.actions, key, 1)[0]
-        row = Experience.like(observation, action, with_last=self.n_steps > 1)
+        row = Experience.like(state, observation, action, with_last=self.n_steps > 1)
         learned = self.begin(task, observation, key)
         none = jnp.array([jnp.inf, -jnp.inf])
         noise = None
@@ -258,6 +259,7 @@ class ActorCritic(Agent, Generic[L]):
 
         def draw(key: PRNGKeyArray) -> tuple[Experience, Discount]:
             steps, discount = join(replay, replay.draw(key, self.batch_size), self.discount)
+            steps = steps.recalled(task)
             steps = steps._replace(
                 observation=now.observation(steps.observation),
                 next_observation=now.observation(steps.next_observation),

@@ -216,7 +216,7 @@ class DQN(Agent):
             hindsight.require_exogenous(task)
             row: Experience | Move = Move(state.market, state.market)
         else:
-            row = Experience.like(observation, zero, with_last=self.n_steps > 1)
+            row = Experience.like(state, observation, zero, with_last=self.n_steps > 1)
         return DQNState(
             online=online,
             target=online,
@@ -333,7 +333,7 @@ class DQN(Agent):
                 assert not isinstance(online, Heads)
                 assert not isinstance(target, Heads)
                 batch, discount = join(replay, index, self.discount)
-                losses = self._losses(online, target, batch, discount, key)
+                losses = self._losses(online, target, batch.recalled(task), discount, key)
             return (weight * losses.each).mean(), losses
 
         (loss, losses), gradient = jax.value_and_grad(objective, has_aux=True)(online)

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require
-from qfolio.core.mdp import Transition
+from qfolio.core.market import View
+from qfolio.core.mdp import Position, Task, Transition
 from qfolio.learning.priorities import Priorities
 from qfolio.learning.targets import Scalar, n_step
 
@@ -21,7 +22,11 @@ Discount = Float[Array, "*#batch"] | float
 
 
 class Experience(NamedTuple):
-    """A transition as the buffer stores it; nothing is bootstrapped after ``terminal``."""
+    """A transition as the buffer stores it; nothing is bootstrapped after ``terminal``.
+
+    A view of a market is many times larger than the position that it is a view of, so the buffer
+    stores positions, and ``recalled`` gives the views of those that are drawn.
+    """
 
     observation: PyTree
     action: Array
@@ -31,11 +36,13 @@ class Experience(NamedTuple):
     last: Bool[Array, "*batch"] | None = None  # of its episode; returns over steps stop there
 
     @staticmethod
-    def like(observation: PyTree, action: Array, *, with_last: bool = False) -> "Experience":
+    def like(
+        state: PyTree, observation: PyTree, action: Array, *, with_last: bool = False
+    ) -> "Experience":
         """An example of a row, for its shapes and types."""
-        no = jnp.array(False)
+        no, seen = jnp.array(False), _stored(state, observation)
         last = no if with_last else None
-        return Experience(observation, action, jnp.array(0.0), observation, no, last)
+        return Experience(seen, action, jnp.array(0.0), seen, no, last)
 
     @staticmethod
     def of(
@@ -47,9 +54,21 @@ class Experience(NamedTuple):
         if time_limit_terminal:
             terminal = last
         return Experience(
-            step.observation, step.action, step.reward, step.next_observation, terminal,
-            last if with_last else None,
+            _stored(step.state, step.observation), step.action, step.reward,
+            _stored(step.next_state, step.next_observation), terminal, last if with_last else None,
         )  # fmt: skip
+
+    def recalled(self, task: Task) -> "Experience":
+        """A batch with observations, as the agent saw them."""
+        if not isinstance(self.observation, Position):
+            return self
+        seen, then = map(jax.vmap(task.observe), (self.observation, self.next_observation))
+        return self._replace(observation=seen, next_observation=then)
+
+
+def _stored(state: PyTree, observation: PyTree) -> PyTree:
+    """What the buffer stores of an observation."""
+    return state if isinstance(observation, View) else observation
 
 
 class ReplayConfig(NamedTuple):
