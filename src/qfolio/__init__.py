@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from qfolio.core.version import __version__
 
 if TYPE_CHECKING:
+    from qfolio.adapters.progress import Progress as Progress
     from qfolio.agents.a2c import A2C as A2C
     from qfolio.agents.ddpg import DDPG as DDPG
     from qfolio.agents.dqn import DQN as DQN
@@ -59,6 +60,7 @@ _HOMES = {
     "Policy": "qfolio.portfolio.policy:Policy",
     "Portfolio": "qfolio.portfolio.task:Portfolio",
     "REINFORCE": "qfolio.agents.reinforce:REINFORCE",
+    "Progress": "qfolio.adapters.progress:Progress",
     "QfolioError": "qfolio.core.errors:QfolioError",
     "Run": "qfolio.experiments.run:Run",
     "SAC": "qfolio.agents.sac:SAC",

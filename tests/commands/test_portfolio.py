@@ -8,6 +8,7 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.folder import BacktestFolder
+from qfolio.portfolio.backtest.run import Backtest
 
 from shell import qfolio
 from tables import write_table
@@ -41,6 +42,16 @@ def test_backtest_writes_the_whole_folder(folder):
     assert (task["window"], task["horizon"]) == (10, 20)
     assert config["command"].startswith("qfolio backtest ")
     assert "equal-weight" in (folder / "report.html").read_text()
+
+
+def test_a_backtest_shows_itself_in_a_notebook(folder):
+    backtest = Backtest.open(folder)
+    shown = backtest._repr_html_()
+    assert "Backtest of pathwise" in shown
+    measures = json.loads((folder / "summary.json").read_text())["strategies"]
+    growth = measures["equal-weight"]["measures"]["growth"]["mean"]
+    assert f"<td>equal-weight</td><td>{100 * growth:.1f} %</td>" in shown
+    assert "equal-weight at" not in shown  # the other speeds of rebalancing
 
 
 def test_resuming_a_finished_backtest_reports_again(folder, monkeypatch, capsys):

@@ -223,6 +223,15 @@ def finished(tmp_path_factory):
     return run, run.finish()
 
 
+def test_a_comparison_shows_itself_in_a_notebook(finished):
+    run, content = finished
+    shown = run._repr_html_()
+    assert "2 of 2 agents" in shown
+    for name in ("slow", "quick"):
+        assert f"<td>{name}</td>" in shown
+        assert f"{np.mean(content['results'][name]['returns']):,.4g}" in shown
+
+
 def test_a_comparison_in_its_folder(finished):
     run, content = finished
     assert {path.name for path in run.folder.iterdir()} == {

@@ -61,6 +61,16 @@ def test_a_run_says_what_it_is(task, agent, tmp_path):
     assert repr(run) == f"<Run: dqn on pendulum, 2 seeds, 0 of 1,000 steps, in {tmp_path / 'run'}>"
 
 
+def test_a_run_shows_itself_in_a_notebook(task, agent, tmp_path):
+    run = Run.create(task, agent, episodes=12, seeds=2, preset="<b>", out=tmp_path / "run")
+    assert "0 of 12 episodes" in run._repr_html_()
+    run.train()
+    shown = run._repr_html_()
+    assert "preset &lt;b&gt;" in shown
+    assert "<svg" in shown
+    assert f"{run.evaluations[-1]['return']:,.4g}" in shown
+
+
 def test_steps_say_how_far_as_episodes_do(task, agent, tmp_path):
     create(task, agent, tmp_path / "straight", episodes=None, steps=300, seeds=2).train()
     create(task, agent, tmp_path / "halves", episodes=None, steps=133, seeds=2).train()

@@ -7,7 +7,7 @@ import platform
 import threading
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from time import perf_counter
@@ -39,6 +39,9 @@ class Tracker:
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Numbers by name, ``job/metric`` if there are several jobs; step: of the job's members."""
+
+    def event(self, event: Mapping[str, Any]) -> None:
+        """Every event after the start, as the log has it; ``log`` is told of records besides."""
 
     def finish(self) -> None:
         """The work has ended, in whatever way."""
@@ -94,9 +97,10 @@ class Log:
 
     def write(self, event: str, **values: Any) -> None:
         """Appends an event in one piece, so that several processes may share a log."""
+        content = {"event": event, "time": round(time.time(), 3), **values}
         if self._file >= 0:
-            content = {"event": event, "time": round(time.time(), 3), **values}
             os.write(self._file, msgspec.json.encode(content) + b"\n")
+        self._tell(lambda tracker: tracker.event(content))
 
     def settle(self, finished: bool) -> None:
         """Says whether the work is finished, or was stopped before."""
@@ -120,13 +124,17 @@ class Log:
                 for name, each in values.items()
             }
             means = {f"{prefix}{k}": sum(x) / len(x) for k, x in known.items() if x}
-            for tracker in list(self._trackers):
-                try:
-                    tracker.log(means, step)
-                except Exception as error:  # which is no reason to lose a training
-                    self._trackers.remove(tracker)
-                    name = type(tracker).__name__
-                    warnings.warn(f"{name} is left out: {one_line(error)}", stacklevel=2)
+            self._tell(lambda tracker: tracker.log(means, step))
+
+    def _tell(self, tell: Callable[[Tracker], None]) -> None:
+        """Tells all trackers; one that fails is no reason to lose a training."""
+        for tracker in list(self._trackers):
+            try:
+                tell(tracker)
+            except Exception as error:
+                self._trackers.remove(tracker)
+                name = type(tracker).__name__
+                warnings.warn(f"{name} is left out: {one_line(error)}", stacklevel=2)
 
     def _close(self) -> None:
         os.close(self._file)

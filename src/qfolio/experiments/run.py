@@ -15,6 +15,7 @@ from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, require_new
 from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
+from qfolio.core.notebook import card, number
 from qfolio.core.population import Population
 from qfolio.core.registry import short
 from qfolio.experiments.budget import Budget
@@ -124,6 +125,23 @@ class Run:
         done = f"{self.done(unit):,} of {self.budget.amount:,} {unit}"
         where = f", in {self.folder}" if self.folder else ""
         return f"<Run: {config.agent} on {config.task}, {seeds}, {done}{where}>"
+
+    def _repr_html_(self) -> str:
+        config, unit, seeds = self.config, self.budget.unit, self.config.seeds
+        points = [row["return"] for row in self.evaluations]
+        points = points[: len(points) // seeds * seeds]
+        return card(
+            f"{config.agent} on {config.task}",
+            [
+                *([] if config.preset is None else [f"preset {config.preset}"]),
+                f"{self.done(unit):,} of {self.budget.amount:,} {unit}",
+                f"{self.seconds_train:.1f} s of training",
+                *([] if self.folder is None else [str(self.folder)]),
+            ],
+            ("seed", "greedy return"),
+            [(str(int(row["seed"])), number(row["return"])) for row in self.evaluations[-seeds:]],
+            np.reshape(points, (-1, seeds)).mean(1).tolist(),
+        )
 
     @property
     def folder(self) -> Path | None:

@@ -24,6 +24,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, read_json
 from qfolio.core.mdp import Agent, Task
+from qfolio.core.notebook import card, number
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.conclusion import conclusion, listed
@@ -188,6 +189,19 @@ class Comparison:
     def open(cls, folder: Path | str) -> "Comparison":
         """A comparison as its last finished agent left it."""
         return cls(read_config(Path(folder) / FILE, ComparisonConfig), Path(folder))
+
+    def _repr_html_(self) -> str:
+        config, rows = self.config, []
+        for name in self.entrants:
+            known = _measures(self.results[name]) if name in self.results else {}
+            seconds = self.results[name].seconds_train if name in self.results else None
+            cells = (known.get("return"), known.get("regret"), seconds)
+            rows.append((name, *map(number, cells), self.failures.get(name, "")))
+        done = f"{len(self.results)} of {len(self.entrants)} agents"
+        seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
+        header = ("agent", "return", "regret", "seconds", "")
+        facts = [done, seeds, *config.conclusion[:1], str(self.folder)]
+        return card(f"Comparison on {config.task}", facts, header, rows)
 
     def place(self, name: str) -> Path:
         """The run folder of an agent."""

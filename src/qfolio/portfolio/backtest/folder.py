@@ -240,6 +240,22 @@ class BacktestFolder:
     def write_summary(self, summary: dict[str, Any]) -> None:
         write_json(self.path / "summary.json", summary)
 
+    def read_measures(self) -> dict[str, dict[str, float]]:
+        """The measures of each strategy (means over seeds); none before there is a summary."""
+        path = self.path / "summary.json"
+        if not path.exists():
+            return {}
+        try:
+            return {
+                name: {key: float(x["mean"]) for key, x in strategy["measures"].items()}
+                for name, strategy in read_json(path)["strategies"].items()
+                if strategy["kind"] != "rebalancing"
+            }
+        except (AttributeError, KeyError, TypeError, ValueError):
+            raise QfolioError(
+                f"{path} is damaged; write it again with qfolio backtest --resume {self.path}."
+            ) from None
+
     def write_why(self, content: dict[str, Any]) -> None:
         write_json(self.path / "why.json", content)
 

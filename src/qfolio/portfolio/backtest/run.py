@@ -18,6 +18,7 @@ from qfolio.core import devices, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
+from qfolio.core.notebook import card
 from qfolio.core.registry import BASELINES, short
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
@@ -191,6 +192,23 @@ class Backtest:
             f"<Backtest: {', '.join(self.agents)} on {len(self.prices.assets)} assets, {folds} "
             f"from {day(self.dates[0])} to {day(self.dates[-1])}, {seeds}{where}>"
         )
+
+    def _repr_html_(self) -> str:
+        trained = sum(self._is_trained(a, f.name) for a in self.agents for f in self._jobs)
+        facts = [
+            f"{trained} of {len(self.agents) * len(self._jobs)} trainings done",
+            f"{len(self.prices.assets)} assets",
+            f"{len(self.folds)} folds, {day(self.dates[0])} to {day(self.dates[-1])}",
+            f"{self.config.cost * 1e4:g} bp",
+            f"lag {self.config.lag}",
+            *([] if self.folder is None else [str(self.folder)]),
+        ]
+        header, rows = ("a year, net", "growth", "Sharpe", "turnover", "drawdown"), []
+        for name, measures in (self._folder.read_measures() if self._folder else {}).items():
+            growth, drawdown = (100 * measures[key] for key in ("growth", "drawdown"))
+            cells = (f"{growth:.1f} %", f"{measures['sharpe']:.2f}", f"{measures['turnover']:.1f}")
+            rows.append((name, *cells, f"{drawdown:.1f} %"))
+        return card(f"Backtest of {' and '.join(self.agents)}", facts, header, rows)
 
     @property
     def folder(self) -> Path | None:

@@ -1,0 +1,61 @@
+"""The bar of ``qfolio.Progress``, in a notebook (a stand-in for IPython) and without one."""
+
+import sys
+import types
+
+import pytest
+
+import qfolio
+from qfolio.experiments.log import Log
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    """What a notebook displays, picture after picture."""
+    pictures: list[str] = []
+
+    class Handle:
+        def update(self, html):
+            pictures.append(html)
+
+    shell = types.SimpleNamespace(kernel=object())
+    interactive = types.ModuleType("IPython")
+    interactive.get_ipython = lambda: shell  # type: ignore[attr-defined]
+    display = types.ModuleType("IPython.display")
+    display.HTML = str  # type: ignore[attr-defined]
+    display.display = lambda html, display_id: Handle()  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "IPython", interactive)
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    return pictures
+
+
+def train(task="pendulum"):
+    with (
+        qfolio.tracked(qfolio.Progress()),
+        Log(None).opened(kind="backtest", agents=["dqn"], task=task) as log,
+    ):
+        log.queue(["a", "b"])
+        log.write("running", job="a")
+        log.job("a").record(5, {"return": [1.0, 3.0, None]}, share=0.5, rate=1234.5)
+        log.write("done", job="a")
+        log.write("done", job="b")
+
+
+def test_a_notebook_shows_how_far_it_is(shown, monkeypatch):
+    monkeypatch.setattr("qfolio.adapters.progress.EVERY", 0.0)
+    train()
+    assert any('value="0.2500"' in picture for picture in shown)
+    assert any("0 of 2 jobs  return 2  1,234 steps/s" in picture for picture in shown)
+    assert 'value="1.0000"' in shown[-1]
+    assert "2 of 2 jobs" in shown[-1]
+
+
+def test_hostile_names_stay_text(shown):
+    train("<img src=x onerror=alert(1)>")
+    assert "&lt;img" in shown[-1]
+    assert "<img" not in shown[-1]
+
+
+def test_nothing_is_printed_where_there_is_no_terminal(capsys):
+    train()
+    assert capsys.readouterr().out == ""
