@@ -57,6 +57,13 @@ def test_groups_are_the_run(task, agent, tmp_path):
     same(here, Run.open(tmp_path / "there"))
     jobs = [(event["job"], event["members"]) for event in logged(tmp_path / "there", "running")]
     assert jobs == [(f"dqn/{seed}", [f"seed {seed}"]) for seed in range(SEEDS)]
+    graded = [
+        (event["step"], event["values"]["greedy return"])
+        for event in logged(tmp_path / "there", "record")
+        if event["job"] == "dqn/1" and "greedy return" in event["values"]
+    ]
+    curve = [row for row in here.evaluations if row["seed"] == 1]
+    assert graded == [(row["env_steps"], [row["return"]]) for row in curve]
     assert logged(tmp_path / "there", "end")[-1]["state"] == "done"
     names = [{path.name for path in run.folder.iterdir()} for run in (here, elsewhere)]
     assert names[0] == names[1]

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -24,7 +25,7 @@ from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.experiments.grading import grade
 from qfolio.experiments.log import JobLog, Log, add_result, seed_names
-from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder
+from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder, curve_point
 from qfolio.experiments.seed_groups import SeedGroups, SeedsJob, TrainedSeeds
 
 EVALUATIONS = 20
@@ -200,7 +201,8 @@ class Run:
         self.interrupted = False
         if jobs:
             with Log(self.folder).opened(**self._about) as log:
-                self.interrupted = carry_out(executor, jobs, listen, self.groups.store, log)
+                store = partial(self.groups.store, log=log)
+                self.interrupted = carry_out(executor, jobs, listen, store, log)
 
     def _train(self, budget: Budget, listeners: Sequence[Listener], log: JobLog | None) -> None:
         self.interrupted = False
@@ -303,9 +305,7 @@ class Run:
         ]
         self._record(EVALUATION, self.evaluations, rows)
         if self._log is not None:
-            names = {"greedy return": "return", "overestimation": "overestimation"}
-            columns = {name: [row[key] for row in rows] for name, key in names.items()}
-            self._log.record(self.done("steps"), columns)
+            self._log.record(self.done("steps"), curve_point(rows))
 
     def _record(self, name: str, table: list[Row], rows: list[Row]) -> None:
         table += rows

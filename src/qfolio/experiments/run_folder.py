@@ -120,6 +120,12 @@ class RunFolder:
             path.unlink()
 
 
+def curve_point(rows: Sequence[Row]) -> dict[str, list[float]]:
+    """What the log says of one point of the learning curve, a row of evaluation.csv each seed."""
+    names = {"greedy return": "return", "overestimation": "overestimation"}
+    return {name: [row[key] for row in rows] for name, key in names.items()}
+
+
 def _csv(rows: Sequence[Row], header: bool) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")

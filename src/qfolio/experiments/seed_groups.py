@@ -7,6 +7,7 @@ until the last one is there and all of them become the run.
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,10 +21,10 @@ from qfolio.core.files import new_folder
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.registry import short
 from qfolio.experiments.budget import Budget
-from qfolio.experiments.executor import Executor, Job
+from qfolio.experiments.executor import Executor
 from qfolio.experiments.fit import Listener, Row
 from qfolio.experiments.log import Log, seed_names
-from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder
+from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder, curve_point
 
 if TYPE_CHECKING:
     from qfolio.experiments.run import Run
@@ -142,16 +143,19 @@ class SeedGroups:
             for group in groups
         ]
 
-    def store(self, job: Job, trained: TrainedSeeds | QfolioError) -> None:
+    def store(self, job: SeedsJob, trained: TrainedSeeds | QfolioError, log: Log) -> None:
         """Keeps what a job has trained; after the last one, all of them become the run.
 
-        Raises QfolioError if the job could not train its seeds.
+        Raises QfolioError if the job could not train its seeds. log: hears of its learning curve.
         """
         if isinstance(trained, QfolioError):
             raise trained
         self._done[trained.config.seed] = trained
         if self._place is not None:
             _write(self._place, trained, self._run.agent)
+        said = log.job(job.name, job.members)
+        for step, rows in groupby(trained.evaluations, lambda row: row["env_steps"]):
+            said.record(int(step), curve_point(list(rows)))
         if not self.missing:
             self._join()
 

@@ -263,7 +263,7 @@ class Comparison:
 
         def store(job: SeedsJob, trained: TrainedSeeds | QfolioError) -> None:
             try:
-                runs[job.label].groups.store(job, trained)
+                runs[job.label].groups.store(job, trained, log)
             except QfolioError as error:
                 self._fail(job, job.label, error, log)
             keep_if_finished(job.label)
