@@ -87,9 +87,11 @@ def test_the_highest_ratio_of_uncorrelated_assets() -> None:
 
 
 def test_ratios_without_a_highest() -> None:
-    with pytest.raises(QfolioError, match="no mean is positive"):
+    with pytest.raises(QfolioError, match="no portfolio within the cap has a positive mean"):
         maximum_ratio([-1.0, 0.0], np.eye(2))
-    with pytest.raises(QfolioError, match="is there no risk at all"):
+    with pytest.raises(QfolioError, match="no portfolio within the cap has a positive mean"):
+        maximum_ratio([1.0, -1.0, -2.0], np.eye(3), 0.4)
+    with pytest.raises(QfolioError, match="a portfolio may be without risk"):
         maximum_ratio([1.0, 1.0], np.array([[1.0, -1.0], [-1.0, 1.0]]))
     with pytest.raises(QfolioError, match="do not fit"):
         maximum_ratio([1.0, 1.0], np.eye(3))

@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from qfolio.solvers.shared import require
 
 
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # steps that are not finite end it
 def maximum_ratio(
     mean: ArrayLike, covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-10
 ) -> NDArray[np.float64]:
@@ -17,7 +18,7 @@ def maximum_ratio(
     finds y, with multipliers z of y ≥ 0 and v of cap Σy − y ≥ 0. An iteration solves one system.
 
     Args:
-        mean: μ, shape (asset,); at least one is positive.
+        mean: μ, shape (asset,).
         covariance: Σ, shape (asset, asset), positive semidefinite.
         cap: Largest weight, at least 1/assets.
         tol: Largest gap between the primal and the dual value that is accepted, relative to μ'y.
@@ -26,8 +27,8 @@ def maximum_ratio(
         Weights of shape (asset,); those that are zero or at the cap are so exactly.
 
     Raises:
-        QfolioError: The arguments are invalid, no mean is positive, the cap is too low, or there is
-            no convergence, as without any risk.
+        QfolioError: The arguments are invalid, no portfolio has a positive mean, the cap is too
+            low, or there is no convergence, as without any risk.
     """
     mu, sigma = np.asarray(mean, dtype=float), np.asarray(covariance, dtype=float)
     count = len(mu)
@@ -41,8 +42,9 @@ def maximum_ratio(
     )
     scale = float(np.trace(sigma)) / count
     require(scale > 0, "a covariance needs some variance, else no ratio is the highest")
-    require(float(mu.max()) > 0, "no mean is positive, so that no ratio is")
     require(cap * count >= 1 - 1e-12, f"a cap of {cap:g} is too low for {count} assets")
+    filled = np.diff(np.minimum(cap * np.arange(count + 1), 1))  # of the best assets, in order
+    require(float(filled @ -np.sort(-mu)) > 0, "no portfolio within the cap has a positive mean")
     if cap * count <= 1 + 1e-9 or count == 1:
         return np.full(count, 1 / count)
     mu, sigma = mu / mu.max(), sigma / scale
@@ -77,6 +79,8 @@ def maximum_ratio(
         except np.linalg.LinAlgError:
             break
         step_s = room(step)
+        if not np.isfinite(step).all():
+            break
         step_z = target / y - z - z / y * step
         step_v = pushed - v - v / s * step_s
         length = 1.0
@@ -84,7 +88,9 @@ def maximum_ratio(
             falling = change < 0
             length = min(length, 0.99 * float(np.min(-value[falling] / change[falling], initial=2)))
         y, z, v = y + length * step, z + length * step_z, v + length * step_v
-    require(solved, "the weights of the highest ratio were not found; is there no risk at all?")
+    require(
+        solved, "the weights of the highest ratio were not found; a portfolio may be without risk"
+    )
     full, empty = room(y) < v, y < z
     w = np.where(full, cap, np.where(empty, 0, y / y.sum()))
     inside = ~full & ~empty
