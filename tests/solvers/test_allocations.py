@@ -5,6 +5,7 @@ import pytest
 from skfolio.optimization import MeanRisk, ObjectiveFunction, RiskBudgeting
 
 from qfolio.core.errors import QfolioError
+from qfolio.solvers import sifting
 from qfolio.solvers.maximum_ratio import maximum_ratio
 from qfolio.solvers.minimum_variance import minimum_variance
 from qfolio.solvers.risk_budgeting import equal_risk
@@ -76,6 +77,31 @@ def test_the_highest_ratio_is_no_lower_than_that_of_skfolio(cap: float) -> None:
     slope = mean / (mean @ w) - sigma @ w / (w @ sigma @ w)
     takes, gives = slope[w < cap - 1e-12], slope[w > 0]
     assert gives.min() >= takes.max() - 1e-6
+
+
+@pytest.mark.parametrize("cap", [1.0, 0.02])
+@pytest.mark.parametrize("rows", [100, 400])
+def test_what_is_sifted_out_of_many_assets_is_the_optimum_of_all(
+    cap: float, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many = returns(rows, 240) + 0.001
+    mean, sigma = many.mean(axis=0), np.cov(many.T)
+    sizes = []
+    solve = np.linalg.solve
+
+    def counted(system: np.ndarray, right: np.ndarray) -> np.ndarray:
+        sizes.append(len(system))
+        return solve(system, right)
+
+    monkeypatch.setattr(np.linalg, "solve", counted)
+    least, best = minimum_variance(sigma, cap), maximum_ratio(mean, sigma, cap)
+    assert max(sizes) < 240
+    monkeypatch.setattr(sifting, "FIRST", 240)
+    whole = minimum_variance(sigma, cap)
+    assert least @ sigma @ least == pytest.approx(whole @ sigma @ whole, rel=1e-8)
+    np.testing.assert_allclose(least, whole, atol=1e-4)
+    np.testing.assert_allclose(best, maximum_ratio(mean, sigma, cap), atol=1e-4)
+    assert max(sizes) == 240
 
 
 def test_the_highest_ratio_of_uncorrelated_assets() -> None:

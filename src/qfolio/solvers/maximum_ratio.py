@@ -1,21 +1,22 @@
 """The long-only portfolio of the highest ratio of mean to deviation, with a cap on each weight."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from qfolio.solvers.shared import require
+from qfolio.solvers.sifting import Floats, sift
 
 
-@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # steps that are not finite end it
 def maximum_ratio(
     mean: ArrayLike, covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-10
-) -> NDArray[np.float64]:
+) -> Floats:
     """The weights w that maximise μ'w/√(w'Σw) with Σw = 1 and 0 ≤ w ≤ cap.
 
     The ratio does not depend on the scale of w, so that w = y/Σy, where y minimises
     ½ y'Σy − μ'y with 0 ≤ y ≤ cap Σy (cf. G. Cornuéjols and R. Tütüncü, "Optimization Methods in
     Finance", 2006, section 8.2). A primal-dual interior-point method (Wright 1997, chapter 5)
-    finds y, with multipliers z of y ≥ 0 and v of cap Σy − y ≥ 0. An iteration solves one system.
+    finds y, with multipliers z of y ≥ 0 and v of cap Σy − y ≥ 0. An iteration solves one system. Of
+    many assets those that are held are sifted out first.
 
     Args:
         mean: μ, shape (asset,).
@@ -48,9 +49,22 @@ def maximum_ratio(
     if cap * count <= 1 + 1e-9 or count == 1:
         return np.full(count, 1 / count)
     mu, sigma = mu / mu.max(), sigma / scale
+    return sift(
+        -mu,
+        cap,
+        lambda some: _interior_point(mu[some], sigma[np.ix_(some, some)], cap, tol),
+        lambda w: sigma @ w / (w @ sigma @ w) - mu / (mu @ w),
+        tol=1e-7,
+    )
+
+
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # steps that are not finite end it
+def _interior_point(mu: Floats, sigma: Floats, cap: float, tol: float) -> Floats:
+    """The weights of means of at most 1 and a mean variance of about 1; 1/assets < cap."""
+    count = len(mu)
     capped, diagonal = cap < 1, np.diag_indices(count)
 
-    def room(y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def room(y: Floats) -> Floats:
         """The distance from the cap, and as a matrix its own transpose; free without a cap."""
         return cap * y.sum() - y if capped else np.zeros(count)
 

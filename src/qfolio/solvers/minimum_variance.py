@@ -1,19 +1,19 @@
 """The long-only portfolio of least variance with a cap on each weight."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from qfolio.solvers.shared import require
+from qfolio.solvers.sifting import Floats, sift
 
 
-def minimum_variance(
-    covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-12
-) -> NDArray[np.float64]:
+def minimum_variance(covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-12) -> Floats:
     """The weights w that minimise w'Σw with Σw = 1 and 0 ≤ w ≤ cap.
 
     A primal-dual interior-point method (Wright 1997, chapter 5) from equal weights, with
     multipliers z of w ≥ 0 and v of w ≤ cap: Σw − y − z + v = 0 holds after a full step, and the
-    products w z and (cap − w) v go to zero together. An iteration solves one system.
+    products w z and (cap − w) v go to zero together. An iteration solves one system. Of many assets
+    those that are held are sifted out first.
 
     Args:
         covariance: Σ, shape (asset, asset), positive semidefinite.
@@ -37,6 +37,18 @@ def minimum_variance(
     if cap * count <= 1 + 1e-9 or count == 1:
         return np.full(count, 1 / count)
     sigma = sigma / scale
+    return sift(
+        np.diag(sigma),
+        cap,
+        lambda some: _interior_point(sigma[np.ix_(some, some)], cap, tol),
+        lambda w: sigma @ w,
+        tol=1e-9,
+    )
+
+
+def _interior_point(sigma: Floats, cap: float, tol: float) -> Floats:
+    """The weights of a covariance with a mean variance of about 1; 1/assets < cap."""
+    count = len(sigma)
     w = np.full(count, 1 / count)
     z = v = np.full(count, 1.0)
     for _ in range(100):

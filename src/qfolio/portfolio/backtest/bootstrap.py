@@ -22,6 +22,8 @@ LEVEL = 0.95
 
 _CHUNK = 2_000_000  # resampled days held at a time: tens of megabytes, whatever the resamples
 
+_TOGETHER = 100  # least histories at a time, because each chunk loops over all days in Python
+
 
 def block_length(series: ArrayLike) -> float:
     """Choose the mean block length of the stationary bootstrap from a series' autocorrelation.
@@ -113,7 +115,7 @@ def bootstrap_measures(
     centre = track[0].mean(axis=-1)
     features = per_period(track, centre).reshape(-1, periods).T
     steps = np.ascontiguousarray(log_growth(track[0]).T)
-    chunk = max(1, _CHUNK // periods)
+    chunk = max(_TOGETHER, _CHUNK // periods)
     parts = []
     for start in range(0, resamples, chunk):
         size = min(chunk, resamples - start)

@@ -1,0 +1,47 @@
+"""Sifting: an optimum over many assets from optima over few of them.
+
+Most weights of a long-only optimum are zero. The problem is solved among some assets; those that
+would then be bought are added, until there are none (R. Bixby et al., "Very Large-Scale Linear
+Programming", 1992, for columns of linear programs). The result is the optimum over all.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+FIRST = 100
+"""Assets at the start, and the most that are added at a time."""
+
+
+def sift(
+    order: Floats,
+    cap: float,
+    solve: Callable[[NDArray[np.intp]], Floats],
+    price: Callable[[Floats], Floats],
+    tol: float,
+) -> Floats:
+    """The optimal weights of all assets.
+
+    Args:
+        order: The assets with the smallest numbers are tried first, shape (asset,).
+        cap: Largest weight of one asset.
+        solve: The optimal weights of some assets alone, by their places.
+        price: The marginal cost of each asset at weights of all; at an optimum no asset costs less
+            than one that is held, unless it is at the cap.
+        tol: Smaller differences of such costs are rounding errors.
+    """
+    count = len(order)
+    chosen = np.zeros(count, dtype=bool)
+    chosen[np.argsort(order, kind="stable")[: max(FIRST, int(np.ceil(2 / cap)))]] = True
+    while True:
+        weights = np.zeros(count)
+        weights[chosen] = solve(np.flatnonzero(chosen))
+        costs = price(weights)
+        cheap = np.where(chosen, np.inf, costs) < costs[weights > 0].max() - tol
+        if not cheap.any():
+            return weights
+        found = np.flatnonzero(cheap)
+        chosen[found[np.argsort(costs[found], kind="stable")[:FIRST]]] = True
