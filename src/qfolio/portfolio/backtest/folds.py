@@ -97,10 +97,16 @@ def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) ->
 
 def spell(date: np.datetime64, dates: np.ndarray) -> str:
     """A date as text, with the time if rows are less than a day apart."""
+    return spell_all(np.array([date]), dates)[0]
+
+
+def spell_all(some: np.ndarray, dates: np.ndarray) -> list[str]:
+    """Some dates of a table as text, likewise."""
     days = dates.astype("datetime64[D]")
     if (days[1:] > days[:-1]).all():
-        return str(date.astype("datetime64[D]"))
-    return str(date.astype("datetime64[s]")).replace(":", "").replace("T", "-")
+        return list(map(str, some.astype("datetime64[D]")))
+    texts = map(str, some.astype("datetime64[s]"))
+    return [text.replace(":", "").replace("T", "-") for text in texts]
 
 
 def parse_length(text: str) -> tuple[int, str]:

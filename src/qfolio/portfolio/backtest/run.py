@@ -36,7 +36,7 @@ from qfolio.portfolio.backtest.folder import (
     BacktestConfig,
     BacktestFolder,
 )
-from qfolio.portfolio.backtest.folds import Fold, latest, spell, walk_forward
+from qfolio.portfolio.backtest.folds import Fold, latest, spell_all, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.replay import Entry, Stretch, decide
@@ -367,7 +367,7 @@ class Backtest:
         With attributions, why.json as well, and the diagnosis in summary.json.
         """
         assert self._folder is not None
-        days = [spell(date, self.prices.dates) for date in self.dates]
+        days = spell_all(self.dates, self.prices.dates)
         columns = {
             f"{name}/{self.config.seed + i}" if name in self.agents else name: series
             for name, entry in entries.items()
