@@ -55,7 +55,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "sac": _OFF_POLICY,
     "td3": _OFF_POLICY,
     "ddpg": _OFF_POLICY,
-    "dqn-cartpole": {
+    "dqn-CartPole-v1": {
         "learning_rate": 1e-3,
         "buffer_size": 50_000,
         "learning_starts": 1000,
@@ -66,7 +66,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "gamma": 0.99,
         "net_arch": [64, 64],
     },
-    "ppo-cartpole": {
+    "ppo-CartPole-v1": {
         "num_envs": 8,
         "n_steps": 128,
         "n_epochs": 10,
@@ -75,6 +75,16 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "gae_lambda": 0.95,
         "learning_rate": 1e-3,
         "ent_coef": 0.0,
+        "net_arch": [64, 64],
+    },
+    "sac-Pendulum-v1": {
+        **_OFF_POLICY,
+        "learning_rate": 2e-3,
+        "batch_size": 128,
+        "tau": 0.02,
+        "gamma": 0.98,
+        "train_freq": 4,
+        "gradient_steps": 4,
         "net_arch": [64, 64],
     },
 }
@@ -101,24 +111,24 @@ def gymnasium(library: str, algorithm: str) -> Callable[[], int]:
 
     name, _, where = algorithm.partition("-")
     settings = SETTINGS[algorithm]
-    if where == "cartpole":
+    if where:
         from stable_baselines3.common.env_util import make_vec_env
 
-        env: Any = make_vec_env("CartPole-v1", settings.get("environments", 1))
+        env: Any = make_vec_env(where, settings.get("num_envs", 1))
     elif name == "ppo":
         from stable_baselines3.common.env_util import make_vec_env
 
-        env = make_vec_env("Pendulum-v1", settings["environments"])
+        env = make_vec_env("Pendulum-v1", settings["num_envs"])
     else:
         env = gym.make("Pendulum-v1", disable_env_checker=True)
         env = Torques(env) if name == "dqn" else env
-    kept = {key: value for key, value in settings.items() if key != "environments"}
+    kept = {key: value for key, value in settings.items() if key != "num_envs"}
     relu = import_module("torch.nn").ReLU if library != "sbx" else import_module("jax").nn.relu
     policy = {"net_arch": kept.pop("net_arch"), "activation_fn": relu}
     model = getattr(import_module(library), name.upper())(
         "MlpPolicy", env, **kept, policy_kwargs=policy, device="cpu", seed=0
     )
-    chunk = settings.get("n_steps", CHUNK) * settings.get("environments", 1)
+    chunk = settings.get("n_steps", CHUNK) * settings.get("num_envs", 1)
 
     def advance() -> int:
         model.learn(chunk, reset_num_timesteps=False)
@@ -145,9 +155,9 @@ def rejax(algorithm: str) -> Callable[[], int]:
 
     chunk, settings = CHUNK, SETTINGS[algorithm]
     if algorithm == "ppo":
-        chunk = settings["n_steps"] * settings["environments"]
+        chunk = settings["n_steps"] * settings["num_envs"]
         own = {
-            "num_envs": settings["environments"],
+            "num_envs": settings["num_envs"],
             "num_steps": settings["n_steps"],
             "num_epochs": settings["n_epochs"],
             "num_minibatches": chunk // settings["batch_size"],

@@ -152,11 +152,12 @@ def of_families(effort: Effort) -> Outcome:
 def of_host_loop(effort: Effort) -> Outcome:
     """Agents in an environment of Gymnasium, here and in stable-baselines3."""
     outcomes = {}
-    for algorithm, agent in hosted().items():
-        own = trained(HostPopulation(GymnasiumTask("CartPole-v1"), agent, [0]))
-        name = f"{algorithm.upper()} on CartPole-v1"
+    for contest, agent in hosted().items():
+        algorithm, _, environment = contest.partition("-")
+        own = trained(HostPopulation(GymnasiumTask(environment), agent, [0]))
+        name = f"{algorithm.upper()} on {environment}"
         targets = {"stable_baselines3": 2.0}
-        outcomes[name] = against(f"{algorithm}-cartpole", name, own, targets, effort)
+        outcomes[name] = against(contest, name, own, targets, effort)
     return joined(outcomes)
 
 

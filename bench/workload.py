@@ -44,15 +44,19 @@ def families() -> dict[str, Agent]:
 
 
 def hosted() -> dict[str, Agent]:
-    """Algorithms on CartPole-v1; peers.py has the same settings."""
+    """Agents by algorithm and environment of Gymnasium; peers.py has the same settings."""
     return {
-        "dqn": DQN(
+        "dqn-CartPole-v1": DQN(
             hidden=(64, 64), batch_size=64, replay_capacity=50_000, learning_starts=1000,
             target_update_interval=200, learning_rate=1e-3, discount=0.99,
         ),
-        "ppo": PPO(
+        "ppo-CartPole-v1": PPO(
             num_envs=8, rollout_length=128, epochs=10, batch_size=64, hidden=(64, 64),
             discount=0.99, gae_lambda=0.95, learning_rate=1e-3, entropy_coef=0.0,
+        ),
+        "sac-Pendulum-v1": SAC(
+            num_envs=4, gradient_steps=4, batch_size=128, hidden=(64, 64), discount=0.98, tau=0.02,
+            replay_capacity=50_000, learning_starts=256, learning_rate=2e-3,
         ),
     }  # fmt: skip
 

@@ -365,6 +365,8 @@ def test_names_and_presets():
     unknown = presets.preset("fast", "gym:TestDelay-v0", "dqn")
     assert unknown.build() == DQN()
     assert settings.build(GymnasiumTask, unknown.task) == task(Delay)
+    for agent in ("ppo", "a2c", "sac", "td3", "ddpg"):
+        assert presets.preset("fast", "gym:TestDelay-v0", agent).settings["normalize_observations"]
     for name, agent in presets.PRESETS:
         if name.startswith(registry.GYM):
             assert presets.preset("fast", name, agent).task["id"] == name.removeprefix("gym:")
@@ -421,3 +423,19 @@ def test_the_pole_is_balanced(agent):
     )
     run.train()
     assert run.grade()["return_per_seed"] == [500.0, 500.0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "returns"), [("MountainCarContinuous-v0", 85.0), ("Pendulum-v1", -170.0)]
+)
+def test_actions_with_bounds_are_learned(task, returns):
+    """Within a third of the budget.
+
+    The first by exploration that persists: with independent noise it stays at 0.
+    """
+    preset = presets.preset("fast", f"gym:{task}", "sac")
+    third = preset.steps // 3
+    run = Run.create(GymnasiumTask(**preset.task), preset.build(), seeds=2, seed=100, steps=third)
+    run.train()
+    assert min(run.grade()["return_per_seed"]) > returns

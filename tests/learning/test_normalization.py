@@ -96,7 +96,9 @@ def test_observations_are_standardised_and_clipped():
 
 
 def test_nothing_is_kept_or_changed_without_the_settings():
-    assert not jax.tree.leaves(NormalizationConfig(False, False).begin(Cliff(), jnp.array(0), 2))
+    numbered = Cliff(), jnp.array(0), 2
+    assert not jax.tree.leaves(NormalizationConfig(False, False).begin(Aim(), jnp.ones(1), 2))
+    assert NormalizationConfig(True, False).begin(*numbered).observations is None
 
 
 @pytest.mark.parametrize("agent", SMALL.values(), ids=SMALL)
@@ -185,7 +187,6 @@ def test_policies_are_learned_in_any_units(agent):
         (lambda: MBPO(normalize_rewards=True), "normalize_rewards is True"),
         (lambda: MBPO(noise_theta=0.5), "noise_theta is 0.5"),
         (lambda: SAC(noise_theta=0.0), "noise_theta is 0.0"),
-        (lambda: Population(Cliff(), PPO(**BOTH), [0]), "one array of numbers"),
         (lambda: Population(Merton(), SAC(**BOTH), [0]), "one array of numbers"),
     ],
 )

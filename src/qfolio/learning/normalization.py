@@ -136,8 +136,8 @@ class NormalizationConfig(NamedTuple):
         observation: an example.
         """
         observations, rewards = None, None
-        if self.normalize_observations:
-            if task.states is not None or not isinstance(observation, jax.Array):
+        if self.normalize_observations and task.states is None:  # numbered states stay numbered
+            if not isinstance(observation, jax.Array):
                 raise QfolioError(
                     f"normalize_observations needs one array of numbers, which observations of "
                     f"{task.name} are not; set it to false."

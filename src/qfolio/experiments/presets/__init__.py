@@ -29,7 +29,7 @@ def presets_of(task: str, agent: str) -> dict[str, Preset]:
     if known or (task in (*TASKS, "portfolio") and agent in AGENTS):
         return known
     if task.startswith(GYM):
-        return {"fast": gymnasium.of_any(task.removeprefix(GYM), agent, 100_000)}
+        return {"fast": gymnasium.of_any(task.removeprefix(GYM), agent)}
     if task == "portfolio":
         return {"fast": portfolio.of_any(agent)}
     return {"fast": Preset(agent, {}, steps=100_000, seeds=4)}
