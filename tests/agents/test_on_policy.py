@@ -11,7 +11,7 @@ from equinox import filter_jit as jit
 from scipy import stats
 
 from qfolio.agents.a2c import A2C
-from qfolio.agents.on_policy import Batch, standardized
+from qfolio.agents.on_policy import Batch, explained_variance, standardized
 from qfolio.agents.ppo import PPO, clipped, minibatches, shuffled
 from qfolio.agents.reinforce import REINFORCE
 from qfolio.core.errors import QfolioError
@@ -105,6 +105,45 @@ def test_clipped_objective_by_hand():
     )
     slope = jax.grad(lambda ratio: clipped(ratio, advantage, 0.2).sum())(ratio)
     np.testing.assert_array_equal(slope, [1, 1, 1, 0, 0, -1, -1, -1])
+
+
+def judged(advantage, target, counted=None):
+    blank = jnp.zeros(len(target))
+    mask = None if counted is None else jnp.array(counted)
+    return Batch(blank, blank, blank, jnp.array(advantage), jnp.array(target), mask)
+
+
+def test_explained_variance_by_hand():
+    target = [1.0, 3.0, 5.0, 7.0]
+    assert explained_variance(judged([0.0] * 4, target)) == 1  # the critic is right
+    assert explained_variance(judged([-3.0, -1.0, 1.0, 3.0], target)) == 0  # it is a constant
+    assert explained_variance(judged([-6.0, -2.0, 2.0, 6.0], target)) == -3
+    assert explained_variance(judged([1.0, 2.0], [4.0, 4.0])) == 0  # nothing to explain
+    masked = judged([0.0, 0.0, 99.0], [1.0, 2.0, 9.0], [True, True, False])
+    assert explained_variance(masked) == 1
+    assert jnp.isfinite(explained_variance(judged([1e18, -1e18], [0.0, 1e-19])))
+
+
+def test_divergence_and_clipped_share_by_hand():
+    ratio = np.array([1.0, 1.1, 0.5, 2.0])
+    found = PPO(clip_range=0.2).diagnose(jnp.log(ratio))
+    assert found["clip_fraction"] == 0.5
+    np.testing.assert_allclose(found["kl"], (ratio - 1 - np.log(ratio)).mean(), rtol=1e-5)
+    assert jnp.isfinite(PPO().diagnose(jnp.array([1e5]))["kl"])
+
+
+@pytest.mark.parametrize("kind", [A2C, PPO, REINFORCE])
+def test_what_is_measured_while_learning(kind):
+    sizes = {"batch_size": 40, "epochs": 1} if kind is PPO else {}
+    agent = kind(hidden=(8,), num_envs=2, rollout_length=20, **sizes)
+    population = Population(Pendulum(horizon=20), agent, [0])
+    episodes = population.advance(20)
+    measured = {name: float(x[episodes.finished][0]) for name, x in episodes.metrics.items()}
+    assert measured["gradient_norm"] > 0
+    assert measured["explained_variance"] < 1
+    if kind is PPO:  # a single step, from the policy that acted
+        assert measured["kl"] == pytest.approx(0, abs=1e-6)
+        assert measured["clip_fraction"] == 0
 
 
 def test_normalized_by_hand():

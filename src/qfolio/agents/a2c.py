@@ -7,7 +7,7 @@ docs/policy_gradients.md has the formulas and the deviations from the paper.
 
 from jaxtyping import PRNGKeyArray
 
-from qfolio.agents.on_policy import OnPolicy, OnPolicyState
+from qfolio.agents.on_policy import OnPolicy, OnPolicyState, explained_variance
 from qfolio.core.fields import number, require, static
 from qfolio.core.mdp import Metrics, Transition
 
@@ -26,4 +26,6 @@ class A2C(OnPolicy):
     def improve(
         self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        return self.descend(state, self.judge(state.weights, rollout, self.gae_lambda))
+        batch = self.judge(state.weights, rollout, self.gae_lambda)
+        state, metrics = self.descend(state, batch)
+        return state, metrics | {"explained_variance": explained_variance(batch)}

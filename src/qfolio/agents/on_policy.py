@@ -14,6 +14,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.fields import constant, number, require, sizes, static
@@ -24,6 +25,9 @@ from qfolio.learning.networks import Network, NetworkConfig, Outputs, outputs_of
 from qfolio.learning.normalization import Moments, NormalizationConfig, Normalizer, normalized
 from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.targets import Scalar, advantages
+
+LARGEST = 1e18
+"""Bound of metrics: one that is not finite would count as a failed training."""
 
 REACH = 2.0
 """Mean, in units of the bound, beyond which nearly all draws are clipped."""
@@ -226,16 +230,23 @@ class OnPolicy(Agent):
         output = weights.actor(batch.observation)
         policy = policy_of(weights.actions, output, weights.log_std)
         mean = partial(jnp.mean, where=batch.counted)
-        loss = -mean(self.objective(policy.log_prob(batch.action), batch))
+        log_prob = policy.log_prob(batch.action)
+        loss = -mean(self.objective(log_prob, batch))
         value_loss = mean((batch.target - weights.value(batch.observation)) ** 2)
         entropy = mean(policy.entropy())
         total = loss + self.value_coef * value_loss - self.entropy_coef * entropy
         total += self.saturation_penalty * mean(saturation(weights.actions, output, REACH))
-        return total, {"loss": loss, "value_loss": value_loss, "entropy": entropy}
+        metrics = {"loss": loss, "value_loss": value_loss, "entropy": entropy}
+        return total, metrics | self.diagnose(log_prob - batch.log_prob)
+
+    def diagnose(self, log_ratio: Float[Array, " batch"]) -> Metrics:
+        """Further metrics, given the log ratio of new to old probabilities of the actions."""
+        return {}
 
     def descend(self, state: OnPolicyState, batch: Batch) -> tuple[OnPolicyState, Metrics]:
         """One gradient step."""
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.weights, batch)
+        metrics["gradient_norm"] = jnp.minimum(optax.tree.norm(gradient), LARGEST)
         gradient = optimizer.clip(gradient, self.max_grad_norm)
         rate = self._schedule(state.optimizer.count + 1)
         weights, adam = optimizer.descend(state.weights, gradient, state.optimizer, rate)
@@ -248,6 +259,17 @@ def standardized(
     """Advantages with mean 0 and standard deviation 1 over those that count."""
     mean, std = advantage.mean(where=counted), advantage.std(where=counted)
     return (advantage - mean) / (std + 1e-8)
+
+
+def explained_variance(batch: Batch) -> Float[Array, ""]:
+    """The share of the targets' variance that the critic's values explain; 1 at best.
+
+    It is negative if the critic is worse than a constant, and 0 if all targets are the same.
+    """
+    error = batch.advantage.var(where=batch.counted)
+    total = batch.target.var(where=batch.counted)
+    share = 1 - error / jnp.where(total > 0, total, 1.0)
+    return jnp.where(total > 0, jnp.maximum(share, -LARGEST), 0.0)
 
 
 def _coordinates(actions: Actions) -> int:

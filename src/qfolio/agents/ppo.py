@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState
+from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, explained_variance
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, static
 from qfolio.core.mdp import Metrics, Transition
@@ -41,6 +41,16 @@ class PPO(OnPolicy):
     def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
         return clipped(jnp.exp(log_prob - batch.log_prob), self.weighed(batch), self.clip_range)
 
+    def diagnose(self, log_ratio: Float[Array, " batch"]) -> Metrics:
+        """An estimate of KL(old, new) (Schulman 2020), and the share of clipped ratios.
+
+        Source: http://joschu.net/blog/kl-approx.html, the estimator (r − 1) − log r.
+        """
+        log_ratio = jnp.minimum(log_ratio, 20.0)  # a metric must be finite
+        ratio = jnp.exp(log_ratio)
+        clipped = jnp.abs(ratio - 1) > self.clip_range
+        return {"kl": (ratio - 1 - log_ratio).mean(), "clip_fraction": clipped.mean()}
+
     def improve(
         self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
@@ -51,7 +61,8 @@ class PPO(OnPolicy):
             return lax.scan(descend, state, minibatches(key, batch, self.batch_size))
 
         state, metrics = lax.scan(epoch, state, jax.random.split(key, self.epochs))
-        return state, jax.tree.map(jnp.mean, metrics)
+        metrics = jax.tree.map(jnp.mean, metrics)
+        return state, metrics | {"explained_variance": explained_variance(batch)}
 
 
 def minibatches(key: PRNGKeyArray, batch: Batch, size: int) -> Batch:

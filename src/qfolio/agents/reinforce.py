@@ -11,7 +11,7 @@ paper.
 from jax import lax
 from jaxtyping import Array, Bool, PRNGKeyArray
 
-from qfolio.agents.on_policy import OnPolicy, OnPolicyState
+from qfolio.agents.on_policy import OnPolicy, OnPolicyState, explained_variance
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import static
 from qfolio.core.mdp import Metrics, Task, Transition
@@ -35,7 +35,9 @@ class REINFORCE(OnPolicy):
         self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
         batch = self.judge(state.weights, rollout, gae_lambda=1.0)
-        return self.descend(state, batch._replace(counted=finished(rollout).reshape(-1)))
+        batch = batch._replace(counted=finished(rollout).reshape(-1))
+        state, metrics = self.descend(state, batch)
+        return state, metrics | {"explained_variance": explained_variance(batch)}
 
 
 def finished(rollout: Transition) -> Bool[Array, "time environment"]:
