@@ -10,7 +10,7 @@ from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import evaluate, start_keys
 from qfolio.core.market import MenuActions
-from qfolio.core.mdp import Discrete, Position, Simplex
+from qfolio.core.mdp import Discrete, Position, Simplex, Transition
 from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.costs import drift
@@ -39,20 +39,42 @@ def portfolio(prices=None, **settings):
 @pytest.mark.parametrize("lag", [0, 1, 2])
 @pytest.mark.parametrize("menu", ["", "tilts:0.2"])
 def test_rewards_are_the_log_returns_of_the_replay(lag, menu):
-    """The task pays, in float32, what the float64 replay of the same decisions earns."""
+    """The task pays, in float32, what the float64 replay of the same decisions earns.
+
+    It measures the same turnover and cost, too.
+    """
     task, prices = portfolio(lag=lag, menu=menu, cost=0.01), table()
     state = Position(task.first_decision, task.hold(jnp.array([1.0, 0, 0, 0])))
-    rng, decisions, rewards = np.random.default_rng(1), [], []
+    rng, decisions, rewards, measured = np.random.default_rng(1), [], [], []
     for _ in range(20):
         action = jnp.array(rng.integers(task.actions.n) if menu else rng.dirichlet(np.ones(4)))
         action = action.astype(jnp.int32 if menu else jnp.float32)
         decisions.append(np.asarray(task.intent(state, action), float))
         step = task.step(state, action, jax.random.key(0))
         rewards.append(float(step.reward))
+        end = jnp.array(False)
+        now = Transition(state, (), action, step.reward, step.state, (), end, end)
+        measured.append({name: float(x) for name, x in task.measure(now).items()})
         state = step.state
     decisions = np.array(decisions) / np.sum(decisions, axis=1, keepdims=True)
     replay = simulate(prices.values, decisions, first=WINDOW, cost=0.01, lag=lag)
     np.testing.assert_allclose(rewards, replay.growth, atol=2e-6)
+    for name in ("growth", "turnover", "cost"):
+        column = [each[name] for each in measured]
+        np.testing.assert_allclose(column, getattr(replay, name), atol=5e-6, err_msg=name)
+    np.testing.assert_allclose([each["cash"] for each in measured], decisions[:, 0], atol=1e-6)
+    assert all(0.99 < each["assets"] < ASSETS + 1e-3 for each in measured if each["cash"] < 0.99)
+
+
+def test_an_equal_weight_is_at_its_anchor_and_holds_all_assets():
+    task = portfolio(anchor="equal-weight", lag=0)
+    state = Position(task.first_decision, task.hold(jnp.array([1.0, 0, 0, 0])))
+    action, end = jnp.array([0.0, 1, 1, 1]) / 3, jnp.array(False)
+    step = task.step(state, action, jax.random.key(0))
+    measured = task.measure(Transition(state, (), action, step.reward, step.state, (), end, end))
+    assert measured["distance"] == pytest.approx(0, abs=1e-5)
+    assert measured["assets"] == pytest.approx(ASSETS, rel=1e-5)
+    assert measured["cash"] == pytest.approx(0, abs=1e-6)
 
 
 def test_no_order_is_free_at_any_lag():

@@ -301,7 +301,7 @@ class HostPopulation(Population):
         monitored = jax.eval_shape(self.agent.monitor, state.agent)
         zeros: Any = np.zeros(shape, np.float32)
         never: Any = np.zeros(shape, bool)
-        metrics = dict.fromkeys(monitored | state.tally.metrics, zeros)
+        metrics = dict.fromkeys(monitored | state.tally.metrics | state.tally.measured, zeros)
         return Episodes(never, zeros, metrics)
 
     def _fetch(self, where: Callable[[TrainingState], PyTree]) -> PyTree:

@@ -153,6 +153,10 @@ class Task(eqx.Module):
         """The meaning of a numbered menu action; other actions are returned unchanged."""
         return action
 
+    def measure(self, step: "Transition") -> "Metrics":
+        """Named scalars of one step, of which records of training hold the means over episodes."""
+        return {}
+
     def rule(self, policy: Policy) -> Mapping[str, float | None]:
         """The few numbers that describe a policy, in tasks that define some.
 

@@ -29,6 +29,7 @@ class Tally(NamedTuple):
     learned: Int[Array, " environment"]  # of these, the steps that learned
     reward: Float[Array, " environment"]
     metrics: dict[str, Float[Array, " environment"]]  # summed over the steps that learned
+    measured: dict[str, Float[Array, " environment"]]  # by the task, summed over all steps
 
 
 class TrainingState(eqx.Module):
@@ -62,25 +63,28 @@ def begin(task: Task, agent: Agent, seed: UInt32[Array, ""]) -> TrainingState:
     started = TrainingState(
         agent=state,
         task=jax.vmap(task.reset)(jax.random.split(task_key, environments)),
-        tally=Tally(count, count, zeros, {}),
+        tally=Tally(count, count, zeros, {}, {}),
         key=jax.random.key_data(key),
         steps=zero,
         episodes=zero,
         healthy=jnp.array(True),
     )
 
-    def learned(state: TrainingState) -> Metrics:
-        """The metrics of a blank rollout; only their names are used."""
+    def learned(state: TrainingState) -> tuple[Metrics, Metrics]:
+        """The metrics of a blank rollout, and what the task measures; only names are used."""
         observation = jax.vmap(task.observe)(state.task)
         action = agent.act(state.agent, observation, task_key)
         no = jnp.zeros(environments, bool)
         step = Transition(state.task, observation, action, zeros, state.task, observation, no, no)
         time = agent.rollout_steps
         rollout = jax.tree.map(lambda x: jnp.broadcast_to(x, (time, *x.shape)), step)
-        return absorb(task, agent, state, rollout, learning=True)[2]
+        measured = jax.vmap(task.measure)(step)
+        tally = state.tally._replace(measured=dict.fromkeys(measured, zeros))
+        state = eqx.tree_at(lambda s: s.tally, state, tally)
+        return absorb(task, agent, state, rollout, learning=True)[2], measured
 
-    metrics = jax.eval_shape(learned, started)
-    return eqx.tree_at(lambda s: s.tally.metrics, started, dict.fromkeys(metrics, zeros))
+    names = (dict.fromkeys(metrics, zeros) for metrics in jax.eval_shape(learned, started))
+    return eqx.tree_at(lambda s: (s.tally.metrics, s.tally.measured), started, tuple(names))
 
 
 def advance(
@@ -179,18 +183,22 @@ def absorb(
         learner, metrics = agent.observe(state.agent, rollout), {}
     monitored = agent.monitor(state.agent)
 
-    def count(tally: Tally, transition: Transition) -> tuple[Tally, Episodes]:
+    def count(tally: Tally, step: tuple[Transition, Metrics]) -> tuple[Tally, Episodes]:
+        transition, measured = step
         sums = {name: total + metrics.get(name, 0.0) for name, total in tally.metrics.items()}
         learned = tally.learned + int(learning)
         reward = tally.reward + transition.reward
         means = {name: total / learned for name, total in sums.items()}
+        totals = {name: total + measured[name] for name, total in tally.measured.items()}
+        means |= {name: total / (tally.steps + 1) for name, total in totals.items()}
         now = {name: jnp.broadcast_to(value, reward.shape) for name, value in monitored.items()}
         finished = transition.terminated | transition.truncated
         record = Episodes(finished, reward, now | means)
-        tally = Tally(tally.steps + 1, learned, reward, sums)
+        tally = Tally(tally.steps + 1, learned, reward, sums, totals)
         return jax.tree.map(lambda x: jnp.where(finished, jnp.zeros_like(x), x), tally), record
 
-    tally, records = _scan(count, state.tally, rollout)
+    measured = jax.vmap(jax.vmap(task.measure))(rollout)
+    tally, records = _scan(count, state.tally, (rollout, measured))
     finite = [jnp.isfinite(metric).all() for metric in metrics.values()]
     state = TrainingState(
         agent=learner,

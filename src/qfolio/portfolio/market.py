@@ -19,9 +19,17 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import MenuActions, View
-from qfolio.core.mdp import Actions, Discrete, ExogenousTask, Position, Simplex
+from qfolio.core.mdp import (
+    Actions,
+    Discrete,
+    ExogenousTask,
+    Metrics,
+    Position,
+    Simplex,
+    Transition,
+)
 from qfolio.core.registry import Kind, build
-from qfolio.portfolio.costs import Context, CostModel, grown
+from qfolio.portfolio.costs import Context, CostModel, grown, traded
 from qfolio.portfolio.feasible import CappedSimplex, Feasible
 from qfolio.portfolio.rewards import Outcome, Reward
 
@@ -272,6 +280,29 @@ class Market(ExogenousTask):
     ) -> tuple[Float[Array, ""], Holding]:
         target = self.target(market, holding.weights, action)
         return self._earn(market, next_market, holding, target)
+
+    def measure(self, step: Transition) -> Metrics:
+        """Turnover and cost, cash, the effective number of assets, growth (a row, logarithmic),
+        and half the absolute differences to the anchor, if there is one."""
+        costs, wait = self.costs, Context(rows=self.lag)
+        market, held = step.state.market, step.state.holding.weights
+        moved = self.relatives(market, step.next_state.market)
+        # What is held next is the target, drifted.
+        target = grown(step.next_state.holding.weights, 1 / costs.carry(moved.coming, Context()))
+        waiting = costs.carry(moved.waiting, wait)
+        before, after = grown(held, waiting), grown(target, waiting)
+        remainder, paid = costs.trade(before, after, wait)
+        assets = target[1:]
+        measured = {
+            "growth": jnp.log(remainder * (after * costs.carry(moved.earning, Context())).sum()),
+            "turnover": traded(before, after, remainder),
+            "cost": sum(paid.values()),
+            "cash": target[0],
+            "assets": assets.sum() ** 2 / jnp.maximum((assets**2).sum(), 1e-12),
+        }
+        if (anchor := self.anchor_weights(market)) is not None:
+            measured["distance"] = abs(assets - anchor).sum() / 2
+        return measured
 
     def _earn(
         self, market: PyTree, next_market: PyTree, holding: Holding, target: Float[Array, " entry"]
