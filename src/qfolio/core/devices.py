@@ -89,8 +89,9 @@ def require_memory(tree: Any, count: int) -> None:
 class Members:
     """``count`` members spread over the devices, each in a slot of its device.
 
-    room: members that there are slots for, if more than ``count``; programs depend on it alone.
+    room: members that there are slots for, if more than ``count``.
     one_by_one: whether a device runs its members in turn instead of in lockstep.
+    form: all that programs depend on.
 
     Outside, leaves have a leading axis of length ``count``; on the devices, an axis of slots.
     ``place`` and ``fetch`` convert between the two.
@@ -100,6 +101,7 @@ class Members:
         self.room = max(count, room)
         devices = jax.devices()[: min(len(jax.devices()), self.room)]
         self.one_by_one = devices[0].platform not in LOCKSTEP
+        self.form = (self.room, len(devices), self.one_by_one)
         # At least two slots if members take turns: XLA drops an axis of length one and then rounds
         # differently. An empty slot costs memory, but no time.
         slots = max(2 if self.one_by_one else 1, -(-self.room // len(devices)))

@@ -68,7 +68,7 @@ class Population:
         self._own = self._members.place(own)
         # The key holds everything that a compiled program depends on.
         rows = chunk_steps(self.task, self.agent)
-        self._programs = programs_of((form, self._members.room, self._members.one_by_one, rows))
+        self._programs = programs_of((form, self._members.form, rows))
         self._require_memory()
         seeds = self._members.place(np.array(self.seeds, np.uint32))
         self.state: TrainingState = self._run(

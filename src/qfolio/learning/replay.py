@@ -68,7 +68,8 @@ class Experience(NamedTuple):
 
 def _stored(state: PyTree, observation: PyTree) -> PyTree:
     """What the buffer stores of an observation."""
-    return state if isinstance(observation, View) else observation
+    kept = isinstance(state, Position) and isinstance(observation, View)
+    return state if kept else observation
 
 
 class ReplayConfig(NamedTuple):

@@ -12,6 +12,8 @@ def test_only_modules_that_a_job_names_travel_with_it(monkeypatch):
     packer = Packer()
     assert packer.pack({"reward": "math:Mine"}).modules == ("math",)
     assert packer.pack({"reward": "log"}).modules == ()
+    assert packer.pack({"math_of": "mathematics"}).modules == ()
+    assert packer.pack(("math", 1)).modules == ("math",)
 
 
 def test_a_large_array_travels_beside_its_jobs_once():

@@ -50,7 +50,7 @@ class Packer:
 
         Pickler(file, protocol=5).dump(job)
         content = file.getvalue()
-        named = (module for module in trusted() if module.encode() in content)
+        named = (module for module in trusted() if _names(content, module))
         return Parcel(content, tuple(needs), tuple(named))
 
     def _digest(self, array: Any) -> str:
@@ -60,6 +60,13 @@ class Packer:
             self.arrays[digest] = content
             self._known[id(array)] = (array, digest)
         return self._known[id(array)][1]
+
+
+def _names(pickled: bytes, module: str) -> bool:
+    """Whether a pickle has ``module:Name`` in a text, or the module as a whole text."""
+    name = module.encode()
+    whole = pickle.SHORT_BINUNICODE + bytes([len(name) % 256]) + name
+    return name + b":" in pickled or whole in pickled
 
 
 class Unpacker:
