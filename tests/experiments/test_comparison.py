@@ -131,6 +131,16 @@ def test_ranking_by_regret():
     json.dumps(ranking, allow_nan=False)
 
 
+def test_an_optimum_of_zero_leaves_no_share_to_miss(tmp_path):
+    """As in a market where staying out is best: the comparison still shows itself."""
+    comparison = Comparison.create(tiny(), seeds=3, out=tmp_path / "c")
+    found = result([-1.0, -2.0, 0.0], optimum=0.0)
+    comparison.results = {"slow": found, "quick": found}
+    assert "Comparison on pendulum" in comparison._repr_html_()
+    measured = comparing._measures(found)
+    assert measured == {"return": -1.0, "optimum": 0.0, "regret": math.inf}
+
+
 def test_ranking_by_return_where_no_optimum_is_known():
     best = result([480.0, 500.0, 500.0, 490.0], curve=(10.0, 460.0, 500.0), optimum=None)
     worse = result([120.0, 130.0, 110.0, 90.0], curve=(10.0, 100.0, 120.0), optimum=None)

@@ -29,7 +29,7 @@ from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.conclusion import conclusion, listed
 from qfolio.experiments.comparison.measure import measure
-from qfolio.experiments.comparison.ranking import Result, rank
+from qfolio.experiments.comparison.ranking import Result, rank, regret
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener
@@ -404,10 +404,9 @@ def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
 
 def _measures(result: Result) -> dict[str, float | None]:
     """What the log says of a result."""
-    final = float(np.mean(result.returns))
-    optimum = result.optimum
-    gap = None if optimum is None else (optimum - final) / abs(optimum)
-    return {"return": final, "optimum": optimum, "regret": gap}
+    final, optimum = float(np.mean(result.returns)), result.optimum
+    missed = None if optimum is None else float(regret(final, optimum))
+    return {"return": final, "optimum": optimum, "regret": missed}
 
 
 def _same(first: Any, second: Any) -> bool:
