@@ -10,36 +10,29 @@ import argparse
 import statistics
 from time import process_time
 
-import numpy as np
-
 from qfolio.core import devices, settings
 
 devices.configure()
 
 import jax  # noqa: E402
 
+from made_up import table  # noqa: E402
 from qfolio.core.population import Population  # noqa: E402
 from qfolio.core.training import chunk_steps  # noqa: E402
 from qfolio.experiments.described import agent_of  # noqa: E402
 from qfolio.experiments.presets import preset  # noqa: E402
-from qfolio.portfolio.prices.table import Prices  # noqa: E402
 from qfolio.portfolio.task import Portfolio  # noqa: E402
 
-ROWS, ROUNDS = 1300, 5
+ROWS = 1300
+"""Five years and a look-back."""
 
-
-def table(assets: int) -> Prices:
-    """Five years and a look-back of one common factor and as much noise."""
-    rng = np.random.default_rng(0)
-    moves = 2e-4 + 0.01 * (rng.normal(size=(ROWS, 1)) + rng.normal(size=(ROWS, assets)))
-    days = np.busday_offset("2000-01-03", np.arange(ROWS), roll="forward").astype("datetime64[s]")
-    return Prices(days, tuple(f"A{i}" for i in range(assets)), 50 * np.exp(np.cumsum(moves, 0)))
+ROUNDS = 5
 
 
 def population(name: str, assets: int) -> Population:
     """One member of a preset that has filled its memory and compiled its program."""
     given = preset("fast", "portfolio", name)
-    task = Portfolio.of(table(assets), **settings.convert(Portfolio, dict(given.task)))
+    task = Portfolio.of(table(assets, ROWS), **settings.convert(Portfolio, dict(given.task)))
     one = Population(task, agent_of(name, given.settings), [0])
     while not one.learning:
         one.advance(10**6)

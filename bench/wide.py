@@ -14,6 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from made_up import table
 from qfolio.core.registry import BASELINES, short
 from qfolio.portfolio.backtest.attribution.factors import factor_returns
 from qfolio.portfolio.backtest.baselines import baseline
@@ -31,15 +32,12 @@ found: dict[str, list[float]] = {}
 """Seconds by name, one for each table."""
 
 
-def table(assets: int, place: Path) -> Prices:
-    """A table of one common factor and as much noise, written as CSV and read from it."""
-    rng = np.random.default_rng(0)
-    moves = 2e-4 + 0.01 * (rng.normal(size=(ROWS, 1)) + rng.normal(size=(ROWS, assets)))
-    days = np.busday_offset("2000-01-03", np.arange(ROWS), roll="forward")
-    path = place / f"{assets}.csv"
+def read(assets: int, place: Path) -> Prices:
+    """A made-up table, written as CSV and read from it."""
+    made, path = table(assets, ROWS), place / f"{assets}.csv"
     with path.open("w") as file:
-        file.write(",".join(["date", *(f"A{i}" for i in range(assets))]) + "\n")
-        for day, row in zip(days.astype(str), 50 * np.exp(np.cumsum(moves, axis=0)), strict=True):
+        file.write(",".join(["date", *made.assets]) + "\n")
+        for day, row in zip(made.dates.astype("datetime64[D]"), made.values, strict=True):
             file.write(f"{day}," + ",".join(f"{value:.6f}" for value in row) + "\n")
     return timed("reading", lambda: load(path))
 
@@ -69,7 +67,7 @@ def main() -> None:
     sizes = [int(each) for each in sys.argv[1:]] or [20, 100, 500, 1000]
     with tempfile.TemporaryDirectory() as place:
         for size in sizes:
-            measure(table(size, Path(place)))
+            measure(read(size, Path(place)))
     print(f"{'assets':<32}" + "".join(f"{size:>10,}" for size in sizes))
     for name, seconds in found.items():
         print(f"{name:<32}" + "".join(f"{each:9.2f}s" for each in seconds))

@@ -13,6 +13,9 @@ from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
 
+AT_ONCE = 32
+"""Members of a job if they advance in lockstep."""
+
 R_co = TypeVar("R_co", covariant=True)
 R = TypeVar("R")
 
@@ -88,6 +91,11 @@ class Here:
                 if job is None or result is None:
                     return
                 yield job, result
+
+
+def at_once(executor: Executor, in_lockstep: int = AT_ONCE) -> int:
+    """How many members fill a worker; in_lockstep: how many if its device steps them together."""
+    return max(executor.devices, in_lockstep if executor.lockstep else 1)
 
 
 ListenToJob = Callable[[Job, float, float], Sequence[Listener]]

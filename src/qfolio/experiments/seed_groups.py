@@ -21,7 +21,7 @@ from qfolio.core.files import new_folder
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.registry import short
 from qfolio.experiments.budget import Budget
-from qfolio.experiments.executor import Executor
+from qfolio.experiments.executor import Executor, at_once
 from qfolio.experiments.fit import Listener, Row
 from qfolio.experiments.log import Log, seed_names
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder, curve_point
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from qfolio.experiments.run import Run
 
 FOLDER = "seeds"
-
-AT_ONCE = 32
-"""Seeds of a group if members advance in lockstep."""
 
 
 class TrainedSeeds(NamedTuple):
@@ -181,7 +178,7 @@ class SeedGroups:
 
 def _groups(seeds: Sequence[int], executor: Executor) -> list[range]:
     """Ascending seeds in groups of consecutive ones that fill a worker's devices."""
-    size = max(executor.devices, AT_ONCE if executor.lockstep else 1)
+    size = at_once(executor)
     groups: list[range] = []
     for seed in seeds:
         if groups and groups[-1].stop == seed and len(groups[-1]) < size:

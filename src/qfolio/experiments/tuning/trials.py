@@ -14,11 +14,8 @@ from jaxtyping import Float
 from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.experiments.budget import Budget
-from qfolio.experiments.executor import Executor, Here
+from qfolio.experiments.executor import Executor, Here, at_once
 from qfolio.experiments.fit import Listener, fit
-
-AT_ONCE = 32
-"""Members of a job if they advance in lockstep."""
 
 
 class TrainedTrials(NamedTuple):
@@ -88,8 +85,7 @@ def trials_jobs(
     groups = defaultdict(list)
     for name, agent in agents.items():
         groups[jax.tree.structure(agent)].append(name)
-    members = max(executor.devices, AT_ONCE if executor.lockstep else 1)
-    size = len(agents) if isinstance(executor, Here) else math.ceil(members / len(seeds))
+    size = len(agents) if isinstance(executor, Here) else math.ceil(at_once(executor) / len(seeds))
     parts = [
         (group[i : i + size], min(size, len(group)))
         for group in groups.values()

@@ -22,7 +22,7 @@ from qfolio.core.notebook import card
 from qfolio.core.registry import BASELINES, short
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
-from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
+from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, at_once, carry_out
 from qfolio.experiments.fit import Row
 from qfolio.experiments.log import Log, add_result
 from qfolio.experiments.presets import Preset
@@ -423,7 +423,7 @@ class Backtest:
     def _missing(self, name: str, executor: Executor) -> list[FoldsJob]:
         """The folds that are still to be trained, in groups that fill a worker's devices."""
         missing = [fold for fold in self._jobs if not self._is_trained(name, fold.name)]
-        size = max(executor.devices, FOLDS_AT_ONCE if executor.lockstep else 1)
+        size = at_once(executor, FOLDS_AT_ONCE)
         most = min(size, len(missing))
         return [self._job(name, missing[i : i + size], most) for i in range(0, len(missing), size)]
 
