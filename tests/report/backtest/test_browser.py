@@ -58,11 +58,11 @@ def test_pointer_reads_the_values(browser: Browser, data: BacktestData, tmp_path
     for step in range(3):
         browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + step, y=y)
     browser.wait(f"{date} !== '{last}'")
-    there = np.flatnonzero(
-        data.dates.astype("datetime64[D]") == np.datetime64(browser.evaluate(date))
-    )
+    # Both are read at once, because the page may still be following the pointer.
+    day, shown = browser.evaluate(f"[{date}, {cell}]")
+    there = np.flatnonzero(data.dates.astype("datetime64[D]") == np.datetime64(day))
     wealth = np.median(np.prod(1 + data.strategies["DQN"].returns[:, : there[0] + 1], axis=1))
-    assert browser.evaluate(cell) == f"{wealth:.2f}"
+    assert shown == f"{wealth:.2f}"
     browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=5, y=5)
     browser.wait(f"{date} === '{last}'")
     assert browser.evaluate(cell) == final
