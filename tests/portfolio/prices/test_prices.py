@@ -484,21 +484,6 @@ def test_features_must_be_finite():
 # What looks odd.
 
 
-@pytest.mark.parametrize(
-    ("factor", "ratio"), [(0.5, "1/2"), (2.0, "2"), (1 / 3, "1/3"), (0.1, "1/10"), (1.5, "3/2"),
-                          (2 / 3, "2/3"), (0.01, "1/100")],
-)  # fmt: skip
-def test_jumps_like_splits(factor: float, ratio: str):
-    rng = np.random.default_rng(3)
-    values = 50 * np.exp(np.cumsum(rng.normal(0, 0.01, (300, 3)), axis=0))
-    days = pd.bdate_range("2020-01-01", periods=300)
-    assert warnings(pd.DataFrame(values, index=days, columns=list("ABC"))) == []
-    values[200:, 1] *= factor
-    (found,) = warnings(pd.DataFrame(values, index=days, columns=list("ABC")))
-    assert (found.row, found.column, found.date) == (200, "B", str(days[200])[:10])
-    assert found.message.endswith(f"close to {ratio}: perhaps a split that was not adjusted")
-
-
 def test_wild_assets_have_no_splits():
     """A move of −50 % is nothing special where every move is as large."""
     values = np.where(np.arange(300) % 2, 1.0, 2.0)[:, None]

@@ -1,6 +1,4 @@
-"""Reports cells that are not prices, impossible moves, likely splits and gaps in time."""
-
-from typing import Any
+"""Reports cells that are not prices, tables that are too short, and gaps in time."""
 
 import numpy as np
 
@@ -12,9 +10,6 @@ from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Block, Grid, report_cells
 
 FEWEST_ROWS, FEW_ROWS = 3, 60
-LEAST_JUMP = 0.3  # in log; the smallest split, 3/2, is 0.41
-LARGEST_MOVE = 1e6  # within one row; beyond it relatives and their products overflow float32
-SPLITS = (1.5, 2, 3, 4, 5, 6, 7, 8, 10, 15, 20, 25, 30, 50, 100, 1000)
 
 
 def check_cells(grid: Grid, findings: Findings) -> None:
@@ -65,51 +60,6 @@ def check_cells(grid: Grid, findings: Findings) -> None:
 def _complaint(grid: Grid, block: Block, i: int, j: int) -> str:
     cell = grid.table.columns[block.columns[j]][int(grid.lines[i, j])]
     return not_a_number(cell, grid.table.decimal)
-
-
-def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
-    """Report implausibly large moves, and moves that look like unadjusted splits."""
-    values = np.where(np.isfinite(rest.values) & (rest.values > 0), rest.values, np.nan)
-    with np.errstate(over="ignore", divide="ignore", under="ignore"):
-        relatives = values[1:] / values[:-1]
-        moves = np.log(relatives)
-    sizes = np.abs(moves)
-
-    def spot(i: int, j: int) -> dict[str, Any]:
-        return grid.spot(grid.prices, rest.head + i + 1, int(rest.assets[j]))
-
-    wild = np.argwhere(sizes > np.log(LARGEST_MOVE))  # NaN compares false
-    for i, j in wild[:LISTED].tolist():
-        findings.error(
-            f"{grid.subject(grid.prices, int(rest.assets[j]))} goes from {values[i, j]:.6g} to "
-            f"{values[i + 1, j]:.6g} in one row",
-            advice="Check the units of both prices.", **spot(i, j),
-        )  # fmt: skip
-    if (more := len(wild) - LISTED) > 0:
-        findings.error(f"and {amount(more, 'more price')} that change by such factors", count=more)
-    ratios = np.log(np.array(SPLITS))
-    splits = []
-    for j in np.flatnonzero((sizes > LEAST_JUMP).any(axis=0)).tolist():
-        # The usual move: the median is robust to the jumps in question.
-        usual = float(np.median(sizes[:, j][sizes[:, j] > 0])) / 0.6745
-        for i in np.flatnonzero(sizes[:, j] > max(LEAST_JUMP, 6 * usual)).tolist():
-            distances = np.abs(ratios - sizes[i, j])
-            if distances.min() < min(0.1, max(0.02, 2 * usual)):
-                splits.append((i, j, _ratio(SPLITS[distances.argmin()], moves[i, j] > 0)))
-    for i, j, ratio in sorted(splits)[:LISTED]:
-        findings.warn(
-            f"{grid.subject(grid.prices, int(rest.assets[j]))} is {relatives[i, j]:.4g} times the "
-            f"one before, close to {ratio}: perhaps a split that was not adjusted",
-            advice="If so, use adjusted prices.", **spot(i, j),
-        )  # fmt: skip
-    if (more := len(splits) - LISTED) > 0:
-        findings.warn(f"and {amount(more, 'more move')} that may be splits", count=more)
-
-
-def _ratio(split: float, up: bool) -> str:
-    over, under = (3, 2) if split == 1.5 else (int(split), 1)
-    over, under = (over, under) if up else (under, over)
-    return str(over) if under == 1 else f"{over}/{under}"
 
 
 def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:

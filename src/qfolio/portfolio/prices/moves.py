@@ -1,0 +1,140 @@
+"""Reports moves that no market makes: impossible ones, bad ticks and splits that were not adjusted.
+
+A jump is a large move for its asset that the other assets do not share. One that goes back within a
+few rows is a bad tick. One that stays, at a ratio that companies split their shares by, looks like
+a split; any other is left to the reader.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day
+from qfolio.portfolio.prices.gaps import Rest
+from qfolio.portfolio.prices.grid import Grid
+
+LARGEST_MOVE = 1e6  # within one row; beyond it relatives and their products overflow float32
+LEAST_JUMP = 0.3  # in log; the smallest split, 3/2, is 0.41
+UNUSUAL = 6.0  # times the usual move of the asset, over the table and around the jump
+AROUND = 30  # rows before and after a jump: in a crisis large moves are usual
+TICKS = 10  # a jump by fewer steps of the price says nothing: from 0.02 the next price is 0.03
+BRIEF = 3  # rows that a bad tick lasts at most
+SPLITS = (1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 100, 1000)
+EXACT = 0.005  # how far a split's ratio may be from one of these
+
+Jump = tuple[int, int]  # the row before the jump, and the asset
+
+
+def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
+    """Report impossible moves, bad ticks, likely splits, and how many other jumps there are."""
+    values = np.where(np.isfinite(rest.values) & (rest.values > 0), rest.values, np.nan)
+    with np.errstate(over="ignore", divide="ignore", under="ignore"):
+        relatives = values[1:] / values[:-1]
+        logs = np.log(values)
+    moves = np.diff(logs, axis=0)
+    sizes = np.abs(moves)
+
+    def spot(i: int, j: int) -> dict[str, Any]:
+        return grid.spot(grid.prices, rest.head + i, int(rest.assets[j]))
+
+    def subject(j: int) -> str:
+        return grid.subject(grid.prices, int(rest.assets[j]))
+
+    wild = np.argwhere(sizes > np.log(LARGEST_MOVE))  # NaN compares false
+    for i, j in wild[:LISTED].tolist():
+        findings.error(
+            f"{subject(j)} goes from {values[i, j]:.6g} to {values[i + 1, j]:.6g} in one row",
+            advice="Check the units of both prices.", **spot(i + 1, j),
+        )  # fmt: skip
+    if (more := len(wild) - LISTED) > 0:
+        findings.error(f"and {amount(more, 'more price')} that change by such factors", count=more)
+    ticks, splits, others = _sort_out(values, logs, moves, _jumps(values, moves, sizes))
+    for (i, j), rows in list(ticks.items())[:LISTED]:
+        spell = "in the next row" if rows == 1 else f"{rows} rows later"
+        power = round(np.log10(relatives[i, j]))
+        misplaced = power and abs(moves[i, j] - power * np.log(10)) < LEAST_JUMP
+        findings.warn(
+            f"{subject(j)} is {relatives[i, j]:.4g} times the one before and goes back {spell}: "
+            f"perhaps a wrong price{', a digit or the decimal mark misplaced' * bool(misplaced)}",
+            advice="If so, correct it, or empty the cell and choose missing='forward-fill' "
+            "(--missing).",
+            **spot(i + 1, j),
+        )
+    if (more := len(ticks) - LISTED) > 0:
+        findings.warn(f"and {amount(more, 'more price')} that may be wrong", count=more)
+    for (i, j), ratio in list(splits.items())[:LISTED]:
+        findings.warn(
+            f"{subject(j)} is {relatives[i, j]:.4g} times the one before, close to {ratio}: "
+            "perhaps a split that was not adjusted",
+            advice="If so, use adjusted prices.", **spot(i + 1, j),
+        )  # fmt: skip
+    if (more := len(splits) - LISTED) > 0:
+        findings.warn(f"and {amount(more, 'more move')} that may be splits", count=more)
+    if others:
+        i, j = max(others, key=lambda jump: sizes[jump])
+        when = day(grid.dates[rest.head + i + 1])
+        findings.note(
+            f"{amount(len(others), 'large move')} that no other asset explains and no usual split; "
+            f"the largest: {subject(j)} on {when} is {relatives[i, j]:.4g} times the one before",
+            **spot(i + 1, j),
+        )
+
+
+def _jumps(values: np.ndarray, moves: np.ndarray, sizes: np.ndarray) -> list[Jump]:
+    """Moves that are large for their asset and that most others do not share, by row."""
+    jumps = sizes > LEAST_JUMP
+    for j in np.flatnonzero(jumps.any(axis=0)).tolist():
+        # The median is robust to the jumps in question.
+        usual = float(np.median(sizes[:, j][sizes[:, j] > 0])) / 0.6745
+        steps = np.abs(np.diff(values[:, j]))
+        tick = steps[steps > 0].min()
+        jumps[:, j] &= (sizes[:, j] > UNUSUAL * usual) & (steps > (TICKS - 0.5) * tick)
+        for i in np.flatnonzero(jumps[:, j]).tolist():
+            around = sizes[max(i - AROUND, 0) : i + AROUND + 1, j]
+            jumps[i, j] = sizes[i, j] > UNUSUAL * float(np.nanmedian(around)) / 0.6745
+    for i in np.flatnonzero(jumps.any(axis=1)).tolist():
+        known = np.sort(moves[i][~np.isnan(moves[i])])
+        where = np.flatnonzero(jumps[i])
+        half = moves[i, where] / 2
+        above = len(known) - np.searchsorted(known, half)
+        as_far = np.where(half > 0, above, np.searchsorted(known, half, "right"))
+        others = len(known) - 1
+        jumps[i, where] &= (as_far - 1 < others / 2) | (others == 0)
+    return [(i, j) for i, j in np.argwhere(jumps).tolist()]
+
+
+def _sort_out(
+    values: np.ndarray, logs: np.ndarray, moves: np.ndarray, jumps: Iterable[Jump]
+) -> tuple[dict[Jump, int], dict[Jump, str], list[Jump]]:
+    """Bad ticks with the rows that they last, splits with their ratios, and other jumps."""
+    ticks: dict[Jump, int] = {}
+    splits: dict[Jump, str] = {}
+    others: list[Jump] = []
+    sound: dict[int, int] = {}  # the first row after the last bad tick, by asset
+    ratios = np.log(np.array(SPLITS))
+    for i, j in jumps:
+        if i < sound.get(j, 0):
+            continue  # the way back
+        jump = moves[i, j]
+        after = logs[i + 2 : i + 2 + BRIEF, j]
+        back = (np.abs(after - logs[i, j]) < abs(jump) / 4) & (
+            -moves[i + 1 : i + 1 + len(after), j] * np.sign(jump) > abs(jump) / 2
+        )
+        if back.any():
+            rows = int(back.argmax()) + 1
+            ticks[i, j] = rows
+            sound[j] = i + 1 + rows
+            continue
+        distances = np.abs(ratios - abs(jump))
+        if distances.min() <= np.log1p(EXACT):
+            splits[i, j] = _ratio(SPLITS[distances.argmin()], jump > 0)
+        else:
+            others.append((i, j))
+    return ticks, splits, others
+
+
+def _ratio(split: float, up: bool) -> str:
+    over, under = (int(2 * split), 2) if split % 1 else (int(split), 1)
+    over, under = (over, under) if up else (under, over)
+    return str(over) if under == 1 else f"{over}/{under}"

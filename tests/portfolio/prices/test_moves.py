@@ -1,0 +1,156 @@
+"""A jump is called a split only where it is one, and a price that goes back is called wrong."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from qfolio.portfolio.prices.findings import Finding
+from qfolio.portfolio.prices.table import check
+
+ROWS, AT = 300, 200
+DAYS = pd.bdate_range("2020-01-01", periods=ROWS)
+SPLIT = "perhaps a split that was not adjusted"
+
+
+def market(assets: int = 4, seed: int = 3) -> np.ndarray:
+    """Prices that move by 1 % a day; the second asset does not move into row AT."""
+    moves = np.random.default_rng(seed).normal(0, 0.01, (ROWS, assets))
+    moves[AT, 1] = 0
+    return 50 * np.exp(np.cumsum(moves, axis=0))
+
+
+def found(values: np.ndarray) -> list[Finding]:
+    names = [f"A{j}" for j in range(values.shape[1])]
+    return [f for f in check(pd.DataFrame(values, index=DAYS, columns=names)) if "one asset" not in
+            f.message]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("factor", "ratio"), [(0.5, "1/2"), (2.0, "2"), (1 / 3, "1/3"), (1.5, "3/2"), (2 / 3, "2/3"),
+                          (0.4, "2/5"), (10.0, "10"), (0.1, "1/10"), (0.01, "1/100"),
+                          (0.502, "1/2"), (0.498, "1/2")],
+)  # fmt: skip
+@pytest.mark.parametrize("assets", [2, 4])
+def test_splits(factor: float, ratio: str, assets: int):
+    values = market(assets)
+    assert found(values) == []
+    values[AT:, 1] *= factor
+    (split,) = found(values)
+    assert (split.severity, split.row, split.column) == ("warning", AT, "A1")
+    assert split.date == str(DAYS[AT])[:10]
+    assert split.message.endswith(f"close to {ratio}: {SPLIT}")
+
+
+def test_a_split_of_the_only_asset_and_one_in_the_last_row():
+    values = market()
+    values[AT:, 1] *= 0.5
+    assert SPLIT in found(values[:, 1:2])[0].message
+    names = list("ABCD")
+    findings = check(pd.DataFrame(values[: AT + 1], index=DAYS[: AT + 1], columns=names))
+    assert [f.row for f in findings if SPLIT in f.message] == [AT]
+
+
+def crash(values: np.ndarray) -> None:
+    """The market halves, and half of the assets by exactly one half."""
+    values[AT:] *= np.array([0.52, 0.5, 0.47, 0.5])
+
+
+def flash_crash(values: np.ndarray) -> None:
+    values[AT] *= 0.5
+
+
+def doubling(values: np.ndarray) -> None:
+    """A takeover, not a split."""
+    values[AT:, 1] *= 1.97
+
+
+def slow_return(values: np.ndarray) -> None:
+    """A squeeze that fades over many rows is a price that was paid."""
+    values[AT : AT + 40, 1] *= np.exp(np.linspace(1.0, 0, 40))
+
+
+def penny_stock(values: np.ndarray) -> None:
+    """Prices of a few cents, of which the next one up is half as much again."""
+    cents = np.random.default_rng(0).integers(-1, 2, ROWS).cumsum()
+    values[:, 1] = np.round(0.01 * (2 + np.abs(cents) % 6), 2)
+
+
+def thin_penny_stock(values: np.ndarray) -> None:
+    """The same after years at a higher price, which make its usual move small."""
+    values[:, 1] = np.round(np.concatenate([np.linspace(9, 8, AT), np.full(ROWS - AT, 0.03)]), 2)
+    values[AT + 20 :, 1] = 0.06
+
+
+@pytest.mark.parametrize(
+    "change", [crash, flash_crash, doubling, slow_return, penny_stock, thin_penny_stock]
+)
+def test_jumps_that_are_no_splits(change: Callable[[np.ndarray], None]):
+    values = market()
+    change(values)
+    assert [f.message for f in found(values) if f.severity == "warning"] == []
+
+
+def test_other_jumps_are_counted_in_a_note():
+    values = market()
+    values[AT:, 1] *= 1.97
+    values[100:, 2] *= 0.7
+    (note,) = found(values)
+    assert (note.severity, note.row, note.column) == ("note", AT, "A1")
+    assert note.message.startswith("2 large moves that no other asset explains")
+    assert "is 1.97 times the one before" in note.message
+
+
+@pytest.mark.parametrize(
+    ("factor", "rows", "said"),
+    [
+        (10.0, 1, "is 10 times the one before and goes back in the next row"),
+        (0.1, 1, "is 0.1 times the one before and goes back in the next row"),
+        (100.0, 2, "is 100 times the one before and goes back 2 rows later"),
+        (2.0, 2, "is 2 times the one before and goes back 2 rows later"),
+        (0.55, 3, "is 0.55 times the one before and goes back 3 rows later"),
+    ],
+)
+def test_bad_ticks(factor: float, rows: int, said: str):
+    values = market()
+    values[AT : AT + rows, 1] *= factor
+    (tick,) = found(values)  # the way back is no finding of its own
+    assert (tick.severity, tick.row, tick.column) == ("warning", AT, "A1")
+    assert tick.message.startswith(f"the price {said}: perhaps a wrong price")
+    misplaced = tick.message.endswith("price, a digit or the decimal mark misplaced")
+    assert misplaced == (factor in (10.0, 0.1, 100.0))
+    assert "empty the cell and choose missing='forward-fill'" in tick.advice
+
+
+def test_a_lost_zero():
+    """105.30 becomes 15.30, which is no power of ten."""
+    values = market()
+    values[AT, 1] = values[AT - 1, 1] * 15.3 / 105.3
+    (tick,) = found(values)
+    assert "goes back in the next row" in tick.message
+
+
+def test_a_tick_in_a_crash_and_a_split_after_a_tick():
+    values = market()
+    values[AT] *= 0.8
+    values[AT, 1] = values[AT - 1, 1] * 10
+    values[AT + 10 :, 2] = values[AT + 9, 2] * 0.5
+    tick, split = found(values)
+    assert (tick.row, tick.column, "goes back" in tick.message) == (AT, "A1", True)
+    assert (split.row, split.column, SPLIT in split.message) == (AT + 10, "A2", True)
+
+
+def test_the_default_table_has_no_bad_ticks_and_one_ratio_of_a_split():
+    """Through the crises of 2000 and 2008; a third of a price is a doubtful move in any case."""
+    (split,) = [str(f) for f in check() if f.severity == "warning"]
+    assert split.startswith("row 69 (1990-04-10), column 'RRC': the price is 0.3332 times")
+
+
+def test_many_are_counted():
+    values = market(12)
+    for j in range(12):
+        values[20 * (j + 1), j] *= 10
+    findings = found(values)
+    assert len(findings) == 6
+    assert findings[-1].message == "and 7 more prices that may be wrong"
