@@ -77,6 +77,7 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
         findings.note(
             f"{amount(len(others), 'large move')} that no other asset explains and no usual split; "
             f"the largest: {subject(j)} on {when} is {relatives[i, j]:.4g} times the one before",
+            advice="Check them: a split on a day on which the price moved looks like this, too.",
             **spot(i + 1, j),
         )
 
