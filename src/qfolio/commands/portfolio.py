@@ -65,6 +65,7 @@ def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> No
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.backtest.attribution.explain import explain
+    from qfolio.portfolio.backtest.results import write_tables
     from qfolio.portfolio.backtest.run import Backtest
 
     executor, following = on(options.on), trackers(options.track)
@@ -93,7 +94,7 @@ def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> No
         entries, notes = run.entries()
         assessment = run.assess(entries)
         why = explain(run, entries)
-        run.write_tables(entries, assessment, why)
+        write_tables(run, entries, assessment, why)
         write_report(run, entries, assessment, notes, why)
     console.print_assessment(assessment)
     for sentences in why.diagnosis.values():

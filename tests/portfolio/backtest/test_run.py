@@ -15,6 +15,7 @@ from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.folder import MOST_WEIGHTS, rows_written
 from qfolio.portfolio.backtest.replay import Stretch, decide
+from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import LATEST, Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.following import follow
@@ -237,7 +238,7 @@ def test_no_strategy_looks_ahead():
 
 def test_tables_say_what_was_replayed(finished):
     entries, _ = finished.entries()
-    finished.write_tables(entries, finished.assess(entries))
+    write_tables(finished, entries, finished.assess(entries))
     lines = (finished.folder / "returns.csv").read_text().splitlines()
     assert lines[0].split(",")[:4] == ["date", "dqn/0", "dqn/1", "dqn-together"]
     assert len(lines) == 161

@@ -1,4 +1,4 @@
-"""The decisions of trained agents over the folds of a backtest."""
+"""Replays agents and baselines over the folds of a backtest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +9,14 @@ import numpy as np
 from jaxtyping import PyTree
 
 from qfolio.core.mdp import Agent
+from qfolio.portfolio.backtest.baselines import Baseline
+from qfolio.portfolio.backtest.folder import TOGETHER
 from qfolio.portfolio.backtest.folds import Fold
-from qfolio.portfolio.backtest.simulation import Simulation
+from qfolio.portfolio.backtest.orders import orders
+from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.following import follow
+from qfolio.portfolio.prices.findings import listing
+from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
 
@@ -55,3 +60,60 @@ def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: 
         parts.append(targets[:, :count])
         held = after[:, count - 1]
     return np.concatenate(parts, axis=1)
+
+
+class Replay(NamedTuple):
+    """The rules that hold for all strategies of a backtest.
+
+    task: of any agent; all have the same costs and lag. cap: largest weight that baselines order.
+    """
+
+    prices: Prices
+    folds: Sequence[Fold]
+    task: Portfolio
+    cap: float
+
+    def left_out(self) -> list[str]:
+        """A note on each fold that leaves out assets."""
+        folds = ((fold.name, fold.tradable(self.prices.values)) for fold in self.folds)
+        return [
+            f"Fold {name} leaves out {listing(late)}, which started too late."
+            for name, tradable in folds
+            if (late := [self.prices.assets[j] for j in np.flatnonzero(~tradable)])
+        ]
+
+    def agent(
+        self, name: str, agent: Agent, stretches: Sequence[Stretch], seeds: int
+    ) -> dict[str, Entry]:
+        """Each seed of an agent by itself and, if there are several, all together."""
+        each = decide(agent, stretches, seeds, together=False)
+        entries = {name: self.entry("agent", each)}
+        if seeds > 1:
+            together = decide(agent, stretches, 1, together=True)
+            entries[f"{name}{TOGETHER}"] = self.entry("ensemble", together)
+        return entries
+
+    def baseline(self, kind: str, name: str, baseline: Baseline) -> tuple[Entry, tuple[str, ...]]:
+        """A baseline, and notes on its decisions."""
+        table = self.prices
+        given = orders(
+            name,
+            baseline,
+            self.folds,
+            table.dates,
+            table.values,
+            cap=self.cap,
+            month=table.month,
+        )
+        return self.entry(kind, given.decisions[None]), given.notes
+
+    def entry(self, kind: str, decisions: np.ndarray) -> Entry:
+        """Decisions of shape (seed, day, entry), carried out."""
+        simulation = simulate(
+            self.prices.values,
+            decisions,
+            first=self.folds[0].decisions.start,
+            cost=self.task.costs,
+            lag=self.task.lag,
+        )
+        return Entry(kind, decisions, simulation)

@@ -8,7 +8,6 @@ float64, beside classical allocators under the same rules.
 import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,28 +23,20 @@ from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, at_once, carry_out
 from qfolio.experiments.fit import Row
-from qfolio.experiments.log import Log, add_result
+from qfolio.experiments.log import Log
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest import assessment, memory
-from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
-from qfolio.portfolio.backtest.folder import (
-    TOGETHER,
-    AgentConfig,
-    BacktestConfig,
-    BacktestFolder,
-)
-from qfolio.portfolio.backtest.folds import Fold, latest, spell_all, walk_forward
+from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
+from qfolio.portfolio.backtest.folds import Fold, latest, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
-from qfolio.portfolio.backtest.orders import orders
-from qfolio.portfolio.backtest.replay import Entry, Stretch, decide
-from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.backtest.kept import Kept
+from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
-from qfolio.portfolio.backtest.verdict import verdicts
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
-from qfolio.portfolio.prices.findings import day, listing
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
 
@@ -71,7 +62,7 @@ class Backtest:
         folder: BacktestFolder | None,
         agents: Mapping[str, Agent] | None = None,
     ) -> None:
-        self.prices, self.config, self._folder = prices, config, folder
+        self.prices, self.config, self._kept = prices, config, Kept(folder)
         dates, length, expanding = prices.dates, config.train, config.expanding
         folds = walk_forward(dates, length, config.test, config.lag, expanding)
         self.folds = [fold.complete(prices.values) for fold in folds]
@@ -89,8 +80,6 @@ class Backtest:
                 f"{min(both)} is an agent and a baseline; give the agent another name."
             )
         self.interrupted = False
-        self._policies: dict[tuple[str, str], Any] = {}  # without a folder
-        self._records: dict[tuple[str, str], list[Row]] = {}  # likewise
         self._parts = {
             (name, fold.name): self._part(task, fold)
             for name, task in self.tasks.items()
@@ -171,7 +160,7 @@ class Backtest:
         if out is not None:
             with new_folder(Path(out)) as folder:
                 BacktestFolder(folder).write(config, prices)
-            backtest._folder = BacktestFolder(Path(out))
+            backtest._kept.folder = BacktestFolder(Path(out))
         return backtest
 
     @classmethod
@@ -194,7 +183,7 @@ class Backtest:
         )
 
     def _repr_html_(self) -> str:
-        trained = sum(self._is_trained(a, f.name) for a in self.agents for f in self._jobs)
+        trained = sum(self._kept.has(a, f.name) for a in self.agents for f in self._jobs)
         facts = [
             f"{trained} of {len(self.agents) * len(self._jobs)} trainings done",
             f"{len(self.prices.assets)} assets",
@@ -204,7 +193,8 @@ class Backtest:
             *([] if self.folder is None else [str(self.folder)]),
         ]
         header, rows = ("a year, net", "growth", "Sharpe", "turnover", "drawdown"), []
-        for name, measures in (self._folder.read_measures() if self._folder else {}).items():
+        folder = self._kept.folder
+        for name, measures in (folder.read_measures() if folder else {}).items():
             growth, drawdown = (100 * measures[key] for key in ("growth", "drawdown"))
             cells = (f"{growth:.1f} %", f"{measures['sharpe']:.2f}", f"{measures['turnover']:.1f}")
             rows.append((name, *cells, f"{drawdown:.1f} %"))
@@ -213,7 +203,7 @@ class Backtest:
     @property
     def folder(self) -> Path | None:
         """The folder of the backtest, if it has one."""
-        return None if self._folder is None else self._folder.path
+        return None if self._kept.folder is None else self._kept.folder.path
 
     def run(
         self,
@@ -258,7 +248,10 @@ class Backtest:
         """Keeps what a job has trained."""
         agent = job.name.partition("/")[0]
         for fold, result in trained.items():
-            self._keep(agent, fold, result)
+            policy = result.kept
+            if fold == LATEST:
+                policy = _learning(policy, 0, self.prices.dates[-1])
+            self._kept.write(agent, fold, result.rows, policy)
 
     @property
     def parts(self) -> list[object]:
@@ -271,7 +264,7 @@ class Backtest:
         name = self._name(agent)
         task, trained = self._parts[name, LATEST], self.agents[name]
         state = state_template(task, trained, self.config.seeds)
-        kept = self._load(name, LATEST, _learning(state, 0, self.prices.dates[-1]))
+        kept = self._kept.policy(name, LATEST, _learning(state, 0, self.prices.dates[-1]))
         return Policy(
             task,
             trained,
@@ -286,46 +279,34 @@ class Backtest:
     def keep(self, agent: str | None, policy: Policy) -> None:
         """Stores an updated policy as the agent's policy for tomorrow."""
         learning = _learning(policy.learner, policy.updates, policy.learned)
-        self._keep_policy(self._name(agent), LATEST, learning)
+        self._kept.write_policy(self._name(agent), LATEST, learning)
 
     def stretches(self, agent: str) -> list[Stretch]:
         """The folds with an agent's policies."""
         task, trained = self.tasks[agent], self.agents[agent]
         members = trained.weights(state_template(task, trained, self.config.seeds))
         return [
-            Stretch(self._parts[agent, fold.name], self._load(agent, fold.name, members), fold)
+            Stretch(
+                self._parts[agent, fold.name], self._kept.policy(agent, fold.name, members), fold
+            )
             for fold in self.folds
         ]
 
     def records(self, agent: str, fold: str) -> list[Row]:
         """Every training episode of an agent in a fold, all seeds, in order of time."""
-        if self._folder is None:
-            return self._records.get((agent, fold), [])
-        return self._folder.read_records(agent, fold)
+        return self._kept.records(agent, fold)
 
     def entries(self) -> tuple[dict[str, Entry], list[str]]:
         """Every strategy replayed over all folds, and notes on problems."""
-        notes = [
-            f"Fold {fold.name} leaves out {listing(late)}, which started too late."
-            for fold in self.folds
-            if (late := self._late(fold))
-        ]
-        entries = {}
-        for name in self.agents:
-            decided = partial(decide, self.agents[name], self.stretches(name))
-            each = decided(self.config.seeds, together=False)
-            entries[name] = self._entry("agent", each)
-            if self.config.seeds > 1:
-                entries[f"{name}{TOGETHER}"] = self._entry("ensemble", decided(1, together=True))
-        table, cap = self.prices, self.config.cap
+        replay = Replay(self.prices, self.folds, next(iter(self.tasks.values())), self.config.cap)
+        notes, entries = replay.left_out(), dict[str, Entry]()
+        for name, agent in self.agents.items():
+            entries |= replay.agent(name, agent, self.stretches(name), self.config.seeds)
         slower = {f"{EQUAL_WEIGHT} at {speed:g}": EqualWeightAt(speed) for speed in SPEEDS}
-        for name, made in {**self.baselines, **slower}.items():
-            given = orders(
-                name, made, self.folds, table.dates, table.values, cap=cap, month=table.month
-            )
-            kind = "rebalancing" if name in slower else "baseline"
-            entries[name] = self._entry(kind, given.decisions[None])
-            notes += given.notes
+        for kind, rules in (("baseline", self.baselines), ("rebalancing", slower)):
+            for name, rule in rules.items():
+                entries[name], said = replay.baseline(kind, name, rule)
+                notes += said
         return entries, notes
 
     @property
@@ -359,41 +340,6 @@ class Backtest:
         bound = constant_bound(table.values, begin, table.periods_per_year)
         return dataclasses.replace(assessed, bound=bound)
 
-    def write_tables(
-        self, entries: dict[str, Entry], assessed: assessment.Assessment, why: Why | None = None
-    ) -> None:
-        """returns.csv (a column per strategy and seed), weights.csv (means) and summary.json.
-
-        With attributions, why.json as well, and the diagnosis in summary.json.
-        """
-        assert self._folder is not None
-        days = spell_all(self.dates, self.prices.dates)
-        columns = {
-            f"{name}/{self.config.seed + i}" if name in self.agents else name: series
-            for name, entry in entries.items()
-            for i, series in enumerate(entry.simulation.returns)
-        }
-        self._folder.write_returns(days, columns)
-        weights = {
-            name: entry.mean_weights
-            for name, entry in entries.items()
-            if entry.kind != "rebalancing"
-        }
-        self._folder.write_weights(self.dates, days, self.prices.assets, weights)
-        summary = {**assessed.to_json(), "verdicts": verdicts(assessed)}
-        if why is not None:
-            self._folder.write_why(why.to_json())
-            summary["diagnosis"] = why.diagnosis
-        self._folder.write_summary(summary)
-        add_result(
-            self.folder,
-            {
-                name: {key: measure.mean for key, measure in strategy.measures.items()}
-                for name, strategy in assessed.strategies.items()
-                if strategy.kind != "rebalancing"
-            },
-        )
-
     def _name(self, agent: str | None) -> str:
         """An agent's name (default: the first); raises QfolioError if it is unknown."""
         name = next(iter(self.agents)) if agent is None else agent
@@ -422,7 +368,7 @@ class Backtest:
 
     def _missing(self, name: str, executor: Executor) -> list[FoldsJob]:
         """The folds that are still to be trained, in groups that fill a worker's devices."""
-        missing = [fold for fold in self._jobs if not self._is_trained(name, fold.name)]
+        missing = [fold for fold in self._jobs if not self._kept.has(name, fold.name)]
         size = at_once(executor, FOLDS_AT_ONCE)
         most = min(size, len(missing))
         return [self._job(name, missing[i : i + size], most) for i in range(0, len(missing), size)]
@@ -438,53 +384,6 @@ class Backtest:
             LATEST,
             most,
         )
-
-    def _late(self, fold: Fold) -> list[str]:
-        """The assets that a fold leaves out."""
-        tradable = fold.tradable(self.prices.values)
-        return [name for name, yes in zip(self.prices.assets, tradable, strict=True) if not yes]
-
-    def _is_trained(self, name: str, fold: str) -> bool:
-        if self._folder is None:
-            return (name, fold) in self._policies
-        return self._folder.has_policy(name, fold)
-
-    def _keep(self, name: str, fold: str, trained: TrainedFold) -> None:
-        """Writes the records first: the policy marks the fold as trained."""
-        if self._folder is None:
-            self._records[name, fold] = trained.rows
-        else:
-            self._folder.write_records(name, fold, trained.rows)
-        if fold == LATEST:
-            self._keep_policy(name, fold, _learning(trained.kept, 0, self.prices.dates[-1]))
-        else:
-            self._keep_policy(name, fold, trained.kept)
-
-    def _keep_policy(self, name: str, fold: str, tree: Any) -> None:
-        if self._folder is None:
-            self._policies[name, fold] = tree
-        else:
-            self._folder.write_policy(name, fold, tree)
-
-    def _load(self, name: str, job: str, template: Any) -> Any:
-        if not self._is_trained(name, job):
-            where = f"qfolio backtest --resume {self.folder}" if self.folder else "run()"
-            raise QfolioError(f"The backtest is not finished; continue with {where} first.")
-        if self._folder is None:
-            return self._policies[name, job]
-        return self._folder.read_policy(name, job, template)
-
-    # Replaying -----------------------------------------------------------------------------------
-
-    def _entry(self, kind: str, decisions: np.ndarray) -> Entry:
-        simulation = simulate(
-            self.prices.values,
-            decisions,
-            first=self.folds[0].decisions.start,
-            cost=next(iter(self.tasks.values())).costs,
-            lag=self.config.lag,
-        )
-        return Entry(kind, decisions, simulation)
 
 
 def _learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, Any]:

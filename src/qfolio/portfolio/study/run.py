@@ -29,6 +29,7 @@ from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.bootstrap import LEVEL
 from qfolio.portfolio.backtest.folds import require_fold
 from qfolio.portfolio.backtest.replay import Entry
+from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
@@ -231,7 +232,7 @@ class Study:
             entries, notes = backtest.entries()
             assessment = backtest.assess(entries)
             why = explain(backtest, entries) if variant == self.config.variants[0] else None
-            backtest.write_tables(entries, assessment, why)
+            write_tables(backtest, entries, assessment, why)
             if report is not None:
                 report(backtest, entries, assessment, notes, why)
         self._note(table, variant)

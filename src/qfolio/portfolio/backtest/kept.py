@@ -1,0 +1,56 @@
+"""What a backtest has trained: in its folder or, without one, in memory."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.fit import Row
+from qfolio.portfolio.backtest.folder import BacktestFolder
+
+
+class Kept:
+    """The policies of a backtest and the records of their training, by agent and fold.
+
+    folder: where they are; None for in memory.
+    """
+
+    def __init__(self, folder: BacktestFolder | None) -> None:
+        self.folder = folder
+        self._policies: dict[tuple[str, str], Any] = {}
+        self._records: dict[tuple[str, str], list[Row]] = {}
+
+    def has(self, agent: str, fold: str) -> bool:
+        """Whether an agent is trained on a fold."""
+        if self.folder is None:
+            return (agent, fold) in self._policies
+        return self.folder.has_policy(agent, fold)
+
+    def policy(self, agent: str, fold: str, template: Any) -> Any:
+        """A policy, in the structure of the template; raises QfolioError if it is not trained."""
+        if not self.has(agent, fold):
+            where = f"qfolio backtest --resume {self.folder.path}" if self.folder else "run()"
+            raise QfolioError(f"The backtest is not finished; continue with {where} first.")
+        if self.folder is None:
+            return self._policies[agent, fold]
+        return self.folder.read_policy(agent, fold, template)
+
+    def records(self, agent: str, fold: str) -> list[Row]:
+        """Every training episode, all seeds, in order of time; empty if there are none."""
+        if self.folder is None:
+            return self._records.get((agent, fold), [])
+        return self.folder.read_records(agent, fold)
+
+    def write(self, agent: str, fold: str, rows: Sequence[Row], policy: Any) -> None:
+        """Keeps a fold; its records come first, because the policy marks it as trained."""
+        if self.folder is None:
+            self._records[agent, fold] = list(rows)
+        else:
+            self.folder.write_records(agent, fold, rows)
+        self.write_policy(agent, fold, policy)
+
+    def write_policy(self, agent: str, fold: str, policy: Any) -> None:
+        """Keeps a policy alone."""
+        if self.folder is None:
+            self._policies[agent, fold] = policy
+        else:
+            self.folder.write_policy(agent, fold, policy)
