@@ -16,7 +16,9 @@ from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import TASKS, find
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
-from qfolio.portfolio.costs import Context, grown
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import grown
+from qfolio.portfolio.market import RUIN
 from qfolio.portfolio.prices.table import load
 
 try:
@@ -84,6 +86,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         self.prices = load(prices)
         chosen = settings.convert(Portfolio, task)
         self.task = Portfolio.of(self.prices, **chosen)
+        self._conditions = Conditions.of(self.prices, self.task.costs.columns)
         if scaled_by is not None:
             other = load(scaled_by)
             if (other.assets, other.feature_names) != (
@@ -136,19 +139,26 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             raise QfolioError("The episode is over; call reset() first.")
         row, lag = self._row, self.task.lag
         self._target = _programs().target(self.task, row, self._held, self._checked(action))
-        values = self.prices.values[row : row + lag + 2]
-        costs = self.task.costs
+        values, costs = self.prices.values[row : row + lag + 2], self.task.costs
+        known = self._conditions.part(row, row + lag + 2)
         traded = simulate(
-            values, self._target[None], first=0, cost=costs, lag=lag, start=self._held
+            values,
+            self._target[None],
+            first=0,
+            cost=costs,
+            lag=lag,
+            start=self._held,
+            conditions=known,
+            long_only=self.task.feasible.long_only,
         )
         reward, self._memory = _programs().reward(self.task, self._memory, traded)
         coming = np.nan_to_num(values[1] / values[0], nan=1.0)
-        self._held = grown(self._target, costs.carry(coming, Context()))
+        self._held = grown(self._target, costs.growth(self._target, coming, known.holding(0, 1)))
         self._wealth *= 1 + float(traded.returns[0])
         self._cost, self._turnover = float(traded.cost[0]), float(traded.turnover[0])
         self._row, self._steps = row + 1, self._steps + 1
         over = self._steps >= self.task.horizon
-        return self._observe(), float(reward), False, over, self._info()
+        return self._observe(), float(reward), bool(traded.ruined), over, self._info()
 
     def render(self) -> str | None:
         """Date, wealth and holdings on one line."""
@@ -243,7 +253,8 @@ class _Programs:
 
     def reward(self, task: Any, memory: Any, traded: Simulation) -> tuple[float, Any]:
         """The reward of a one-day simulation, and the reward's state after it."""
-        outcome = 1 + traded.returns[0], traded.cost[0], traded.weights[0]
+        growth = max(1 + traded.returns[0], RUIN)
+        outcome = growth, traded.cost[0], traded.weights[0]
         with self._double():
             reward, memory = self._reward(task, memory, *outcome)
             return float(reward), self._doubled(memory)

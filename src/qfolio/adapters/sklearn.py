@@ -18,7 +18,8 @@ from qfolio.core.registry import find
 from qfolio.core.settings import names
 from qfolio.experiments import presets
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
-from qfolio.portfolio.costs import Context, drift, grown
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import drift, grown
 from qfolio.portfolio.prices.table import Prices
 
 OWN = ("cost", "lag", "max_weight", "window")
@@ -285,15 +286,29 @@ class PortfolioPolicy(BaseOptimization):
         still = np.zeros((missing, returns.shape[1]))
         prices = _prices(np.concatenate([still, before, returns]), self._assets())
         values, last = prices.values, missing + len(before)  # the last row before X
-        since = task.costs.carry(values[last] / values[last - lag], Context(rows=lag))
-        start = grown(self._held(), 1 / since)
+        known = Conditions.of(prices, task.costs.columns)
+
+        def growth(weights: np.ndarray, start: int, end: int) -> Any:
+            period = known.holding(np.array(start), np.array(end))
+            return task.costs.growth(weights, values[end] / values[start], period)
+
+        held = self._held()
+        start = grown(held, 1 / growth(held, last - lag, last))
         decisions = np.full((days, 1 + returns.shape[1]), np.nan)  # NaN: no order
         if missing < days:
             first = last - lag + missing
-            moved = task.costs.carry(values[first] / values[last - lag], Context(rows=missing))
-            held = grown(start, moved)
+            held = grown(start, growth(start, last - lag, first))
             decisions[missing:], _ = self.policy_.decide(prices, first, held, days - missing)
-        return simulate(values, decisions, first=last - lag, cost=task.costs, lag=lag, start=start)
+        return simulate(
+            values,
+            decisions,
+            first=last - lag,
+            cost=task.costs,
+            lag=lag,
+            start=start,
+            conditions=known,
+            long_only=task.feasible.long_only,
+        )
 
 
 class PolicyPortfolio(Portfolio):

@@ -41,7 +41,8 @@ class Options:
         test: Length of a fold, after which agents are retrained.
         rolling: Train on a window of fixed length instead of all rows so far.
         cap: Largest weight of one asset, from 0 to 1.
-        cost_model: Cost of trading and holding: proportional, or your own as module:Name.
+        cost_model: Cost of trading and holding: proportional, itemized or your own as module:Name;
+            settings follow in brackets, as in "itemized(fixed=5, cash_rate=0.03)".
         signals: Signals that agents observe beside returns, separated by commas, each with the rows
             that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
             own as module:Name (default: the preset's).
@@ -127,7 +128,7 @@ class Options:
             "test": self.test,
             "expanding": not self.rolling,
             "cap": self.cap,
-            "cost_model": _known("cost", self.cost_model),
+            "cost_model": _known("cost", settings.called(self.cost_model)[0]) and self.cost_model,
             "baselines": list(registry.BASELINES)
             if self.baselines is None
             else [_known("baseline", name) for name in _split(self.baselines).values()],

@@ -97,7 +97,10 @@ SIGNALS = {
     "market-momentum": "qfolio.portfolio.signals:MarketMomentum",
     "market-volatility": "qfolio.portfolio.signals:MarketVolatility",
 }
-COSTS = {"proportional": "qfolio.portfolio.costs:Proportional"}
+COSTS = {
+    "proportional": "qfolio.portfolio.costs:Proportional",
+    "itemized": "qfolio.portfolio.itemized:Itemized",
+}
 TRACKERS = {
     "tensorboard": "qfolio.adapters.trackers:TensorBoard",
     "wandb": "qfolio.adapters.trackers:WeightsAndBiases",

@@ -65,6 +65,19 @@ def parse(assignments: Iterable[str]) -> dict[str, str]:
     return pairs
 
 
+def called(text: str) -> tuple[str, dict[str, str]]:
+    """The name and the settings of a part that is written as ``name(setting=value, …)``."""
+    name, bracket, rest = text.strip().partition("(")
+    if not bracket:
+        return name, {}
+    chosen, equals = {}, [part.partition("=") for part in rest.removesuffix(")").split(",")]
+    for setting, given, value in equals if rest.strip(" )") else []:
+        if not (rest.endswith(")") and name and setting.strip() and given and value.strip()):
+            raise QfolioError(f"{text!r} must be written like itemized(fixed=5, spread=0.0004).")
+        chosen[setting.strip()] = value.strip()
+    return name.strip(), chosen
+
+
 def _convert(name: str, kind: Any, value: Any) -> Any:
     try:
         if kind is bool:

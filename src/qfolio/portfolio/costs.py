@@ -1,10 +1,12 @@
 """Exact costs of trading and holding: the same code for training and backtest.
 
 A ``CostModel`` gives the wealth that remains after a trade and the growth of a holding; a market's
-``cost_model=NAME`` names one. ``Proportional``, a share of the value traded, is built in.
+``cost_model=NAME`` names one. ``Proportional``, a share of the value traded, is here; ``Itemized``,
+with commissions, spreads, impact, interest and fees, is in ``itemized.py``.
 
-Weights have a last axis of N + 1 entries, cash first, and sum to 1. Every function works on numpy
-and jax arrays (also under jit, vmap and grad) and broadcasts over leading axes.
+Weights have a last axis of N + 1 entries, cash first, and sum to 1; a negative weight is owed: a
+loan, or assets sold short. Every function works on numpy and jax arrays (also under jit, vmap and
+grad) and broadcasts over leading axes.
 
 A sale of value s yields (1−c)s of cash, and spending m buys (1−c)m worth of the asset.
 Paying for a rebalancing from weights w to weights b leaves the share mu of the wealth, the
@@ -13,20 +15,30 @@ for the financial portfolio management problem", 2017, eq. 14), which solves
 
     mu·b₀ = w₀ + (1−c)·Σᵢ (wᵢ − mu·bᵢ)⁺ − Σᵢ (mu·bᵢ − wᵢ)⁺ / (1−c),
 
-where the sums run over the assets, without cash.
+where the sums run over the assets, without cash. It holds for negative weights, too.
 """
 
 import abc
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 
 class Context(NamedTuple):
-    """The circumstances of a trade, or of a holding period, besides relatives."""
+    """The circumstances of a trade, or of a holding period, besides relatives.
 
-    rows: Any = 1  # number of rows: from the decision to its trade, or of the holding period
+    rows: number of rows from the decision to its trade, or of the holding period. years: length of
+    the holding period. columns: those that the cost model asks for, by name, of shape (..., 1) or
+    (..., N): their values in the row of the trade, or their integrals over the years of the holding
+    period. wealth: before the trade, in multiples of the wealth at the start, of shape (...).
+    """
+
+    rows: Any = 1
+    years: Any = 0.0
+    columns: Mapping[str, Any] = {}
+    wealth: Any = 1.0
 
 
 class CostModel(abc.ABC):
@@ -36,12 +48,24 @@ class CostModel(abc.ABC):
     setting (such as ``cost``) takes its value.
     """
 
+    depends_on_wealth: ClassVar[bool] = False
+    """Whether costs, as a share of wealth, depend on the wealth."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of the price table that ``trade``, ``carry`` and ``owe`` read (default: none).
+
+        "price" is the price itself; "volatility" is that of the 21 log returns up to a row, unless
+        the table has a column of this name. "years" asks for the lengths of holding periods alone.
+        """
+        return ()
+
     @abc.abstractmethod
     def trade(self, before: Any, after: Any, context: Context) -> tuple[Any, dict[str, Any]]:
         """The share of wealth that remains after a rebalancing, and its cost.
 
         Args:
-            before: Weights before the trade, of shape (..., N + 1), not negative, of sum 1.
+            before: Weights before the trade, of shape (..., N + 1), of sum 1.
             after: Weights after it, likewise.
             context: The circumstances of the trade.
 
@@ -59,8 +83,19 @@ class CostModel(abc.ABC):
             context: The holding period; ``rows`` is a number or of shape (...).
 
         Returns:
-            Growth factors of shape (..., N + 1), cash first.
+            Growth factors of shape (..., N + 1), cash first, all positive.
         """
+
+    def owe(self, relatives: Any, context: Context) -> Any | None:
+        """Growth factors of a loan and of assets sold short; None (default): as ``carry``'s."""
+        return None
+
+    def growth(self, weights: Any, relatives: Any, context: Context) -> Any:
+        """Growth factors of each entry of a holding, of shape (..., N + 1), by its sign."""
+        owned, owed = self.carry(relatives, context), self.owe(relatives, context)
+        if owed is None:
+            return owned
+        return weights.__array_namespace__().where(weights < 0, owed, owned)
 
 
 @dataclass(frozen=True)
@@ -68,16 +103,19 @@ class Proportional(CostModel):
     """A share of the value traded, one way; holding costs nothing and cash earns nothing."""
 
     cost: float = 0.001
+    gross: float = 1.0  # the largest sum of absolute weights of the assets
 
     def trade(self, before: Any, after: Any, context: Context) -> tuple[Any, dict[str, Any]]:
-        remainder = remainder_factor(before, after, self.cost)
+        remainder = remainder_factor(before, after, self.cost, gross=self.gross)
         return remainder, {"proportional": 1 - remainder}
 
     def carry(self, relatives: Any, context: Context) -> Any:
         return with_cash(relatives)
 
 
-def remainder_factor(before: Any, after: Any, cost: Any, *, highest: float = 0.2) -> Any:
+def remainder_factor(
+    before: Any, after: Any, cost: Any, *, highest: float = 0.2, gross: float = 1.0
+) -> Any:
     """The share of wealth that remains after paying for a rebalancing.
 
     Right side minus left side of the equation above is decreasing, concave and piecewise linear in
@@ -94,20 +132,20 @@ def remainder_factor(before: Any, after: Any, cost: Any, *, highest: float = 0.2
     trade is free to first order, which lies between the two one-sided derivatives.
 
     Args:
-        before: Weights w before the trade, of shape (..., N + 1), not negative, of sum 1.
+        before: Weights w before the trade, of shape (..., N + 1), of sum 1.
         after: Weights b after it, likewise, an array of the same kind.
         cost: One-way trading cost c, as a fraction, 0 ≤ c < 1; a number or of shape (...).
         highest: Upper bound of the cost if it is an array, whose values are not read.
+        gross: Upper bound of the sum of absolute weights of the assets, in b.
 
     Returns:
-        Remainder factors mu of shape (...), between (1−c)² and 1.
+        Remainder factors mu of shape (...), between (1−c)² and 1 for weights that are not negative.
     """
     xp = before.__array_namespace__()
     held, wanted = before[..., 1:], after[..., 1:]
     excess = held - wanted
-    steps = newton_steps(
-        excess.shape[-1], cost if isinstance(cost, float | int) else highest, excess.dtype
-    )
+    highest = cost if isinstance(cost, float | int) else highest
+    steps = newton_steps(excess.shape[-1], highest, excess.dtype, gross)
     cost = xp.asarray(cost, dtype=excess.dtype)[..., None]
     selling, buying = -cost, cost / (1 - cost)
 
@@ -123,19 +161,20 @@ def remainder_factor(before: Any, after: Any, cost: Any, *, highest: float = 0.2
     return remainder
 
 
-def newton_steps(assets: int, cost: float, dtype: Any) -> int:
+def newton_steps(assets: int, cost: float, dtype: Any, gross: float = 1.0) -> int:
     """Steps after which the remainder factor is exact to the last digit, for any weights.
 
     Let step j switch assets of total weight mⱼ (in b) from bought to sold. It multiplies the error
     by q·mⱼ or less, with q = 1/(1−c)² − 1. No asset switches twice, so the mⱼ sum to at most 1, and
     K steps leave at most (1 − (1−c)²)·(q/K)ᴷ. Nor can all N assets switch, because selling
     everything gains cash; so N steps leave nothing. At 10 bp that is 2 steps for 4-byte floats and
-    5 for 8-byte ones, at 20 % it is 7 and 12.
+    5 for 8-byte ones, at 20 % it is 7 and 12. Both bounds grow with the gross weight of the assets.
     """
     kept = (1 - cost) ** 2
+    first, later = gross * (1 - kept), gross * (1 / kept - 1)
     digit = np.finfo(dtype).eps / 4
     steps = 1
-    while steps < assets and (1 - kept) * ((1 / kept - 1) / steps) ** steps > digit:
+    while steps < assets and first * (later / steps) ** steps > digit:
         steps += 1
     return steps
 

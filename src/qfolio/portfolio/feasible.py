@@ -12,6 +12,16 @@ from jaxtyping import Array, Float, PRNGKeyArray
 class Feasible(eqx.Module):
     """A set of weights, cash first."""
 
+    @property
+    def long_only(self) -> bool:
+        """Whether no weight of the set is negative, cash included."""
+        return True
+
+    @property
+    def gross(self) -> float:
+        """The largest sum of absolute weights of the assets."""
+        return 1.0
+
     @abc.abstractmethod
     def project(
         self, wanted: Float[Array, " entry"], held: Float[Array, " entry"]

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, PyTree
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Agent
-from qfolio.portfolio.costs import Context, grown
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
@@ -77,7 +76,7 @@ def paths(
             return task.target(row, held, agent.policy(weights, view)[0])
 
         target = jax.vmap(one)(members).mean(0)
-        after = grown(target, task.costs.carry(task.coming(row), Context()))
+        after = task.drifted(row, target)
         return after, (target, after)
 
     def path(members: PyTree, held: Array) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio.core import simplex
+from qfolio.core import settings, simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import MenuActions, View
 from qfolio.core.mdp import (
@@ -35,6 +35,9 @@ from qfolio.portfolio.rewards import Outcome, Reward
 
 MENU_LIMIT = 2000
 
+RUIN = 1e-3
+"""The growth that an account which is wiped out is taken to have; it goes on in cash."""
+
 RATE = 0.3
 """The share of the way to a target that the menu "signals" trades."""
 
@@ -52,6 +55,15 @@ class Relatives(NamedTuple):
     waiting: Float[Array, " asset"]  # from the decision to its execution
     earning: Float[Array, " asset"]  # from the execution to the next one
     coming: Float[Array, " asset"]  # from the decision to the next one
+
+
+class Contexts(NamedTuple):
+    """The circumstances of a decision's trade and of the periods of ``Relatives``."""
+
+    waiting: Context = Context(rows=0)
+    trade: Context = Context(rows=0)
+    earning: Context = Context()
+    coming: Context = Context()
 
 
 class Signalled(NamedTuple):
@@ -175,6 +187,10 @@ class Market(ExogenousTask):
     def relatives(self, market: PyTree, next_market: PyTree) -> Relatives:
         """How prices moved after a decision."""
 
+    def contexts(self, market: PyTree, next_market: PyTree) -> Contexts:
+        """What a cost model may know of a decision's trade and of the time around it."""
+        return Contexts()
+
     @property
     def actions(self) -> Actions:
         return self._menu.actions if self.menu else Simplex(self.limits.shape[0])
@@ -201,6 +217,11 @@ class Market(ExogenousTask):
     def feasible(self) -> Feasible:
         """The set of weights that may be ordered."""
         return CappedSimplex(self.limits)
+
+    @property
+    def gross(self) -> float:
+        """The largest sum of absolute weights of the assets."""
+        return self.feasible.gross
 
     @property
     def costs(self) -> CostModel:
@@ -284,17 +305,22 @@ class Market(ExogenousTask):
     def measure(self, step: Transition) -> Metrics:
         """Turnover and cost, cash, the effective number of assets, growth (a row, logarithmic),
         and half the absolute differences to the anchor, if there is one."""
-        costs, wait = self.costs, Context(rows=self.lag)
+        costs = self.costs
         market, held = step.state.market, step.state.holding.weights
-        moved = self.relatives(market, step.next_state.market)
+        next_market = step.next_state.market
+        moved, at = self.relatives(market, next_market), self.contexts(market, next_market)
         # What is held next is the target, drifted.
-        target = grown(step.next_state.holding.weights, 1 / costs.carry(moved.coming, Context()))
-        waiting = costs.carry(moved.waiting, wait)
-        before, after = grown(held, waiting), grown(target, waiting)
-        remainder, paid = costs.trade(before, after, wait)
+        after = step.next_state.holding.weights
+        target = grown(after, 1 / costs.growth(after, moved.coming, at.coming))
+        before, after = (
+            grown(w, costs.growth(w, moved.waiting, at.waiting)) for w in (held, target)
+        )
+        remainder, paid = costs.trade(before, after, at.trade)
         assets = target[1:]
         measured = {
-            "growth": jnp.log(remainder * (after * costs.carry(moved.earning, Context())).sum()),
+            "growth": jnp.log(
+                remainder * (after * costs.growth(after, moved.earning, at.earning)).sum()
+            ),
             "turnover": traded(before, after, remainder),
             "cost": sum(paid.values()),
             "cash": target[0],
@@ -307,19 +333,29 @@ class Market(ExogenousTask):
     def _earn(
         self, market: PyTree, next_market: PyTree, holding: Holding, target: Float[Array, " entry"]
     ) -> tuple[Float[Array, ""], Holding]:
-        costs, moved = self.costs, self.relatives(market, next_market)
-        wait = Context(rows=self.lag)
-        waiting = costs.carry(moved.waiting, wait)
-        before, after = grown(holding.weights, waiting), grown(target, waiting)
-        remainder, paid = costs.trade(before, after, wait)
-        growth = remainder * (after * costs.carry(moved.earning, Context())).sum()
+        costs, wealth_may_end = self.costs, not self.feasible.long_only
+        moved, at = self.relatives(market, next_market), self.contexts(market, next_market)
+        before = grown(holding.weights, costs.growth(holding.weights, moved.waiting, at.waiting))
+        after = grown(target, costs.growth(target, moved.waiting, at.waiting))
+        remainder, paid = costs.trade(before, after, at.trade)
+        growth = remainder * (after * costs.growth(after, moved.earning, at.earning)).sum()
+        drifted = grown(target, costs.growth(target, moved.coming, at.coming))
+        if wealth_may_end:
+            lives = growth > RUIN
+            growth = jnp.where(lives, growth, RUIN)
+            drifted = jnp.where(lives, drifted, jnp.eye(drifted.shape[0])[0])
         outcome = Outcome(growth, sum(paid.values()), after)
         reward, state = self.reward_function(holding.reward, outcome)
-        return reward, Holding(grown(target, costs.carry(moved.coming, Context())), state)
+        return reward, Holding(drifted, state)
 
 
-def _part(market: Market, kind: Kind, name: str) -> Any:
-    """The part of a market that a setting names, with the market's values of shared settings."""
-    part = build(kind, name, {})
-    shared = [field.name for field in dataclasses.fields(part) if hasattr(market, field.name)]
-    return dataclasses.replace(part, **{name: getattr(market, name) for name in shared})
+def _part(market: Market, kind: Kind, text: str) -> Any:
+    """The part of a market that a setting names, as ``name`` or ``name(setting=value, …)``.
+
+    Settings that it shares with the market have the market's values, unless they are written out.
+    """
+    name, chosen = settings.called(text)
+    part = build(kind, name, chosen)
+    fields = {field.name for field in dataclasses.fields(part)} - chosen.keys()
+    shared = {name: getattr(market, name) for name in fields if hasattr(market, name)}
+    return dataclasses.replace(part, **shared)

@@ -19,7 +19,9 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Position, Simplex
 from qfolio.portfolio import anchors, signals
-from qfolio.portfolio.market import Holding, Market, Relatives, Signalled
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import grown
+from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
 
 Row = Int[Array, ""]
@@ -40,6 +42,7 @@ class Portfolio(Market):
     limits: Float[Array, " asset"]  # largest weight of each asset; 0 where it cannot be traded
     center: Float[Array, " channel"]  # of the observed channels, from the rows of the part
     scale: Float[Array, " channel"]
+    conditions: Conditions  # the columns that the cost model reads; empty if it reads none
     first_decision: Row
     last_decision: Row
     window: int = static(60)  # rows that are observed
@@ -76,6 +79,7 @@ class Portfolio(Market):
             limits=jnp.zeros(assets),
             center=jnp.zeros(1 + channels),
             scale=jnp.ones(1 + channels),
+            conditions=Conditions(jnp.zeros(0), {}, {}),
             first_decision=jnp.array(0, jnp.int32),
             last_decision=jnp.array(0, jnp.int32),
             **settings,
@@ -93,8 +97,9 @@ class Portfolio(Market):
         computed = signals.compute(chosen, prices.values, self.signal_scale, columns)
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
         followed = anchors.path(self.anchor, prices) if self.anchor else logs[:0]
-        where = lambda t: (t.log_relatives, t.extra, t.anchors)  # noqa: E731
-        arrays = [jnp.asarray(x, jnp.float32) for x in (logs, extra, followed)]
+        where = lambda t: (t.log_relatives, t.extra, t.anchors, t.conditions)  # noqa: E731
+        known = Conditions.of(prices, self.costs.columns)
+        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (logs, extra, followed, known))
         return eqx.tree_at(where, self, arrays)
 
     def __check_init__(self) -> None:
@@ -242,6 +247,21 @@ class Portfolio(Market):
             earning=jnp.exp(after[self.lag]),
             coming=jnp.exp(after[0]),
         )
+
+    def contexts(self, market: Row, next_market: Row) -> Contexts:
+        executed, then = market + self.lag, self.conditions
+        return Contexts(
+            waiting=then.holding(market, executed),
+            trade=then.trade(executed, self.lag),
+            earning=then.holding(executed, executed + 1),
+            coming=then.holding(market, market + 1),
+        )
+
+    def drifted(self, row: Row, weights: Float[Array, " entry"]) -> Float[Array, " entry"]:
+        """Weights one row after they were held at a row, without a trade."""
+        last = self.log_relatives.shape[0] - 1
+        period = self.conditions.holding(row, jnp.minimum(row + 1, last))
+        return grown(weights, self.costs.growth(weights, self.coming(row), period))
 
     def coming(self, row: Row) -> Float[Array, " asset"]:
         """Relatives from a row to the next; 1 after the table's last row."""

@@ -1,6 +1,6 @@
 """Replays agents and baselines over the folds of a backtest."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -14,6 +14,7 @@ from qfolio.portfolio.backtest.folder import TOGETHER
 from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
+from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.following import follow
 from qfolio.portfolio.prices.findings import listing
 from qfolio.portfolio.prices.table import Prices
@@ -82,6 +83,16 @@ class Replay(NamedTuple):
             if (late := [self.prices.assets[j] for j in np.flatnonzero(~tradable)])
         ]
 
+    def wiped_out(self, entries: Mapping[str, Entry]) -> list[str]:
+        """A note on each strategy that lost everything."""
+        counts = {name: int(entry.simulation.ruined.sum()) for name, entry in entries.items()}
+        return [
+            f"{name} was wiped out: its debts exceeded what it owned"
+            + (f", with {count} of {len(entries[name].decisions)} seeds." if count > 1 else ".")
+            for name, count in counts.items()
+            if count
+        ]
+
     def agent(
         self, name: str, agent: Agent, stretches: Sequence[Stretch], seeds: int
     ) -> dict[str, Entry]:
@@ -115,5 +126,7 @@ class Replay(NamedTuple):
             first=self.folds[0].decisions.start,
             cost=self.task.costs,
             lag=self.task.lag,
+            conditions=Conditions.of(self.prices, self.task.costs.columns),
+            long_only=self.task.feasible.long_only,
         )
         return Entry(kind, decisions, simulation)

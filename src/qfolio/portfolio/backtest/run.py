@@ -120,7 +120,7 @@ class Backtest:
             cost: One-way trading cost, as a fraction of the value traded.
             cap: Largest weight of one asset.
             cost_model: Cost of trading and holding, in training and replay: a name of the registry,
-                or your own as ``module:Name``.
+                or your own as ``module:Name``, with its settings as in "itemized(fixed=5)".
             baselines: Names of the baselines, likewise; equal weights are always included.
             seeds: Agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
             episodes: Training episodes in a fold of each agent without a preset.
@@ -307,7 +307,7 @@ class Backtest:
             for name, rule in rules.items():
                 entries[name], said = replay.baseline(kind, name, rule)
                 notes += said
-        return entries, notes
+        return entries, notes + replay.wiped_out(entries)
 
     @property
     def dates(self) -> np.ndarray:

@@ -4,20 +4,28 @@ The rule of timing: a decision at row t sees prices up to row t and sets target 
 prices of row t. This is an order in shares, scaled to the wealth. It is executed at the close of
 row t + lag, after prices have moved both the holding and the order, and the cost of that trade is
 charged to the return of row t + lag + 1.
+
+An account whose debts exceed what it owns is wiped out: its return is −1, and 0 from then on. So is
+one with an order whose debts exceed what it buys by the time of its trade.
 """
 
 import operator
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.costs import Context, CostModel, Proportional, traded
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import Context, CostModel, Proportional, traded, with_cash
 
 TOLERANCE = 1e-6
 """How far weights may be off the simplex; within it they are projected back."""
+
+ROUNDS = 100
+"""Most repetitions until costs and the wealth that they depend on agree."""
 
 BLOCK = 60_000
 """Numbers per array in a block: several such arrays fit into a core's cache."""
@@ -43,10 +51,23 @@ class Simulation:
     weights: Floats
     """Weights right after the trade, cash first, of shape (..., D, N + 1)."""
 
+    costs: dict[str, Floats] = field(default_factory=dict)
+    """``cost`` by kind, each of shape (..., D)."""
+
+    financing: Floats | None = None
+    """Share of the wealth after the trade that interest, fees and carry earned until the next one,
+    negative if they cost, of shape (..., D); None if the cost model has none."""
+
+    @property
+    def ruined(self) -> Bools:
+        """Whether an account was wiped out, of shape (...)."""
+        return np.asarray((self.returns <= -1).any(-1))
+
     @cached_property
     def growth(self) -> Floats:
-        """Net log growth, of shape (..., D)."""
-        return np.log1p(self.returns)
+        """Net log growth, of shape (..., D); minus infinity where an account is wiped out."""
+        with np.errstate(divide="ignore"):
+            return np.log1p(self.returns)
 
     @cached_property
     def wealth(self) -> Floats:
@@ -63,6 +84,8 @@ def simulate(
     cost: float | CostModel,
     lag: int = 1,
     start: ArrayLike | None = None,
+    conditions: Conditions | None = None,
+    long_only: bool = True,
 ) -> Simulation:
     """Replay decisions made at the rows first, first + 1, …; each earns one return.
 
@@ -75,14 +98,16 @@ def simulate(
             of the costs of trading and holding.
         lag: Rows between a decision and its trade, 0 or more.
         start: Weights held at row ``first``, of shape (N + 1,) or (..., N + 1) (default: all cash).
+        conditions: The columns of the table that the cost model reads, at the rows of ``values``.
+        long_only: Whether negative weights are refused.
 
     Returns:
         The returns of rows first + lag + 1 to first + lag + D, and the trades before them.
 
     Raises:
         QfolioError: There are too few rows, cost or lag is out of range, a price is not positive
-            or missing after an asset's start, or weights are off the simplex by more than 1e-6 or
-            positive before the asset's first price.
+            or missing after an asset's start, or weights do not sum to 1, are negative though
+            long-only (both by more than 1e-6), or held before the asset's first price.
     """
     prices, begun = _prices(values)
     orders = np.asarray(decisions, dtype=float)
@@ -114,10 +139,17 @@ def simulate(
             f"be {(entries,)} or {(*leading, entries)}, cash first."
         ) from None
 
+    if conditions is None:
+        if cost.columns:
+            read = ", ".join(cost.columns)
+            raise QfolioError(f"{type(cost).__name__} reads {read}; give the table's conditions.")
+        conditions = Conditions(np.empty(0), {}, {})
     shown = prices[first : first + lag + days + 1]
-    market = _Market(shown, begun[first:], first, days, lag, cost)
     orders, held = orders.reshape(-1, days, entries), held.reshape(-1, entries)
-    result = [*(np.empty(orders.shape[:2]) for _ in range(3)), np.empty(orders.shape)]
+    market = _Market(shown, begun[first:], first, lag, cost, conditions, long_only)
+    returns, turnover, paid = (np.empty(orders.shape[:2]) for _ in range(3))
+    financing = None if market.income is None else np.empty(orders.shape[:2])
+    result = Simulation(returns, turnover, paid, np.empty(orders.shape), {}, financing)
     # glibc returns large freed arrays to the system, which is slower than the arithmetic on them,
     # unless a larger array has been freed before.
     np.empty(2**21)
@@ -125,36 +157,69 @@ def simulate(
     together = max(1, columns // max(1, days))
     for low in range(0, len(orders), together):
         some = slice(low, low + together)
-        part = [array[some] for array in result]
-        _replay(market, orders[some], held[some], columns, part)
-    return Simulation(*(array.reshape(*leading, *array.shape[1:]) for array in result))
+        _replay(market, orders, held, columns, result, some)
+    shaped = lambda array: array.reshape(*leading, *array.shape[1:])  # noqa: E731
+    return Simulation(
+        shaped(returns),
+        shaped(turnover),
+        shaped(paid),
+        shaped(result.weights),
+        {kind: shaped(array) for kind, array in result.costs.items()},
+        None if financing is None else shaped(financing),
+    )
 
 
 class _Market:
-    """The prices from the first decision to the last return, and the cost model.
+    """The prices from the first decision to the last return, the cost model and its columns.
 
     Growth factors of cash and assets have the entries as first axis, also in memory: numpy then
-    sums a few long rows instead of many short ones.
+    sums a few long rows instead of many short ones. Those of what is owned come before those of
+    what is owed; there is only the first if they are the same.
     """
 
     def __init__(
-        self, prices: Floats, begun: Bools, first: int, days: int, lag: int, costs: CostModel
+        self,
+        prices: Floats,
+        begun: Bools,
+        first: int,
+        lag: int,
+        costs: CostModel,
+        conditions: Conditions,
+        long_only: bool,
     ) -> None:
-        self.prices, self.costs = prices, costs
+        self.prices, self.costs, self.conditions = prices, costs, conditions
         self.begun = None if begun.all() else np.insert(begun, 0, True, axis=1)
-        self.first, self.days, self.lag = first, days, lag
-        day = np.arange(days)
-        to_trade, after_trade = self.moved(day, day), self.grown(day + lag, day + lag + 1)
-        self.to_trade, self.after_trade = (r.T.copy()[:, None] for r in (to_trade, after_trade))
+        self.first, self.lag, self.long_only = first, lag, long_only
+        self.days = len(prices) - lag - 1
+        day = np.arange(self.days)
+        columns = lambda growth: growth.T.copy()[:, None]  # noqa: E731
+        self.to_trade = [columns(x) for x in self.moved(day, day)]
+        self.after_trade = [columns(x) for x in self.grown(day + lag, day + lag + 1)]
+        plain = columns(with_cash(prices[day + lag + 1] / prices[day + lag]))
+        income = [growth - plain for growth in self.after_trade]
+        self.income = income if any(x.any() for x in income) else None
 
-    def moved(self, decided: Rows, trade: Rows) -> Floats:
+    def moved(self, decided: Rows, trade: Rows) -> list[Floats]:
         """Growth from days of decisions to the trades of later days' decisions, cash first."""
         return self.grown(decided, trade + self.lag)
 
-    def grown(self, start: Rows, end: Rows) -> Floats:
-        """Growth factors of each entry from one row to another."""
+    def grown(self, start: Rows, end: Rows) -> list[Floats]:
+        """Growth factors of each entry from one row to another, owned and owed."""
         relatives = self.prices[end] / self.prices[start]
-        return np.asarray(self.costs.carry(relatives, Context(rows=end - start)))
+        context = self.conditions.holding(start + self.first, end + self.first)
+        found = self.costs.carry(relatives, context), self.costs.owe(relatives, context)
+        return [np.asarray(growth) for growth in found if growth is not None]
+
+    def trades(self, days: slice, wealth: Floats) -> Context:
+        """The circumstances of the trades of some days."""
+        begin = self.first + self.lag
+        rows = slice(begin + days.start, begin + days.stop)
+        return self.conditions.trade(rows, self.lag, wealth)
+
+
+def _by_sign(weights: Floats, growth: list[Floats]) -> Floats:
+    """The growth factors of a holding's entries."""
+    return growth[0] if len(growth) == 1 else np.where(weights < 0, growth[1], growth[0])
 
 
 def _replay(
@@ -162,51 +227,116 @@ def _replay(
     orders: Floats,
     held: Floats,
     columns: int,
-    result: list[Floats],
+    result: Simulation,
+    some: slice,
 ) -> None:
-    """Computes the result of orders of shape (S, D, N + 1), some days at a time.
+    """Computes the result of some orders of shape (S, D, N + 1), a few days at a time.
 
     Arrays in here have the shape (N + 1, S, days). Between trades, weights times relatives give
     values, which are normalised only by their sums.
     """
-    returns, turnover, paid, weights = result
-    start, given = _on_simplex(market, held[:, None], 0)
+    orders, held = orders[some], held[some]
+    start, given = _checked(market, held[:, None], 0)
     if not given.all():
         raise QfolioError("The start weights are NaN; give weights that sum to 1, or none at all.")
     start = start[..., 0].T
-    worth = (start * market.moved(np.array(0), np.array(0))).T  # of the holding at the next trade
+    # Of the holding at the next trade.
+    worth = start * _by_sign(start, market.moved(np.array(0), np.array(0)))
     latest = np.full((len(orders), 1), -1)  # day of the last order
+    wealth, ruined = np.ones((len(orders), 1)), np.zeros((len(orders), 1), bool)
     for low in range(0, market.days, columns):
         now = slice(low, min(low + columns, market.days))
-        after, given = _on_simplex(market, orders[:, now], low)
-        after *= market.to_trade[..., now]
+        after, given = _checked(market, orders[:, now], low)
+        after *= _by_sign(after, [growth[..., now] for growth in market.to_trade])
         day = np.where(given, np.arange(now.start, now.stop), -1)
         day = np.maximum(np.maximum.accumulate(day, axis=1), latest)
         latest = day[:, -1:]
         if not given.all():
             who, when = np.nonzero(~given)
             source = day[who, when]
-            ordered = np.maximum(orders[who, source], 0)
+            ordered = orders[who, source]
+            if market.long_only:
+                ordered = np.maximum(ordered, 0)
             wanted = np.where(source[:, None] < 0, start[who], ordered)
-            after[:, who, when] = (wanted * market.moved(np.maximum(source, 0), when + low)).T
+            moved = market.moved(np.maximum(source, 0), when + low)
+            after[:, who, when] = (wanted * _by_sign(wanted, moved)).T
+        broke = _settled(after)
         after /= after.sum(0)
 
-        grown = np.concatenate([worth[..., None], after * market.after_trade[..., now]], axis=-1)
-        worth = grown[..., -1]
+        growing = _by_sign(after, [growth[..., now] for growth in market.after_trade])
+        grown = np.concatenate([worth.T[..., None], after * growing], axis=-1)
+        worth = grown[..., -1].T
+        lost = _settled(grown)
         growth = grown.sum(0)
         before = grown[..., :-1] / growth[:, :-1]
 
         before, after = np.moveaxis(before, 0, -1), np.moveaxis(after, 0, -1)
-        trade = Context(rows=market.lag)
-        remainder, costs = market.costs.trade(before, after, trade)
+        remainder, costs, wealth = _traded(market, before, after, given, growth[:, 1:], wealth, now)
+        here = some, now
+        result.returns[here] = remainder * growth[:, 1:] - 1
+        result.turnover[here] = np.where(given, traded(before, after, remainder), 0)
+        result.cost[here] = np.where(given, sum(costs.values()), 0)
+        result.weights[here] = after
+        for kind, paid in costs.items():
+            of_kind = result.costs.setdefault(kind, np.zeros_like(result.cost))
+            of_kind[here] = np.where(given, paid, 0)
+        if result.financing is not None and market.income is not None:
+            entries = np.moveaxis(after, -1, 0)
+            income = _by_sign(entries, [rate[..., now] for rate in market.income])
+            result.financing[here] = (entries * income).sum(0)
+        lost = broke | lost[:, 1:] | (remainder <= 0)
+        if lost.any() or ruined.any():
+            ruined = _stop(result, here, lost, ruined)
+
+
+def _traded(
+    market: _Market,
+    before: Floats,
+    after: Floats,
+    given: Bools,
+    growth: Floats,
+    wealth: Floats,
+    now: slice,
+) -> tuple[Floats, Mapping[str, Floats], Floats]:
+    """Remainder factors and costs of some days, and the wealth after them, of shape (S, 1).
+
+    A trade's costs may depend on the wealth, which earlier trades' costs have lowered. Starting
+    from no costs, each repetition is right for one more day at least, and far sooner in practice.
+    """
+    remainder = np.ones(given.shape)
+    for _ in range(ROUNDS):
+        path = wealth * np.cumprod(remainder * growth, axis=1)
+        paths = np.concatenate([wealth, path[:, :-1]], axis=1)
+        last = remainder
+        remainder, costs = market.costs.trade(before, after, market.trades(now, paths))
         remainder = np.where(given, remainder, 1)
-        returns[:, now] = remainder * growth[:, 1:] - 1
-        turnover[:, now] = np.where(given, traded(before, after, remainder), 0)
-        paid[:, now] = np.where(given, sum(costs.values()), 0)
-        weights[:, now] = after
+        if not market.costs.depends_on_wealth or np.array_equal(last, remainder):
+            break
+    return remainder, costs, wealth * np.prod(remainder * growth, axis=1, keepdims=True)
 
 
-def _on_simplex(market: _Market, weights: Floats, day: int) -> tuple[Floats, Bools]:
+def _settled(worth: Floats) -> Bools:
+    """Whether debts exceed what is owned, of shape (S, days); such accounts then hold cash."""
+    broke = worth.sum(0) <= 0
+    if broke.any():
+        worth[:, broke] = np.eye(len(worth))[:, :1]
+    return np.asarray(broke)
+
+
+def _stop(result: Simulation, here: tuple[slice, slice], lost: Bools, ruined: Bools) -> Bools:
+    """Ends the accounts that are wiped out, or were before; returns which, of shape (S, 1)."""
+    before = np.maximum.accumulate(np.concatenate([ruined, lost[:, :-1]], axis=1), axis=1)
+    over = before | lost
+    series = [result.turnover, result.cost, *result.costs.values()]
+    for array in (*series, *([] if result.financing is None else [result.financing])):
+        array[here] = np.where(before, 0, array[here])
+    result.returns[here] = np.where(before, 0, np.where(lost, -1, result.returns[here]))
+    cash = np.eye(result.weights.shape[-1])[0]
+    result.weights[here] = np.where(before[..., None], cash, result.weights[here])
+    return over[:, -1:]
+
+
+def _checked(market: _Market, weights: Floats, day: int) -> tuple[Floats, Bools]:
     """Checks weights of shape (S, days, N + 1) from a day on.
 
     Returns them with the assets as first axis, and whether they are given, of shape (S, days).
@@ -214,21 +344,24 @@ def _on_simplex(market: _Market, weights: Floats, day: int) -> tuple[Floats, Boo
     columns = np.moveaxis(weights, -1, 0).copy()
     total, least = columns.sum(0), columns.min(0)
     given = ~np.isnan(total)
-    fits = (abs(total - 1) <= TOLERANCE) & (least >= -TOLERANCE)
+    fits = abs(total - 1) <= TOLERANCE
+    if market.long_only:
+        fits &= least >= -TOLERANCE
     if not fits.all():
         fits |= np.isnan(columns).all(0)
         if not fits.all():
             who, when = np.argwhere(~fits)[0]
+            positive = " and not be negative" if market.long_only else ""
             raise QfolioError(
                 f"Weights at row {market.first + day + when} sum to {total[who, when]:.8g}, with a "
-                f"minimum of {least[who, when]:.3g}; they must sum to 1 and not be negative "
-                "(or all be NaN, which gives no order)."
+                f"minimum of {least[who, when]:.3g}; they must sum to 1{positive} (or all be NaN, "
+                "which gives no order)."
             )
-    if (least < 0).any():
+    if market.long_only and (least < 0).any():
         np.maximum(columns, 0, out=columns)
     if market.begun is not None:
         begun = market.begun[day : day + columns.shape[-1]].T[:, None]
-        early = (columns > 0) & ~begun
+        early = (columns != 0) & ~begun & given
         if early.any():
             asset, _, when = np.argwhere(early)[0]
             raise QfolioError(

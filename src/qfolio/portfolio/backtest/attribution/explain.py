@@ -22,7 +22,6 @@ from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
 from qfolio.portfolio.backtest.folder import followed
 from qfolio.portfolio.backtest.replay import Entry, Stretch
 from qfolio.portfolio.backtest.run import EQUAL_WEIGHT, Backtest
-from qfolio.portfolio.costs import Context
 
 
 def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
@@ -72,10 +71,11 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
 
 def held_returns(backtest: Backtest, stretch: Stretch, days: int) -> Floats:
     """Returns of cash and assets from each day's trade to the next, shape (days, N + 1)."""
-    begin = stretch.fold.decisions.start + backtest.config.lag
-    values = backtest.prices.values[begin : begin + days + 1]
-    relatives = np.nan_to_num(values[1:] / values[:-1], nan=1.0)
-    return np.asarray(stretch.task.costs.carry(relatives, Context())) - 1
+    task, begin = stretch.task, stretch.fold.decisions.start + backtest.config.lag
+    rows = begin + np.arange(days)
+    values = backtest.prices.values
+    relatives = np.nan_to_num(values[rows + 1] / values[rows], nan=1.0)
+    return np.asarray(task.costs.carry(relatives, task.conditions.holding(rows, rows + 1))) - 1
 
 
 def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> Rule:

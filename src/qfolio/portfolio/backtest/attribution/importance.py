@@ -100,9 +100,16 @@ def importance(
             moved.append(float(abs(each - targets).max()))
             weights = each.astype(float)
             weights /= weights.sum(-1, keepdims=True)
-            logs.append(
-                simulate(values, weights, first=first, cost=task.costs, lag=task.lag).growth
+            replayed = simulate(
+                values,
+                weights,
+                first=first,
+                cost=task.costs,
+                lag=task.lag,
+                conditions=task.conditions,
+                long_only=task.feasible.long_only,
             )
+            logs.append(replayed.growth)
     lost = (logs[0] - np.array(logs[1:])).reshape(count + 1, draws, -1)
     each = periods_per_year * lost.mean(2)
     worth = [

@@ -1,0 +1,91 @@
+"""What a market knows at each row besides prices, as cost models use it: dates and columns."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from numpy.typing import NDArray
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.costs import Context
+from qfolio.portfolio.prices.table import Prices
+
+YEAR = np.timedelta64(365, "D") / np.timedelta64(1, "s")
+"""Seconds in a year of interest (actual/365)."""
+
+MEMORY = 21
+"""Log returns that a volatility is estimated from."""
+
+Floats = NDArray[np.float64]
+
+
+class Conditions(eqx.Module):
+    """Dates and columns of a table, in numpy or jax arrays; empty if a cost model reads none.
+
+    years: time of each row since the first, shape (row,). values: each column at each row, of shape
+    (row, asset), or (row, 1) if all assets share it, by name. sums: their integrals over the years
+    since the first row, likewise; between two rows a column keeps its value at the first.
+    """
+
+    years: Any
+    values: dict[str, Any]
+    sums: dict[str, Any]
+
+    @staticmethod
+    def of(prices: Prices, columns: Sequence[str]) -> "Conditions":
+        """The columns that a cost model asks for. Raises QfolioError if the table lacks one."""
+        values = {name: _column(name, prices) for name in columns if name != "years"}
+        if not columns:
+            return Conditions(np.empty(0), {}, {})
+        years = (prices.dates - prices.dates[0]) / np.timedelta64(1, "s") / YEAR
+        return Conditions(years, values, {name: _sums(x, years) for name, x in values.items()})
+
+    def part(self, start: int, stop: int) -> "Conditions":
+        """Those of some rows, for tables that begin with the first of them."""
+        values, sums = ({k: x[start:stop] for k, x in d.items()} for d in (self.values, self.sums))
+        return Conditions(self.years[start:stop], values, sums)
+
+    def trade(self, row: Any, rows: Any, wealth: Any = 1.0) -> Context:
+        """The circumstances of trades at some rows, ``rows`` after their decisions."""
+        columns = {name: x[row] for name, x in self.values.items()}
+        return Context(rows=rows, columns=columns, wealth=wealth)
+
+    def holding(self, start: Any, end: Any) -> Context:
+        """The holding periods from some rows to others."""
+        if not self.years.shape[0]:
+            return Context(rows=end - start)
+        columns = {name: x[end] - x[start] for name, x in self.sums.items()}
+        return Context(end - start, self.years[end] - self.years[start], columns)
+
+
+def _column(name: str, prices: Prices) -> Floats:
+    """A column's values, of shape (row, asset) or (row, 1); 0 before an asset's first price."""
+    if name == "price":
+        return np.nan_to_num(prices.values)
+    if name in prices.feature_names:
+        return np.nan_to_num(prices.features[..., prices.feature_names.index(name)])
+    if name == "volatility":
+        return _volatility(prices.values)
+    known = ", ".join(prices.feature_names) or "none"
+    raise QfolioError(
+        f"The cost model reads the column {name!r}, which the price table does not have (it has "
+        f"{known}); load it as a feature, or give a number instead."
+    )
+
+
+def _sums(values: Floats, years: Floats) -> Floats:
+    each = values[:-1] * np.diff(years)[:, None]
+    return np.concatenate([np.zeros_like(values[:1]), np.cumsum(each, 0)])
+
+
+def _volatility(values: Floats) -> Floats:
+    """Of the log returns up to each row, ``MEMORY`` of them, or as many as there are."""
+    logs = np.zeros(values.shape)
+    logs[1:] = np.nan_to_num(np.diff(np.log(values), axis=0))
+    sums, squares = (np.cumsum(x, 0) for x in (logs, logs**2))
+    counts = np.minimum(np.arange(len(values)), MEMORY)
+    before = np.arange(len(values)) - counts
+    n = np.maximum(counts, 1)[:, None]
+    mean, square = (sums - sums[before]) / n, (squares - squares[before]) / n
+    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0)))

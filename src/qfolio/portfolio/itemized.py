@@ -1,0 +1,205 @@
+"""Costs by kind: commission, taxes, spread and impact of trading; interest, fees and carry."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.fields import require
+from qfolio.portfolio.costs import Context, CostModel
+
+COLUMN = "column:"
+"""Prefix of a quantity that is a column of the price table."""
+
+SMALLEST = 1e-6
+"""Smaller changes of a weight are no orders: they pay no fixed or minimum commission."""
+
+STEPS = 6
+"""Newton's steps under jax; in numpy they go on until nothing changes, up to ``MOST``."""
+
+MOST = 60
+
+TINY = 1e-20
+"""Keeps roots and ratios of nothing finite."""
+
+
+@dataclass(frozen=True)
+class Itemized(CostModel):
+    """Costs of trading and holding by kind; each is 0 by default, except the commission.
+
+    A quantity is a number, or "column:NAME" for a column of the price table. Rates are fractions a
+    year, accrued continuously on the days between rows (actual/365); sums of money are in units of
+    the prices.
+
+    cost: commission, as a share of the value traded. buy, sell: quantities, further shares of the
+    value bought and sold, such as a stamp duty. spread: quantity, the quoted spread as a share of
+    the price, of which a trade pays half. fixed, minimum: money for each order, and its least
+    commission. impact, impact_power: a trade of the share p of a row's volume moves its price by
+    impact · σ · p^impact_power (a square root by default; 1 is linear), where σ is the volatility
+    of a row's returns. volume: quantity, in shares. capital: wealth at the start. cash_rate:
+    quantity, the rate that cash earns. borrow_spread: what a loan costs above it. borrow_fee:
+    quantity, the rate that assets sold short cost. carry: quantity, the rate that holding an asset
+    earns besides its price (a dividend paid out), or costs if negative (a management fee); a short
+    position pays it.
+
+    Source of the impact: R. Almgren, C. Thum, E. Hauptmann and H. Li, "Direct Estimation of Equity
+    Market Impact" (2005); B. Tóth et al., "Anomalous Price Impact and the Critical Nature of
+    Liquidity in Financial Markets" (2011).
+    """
+
+    cost: float = 0.001
+    buy: str = "0"
+    sell: str = "0"
+    spread: str = "0"
+    fixed: float = 0.0
+    minimum: float = 0.0
+    impact: float = 0.0
+    impact_power: float = 0.5
+    volume: str = "column:volume"
+    capital: float = 1e6
+    cash_rate: str = "0"
+    borrow_spread: float = 0.0
+    borrow_fee: str = "0"
+    carry_rate: str = "0"
+
+    def __post_init__(self) -> None:
+        require(self, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
+        require(self, "fixed minimum impact", lambda x: 0 <= x < math.inf, "at least 0")
+        require(self, "impact_power", lambda x: 0 < x <= 2, "above 0 and at most 2")
+        require(self, "capital", lambda x: 0 < x < math.inf, "above 0")
+        require(self, "borrow_spread", lambda x: 0 <= x <= 1, "from 0 to 1, a year")
+        for name in ("buy", "sell", "spread"):
+            require(self, name, lambda x: _fits(x, 0, 0.2), "from 0 to 0.2, or column:NAME")
+        require(self, "volume", lambda x: _fits(x, 1e-9, math.inf), "above 0, or column:NAME")
+        for name in ("cash_rate", "borrow_fee", "carry_rate"):
+            require(self, name, lambda x: _fits(x, -1, 1), "from -1 to 1, a year, or column:NAME")
+
+    @property
+    def depends_on_wealth(self) -> bool:  # type: ignore[override]
+        return self.fixed > 0 or self.minimum > 0 or self.impact > 0
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        read = ["buy", "sell", "spread", "cash_rate", "borrow_fee", "carry_rate"]
+        read += ["volume"] * (self.impact > 0)
+        columns = [_column(getattr(self, name)) for name in read]
+        named = [column for column in columns if column is not None]
+        named += ["volatility", "price"] * (self.impact > 0)
+        financed = any(getattr(self, name) != "0" for name in ("cash_rate", "borrow_fee"))
+        timed = financed or self.borrow_spread > 0 or self.carry_rate != "0"
+        return tuple(dict.fromkeys([*named, *["years"] * timed]))
+
+    def trade(self, before: Any, after: Any, context: Context) -> tuple[Any, dict[str, Any]]:
+        """The remainder factor mu solves mu = 1 − Σᵢ kᵢ(mu·bᵢ − wᵢ), with the costs kᵢ of a trade.
+
+        The sum is convex in mu, so that Newton's method descends to the root from mu = 1, and its
+        last step has the derivatives of the root.
+        """
+        xp = before.__array_namespace__()
+        held, wanted = before[..., 1:], after[..., 1:]
+        rates = _Rates(self, context, abs(held - wanted) > SMALLEST, held.dtype)
+        remainder = xp.ones_like(before[..., 0])
+        for _ in range(MOST if xp is np else STEPS):
+            change = remainder[..., None] * wanted - held
+            paid, slope = rates.paid(change)
+            total = sum(kind.sum(-1) for kind in paid.values())
+            last = remainder
+            remainder = last - (last - 1 + total) / (1 + (slope * wanted).sum(-1))
+            remainder = xp.maximum(remainder, xp.zeros_like(remainder))
+            if xp is np and (abs(remainder - last) <= np.finfo(last.dtype).eps).all():
+                break
+        paid, _ = rates.paid(remainder[..., None] * wanted - held)
+        return remainder, {name: kind.sum(-1) for name, kind in paid.items()}
+
+    def carry(self, relatives: Any, context: Context) -> Any:
+        return self._grown(relatives, context, 0.0, "0")
+
+    def owe(self, relatives: Any, context: Context) -> Any | None:
+        if self.borrow_spread == 0 and self.borrow_fee == "0":
+            return None
+        return self._grown(relatives, context, self.borrow_spread, self.borrow_fee)
+
+    def _grown(self, relatives: Any, context: Context, spread: float, fee: str) -> Any:
+        """Growth of cash at its rate plus a spread, and of assets with their carry plus a fee."""
+        xp = relatives.__array_namespace__()
+        years = xp.asarray(context.years, dtype=relatives.dtype)[..., None]
+
+        def accrued(quantity: str) -> Any:  # of shape (..., 1) or (..., N)
+            column = _column(quantity)
+            return float(quantity) * years if column is None else context.columns[column]
+
+        interest = accrued(self.cash_rate)
+        if interest.shape[-1] != 1:
+            raise QfolioError(
+                f"cash_rate is {self.cash_rate}, which has a number for each asset; name a column "
+                "with one rate for each date."
+            )
+        growth = relatives
+        if {self.carry_rate, fee} != {"0"}:
+            growth = relatives * xp.exp(accrued(self.carry_rate) + accrued(fee))
+        cash = xp.exp(interest + spread * years)
+        return xp.concat([xp.broadcast_to(cash, (*growth.shape[:-1], 1)), growth], axis=-1)
+
+
+class _Rates:
+    """What a trade pays, asset by asset, of changes of weights."""
+
+    def __init__(self, model: Itemized, context: Context, ordered: Any, dtype: Any) -> None:
+        xp = self.xp = ordered.__array_namespace__()
+        self.model, self.ordered = model, ordered
+
+        def known(quantity: str) -> Any:
+            column = _column(quantity)
+            return float(quantity) if column is None else context.columns[column]
+
+        half = known(model.spread) / 2
+        sides = [{"commission": model.cost, "tax": known(tax), "spread": half}
+                 for tax in (model.buy, model.sell)]  # fmt: skip
+        buying, self.selling = sides
+        # Spending m buys (1 − c)m, so that buying v costs v·c/(1 − c).
+        kept = 1 - sum(buying.values())
+        self.buying = {kind: rate / kept for kind, rate in buying.items()}
+        self.money = model.capital * xp.asarray(context.wealth, dtype=dtype)[..., None]
+        if model.impact > 0:
+            volume = known(model.volume) * context.columns["price"]
+            share = self.money / xp.maximum(xp.asarray(volume, dtype=dtype), TINY)
+            volatility = context.columns["volatility"]
+            self.impact = model.impact * volatility * share**model.impact_power
+
+    def paid(self, change: Any) -> tuple[dict[str, Any], Any]:
+        """Shares of wealth by kind of cost, and their derivative by the change of a weight."""
+        xp, model, size = self.xp, self.model, abs(change)
+        bought, sold = (change > 0) * size, (change < 0) * size
+        rates = {kind: (self.buying[kind], self.selling[kind]) for kind in self.buying}
+        paid = {kind: bought * buy + sold * sell for kind, (buy, sell) in rates.items()}
+        slope = (change > 0) * sum(self.buying.values()) - (change < 0) * sum(self.selling.values())
+        if model.minimum > 0:
+            least = self.ordered * model.minimum / self.money
+            buy, sell = rates["commission"]
+            under = paid["commission"] < least
+            paid["commission"] = xp.where(under, least, paid["commission"])
+            slope = slope - under * ((change > 0) * buy - (change < 0) * sell)
+        if model.fixed > 0:
+            paid["fixed"] = self.ordered * model.fixed / self.money
+        if model.impact > 0:
+            # A power of 0 has no derivative; below TINY the impact is 0 to the last digit.
+            power = xp.maximum(size, TINY) ** model.impact_power
+            paid["impact"] = self.impact * power * size
+            slope = slope + xp.sign(change) * self.impact * (1 + model.impact_power) * power
+        return paid, slope
+
+
+def _column(quantity: str) -> str | None:
+    """The column that a quantity names; None for a number."""
+    return quantity.removeprefix(COLUMN) if quantity.startswith(COLUMN) else None
+
+
+def _fits(text: str, least: float, most: float) -> bool:
+    if text.startswith(COLUMN):
+        return len(text) > len(COLUMN)
+    try:
+        return least <= float(text) <= most
+    except ValueError:
+        return False
