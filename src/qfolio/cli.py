@@ -21,10 +21,11 @@ def run() -> NoReturn:
     """Runs the command line; a QfolioError becomes one sentence and exit code 2."""
     import tyro
 
+    from qfolio.commands.allocation import allocate
     from qfolio.commands.board import board
     from qfolio.commands.comparison import compare
     from qfolio.commands.continual import continual
-    from qfolio.commands.portfolio import allocate, backtest, prices
+    from qfolio.commands.portfolio import backtest, prices
     from qfolio.commands.study import study
     from qfolio.commands.training import evaluate, train, watch
     from qfolio.commands.tuning import tune

@@ -1,15 +1,12 @@
 """The trades that lead from holdings to target weights."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from qfolio.commands.portfolio import allocate
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.allocation import Allocation, require_fresh
-from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -105,10 +102,11 @@ def test_one_order_leaves_the_noise_of_the_others_alone():
 
 
 def test_whole_shares_by_hand():
-    """Of 19 shares of A (380), 9.5 should go for 4.75 of B: 9 are sold, and 4 bought."""
+    """Of 19 shares of A (380), 9.5 should go for 4.75 of B: 10 are sold for 5 of B."""
     allocation = plan([0, 0.5, 0.5], [19, 0], 0, cost=0.0, whole_shares=True)
-    assert allocation.trades.tolist() == [-9, 4]
-    assert allocation.cash_after == 9 * 20 - 4 * 40
+    assert allocation.trades.tolist() == [-10, 5]
+    assert allocation.cash_after == 0
+    np.testing.assert_allclose(allocation.reached, [0, 9 * 20 / 380, 5 * 40 / 380])
 
 
 def test_whole_shares_are_never_bought_on_credit():
@@ -117,11 +115,12 @@ def test_whole_shares_are_never_bought_on_credit():
     # Of B (40 each), 1.1 of 10 should go for 2.2 of A: one is sold, which pays for 2 of A …
     weights = [0, 44 / 400, 356 / 400]
     assert plan(weights, [0, 10], 0, 0.0, whole_shares=True).trades.tolist() == [2, -1]
-    # … and 0.9 for 1.8: none is sold, so there is no money for the one of A.
+    # … and 0.9 for 1.8: one is sold again. With a cost, it pays for one of A only.
     weights = [0, 36 / 400, 364 / 400]
-    allocation = plan(weights, [0, 10], 0, 0.0, whole_shares=True)
-    assert allocation.trades.tolist() == [0, 0]
-    assert allocation.cash_after == 0
+    assert plan(weights, [0, 10], 0, 0.0, whole_shares=True).trades.tolist() == [2, -1]
+    allocation = plan(weights, [0, 10], 0, 0.01, whole_shares=True)
+    assert allocation.trades.tolist() == [1, -1]
+    assert allocation.cash_after == pytest.approx(40 * 0.99 - 20 / 0.99)
 
 
 def test_fractions_that_are_held_stay_where_whole_shares_are_sold():
@@ -130,45 +129,22 @@ def test_fractions_that_are_held_stay_where_whole_shares_are_sold():
     assert allocation.cash_after == 2 * 20 + 3 * 40
 
 
-def test_what_was_learned_is_kept_last(monkeypatch, tmp_path, capsys):
-    """A refused allocation keeps nothing; assets may start late, long before the last row."""
-    kept = []
-
-    class Updated(Fixed):
-        def __init__(self, updates):
-            super().__init__([1 / 2, 1 / 4, 1 / 4], 0.0)
-            self.updates, self.learned = updates, np.datetime64("2024-12-31", "s")
-
-        def table(self, prices, **options):
-            return prices
-
-        def update(self, prices, episodes=None, *, listeners=(), **options):
-            return Updated(self.updates + 1)
-
-    test_run = SimpleNamespace(
-        prices=PRICES,
-        agents={"dqn": None},
-        config=SimpleNamespace(feature_names=[]),
-        policy=lambda agent: Updated(0),
-        keep=lambda agent, policy: kept.append((agent, policy.updates)),
-    )
-    monkeypatch.setattr(Backtest, "open", lambda folder: test_run)
-    newer = tmp_path / "newer.csv"
-    newer.write_text("date,A,B\n2025-01-01,1,\n2025-01-02,1,2\n2025-01-03,1,2\n")
-    options = {"prices": newer, "as_of": "2025-01-03", "anyway": True, "as_json": True}
-    with pytest.raises(QfolioError, match="nothing to allocate"):
-        allocate(tmp_path, update=True, **options)
-    assert kept == []
-    allocate(tmp_path, capital=100, **options)
-    assert kept == []
-    allocate(tmp_path, update=True, capital=100, **options)
-    assert kept == [("dqn", 1)]
-    assert capsys.readouterr().out.count("2025-01-03") == 2
-
-
 def test_nothing_to_allocate():
     with pytest.raises(QfolioError, match="nothing to allocate"):
         plan([1, 0, 0], [0, 0], 0)
+
+
+def test_costs_by_kind():
+    """Two orders of 1 money each, and a spread of 2 % of which half is paid."""
+    policy = Fixed([0.2, 0.4, 0.4], 0.0)
+    model = "itemized(fixed=1,spread=0.02)"
+    policy.task = dataclasses.replace(policy.task, cost_model=model)
+    allocation = Allocation.of(policy, PRICES, np.zeros(2), 10_000.0, whole_shares=True)
+    assert allocation.costs["fixed"] == pytest.approx(2)
+    bought = allocation.trades @ allocation.prices
+    assert allocation.costs["spread"] == pytest.approx(bought * 0.01, rel=0.02)
+    assert allocation.cash_after == pytest.approx(10_000 - bought - allocation.cost)
+    np.testing.assert_allclose(allocation.reached, [0.2, 0.4, 0.4], atol=40 / 10_000)
 
 
 def test_prices_of_another_day():

@@ -264,42 +264,42 @@ def _growth(entry: "Active | Pooled") -> tuple[str, str]:
     return growth, f"{low.removesuffix('%')} … {high}"
 
 
-def print_allocation(allocation: "Allocation", standing: "Standing", trained: str) -> None:
-    """The agent, its trades, and their cost.
+def print_allocation(allocation: "Allocation", standing: "Standing", trained: str | None) -> None:
+    """What is followed and what its backtest found, the trades, and their cost.
 
-    trained: the date of the last row that the policy has learned from.
+    trained: the date of the last row that the policy has learned from, if it has.
     """
-    say(f"Agent: {standing.agent}, trained on prices up to {trained}.")
-    say(f"In its backtest: {standing.verdict or 'not finished, so there is no verdict.'}")
+    kind = "Agent" if standing.learned else "Baseline"
+    say(f"{kind}: {standing.agent}" + (f", trained on prices up to {trained}." if trained else "."))
+    found = f"In its backtest: {standing.verdict or 'not finished, so there is no verdict.'}"
+    if standing.worse:
+        console.print(Text(f"WARNING. {printable(found)}", style="bold red"))
+    else:
+        say(found)
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("asset")
-    for name in ("price", "weight now", "target", "trade, money", "trade, shares"):
+    for name in ("price", "weight now", "target", "after", "trade, money", "trade, shares"):
         table.add_column(name, justify="right")
-    held, targets = allocation.held, allocation.weights
-    rows = zip(
-        allocation.assets,
-        allocation.prices,
-        held[1:],
-        targets[1:],
-        allocation.trades,
-        strict=True,
-    )
-    for asset, price, now, target, trade in rows:
-        if now or target or trade:
+    held, targets, after = allocation.held, allocation.weights, allocation.reached
+    for i, asset in enumerate(allocation.assets):
+        trade, price = allocation.trades[i], allocation.prices[i]
+        if held[1 + i] or targets[1 + i] or trade:
             table.add_row(
                 Text(printable(asset)),
                 f"{price:,.2f}",
-                f"{now:.2%}",
-                f"{target:.2%}",
+                f"{held[1 + i]:.2%}",
+                f"{targets[1 + i]:.2%}",
+                f"{after[1 + i]:.2%}",
                 f"{trade * price:+,.2f}",
                 f"{trade:+,.4g}",
             )
-    table.add_row("cash", "", f"{held[0]:.2%}", f"{targets[0]:.2%}", "", "")
+    table.add_row("cash", "", f"{held[0]:.2%}", f"{targets[0]:.2%}", f"{after[0]:.2%}", "", "")
     console.print(table)
+    kinds = ", ".join(f"{kind} {money:,.2f}" for kind, money in allocation.costs.items())
     say(
         f"After the close of {allocation.date}: wealth {allocation.wealth:,.2f}, expected cost "
-        f"{allocation.cost:,.2f}, cash left {allocation.cash_after:,.2f}. "
-        "Assets that are neither held nor wanted are not shown."
+        f"{allocation.cost:,.2f}{f' ({kinds})' if len(allocation.costs) > 1 else ''}, cash left "
+        f"{allocation.cash_after:,.2f}. Assets that are neither held nor wanted are not shown."
     )
 
 

@@ -3,21 +3,35 @@
 import dataclasses
 import datetime
 import math
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
-from qfolio.portfolio.costs import remainder_factor
-from qfolio.portfolio.policy import Policy
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import Context, CostModel
+from qfolio.portfolio.itemized import Itemized
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.whole_shares import whole_shares as rounded
 
 MAX_AGE = datetime.timedelta(days=7)
 """Older prices are stale."""
 
 NOISE = 1e-6
 """Smaller changes of a weight are not ordered, since policies decide in float32."""
+
+
+@runtime_checkable
+class Followed(Protocol):
+    """What can be followed: a learned policy or a baseline."""
+
+    @property
+    def costs(self) -> CostModel: ...
+
+    def weights(self, prices: Any, holdings: Any = None) -> dict[str, float]: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,12 +45,12 @@ class Allocation:
     cash: float
     weights: np.ndarray  # targets, cash first
     trades: np.ndarray  # shares to buy, negative to sell
-    cost: float  # expected, in money
+    costs: dict[str, float]  # expected, in money, by kind
     cash_after: float
 
     @staticmethod
     def of(
-        policy: Policy,
+        policy: Followed,
         prices: Prices,
         shares: np.ndarray,
         cash: float,
@@ -46,81 +60,97 @@ class Allocation:
         """The policy's target after the table's last row, and the trades from the current holding.
 
         The targets are scaled to the wealth after costs (the transaction remainder factor), so that
-        the trades never need more money than there is. Whole shares are rounded toward zero; if the
-        sales then do not cover the purchases, fewer of the cheapest assets are bought.
+        the trades never need more money than there is.
 
         Args:
-            policy: The policy to follow.
+            policy: The policy or baseline to follow.
             prices: Prices up to the row after which to trade.
             shares: Shares held now, of shape (assets,).
             cash: Cash held now, in money.
-            whole_shares: Whether to trade whole shares only.
+            whole_shares: Whether to trade whole shares only, as near to the target as they come.
 
         Raises:
             QfolioError: There is nothing to allocate.
         """
-        last, rate = prices.values[-1], policy.task.cost
-        values = shares * last
-        wealth = values.sum() + cash
+        last = prices.values[-1]
+        known = np.where(np.isnan(last), 0.0, last)  # without a price there are no shares
+        wealth = float(shares @ known + cash)
         if not 0 < wealth < math.inf:
             raise QfolioError(
                 "There is nothing to allocate: give --capital, or --holdings with shares or cash."
             )
-        held = np.append(cash, values) / wealth
+        held = np.append(cash, shares * known) / wealth
         names = ("cash", *prices.assets)
         targets = policy.weights(prices, dict(zip(names, held.tolist(), strict=True)))
         weights = _ordered(np.array([targets[name] for name in names]), held)
-        if np.array_equal(weights, held):
-            trades = np.zeros(len(shares))
-        else:
-            remainder = float(remainder_factor(held, weights, rate))
-            trades = remainder * weights[1:] * wealth / last - shares
-        if whole_shares:
-            trades = _whole(trades, last, cash, rate)
-        money = trades * last
-        spent, received = money[money > 0].sum(), -money[money < 0].sum()
-        # Buying an amount takes amount / (1 − c) of cash; selling it yields (1 − c) of it.
-        cash_after = cash + received * (1 - rate) - spent / (1 - rate)
-        cost = received * rate + spent * rate / (1 - rate)
+        trades = np.zeros(len(shares))
+        context = _context(policy.costs, prices, wealth)
+        after = partial(_settled, policy.costs, context, held, wealth, shares, known)
+        if not np.array_equal(weights, held):
+            remainder = float(policy.costs.trade(held, weights, context)[0])
+            money = remainder * weights[1:] * wealth
+            trades = np.divide(money, known, out=np.zeros_like(money), where=known > 0) - shares
+            if whole_shares:
+                trades[abs(weights - held)[1:] <= NOISE] = 0.0
+                ideal = remainder * weights[0] * wealth
+                trades = rounded(trades, shares, known, ideal, lambda trades: after(trades)[0])
+        cash_after, costs = after(trades) if trades.any() else (cash, {})
         return Allocation(
-            date=str(prices.dates[-1])[:10],
+            date=day(prices.dates[-1]),
             assets=prices.assets,
             prices=last,
             shares=shares,
             cash=cash,
             weights=weights,
             trades=trades,
-            cost=float(cost),
-            cash_after=float(max(cash_after, 0.0)),  # rounding may leave it below 0
+            costs=costs,
+            cash_after=max(cash_after, 0.0) if weights[0] >= 0 else cash_after,  # rounding errors
         )
 
     @property
+    def cost(self) -> float:
+        """The expected cost of all kinds, in money."""
+        return sum(self.costs.values())
+
+    @property
     def wealth(self) -> float:
-        return float(self.shares @ self.prices + self.cash)
+        return float(np.nansum(self.shares * self.prices) + self.cash)
 
     @property
     def held(self) -> np.ndarray:
         """Weights now, cash first."""
-        return np.append(self.cash, self.shares * self.prices) / self.wealth
+        return np.append(self.cash, np.nan_to_num(self.shares * self.prices)) / self.wealth
+
+    @cached_property
+    def reached(self) -> np.ndarray:
+        """Weights after the trades, cash first, as shares and costs allow them."""
+        values = np.nan_to_num((self.shares + self.trades) * self.prices)
+        held = np.append(self.cash_after, values)
+        return np.asarray(held / held.sum())
 
     def to_json(self) -> dict[str, Any]:
         rows = zip(
             self.assets,
-            self.prices.tolist(),
+            [None if math.isnan(price) else price for price in self.prices.tolist()],
             self.held[1:].tolist(),
             self.weights[1:].tolist(),
+            self.reached[1:].tolist(),
             self.trades.tolist(),
-            (self.trades * self.prices).tolist(),
+            np.nan_to_num(self.trades * self.prices).tolist(),
             strict=True,
         )
-        keys = ("asset", "price", "weight_now", "weight", "trade_shares", "trade_money")
+        keys = (
+            "asset", "price", "weight_now", "weight", "weight_after", "trade_shares", "trade_money",
+        )  # fmt: skip
         return {
             "date": self.date,
             "wealth": self.wealth,
             "cash": self.cash,
             "cash_weight": float(self.weights[0]),
+            "cash_weight_after": float(self.reached[0]),
             "cash_after": self.cash_after,
             "expected_cost": self.cost,
+            "expected_cost_by_kind": self.costs,
             "assets": [dict(zip(keys, row, strict=True)) for row in rows],
         }
 
@@ -131,22 +161,45 @@ def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
     if not orders[1:].any():
         return held
     weights = np.where(orders, targets, held)
-    weights[0] = max(0.0, 1 - weights[1:].sum())
+    weights[0] = 1 - weights[1:].sum()
+    if targets[0] >= 0:
+        weights[0] = max(0.0, weights[0])
     return np.asarray(weights / weights.sum())
 
 
-def _whole(trades: np.ndarray, prices: np.ndarray, cash: float, rate: float) -> np.ndarray:
-    """Trades rounded toward zero, with fewer of the cheapest bought if money runs short."""
-    trades = np.trunc(trades + np.copysign(1e-9, trades)) + 0.0  # no -0
-    spent, received = np.maximum(trades, 0) @ prices, np.maximum(-trades, 0) @ prices
-    budget = (cash + received * (1 - rate)) * (1 - rate)
-    short = spent - budget * (1 + 1e-12)  # tolerates rounding
-    for i in np.argsort(prices):
-        if short > 0 and trades[i] > 0:
-            fewer = min(trades[i], np.ceil(short / prices[i]))
-            trades[i] -= fewer
-            short -= fewer * prices[i]
-    return np.asarray(trades)
+def _context(model: CostModel, prices: Prices, wealth: float) -> Context:
+    """The circumstances of a trade as the table's last row has them."""
+    known = Conditions.of(prices, model.columns)
+    capital = model.capital if isinstance(model, Itemized) else wealth
+    return known.trade(len(prices) - 1, 1, wealth / capital)
+
+
+def _settled(
+    model: CostModel,
+    context: Context,
+    held: np.ndarray,
+    wealth: float,
+    shares: np.ndarray,
+    prices: np.ndarray,
+    trades: np.ndarray,
+) -> tuple[float, dict[str, float]]:
+    """The cash that trades leave, and their costs in money by kind.
+
+    The cost model asks for weights after the trade, which depend on the cash that it leaves; the
+    cash is a fixed point, found in a few steps because costs are small.
+    """
+    values = (shares + trades) * prices
+    invested = float(values.sum())
+    cash = wealth - invested
+    costs: dict[str, Any] = {}
+    for _ in range(100):
+        after = np.append(cash, values) / (cash + invested)
+        remainder, costs = model.trade(held, after, context)
+        found = wealth * float(remainder) - invested
+        if abs(found - cash) <= 1e-14 * wealth:
+            break
+        cash = found
+    return cash, {kind: wealth * float(share) for kind, share in costs.items()}
 
 
 def require_fresh(prices: Prices, as_of: str | None) -> None:

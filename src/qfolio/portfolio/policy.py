@@ -23,6 +23,7 @@ from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Listener, fit
 from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio import signals
+from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.following import follow, on_table
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
@@ -187,6 +188,11 @@ class Policy:
             self.updates + 1,
             table.dates[-1],
         )
+
+    @property
+    def costs(self) -> CostModel:
+        """Of the market that it was trained on."""
+        return self.task.costs
 
     @property
     def seeds(self) -> int:

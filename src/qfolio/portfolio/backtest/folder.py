@@ -2,9 +2,9 @@
 
 It holds config.json (settings, written once), prices.safetensors (the table),
 policies/AGENT/FOLD.safetensors (weights, written as soon as a group of folds is trained; for the
-latest policy, the whole learning state), training/AGENT/FOLD.csv (a row for each training episode)
-and, at the end, returns.csv, weights.csv, summary.json, why.json (what explains the agents) and the
-report.
+latest policy, the whole learning state, with latest-N.safetensors after its Nth update),
+training/AGENT/FOLD.csv (a row for each training episode) and, at the end, returns.csv, weights.csv,
+summary.json, why.json (what explains the agents) and the report. ledger/ has the allocations.
 """
 
 import csv
@@ -172,6 +172,13 @@ class BacktestFolder:
         if prices.digest != config.prices["digest"]:
             raise QfolioError(f"{path} does not belong to config.json beside it; restore the two.")
         return prices
+
+    def policies(self, agent: str) -> list[str]:
+        """The names of an agent's policies."""
+        return [path.stem for path in (self.path / "policies" / agent).glob("*.safetensors")]
+
+    def policy_file(self, agent: str, name: str) -> Path:
+        return self._policy(agent, name)
 
     def has_policy(self, agent: str, fold: str) -> bool:
         return self._policy(agent, fold).exists()

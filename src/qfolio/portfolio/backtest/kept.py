@@ -25,6 +25,12 @@ class Kept:
             return (agent, fold) in self._policies
         return self.folder.has_policy(agent, fold)
 
+    def names(self, agent: str) -> list[str]:
+        """The folds that an agent is trained on, and its other policies."""
+        if self.folder is None:
+            return [fold for name, fold in self._policies if name == agent]
+        return self.folder.policies(agent)
+
     def policy(self, agent: str, fold: str, template: Any) -> Any:
         """A policy, in the structure of the template; raises QfolioError if it is not trained."""
         if not self.has(agent, fold):

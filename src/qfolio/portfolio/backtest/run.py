@@ -7,6 +7,7 @@ float64, beside classical allocators under the same rules.
 
 import contextlib
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,8 @@ from qfolio.portfolio.task import Portfolio
 
 LATEST = "latest"
 """Name of the policies trained on the last rows of the table."""
+
+_UPDATED = re.compile(rf"{LATEST}-([0-9]+)")
 
 EQUAL_WEIGHT = "equal-weight"
 
@@ -259,12 +262,16 @@ class Backtest:
         tasks = [part for task in self.tasks.values() for part in task.parts]
         return [*self.agents.values(), *self.baselines.values(), *tasks]
 
-    def policy(self, agent: str | None = None) -> Policy:
-        """The policy for tomorrow of an agent (default: the first)."""
+    def policy(self, agent: str | None = None, stored: str | None = None) -> Policy:
+        """The policy for tomorrow of an agent (default: the first).
+
+        stored: its name among those of the agent (default: the newest, see ``newest``).
+        """
         name = self._name(agent)
+        stored = self.newest(name) if stored is None else stored
         task, trained = self._parts[name, LATEST], self.agents[name]
         state = state_template(task, trained, self.config.seeds)
-        kept = self._kept.policy(name, LATEST, _learning(state, 0, self.prices.dates[-1]))
+        kept = self._kept.policy(name, stored, _learning(state, 0, self.prices.dates[-1]))
         return Policy(
             task,
             trained,
@@ -277,9 +284,15 @@ class Backtest:
         )
 
     def keep(self, agent: str | None, policy: Policy) -> None:
-        """Stores an updated policy as the agent's policy for tomorrow."""
+        """Stores an updated policy as the agent's policy for tomorrow, beside those before it."""
         learning = _learning(policy.learner, policy.updates, policy.learned)
-        self._kept.write_policy(self._name(agent), LATEST, learning)
+        self._kept.write_policy(self._name(agent), f"{LATEST}-{policy.updates}", learning)
+
+    def newest(self, agent: str) -> str:
+        """The name of the agent's newest policy: latest, or latest-N after N updates."""
+        found = map(_UPDATED.fullmatch, self._kept.names(agent))
+        updates = [int(match[1]) for match in found if match]
+        return f"{LATEST}-{max(updates)}" if updates else LATEST
 
     def stretches(self, agent: str) -> list[Stretch]:
         """The folds with an agent's policies."""

@@ -1,4 +1,4 @@
-"""The verdict on an agent of a finished backtest against equal weights."""
+"""What a finished backtest found of an agent or a baseline, for those who follow it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,29 +12,34 @@ from qfolio.portfolio.backtest.folder import followed
 class Standing:
     """The verdict of a backtest on the policy that ``allocate`` follows, all seeds together.
 
-    agent: its name.
-    verdict: the sentence of the report; empty if the backtest is not finished.
-    worse: whether it falls short of equal weights in growth, rebalanced at every row or at the best
-    speed.
+    agent: its name, or that of a baseline.
+    verdict: the sentence of the report, or the measures of a baseline; empty if the backtest is not
+    finished.
+    worse: whether an agent falls short of equal weights in growth, rebalanced at every row or at
+    the best speed.
+    learned: whether it is an agent, not a baseline.
     """
 
     agent: str
     verdict: str
     worse: bool
+    learned: bool = True
 
     @staticmethod
-    def of(folder: Path, agent: str) -> "Standing":
-        """The standing of an agent, from summary.json in the folder of its backtest.
+    def of(folder: Path, agent: str, *, learned: bool = True) -> "Standing":
+        """The standing of an agent or a baseline, from summary.json in the folder of its backtest.
 
         Raises:
             QfolioError: The file is damaged or does not contain the agent.
         """
         path = folder / "summary.json"
         if not path.exists():
-            return Standing(agent, "", False)
+            return Standing(agent, "", False, learned)
         summary = read_json(path)
         strategies = summary.get("strategies", {})
         try:
+            if not learned:
+                return Standing(agent, _measured(strategies[agent]["measures"]), False, learned)
             agents = [name for name, entry in strategies.items() if entry["kind"] == "agent"]
             if agent not in agents:
                 raise QfolioError(
@@ -59,6 +64,8 @@ class Standing:
             folder: The backtest's folder, for the message.
             named: Whether the user named this agent.
         """
+        if not self.learned:
+            return
         if not self.verdict:
             raise QfolioError(
                 f"The backtest in {folder} is not finished, so it does not say how {self.agent} "
@@ -70,3 +77,11 @@ class Standing:
                 f"In its own backtest, {self.verdict.rstrip('.')}; to trade it nevertheless, add "
                 f"--agent {self.agent} or --anyway."
             )
+
+
+def _measured(measures: dict[str, dict[str, float]]) -> str:
+    growth, sharpe, turnover = (measures[k]["mean"] for k in ("growth", "sharpe", "turnover"))
+    return (
+        f"A baseline, which learned nothing: it grew by {growth:.1%} a year after costs, with a "
+        f"Sharpe ratio of {sharpe:.2f} and a turnover of {turnover:.1f} a year."
+    )

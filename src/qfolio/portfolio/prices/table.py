@@ -120,12 +120,17 @@ class Prices:
     @property
     def digest(self) -> str:
         """16 hexadecimal digits, different for tables of different content."""
+        return self.sha256[:16]
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the content, in hexadecimal digits."""
         names = repr((self.assets, self.feature_names, self.values.shape))
         sha = hashlib.sha256(names.encode("utf-8", "surrogatepass"))
         sha.update(self.dates.astype("<i8").tobytes())
         for array in (self.values, self.features):
             sha.update(np.where(np.isnan(array), np.nan, array).astype("<f8").tobytes())
-        return sha.hexdigest()[:16]
+        return sha.hexdigest()
 
     def select(self, assets: Sequence[str]) -> "Prices":
         """The table of these assets, in this order. Raises QfolioError for unknown ones."""

@@ -1,0 +1,165 @@
+"""The desk: trades for tomorrow from a backtest's policy, and the ledger of those made before."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from qfolio.commands.arguments import File, Modules, Name, Names
+from qfolio.commands.backtesting import Missing
+from qfolio.core import registry
+from qfolio.core.errors import QfolioError
+
+if TYPE_CHECKING:
+    from qfolio.portfolio.backtest.desk import Desk
+
+Date = Annotated[str | None, arg(metavar="DATE", help_behavior_hint="")]
+
+
+def allocate(
+    folder: Positional[Path],
+    *,
+    prices: File = None,
+    holdings: File = None,
+    capital: Annotated[float | None, arg(metavar="X", help_behavior_hint="")] = None,
+    agent: Name = None,
+    anyway: bool = False,
+    whole_shares: bool = False,
+    as_of: Date = None,
+    update: bool = False,
+    orders: File = None,
+    layout: str = "generic",
+    currency: str = "USD",
+    dry_run: bool = False,
+    reproduce: Date = None,
+    trust: Modules = (),
+    missing: Missing = "error",
+    features: Names = (),
+    date: Name = None,
+    as_json: Annotated[bool, arg(name="json")] = False,
+) -> None:
+    """Compute tomorrow's target weights, and the trades to reach them.
+
+    The verdict of the backtest on the agent is printed, too. If the first agent did worse than
+    equal weights, nothing is allocated without --agent or --anyway. Each allocation is recorded in
+    the ledger of the folder.
+
+    Args:
+        folder: Folder of a backtest; its policies are also trained on the latest rows.
+        prices: Latest prices, CSV or Parquet, of the assets of the backtest (default: the prices
+            of the backtest).
+        holdings: Table with a column of assets (asset, symbol, ticker) and one of shares (shares,
+            quantity, qty); a row "cash" holds money (default: all is cash).
+        capital: Cash, unless the holdings include it.
+        agent: Agent to follow, or a baseline such as equal-weight (default: the first agent of the
+            backtest).
+        anyway: Allocate even if the backtest is not finished, or found the agent worse than equal
+            weights.
+        whole_shares: Trade whole shares only.
+        as_of: Day of the allocation; prices may be up to a week older (default: today).
+        update: Update the policy on the new rows first, and store the updated policy beside those
+            before it.
+        orders: Write the trades to this CSV file.
+        layout: Columns of that file: generic, or ib for a basket of Interactive Brokers.
+        currency: Currency in that file, where the layout names one.
+        dry_run: Write nothing: neither a record in the ledger nor an updated policy.
+        reproduce: Compute the ledger's allocation of this date again, from the inputs that it kept
+            or, if they are given, from --prices and --holdings, and compare the two.
+        trust: Modules of your own code that the folder may name (default: none).
+        missing: How to treat missing prices.
+        features: Columns that hold features (default: those of the backtest).
+        date: Column of dates (default: found by its name).
+        as_json: Print JSON instead of a table.
+    """
+    import numpy as np
+
+    from qfolio.core import devices
+    from qfolio.core.files import write_csv
+
+    devices.configure()
+    registry.trust(trust)
+    from qfolio.commands import console
+    from qfolio.portfolio.allocation import Allocation, require_fresh
+    from qfolio.portfolio.backtest.desk import Desk
+    from qfolio.portfolio.backtest.standing import Standing
+    from qfolio.portfolio.holdings import read_holdings
+    from qfolio.portfolio.orders_csv import order_rows
+    from qfolio.portfolio.policy import Policy
+    from qfolio.portfolio.prices.findings import amount, day
+
+    desk = Desk.open(folder, missing=missing, features=features, date=date)
+    if reproduce is not None:
+        if agent is not None or update or orders is not None:
+            raise QfolioError(
+                "--reproduce takes its agent from the ledger and trades nothing; leave out "
+                "--agent, --update and --orders."
+            )
+        return _reproduce(desk, reproduce, prices, holdings, capital, as_json)
+    name = next(iter(desk.run.agents)) if agent is None else agent
+    learned = name not in desk.run.baselines
+    standing = Standing.of(folder, name, learned=learned)
+    if not anyway:
+        standing.require_sound(folder, named=agent is not None)
+    followed = desk.followed(name)
+    table = desk.table(followed, prices)
+    require_fresh(table, as_of)
+    shares, cash = read_holdings(holdings, table.assets, capital)
+    if update:
+        if not isinstance(followed, Policy):
+            raise QfolioError(f"{name} is a baseline, which learns nothing; leave out --update.")
+        followed = followed.update(table)
+    allocation = Allocation.of(followed, table, shares, cash, whole_shares=whole_shares)
+    rows = None if orders is None else order_rows(allocation, layout, currency)
+    said, number = "A dry run: nothing is recorded.", None
+    if not dry_run:
+        if update and isinstance(followed, Policy):
+            desk.run.keep(name, followed)
+        record, said = desk.record(name, allocation, table, whole_shares)
+        number = record.number
+    if orders is not None and rows is not None:
+        write_csv(orders, *rows)
+        said += f" {orders} has {amount(len(rows[1]), 'order')}."
+    trained = None
+    if isinstance(followed, Policy):
+        trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
+    if as_json:
+        of = {
+            "agent": name,
+            "trained_until": trained,
+            "verdict": standing.verdict or None,
+            "worse": standing.worse,
+            "record": number,
+        }
+        print(json.dumps({**of, **allocation.to_json()}, indent=2))
+    else:
+        console.print_allocation(allocation, standing, trained)
+        console.say(said)
+
+
+def _reproduce(
+    desk: "Desk",
+    date: str,
+    prices: Path | None,
+    holdings: Path | None,
+    capital: float | None,
+    as_json: bool,
+) -> None:
+    """Computes an allocation of the ledger again and says how near it comes."""
+    from qfolio.commands import console
+    from qfolio.portfolio.holdings import read_holdings
+
+    held = None
+    if holdings is not None or capital is not None:
+        held = read_holdings(holdings, desk.run.prices.assets, capital)
+    record, again = desk.reproduce(date, prices, held)
+    if as_json:
+        print(json.dumps({"record": record.number, **again.to_json()}, indent=2))
+        return
+    off = max(abs(x - y) for x, y in zip(again.weights.tolist(), record.target, strict=True))
+    console.say(
+        f"Record {record.number} of {record.date} ({record.agent}, made {record.made} by qfolio "
+        f"{record.version}) is reproduced: prices, settings, holdings"
+        f"{' and policy' if record.policy else ''} have the digests of the ledger, and no target "
+        f"weight is off by more than {off:.1g}."
+    )

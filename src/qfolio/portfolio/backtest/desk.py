@@ -1,0 +1,154 @@
+"""From a run to orders, with a trail: allocations that the run's ledger keeps and reproduces."""
+
+import datetime
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.text import quote
+from qfolio.core.version import __version__
+from qfolio.portfolio.allocation import Allocation
+from qfolio.portfolio.backtest.folder import BacktestFolder
+from qfolio.portfolio.backtest.rule import Rule
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.ledger import Ledger, Record, file_digest, holdings_digest
+from qfolio.portfolio.policy import Policy
+from qfolio.portfolio.prices.table import Prices, load
+
+SAME = 1e-6
+"""How far reproduced weights may be off: policies decide in float32, not alike on all machines."""
+
+
+@dataclass
+class Desk:
+    """A run whose agents and baselines are followed.
+
+    load: how prices are read, from the options of the command line.
+    """
+
+    run: Backtest
+    folder: Path
+    load: Callable[..., Prices] = field(default=load)
+
+    @staticmethod
+    def open(folder: Path | str, **options: Any) -> "Desk":
+        """The desk of a finished backtest; options are those of ``prices.load``."""
+        run = Backtest.open(folder)
+        known = {**options, "features": options.get("features") or tuple(run.config.feature_names)}
+        # What is followed looks at the last rows only; assets may start at any row before.
+        return Desk(run, Path(folder), lambda source: load(source, late="join", **known))
+
+    @property
+    def ledger(self) -> Ledger:
+        return Ledger(self.folder / "ledger")
+
+    def followed(self, name: str, stored: str | None = None) -> Policy | Rule:
+        """An agent's policy (default: the newest), or a baseline."""
+        if name in self.run.agents:
+            return self.run.policy(name, stored)
+        if name in self.run.baselines:
+            config, costs = self.run.config, next(iter(self.run.tasks.values())).costs
+            return Rule(
+                name,
+                self.run.baselines[name],
+                self.run.prices.assets,
+                costs,
+                train=config.train,
+                expanding=config.expanding,
+                cap=config.cap,
+            )
+        raise QfolioError(
+            f"The backtest has no agent {quote(name)}; choose from {', '.join(self.run.agents)}, "
+            f"or follow a baseline: {', '.join(self.run.baselines)}."
+        )
+
+    def table(self, followed: Policy | Rule, prices: Path | None) -> Prices:
+        """The prices to decide on (default: those of the backtest)."""
+        return self.run.prices if prices is None else followed.table(self.load(prices))
+
+    def record(
+        self, name: str, allocation: Allocation, prices: Prices, whole_shares: bool
+    ) -> tuple[Record, str]:
+        """Appends an allocation by the newest policy of an agent, or by a baseline."""
+        learned = name in self.run.agents
+        stored = self.run.newest(name) if learned else None
+        held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
+        digests = {"prices": prices.sha256, "holdings": held, **self._digests(name, stored)}
+        return self.ledger.append(
+            allocation,
+            prices,
+            keep_prices=prices.sha256 != self.run.prices.sha256,
+            agent=name,
+            policy=stored,
+            digests=digests,
+            whole_shares=whole_shares,
+            made=datetime.datetime.now().astimezone().isoformat(" ", "seconds"),
+            version=__version__,
+        )
+
+    def reproduce(
+        self,
+        date: str,
+        prices: Path | None = None,
+        holdings: tuple[np.ndarray, float] | None = None,
+    ) -> tuple[Record, Allocation]:
+        """The allocation of a date, computed again.
+
+        Args:
+            date: As the ledger has it.
+            prices: To be compared with those of the ledger; later rows are left out.
+            holdings: Shares and cash, likewise.
+
+        Raises:
+            QfolioError: An input or the result differs; the error says which.
+        """
+        record = self.ledger.on(date)
+        name = f"Record {record.number} ({record.date})"
+        digests = self._digests(record.agent, record.policy)
+        followed = self.followed(record.agent, record.policy)
+        if prices is None:
+            table = self.ledger.prices(record, self.run.prices)
+        else:
+            table = followed.table(self.load(prices))
+            table = table.between(None, int((table.dates <= record.moment).sum()))
+        shares, cash = np.array(record.shares), record.cash
+        if holdings is not None:
+            shares, cash = holdings
+        digests["prices"] = table.sha256
+        digests["holdings"] = holdings_digest(self.run.prices.assets, shares, cash)
+        said = {
+            "prices": f"the prices up to {record.date}",
+            "policy": f"the file of the policy {record.policy}",
+            "settings": "config.json",
+            "holdings": "the holdings",
+        }
+        differing = [
+            words for key, words in said.items() if digests.get(key) != record.digests.get(key)
+        ]
+        if differing:
+            raise QfolioError(
+                f"{name} cannot be reproduced: {' and '.join(differing)} differ from those of the "
+                "ledger; restore them."
+            )
+        again = Allocation.of(followed, table, shares, cash, whole_shares=record.whole_shares)
+        off = float(abs(again.weights - np.array(record.target)).max())
+        if off > SAME:
+            raise QfolioError(
+                f"{name} gives other weights from the same inputs: one is off by {off:.2g}. It was "
+                f"made by qfolio {record.version}, and this is {__version__}."
+            )
+        return record, again
+
+    def _digests(self, name: str, stored: str | None) -> dict[str, str]:
+        """Of the run's settings and an agent's policy."""
+        found = {"settings": file_digest(self.folder / "config.json")}
+        if stored is not None:
+            path = BacktestFolder(self.folder).policy_file(name, stored)
+            if not path.is_file():
+                raise QfolioError(f"{path} is missing; restore it.")
+            found["policy"] = file_digest(path)
+        return found

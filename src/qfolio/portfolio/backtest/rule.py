@@ -1,0 +1,59 @@
+"""A baseline of a backtest, asked for tomorrow's weights as a learned policy is."""
+
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.baselines.base import Baseline, History
+from qfolio.portfolio.backtest.folds import latest
+from qfolio.portfolio.backtest.orders import checked
+from qfolio.portfolio.costs import CostModel
+from qfolio.portfolio.prices.table import Prices, load
+
+
+class Rule:
+    """A baseline's orders after the last row of a table, whatever its calendar.
+
+    It learns from the training window that ends there: all rows, or the last ``train``.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        baseline: Baseline,
+        assets: tuple[str, ...],
+        costs: CostModel,
+        *,
+        train: str,
+        expanding: bool,
+        cap: float,
+    ) -> None:
+        self.name, self.baseline, self.assets, self.costs = name, baseline, assets, costs
+        self.train, self.expanding, self.cap = train, expanding, cap
+
+    def table(self, prices: Any, **options: Any) -> Prices:
+        """The prices with the assets of the backtest, in its order."""
+        table = load(prices, **options)
+        if set(table.assets) != set(self.assets):
+            off = sorted(set(table.assets) ^ set(self.assets))
+            raise QfolioError(
+                f"The price table must have the {len(self.assets)} assets of the backtest, and no "
+                f"others; {off[0]!r} is in one of them only."
+            )
+        return table.select(self.assets)
+
+    def weights(self, prices: Any, holdings: Any = None) -> dict[str, float]:
+        """Target weights by asset, with "cash" first; as held if the baseline gives no order."""
+        table = self.table(prices)
+        held = np.array([(holdings or {"cash": 1.0}).get(n, 0.0) for n in ("cash", *self.assets)])
+        fold = latest("latest", table.dates, self.train, self.expanding).complete(table.values)
+        tradable = fold.tradable(table.values)
+        if not tradable.any():
+            raise QfolioError(
+                f"No asset has prices in all of the last {self.train}; give earlier prices."
+            )
+        history = History(table.dates, table.values, fold.train, tradable, self.cap, table.month)
+        wanted = self.baseline.decide(history, held)
+        target = held if wanted is None else checked(self.name, wanted, history)
+        return dict(zip(("cash", *self.assets), target.tolist(), strict=True))

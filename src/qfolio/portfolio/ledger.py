@@ -1,0 +1,225 @@
+"""The ledger of a run: a record of each allocation, with what is needed to reproduce it.
+
+RUN/ledger/ holds a JSON file for each record (0001.json, 0002.json, …) and, as safetensors named by
+their digest, the prices that it used. A record names the file of its policy, which is never
+overwritten. Records are only ever added; of several for one date, the last one counts.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import locked, read_arrays, read_json, write_arrays, write_json
+from qfolio.core.text import quote
+from qfolio.portfolio.allocation import Allocation
+from qfolio.portfolio.prices.table import Prices
+
+FORMAT = 1
+
+# Names become paths.
+PolicyName = Annotated[str, msgspec.Meta(pattern=r"^latest(-[0-9]+)?$")]
+
+
+class Record(msgspec.Struct, kw_only=True, frozen=True):
+    """An allocation; lists are by asset, weights have cash first.
+
+    digests: SHA-256 of "prices" (the table as used), "policy" (its file; none of a baseline),
+    "settings" (config.json of the run) and "holdings".
+    """
+
+    number: Annotated[int, msgspec.Meta(ge=1)]
+    date: str  # of the last prices
+    made: str  # when the record was written
+    version: str  # of qfolio
+    agent: str
+    policy: PolicyName | None  # among those of the agent; None of a baseline
+    digests: dict[str, str]
+    whole_shares: bool
+    assets: list[str]
+    prices: list[float | None]
+    shares: list[float]  # held before
+    cash: float
+    trades: list[float]
+    cash_after: float
+    weights_before: list[float]
+    target: list[float]
+    weights_after: list[float]
+    costs: dict[str, float]  # expected, in money, by kind
+    supersedes: int | None = None  # number of the record of the same date that it replaces
+    format: int = FORMAT
+
+    def __post_init__(self) -> None:
+        if self.format != FORMAT:
+            raise ValueError(f"format {self.format} is of another version of qfolio")
+        count = len(self.assets)
+        lists = (self.prices, self.shares, self.trades)
+        weights = (self.weights_before, self.target, self.weights_after)
+        if any(len(x) != count for x in lists) or any(len(x) != count + 1 for x in weights):
+            raise ValueError("its lists do not fit its assets")
+
+    @property
+    def moment(self) -> np.datetime64:
+        """The date of its last prices."""
+        return np.datetime64(self.date.replace(" ", "T"), "s")
+
+
+class Ledger:
+    """Reads and appends records; ``folder`` is made with the first one."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def records(self) -> list[Record]:
+        """All records, in the order in which they were made."""
+        paths = sorted(self.folder.glob("[0-9]*.json")) if self.folder.is_dir() else []
+        return [self._read(path) for path in paths]
+
+    def current(self) -> list[Record]:
+        """The record that counts of each date, by date."""
+        last = {record.moment: record for record in self.records()}
+        return [last[moment] for moment in sorted(last)]
+
+    def on(self, date: str) -> Record:
+        """The record that counts of a date, or of the last moment of a day."""
+        found = [record for record in self.current() if record.date.startswith(date)]
+        if not found or not date:
+            known = ", ".join(record.date for record in self.current()[-3:])
+            raise QfolioError(
+                f"The ledger has no allocation of {quote(date)}; "
+                + (f"its last are of {known}." if known else "it is empty.")
+            )
+        return found[-1]
+
+    def append(
+        self, allocation: Allocation, prices: Prices, *, keep_prices: bool, **facts: Any
+    ) -> tuple[Record, str]:
+        """Adds a record, unless that of the same date has the same inputs.
+
+        Args:
+            allocation: The allocation.
+            prices: The table that it used.
+            keep_prices: Whether to store the table; without it, reproducing needs it again.
+            facts: The other fields of the record, but number, date and what it supersedes.
+
+        Returns:
+            The record, and a sentence that says what was done.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with locked(self.folder):
+            records = self.records()
+            content = {**_of(allocation), **facts}
+            before = next((r for r in reversed(records) if r.date == content["date"]), None)
+            if before is not None and _inputs(before) == _inputs(content):
+                return before, f"It is record {before.number} of the ledger already."
+            record = msgspec.convert(
+                {
+                    **content,
+                    "number": 1 + max((r.number for r in records), default=0),
+                    "supersedes": None if before is None else before.number,
+                },
+                Record,
+            )
+            if keep_prices:
+                self._keep(prices)
+            path = self.folder / f"{record.number:04d}.json"
+            write_json(path, msgspec.to_builtins(record))
+        said = f"Recorded in the ledger as {path}."
+        if before is not None:
+            differing = [
+                key for key, value in _inputs(record).items() if value != _inputs(before)[key]
+            ]
+            said += (
+                f" It supersedes record {before.number} of the same date, which had other "
+                f"{' and '.join(differing).replace('_', ' ')}."
+            )
+        return record, said
+
+    def prices(self, record: Record, known: Prices) -> Prices:
+        """The table that a record used: ``known`` or what the ledger stored.
+
+        Raises:
+            QfolioError: The ledger did not store it, or its file is damaged.
+        """
+        wanted = record.digests["prices"]
+        if known.sha256 == wanted:
+            return known
+        path = self._prices(wanted)
+        if not path.exists():
+            raise QfolioError(f"{path} is missing; give the prices of record {record.number}.")
+        arrays = read_arrays(path)
+        try:
+            dates = arrays["dates"].astype("datetime64[s]")
+            assets, features = tuple(record.assets), known.feature_names
+            table = Prices(dates, assets, arrays["values"], arrays["features"], features)
+        except (KeyError, ValueError, QfolioError) as error:
+            raise QfolioError(f"{path} is damaged ({error}); give the prices again.") from None
+        if table.sha256 != wanted:
+            raise QfolioError(f"{path} does not belong to record {record.number}; restore it.")
+        return table
+
+    def _keep(self, prices: Prices) -> None:
+        path = self._prices(prices.sha256)
+        if not path.exists():
+            seconds = prices.dates.astype("datetime64[s]").astype(np.int64)
+            arrays = {"dates": seconds, "values": prices.values, "features": prices.features}
+            write_arrays(path, arrays)
+
+    def _prices(self, digest: str) -> Path:
+        return self.folder / "prices" / f"{digest[:16]}.safetensors"
+
+    def _read(self, path: Path) -> Record:
+        try:
+            record = msgspec.convert(read_json(path), Record)
+            _ = record.moment
+            if int(path.stem) != record.number or not {"prices", "settings", "holdings"} <= set(
+                record.digests
+            ):
+                raise ValueError("its number or digests are wrong")
+        except (msgspec.ValidationError, ValueError) as error:
+            raise QfolioError(f"{path} is damaged ({error}); restore it.") from None
+        return record
+
+
+def holdings_digest(assets: Sequence[str], shares: np.ndarray, cash: float) -> str:
+    """SHA-256 of shares by asset, and cash."""
+    return digest([list(assets), shares.tolist(), cash])
+
+
+def digest(content: Any) -> str:
+    """SHA-256 of a JSON value."""
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's bytes."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _of(allocation: Allocation) -> dict[str, Any]:
+    return {
+        "date": allocation.date,
+        "assets": list(allocation.assets),
+        "prices": [None if np.isnan(price) else price for price in allocation.prices.tolist()],
+        "shares": allocation.shares.tolist(),
+        "cash": float(allocation.cash),
+        "trades": allocation.trades.tolist(),
+        "cash_after": float(allocation.cash_after),
+        "weights_before": allocation.held.tolist(),
+        "target": allocation.weights.tolist(),
+        "weights_after": allocation.reached.tolist(),
+        "costs": allocation.costs,
+    }
+
+
+def _inputs(record: Record | dict[str, Any]) -> dict[str, Any]:
+    """What decides an allocation."""
+    content = record if isinstance(record, dict) else msgspec.structs.asdict(record)
+    names = ("prices", "policy", "settings", "holdings")
+    digests = {name: content["digests"].get(name) for name in names}
+    return {"agent": content["agent"], **digests, "rounding": content["whole_shares"]}

@@ -1,0 +1,102 @@
+"""Orders as CSV, in columns that brokers read."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.text import quote
+from qfolio.portfolio.allocation import Allocation
+
+DIGITS = 6
+"""Decimal places of fractional shares; what is beyond is not ordered."""
+
+Rows = list[list[Any]]
+
+
+def order_rows(allocation: Allocation, layout: str, currency: str) -> tuple[list[str], Rows]:
+    """The header and a row for each trade of an allocation; sales come first.
+
+    Args:
+        allocation: What is to be traded.
+        layout: One of ``LAYOUTS``.
+        currency: Code of the currency, for layouts that name it.
+
+    Raises:
+        QfolioError: The layout is unknown, or cannot hold the trades.
+    """
+    if layout not in LAYOUTS:
+        raise QfolioError(f"--layout is {quote(layout)}; choose from {', '.join(LAYOUTS)}.")
+    return LAYOUTS[layout](allocation, currency)
+
+
+def _generic(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
+    """Market orders, with the weights and a share of the cost in proportion to the value traded."""
+    header = [
+        "date", "symbol", "side", "quantity", "order_type", "price", "notional", "weight_before",
+        "weight_after", "expected_cost",
+    ]  # fmt: skip
+    orders = _orders(allocation)
+    total = sum(abs(allocation.trades[i] * allocation.prices[i]) for i, *_ in orders)
+    rows = []
+    for i, side, quantity in orders:
+        price = float(allocation.prices[i])
+        rows.append(
+            [
+                allocation.date,
+                allocation.assets[i],
+                side,
+                quantity,
+                "MARKET",
+                price,
+                round(quantity * price, 2),
+                round(float(allocation.held[1 + i]), 6),
+                round(float(allocation.reached[1 + i]), 6),
+                round(allocation.cost * abs(allocation.trades[i]) * price / total, 2),
+            ]
+        )
+    return header, rows
+
+
+def _interactive_brokers(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
+    """A basket for the Trader Workstation: market orders for the day, routed by SMART.
+
+    Source: IBKR Guides, "Manually Create a Basket File" and "Basket Fields".
+    """
+    header = [
+        "Action", "Quantity", "Symbol", "SecType", "Exchange", "Currency", "TimeInForce",
+        "OrderType", "BasketTag",
+    ]  # fmt: skip
+    tag = f"qfolio {allocation.date}"
+    rows: Rows = []
+    for i, side, quantity in _orders(allocation):
+        if quantity != int(quantity):
+            raise QfolioError(
+                "A basket of Interactive Brokers has whole shares; add --whole-shares."
+            )
+        symbol = allocation.assets[i]
+        rows.append([side, int(quantity), symbol, "STK", "SMART", currency, "DAY", "MKT", tag])
+    return header, rows
+
+
+LAYOUTS: dict[str, Callable[[Allocation, str], tuple[list[str], Rows]]] = {
+    "generic": _generic,
+    "ib": _interactive_brokers,
+}
+"""Columns by name."""
+
+
+def _orders(allocation: Allocation) -> list[tuple[int, str, float]]:
+    """The place of each asset traded, the side and the quantity; sales first, as they pay."""
+    scale = 10**DIGITS
+    found = []
+    for i in map(int, np.argsort(allocation.trades, kind="stable")):
+        trade = float(allocation.trades[i])
+        size = math.floor(abs(trade) * scale + 1e-3) / scale
+        if size:
+            side = "BUY" if trade > 0 else "SELL"
+            found.append((i, side, int(size) if size == int(size) else size))
+    sales = [order for order in found if order[1] == "SELL"]
+    return sales + [order for order in found if order[1] == "BUY"]

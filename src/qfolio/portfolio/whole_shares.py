@@ -1,0 +1,95 @@
+"""Trades in whole shares that leave a portfolio as near as possible to its target."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+EXACT = 1e-9
+"""How far from a whole number a trade may be and still count as one."""
+
+
+def whole_shares(
+    ideal: np.ndarray,
+    shares: np.ndarray,
+    prices: np.ndarray,
+    cash: float,
+    cash_after: Callable[[np.ndarray], float],
+) -> np.ndarray:
+    """The trades in whole shares that track the ideal ones best.
+
+    Each trade is rounded down or up. The distance to the target is the sum of squares of what each
+    asset and the cash are off, in money. From all trades rounded down, the best change of one trade
+    or of two is made until none makes the distance smaller. That is no proof of the optimum; the
+    tests compare it with every rounding. Fractions of a share that are held are never sold.
+
+    Args:
+        ideal: Shares to buy, negative to sell, of shape (assets,).
+        shares: Shares held now, likewise.
+        prices: Of the assets.
+        cash: What the ideal trades leave.
+        cash_after: The cash that trades leave, after costs; at the result it is not negative, or
+            no larger a loan than that of the ideal trades.
+    """
+    low, high = np.floor(ideal + EXACT), np.ceil(ideal - EXACT)
+    least = np.minimum(shares + ideal, 0.0)  # a holding is not sold short by rounding
+    low = np.where(shares + low < least - EXACT, np.minimum(high, low + 1), low)
+    least_cash = min(cash, 0.0)
+    trades = _affordable(low, prices, lambda trades: cash_after(trades) - least_cash)
+    low = np.minimum(low, trades)
+    while (better := _improved(trades, low, high, ideal, prices, cash, cash_after)) is not None:
+        trades = better
+    return trades + 0.0  # no -0
+
+
+def _affordable(
+    trades: np.ndarray, prices: np.ndarray, cash_after: Callable[[np.ndarray], float]
+) -> np.ndarray:
+    """The trades, with fewer of the cheapest bought if money runs short."""
+    trades = trades.copy()
+    for i in np.argsort(prices, kind="stable"):
+        while trades[i] > 0 and (left := cash_after(trades)) < 0:
+            trades[i] -= min(trades[i], np.ceil(-left / prices[i]))
+    return trades if cash_after(trades) >= 0 else np.zeros_like(trades)
+
+
+def _improved(
+    trades: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    ideal: np.ndarray,
+    prices: np.ndarray,
+    cash: float,
+    cash_after: Callable[[np.ndarray], float],
+) -> np.ndarray | None:
+    """The trades after the best change of one or of two by a share each; None if there is none."""
+    step = np.where(trades < high, 1.0, np.where(trades > low, -1.0, 0.0))
+    (some,) = np.nonzero(step)
+    money, off = (step * prices)[some], ((trades - ideal) * prices)[some]
+    left = cash_after(trades)
+    error = left - cash
+
+    def distance(change: np.ndarray, after: float) -> float:
+        moved = off + change
+        return float(moved @ moved + (after - cash) ** 2 - off @ off - error**2)
+
+    # Costs of a share more or less are left out here, and counted when a change is made.
+    own = 2 * off * money + money**2
+    gains = own + own[:, None] + (error - money - money[:, None]) ** 2 - error**2
+    np.fill_diagonal(gains, own + (error - money) ** 2 - error**2)
+    gains[left - money - np.where(np.eye(len(some)), 0, money[:, None]) < min(cash, 0.0)] = np.inf
+    while len(some):
+        i, j = divmod(int(gains.argmin()), len(some))
+        if not gains[i, j] < 0:
+            break
+        chosen = np.zeros(len(some))
+        chosen[[i, j]] = 1.0
+        changed = trades.copy()
+        changed[some] += chosen * step[some]
+        after = cash_after(changed)
+        if (
+            after >= min(cash, 0.0)
+            and distance(chosen * money, after) < -1e-12 * max(abs(cash), abs(left), 1.0) ** 2
+        ):
+            return changed
+        gains[i, j] = gains[j, i] = np.inf
+    return None

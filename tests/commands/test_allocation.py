@@ -1,0 +1,305 @@
+"""qfolio allocate: trades, the ledger, orders."""
+
+import csv
+import json
+import shutil
+
+import pytest
+
+from shell import qfolio
+from tables import write_table
+
+AS_OF = ["--as-of", "2020-09-16"]
+
+
+@pytest.fixture(scope="module")
+def folder(folder, tmp_path_factory):
+    """A copy, which gets a ledger."""
+    return shutil.copytree(folder, tmp_path_factory.mktemp("desk") / "run")
+
+
+def allocation(folder, monkeypatch, capsys, *options):
+    capsys.readouterr()
+    assert qfolio(monkeypatch, "allocate", folder, *AS_OF, "--json", *options) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_allocate_from_cash(folder, monkeypatch, capsys):
+    plan = allocation(folder, monkeypatch, capsys, "--capital", 10_000)
+    assert plan["wealth"] == 10_000
+    weights = [row["weight"] for row in plan["assets"]]
+    assert sum(weights) + plan["cash_weight"] == pytest.approx(1, abs=1e-5)
+
+
+def test_allocate_from_holdings(folder, monkeypatch, capsys, tmp_path):
+    holdings = tmp_path / "holdings.csv"
+    holdings.write_text("asset,shares\nA,100\ncash,500\n")
+    plan = allocation(folder, monkeypatch, capsys, "--holdings", holdings)
+    price = plan["assets"][0]["price"]
+    assert plan["wealth"] == pytest.approx(100 * price + 500)
+    assert plan["assets"][0]["weight_now"] == pytest.approx(100 * price / plan["wealth"])
+    whole = allocation(folder, monkeypatch, capsys, "--holdings", holdings, "--whole-shares")
+    shares = [row["trade_shares"] for row in whole["assets"]]
+    assert shares == [round(x) for x in shares]
+    assert whole["cash_after"] >= 0
+
+
+def test_allocate_on_newer_prices(folder, monkeypatch, capsys, tmp_path):
+    newer = write_table(tmp_path / "newer.csv", rows=270, names=("A", "B", "C"))
+    options = ["--prices", newer, "--as-of", "2020-09-26", "--capital", 100]
+    plan = allocation(folder, monkeypatch, capsys, *options)
+    assert plan["date"] == "2020-09-26"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--capital", 1], "stale"), ([*AS_OF], "nothing to allocate"),
+        ([*AS_OF, "--capital", -1], "at least 0"), ([*AS_OF, "--agent", "dqn"], "no agent 'dqn'"),
+        (["--as-of", "soon"], "must be a date"), (["--as-of", "2020-01-05"], "after 2020-01-05"),
+    ],
+)  # fmt: skip
+def test_allocations_that_are_refused(folder, monkeypatch, capsys, options, message):
+    assert qfolio(monkeypatch, "allocate", folder, *options) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert "Traceback" not in printed
+
+
+def test_holdings_are_refused_by_their_line(folder, monkeypatch, capsys, tmp_path):
+    path = tmp_path / "holdings.csv"
+    path.write_text("asset,shares\nA,1\ncash,5\n")
+    assert qfolio(monkeypatch, "allocate", folder, *AS_OF, "--holdings", path,
+                  "--capital", 5) == 2  # fmt: skip
+    assert "line 3: cash is also given by --capital" in capsys.readouterr().err
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    """Of the finished backtest, to change."""
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def judge(folder, finding, verdict, against="to_reference"):
+    """Has the backtest find this of its agent, beside equal weights."""
+    path = folder / "summary.json"
+    summary = json.loads(path.read_text())
+    for key in ("to_reference", "to_rebalanced"):
+        growth = summary["strategies"]["pathwise-together"][key]["growth"]
+        assert growth["finding"] in ("better", "worse", "none")
+        growth["finding"] = finding if key == against else "none"
+    summary["verdicts"]["pathwise-together"][0] = verdict
+    path.write_text(json.dumps(summary))
+
+
+def test_an_allocation_names_agent_date_and_verdict(folder, copy, monkeypatch, capsys):
+    summary = json.loads((folder / "summary.json").read_text())
+    verdict = summary["verdicts"]["pathwise-together"][0]
+    plan = allocation(folder, monkeypatch, capsys, "--capital", 1)
+    assert (plan["agent"], plan["trained_until"]) == ("pathwise", "2020-09-16")
+    assert plan["verdict"] == verdict
+    judge(copy, "none", "No evidence of \x1b[2Jskill.")
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 0
+    printed = capsys.readouterr().out
+    assert "Agent: pathwise, trained on prices up to 2020-09-16." in printed
+    assert "In its backtest: No evidence of \\x1b[2Jskill." in printed
+
+
+@pytest.mark.parametrize("against", ["to_reference", "to_rebalanced"])
+def test_a_policy_that_was_found_worse_is_traded_on_demand_only(copy, monkeypatch, capsys, against):
+    judge(copy, "worse", "pathwise-together falls short of equal-weight.", against)
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 2
+    assert capsys.readouterr().err == (
+        "qfolio: In its own backtest, pathwise-together falls short of equal-weight; to trade "
+        "it nevertheless, add --agent pathwise or --anyway.\n"
+    )
+    for consent in (["--agent", "pathwise"], ["--anyway"]):
+        plan = allocation(copy, monkeypatch, capsys, "--capital", 1, *consent)
+        assert plan["verdict"] == "pathwise-together falls short of equal-weight."
+
+
+def test_a_backtest_without_a_verdict(copy, monkeypatch, capsys):
+    (copy / "summary.json").write_text('{"strategies": {"pathwise": 1}}')
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 2
+    assert "summary.json is damaged; write it again" in capsys.readouterr().err
+    (copy / "summary.json").unlink()
+    for consent in ([], ["--agent", "pathwise"]):
+        assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1, *consent) == 2
+        assert "is not finished, so it does not say how pathwise" in capsys.readouterr().err
+    plan = allocation(copy, monkeypatch, capsys, "--capital", 1, "--anyway")
+    assert plan["verdict"] is None
+
+
+def test_prices_that_do_not_match(folder, monkeypatch, capsys, tmp_path):
+    other = write_table(tmp_path / "other.csv", names=("A", "B", "D"))
+    assert qfolio(monkeypatch, "allocate", folder, "--prices", other, *AS_OF) == 2
+    assert "without 'C' and with 'D'" in capsys.readouterr().err
+
+
+def records(folder):
+    return [json.loads(path.read_text()) for path in sorted((folder / "ledger").glob("*.json"))]
+
+
+def test_the_ledger_has_one_record_for_the_same_inputs(copy, monkeypatch, capsys, tmp_path):
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    plan = allocation(copy, monkeypatch, capsys, "--capital", 1000)
+    (record,) = records(copy)
+    assert plan["record"] == record["number"] == 1
+    assert (record["date"], record["agent"], record["policy"]) == (
+        "2020-09-16", "pathwise", "latest",
+    )  # fmt: skip
+    assert all(len(digest) == 64 for digest in record["digests"].values())
+    assert record["target"][1:] == [row["weight"] for row in plan["assets"]]
+    assert record["trades"] == [row["trade_shares"] for row in plan["assets"]]
+    assert sum(record["costs"].values()) == pytest.approx(plan["expected_cost"])
+    assert allocation(copy, monkeypatch, capsys, "--capital", 1000)["record"] == 1
+    assert allocation(copy, monkeypatch, capsys, "--capital", 7, "--dry-run")["record"] is None
+    assert len(records(copy)) == 1
+    capsys.readouterr()
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 2000) == 0
+    printed = capsys.readouterr().out
+    assert "It supersedes record 1 of the same date, which had other holdings." in printed
+    assert [record["supersedes"] for record in records(copy)] == [None, 1]
+    # Back to the first inputs: the last record counts, and it has others.
+    assert allocation(copy, monkeypatch, capsys, "--capital", 1000)["record"] == 3
+
+
+def test_any_order_is_reproduced_after_an_update(copy, monkeypatch, capsys, tmp_path):
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    first = allocation(copy, monkeypatch, capsys, "--capital", 1000)
+    newer = write_table(tmp_path / "newer.csv", rows=270)
+    then = ["--prices", newer, "--as-of", "2020-09-26", "--capital", 1000, "--json"]
+    update = ["allocate", copy, *then, "--update"]
+    capsys.readouterr()
+    assert qfolio(monkeypatch, *update[:-4], "--update") == 2
+    assert "nothing to allocate" in capsys.readouterr().err
+    policies = copy / "policies" / "pathwise"
+    assert not (policies / "latest-1.safetensors").exists()  # a refused one keeps nothing
+    before = (policies / "latest.safetensors").read_bytes()
+    assert qfolio(monkeypatch, *update, "--dry-run") == 0
+    assert not (policies / "latest-1.safetensors").exists()
+    tried = json.loads(capsys.readouterr().out)
+    assert qfolio(monkeypatch, *update) == 0
+    second = json.loads(capsys.readouterr().out)
+    assert second["trained_until"] == "2020-09-26"
+    assert second["assets"] == tried["assets"]
+    assert (policies / "latest.safetensors").read_bytes() == before
+    assert [record["policy"] for record in records(copy)] == ["latest", "latest-1"]
+    for plan in (first, second):
+        assert qfolio(monkeypatch, "allocate", copy, "--reproduce", plan["date"], "--json") == 0
+        again = json.loads(capsys.readouterr().out)
+        assert again["assets"] == plan["assets"]
+    # With the inputs given once more, and rows that came later.
+    later = write_table(tmp_path / "later.csv", rows=280)
+    given = ["--reproduce", "2020-09-26", "--prices", later, "--capital", 1000]
+    assert qfolio(monkeypatch, "allocate", copy, *given) == 0
+    assert "is reproduced: prices, settings, holdings and policy" in capsys.readouterr().out
+    assert qfolio(monkeypatch, "allocate", copy, *given[:-1], 999) == 2
+    assert "the holdings differ from those of the ledger" in capsys.readouterr().err
+    other = write_table(tmp_path / "other.csv", rows=280, scale=2)
+    changed = ["--reproduce", "2020-09-26", "--prices", other, "--capital", 999]
+    assert qfolio(monkeypatch, "allocate", copy, *changed) == 2
+    assert "the prices up to 2020-09-26 and the holdings differ" in capsys.readouterr().err
+    (policies / "latest-1.safetensors").write_bytes(before)
+    assert qfolio(monkeypatch, "allocate", copy, "--reproduce", "2020-09-26") == 2
+    assert "the file of the policy latest-1 differ" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("", "damaged"), ('{"number": 1}', "damaged"), ('{"format": 99}', "damaged")],
+)
+def test_a_damaged_ledger_is_refused(copy, monkeypatch, capsys, content, message):
+    allocation(copy, monkeypatch, capsys, "--capital", 1000)
+    number = max(record["number"] for record in records(copy))
+    (copy / "ledger" / f"{number:04d}.json").write_text(content)
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_what_the_ledger_does_not_know_is_refused(copy, monkeypatch, capsys):
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    assert qfolio(monkeypatch, "allocate", copy, "--reproduce", "2020-09-16") == 2
+    assert "no allocation of '2020-09-16'; it is empty" in capsys.readouterr().err
+    options = ["--reproduce", "2020-09-16", "--agent", "pathwise"]
+    assert qfolio(monkeypatch, "allocate", copy, *options) == 2
+    assert "--reproduce takes its agent from the ledger" in capsys.readouterr().err
+
+
+def test_a_baseline_is_followed(folder, monkeypatch, capsys):
+    """Equal weights after costs, whatever the agents learned; nothing needs to be trained."""
+    plan = allocation(folder, monkeypatch, capsys, "--agent", "equal-weight", "--capital", 3000)
+    assert [row["weight"] for row in plan["assets"]] == pytest.approx([1 / 3] * 3)
+    assert plan["expected_cost"] == pytest.approx(3)  # 10 bp of what is spent
+    assert plan["trained_until"] is None
+    assert "A baseline, which learned nothing: it grew by" in plan["verdict"]
+    assert records(folder)[-1]["policy"] is None
+    capsys.readouterr()
+    momentum = ["--agent", "momentum", "--capital", 3000]
+    assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *momentum) == 0
+    assert "Baseline: momentum.\nIn its backtest: A baseline" in capsys.readouterr().out
+    assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *momentum, "--update") == 2
+    assert "which learns nothing; leave out --update" in capsys.readouterr().err
+
+
+def test_a_baseline_that_gives_no_order_leaves_the_holding(folder, monkeypatch, capsys, tmp_path):
+    holdings = tmp_path / "holdings.csv"
+    holdings.write_text("asset,shares\nA,100\ncash,500\n")
+    kept = ["--agent", "buy-and-hold", "--holdings", holdings]
+    plan = allocation(folder, monkeypatch, capsys, *kept)
+    assert [row["trade_shares"] for row in plan["assets"]] == [0, 0, 0]
+    assert plan["cash_after"] == 500
+    # Of a fully invested account that is equally weighted, nothing is traded either.
+    prices = [row["price"] for row in plan["assets"]]
+    lines = [f"{name},{1000 / price!r}" for name, price in zip("ABC", prices, strict=True)]
+    holdings.write_text("\n".join(["asset,shares", *lines, ""]))
+    plan = allocation(folder, monkeypatch, capsys, "--agent", "equal-weight", *kept[2:])
+    assert [row["trade_shares"] for row in plan["assets"]] == [0, 0, 0]
+
+
+def test_a_warning_stands_above_the_orders_of_a_worse_policy(copy, monkeypatch, capsys):
+    judge(copy, "worse", "pathwise-together falls short of equal-weight.")
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1, "--anyway") == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    warning = "WARNING. In its backtest: pathwise-together falls short of equal-weight."
+    assert warning in printed
+    assert printed.index("WARNING") < printed.index("weight now")
+
+
+def test_orders_as_csv(folder, monkeypatch, capsys, tmp_path):
+    path, holdings = tmp_path / "orders.csv", tmp_path / "holdings.csv"
+    holdings.write_text("asset,shares\nA,100\ncash,5000\n")
+    of = ["--agent", "equal-weight", "--holdings", holdings, "--orders", path]
+    plan = allocation(folder, monkeypatch, capsys, *of)
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["side"] for row in rows] == sorted((row["side"] for row in rows), reverse=True)
+    assert {row["order_type"] for row in rows} == {"MARKET"}
+    by_name = {row["asset"]: row for row in plan["assets"]}
+    for row in rows:
+        asset = by_name[row["symbol"]]
+        sign = 1 if row["side"] == "BUY" else -1
+        assert sign * float(row["quantity"]) == pytest.approx(asset["trade_shares"], abs=1e-6)
+        assert float(row["weight_before"]) == pytest.approx(asset["weight_now"], abs=1e-6)
+        assert float(row["weight_after"]) == pytest.approx(asset["weight_after"], abs=1e-6)
+    paid = sum(float(row["expected_cost"]) for row in rows)
+    assert paid == pytest.approx(plan["expected_cost"], abs=0.02)
+    assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *of, "--layout", "ib") == 2
+    assert "has whole shares; add --whole-shares" in capsys.readouterr().err
+    whole = [*of, "--layout", "ib", "--whole-shares", "--currency", "EUR"]
+    allocation(folder, monkeypatch, capsys, *whole)
+    header, *lines = path.read_text().splitlines()
+    assert header == (
+        "Action,Quantity,Symbol,SecType,Exchange,Currency,TimeInForce,OrderType,BasketTag"
+    )
+    assert all(",STK,SMART,EUR,DAY,MKT,qfolio 2020-09-16" in line for line in lines)
+    assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *of, "--layout", "x") == 2
+    assert "--layout is 'x'; choose from generic, ib" in capsys.readouterr().err
+
+
+def test_nothing_to_trade_is_an_empty_file_of_orders(folder, monkeypatch, capsys, tmp_path):
+    path, holdings = tmp_path / "orders.csv", tmp_path / "holdings.csv"
+    holdings.write_text("asset,shares\nA,100\n")
+    of = ["--agent", "buy-and-hold", "--holdings", holdings, "--orders", path]
+    allocation(folder, monkeypatch, capsys, *of)
+    assert len(path.read_text().splitlines()) == 1

@@ -1,0 +1,103 @@
+"""Whole shares against every rounding, and against rounding toward zero."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from qfolio.portfolio.allocation import Allocation
+from qfolio.portfolio.costs import Proportional
+from qfolio.portfolio.prices.table import Prices
+
+
+class Fixed:
+    """Wants the same weights whatever it sees."""
+
+    def __init__(self, wanted, cost):
+        self.wanted, self.costs = wanted, Proportional(cost)
+
+    def weights(self, prices, holdings=None):
+        return dict(zip(("cash", *prices.assets), self.wanted.tolist(), strict=True))
+
+
+def case(seed, fractions=False):
+    """A random account and target: fractional trades, whole ones, and the distance to the target.
+
+    The distance of trades is the root of the sum of squares, as a share of the wealth.
+    """
+    rng = np.random.default_rng(seed)
+    count, cost = int(rng.integers(1, 7)), float(rng.choice([0.0, 0.001, 0.01, 0.2]))
+    prices = np.exp(rng.normal(4, 1.2, count))
+    shares = np.round(rng.exponential(8, count) * rng.integers(0, 2, count), 2 * fractions)
+    cash, target = float(rng.uniform(1, 4000)), rng.dirichlet(np.ones(count + 1))
+    names = tuple("ABCDEFGH"[:count])
+    table = Prices(np.arange(2).astype("datetime64[D]"), names, np.stack([prices, prices]))
+    policy = Fixed(target, cost)
+    ideal = Allocation.of(policy, table, shares, cash)
+    whole = Allocation.of(policy, table, shares, cash, whole_shares=True)
+
+    def distance(trades, cash_after):
+        off = np.append(cash_after - ideal.cash_after, (trades - ideal.trades) * prices)
+        return float(np.sqrt(off @ off)) / ideal.wealth
+
+    return ideal, whole, distance, cost
+
+
+def money_left(allocation, trades, cost):
+    """Independent of the module: sales yield 1 − c, purchases take 1 / (1 − c)."""
+    money = trades * allocation.prices
+    return (
+        allocation.cash - money[money < 0].sum() * (1 - cost) - money[money > 0].sum() / (1 - cost)
+    )
+
+
+@pytest.mark.parametrize("seed", range(80))
+@pytest.mark.parametrize("fractions", [False, True])
+def test_no_more_is_spent_than_there_is(seed, fractions):
+    ideal, whole, _, cost = case(seed, fractions)
+    np.testing.assert_array_equal(whole.trades, np.round(whole.trades))
+    assert (whole.shares + whole.trades >= 0).all()
+    assert whole.cash_after >= 0
+    left = money_left(whole, whole.trades, cost)
+    assert whole.cash_after == pytest.approx(left, abs=1e-8 * whole.wealth)
+    assert left >= -1e-8 * whole.wealth
+    # A trade is never a share or more off, except that fewer are bought where money is short.
+    assert (whole.trades < ideal.trades + 1).all()
+
+
+def test_the_rounding_is_nearly_the_best_of_all():
+    """In 9 of 10 accounts it is the best; the distance to the target is 2 % longer at most."""
+    found = []
+    for seed in range(80):
+        ideal, whole, distance, cost = case(seed)
+        choices = product(*({np.floor(x + 1e-9), np.ceil(x - 1e-9)} for x in ideal.trades))
+        best = min(
+            (
+                distance(np.array(trades), left)
+                for trades in choices
+                if (left := money_left(ideal, np.array(trades), cost)) >= 0
+                and (ideal.shares + np.array(trades) >= 0).all()
+            ),
+            default=None,
+        )
+        if best is not None:
+            found.append((distance(whole.trades, whole.cash_after), best))
+    ours, best = np.array(found).T
+    assert len(found) > 70
+    assert (ours <= best * (1 + 1e-6) + 1e-9).mean() >= 0.9
+    assert (ours / np.maximum(best, 1e-9)).mean() < 1.02
+
+
+def test_cash_is_nearer_its_target_than_by_rounding_toward_zero():
+    """Mean error of the cash weight: less than half of that."""
+    errors = []
+    for seed in range(80):
+        ideal, whole, _, cost = case(seed)
+        toward_zero = np.trunc(ideal.trades + np.copysign(1e-9, ideal.trades))
+        left = money_left(ideal, toward_zero, cost)
+        if left >= 0:
+            wealth = ideal.wealth
+            errors.append([abs(c - ideal.cash_after) / wealth for c in (whole.cash_after, left)])
+    ours, theirs = np.mean(errors, axis=0)
+    assert theirs > 0.01
+    assert ours < 0.5 * theirs
