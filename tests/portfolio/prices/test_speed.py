@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from qfolio import cli
-from qfolio.portfolio.prices import reading
+from qfolio.portfolio.prices import delimited
 from qfolio.portfolio.prices.table import load
 
 
@@ -23,8 +23,8 @@ def table(path: Path, rows: int, assets: int) -> Path:
 
 
 def test_a_check_reads_the_table_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    parse = Mock(wraps=reading._parse)
-    monkeypatch.setattr(reading, "_parse", parse)
+    parse = Mock(wraps=delimited._parse)
+    monkeypatch.setattr(delimited, "_parse", parse)
     monkeypatch.setattr("sys.argv", ["qfolio", "prices", str(table(tmp_path / "a.csv", 80, 3))])
     with pytest.raises(SystemExit) as end:
         cli.main()

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from qfolio.core.text import quote
 from qfolio.portfolio.prices.findings import Findings, listing
-from qfolio.portfolio.prices.reading import Table
+from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.vocabulary import (
     ADJUSTED_NAMES,
     KINDS,

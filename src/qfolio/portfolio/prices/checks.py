@@ -8,9 +8,9 @@ from qfolio.portfolio.prices.columns import find_columns
 from qfolio.portfolio.prices.findings import Finding, Findings
 from qfolio.portfolio.prices.gaps import complete
 from qfolio.portfolio.prices.grid import arrange
+from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.moves import check_moves
 from qfolio.portfolio.prices.plausibility import FEWEST_ROWS, check_cells, check_size
-from qfolio.portfolio.prices.reading import Table
 
 MISSING = ("error", "drop-asset", "forward-fill")
 LATE = ("error", "drop-asset", "trim", "join")

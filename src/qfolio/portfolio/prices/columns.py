@@ -7,9 +7,10 @@ import numpy as np
 
 from qfolio.core.text import quote
 from qfolio.portfolio.prices.bars import columns_of_kind, pick_prices
-from qfolio.portfolio.prices.cells import dates, is_missing, numbers, readable_date
+from qfolio.portfolio.prices.cells import is_missing, numbers
+from qfolio.portfolio.prices.dates import are_times, read_dates, readable_date
 from qfolio.portfolio.prices.findings import LISTED, Findings, hint, listing
-from qfolio.portfolio.prices.reading import Table
+from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.vocabulary import (
     ADJUSTED_NAMES,
     ASSET_NAMES,
@@ -33,12 +34,14 @@ class Columns:
     """The columns of a table by content, as their indices.
 
     date: the column of dates.
+    time: the column of times of day beside it; None if there is none.
     asset: the column of assets' names in a long table; None in a wide one.
     assets: names of the assets of a wide table; empty in a long one.
     prices: one for each asset of a wide table; a single one in a long table.
     """
 
     date: int
+    time: int | None
     asset: int | None
     assets: tuple[str, ...]
     prices: tuple[int, ...]
@@ -66,7 +69,8 @@ def find_columns(
         )
         return None
     counted = (j for j in columns if j != when and _counts_rows(table, j))
-    columns = [j for j in columns if j not in {when, *counted}]
+    time = _time_column(table, columns, when)
+    columns = [j for j in columns if j not in {when, time, *counted}]
     single = {table.names[j]: j for j in columns}
     by_asset = {name: columns_of_kind(table, name) for name in features}
     for name in features:
@@ -80,9 +84,8 @@ def find_columns(
     if findings.bad:
         return None
     if label is not None and price is not None:
-        return Columns(
-            when, label, (), (price,), tuple(Feature((single[name],), True) for name in features)
-        )
+        own = tuple(Feature((single[name],), True) for name in features)
+        return Columns(when, time, label, (), (price,), own)
     _check_wide(table, others, findings)
     if findings.bad:
         return None
@@ -97,7 +100,7 @@ def find_columns(
             )
         else:
             wanted.append(Feature(tuple(by_asset[name][asset] for asset in assets), by_asset=True))
-    return None if findings.bad else Columns(when, None, assets, prices, tuple(wanted))
+    return None if findings.bad else Columns(when, time, None, assets, prices, tuple(wanted))
 
 
 def _check_names(
@@ -113,10 +116,12 @@ def _check_names(
         if len(where) > 1:
             listed = " and ".join(str(j + 1) for j in where[:LISTED])
             more = " and others" if len(where) > LISTED else ""
+            advice = "Give every column a name of its own."
+            if plain(name) in DATE_NAMES:
+                advice = "Give one column of dates for all assets, or one file for each asset."
             findings.error(
-                f"the columns {listed}{more} have the same name", column=name,
-                advice="Give every column a name of its own.",
-            )  # fmt: skip
+                f"the columns {listed}{more} have the same name", column=name, advice=advice
+            )
     if table.first_row and not findings.bad and readable_date(names[0]):
         findings.error(
             "the first line holds values instead of column names", row=table.first_row - 1,
@@ -154,9 +159,17 @@ def _date_column(table: Table, columns: list[int], date: str | None) -> int | No
     if not columns or plain(table.names[columns[0]]) in ASSET_NAMES:
         return None
     cells = table.columns[columns[0]][:LOOKED_AT]
-    moments, _ = dates(cells)
-    likely = (~np.isnat(moments)).any() or numbers(cells)[1].any()
+    moments, _, unit = read_dates(cells)
+    likely = (~np.isnat(moments) & (unit is None)).any() or numbers(cells)[1].any()
     return columns[0] if likely else None
+
+
+def _time_column(table: Table, columns: list[int], when: int) -> int | None:
+    """The column of times of day beside the dates, as Stooq and MetaTrader have it."""
+    for j in columns:
+        if j != when and plain(table.names[j]) == "time" and are_times(table.columns[j]):
+            return j
+    return None
 
 
 def _long_columns(
@@ -174,7 +187,7 @@ def _long_columns(
     if not assets or not prices:
         return None, None
     labels = [j for j in assets if _are_labels(table.columns[j])]
-    moments, _ = dates(table.columns[when])
+    moments = read_dates(table.columns[when]).moments
     known = moments[~np.isnat(moments)]
     if not labels and len(np.unique(known)) == len(known):
         return None, None

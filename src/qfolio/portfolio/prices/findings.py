@@ -1,7 +1,7 @@
 """Findings: errors, warnings and notes on a price table, with advice."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -53,11 +53,14 @@ class Findings(list[Finding]):
     def note(self, message: str, **rest: Any) -> None:
         self.append(Finding("note", message, **rest))
 
-    def rows(self, first_row: int, column: str, said: Mapping[int, str], advice: str) -> None:
-        """An error for each row in ``said``, which are counted from ``first_row``."""
+    def rows(
+        self, said: Mapping[int, str], spot: Callable[[int], dict[str, Any]], advice: str
+    ) -> None:
+        """An error for each row in ``said``; ``spot`` tells where it is."""
         for line in list(said)[:LISTED]:
-            self.error(said[line], row=first_row + line, column=column, advice=advice)
+            self.error(said[line], **spot(line), advice=advice)
         if (rest := len(said) - LISTED) > 0:
+            column = spot(next(iter(said)))["column"]
             more = f"and {amount(rest, 'more row')} of this kind"
             self.error(more, column=column, advice=advice, count=rest)
 

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.text import quote
-from qfolio.portfolio.prices.cells import NO_DATE, currencies, dates, label, numbers
+from qfolio.portfolio.prices.cells import currencies, label, numbers
 from qfolio.portfolio.prices.columns import Columns
+from qfolio.portfolio.prices.dates import NO_DATE, read_dates, with_times
 from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day
-from qfolio.portfolio.prices.reading import Table
+from qfolio.portfolio.prices.layout import Table
 
 MOST_CELLS, SPARSEST = 100_000_000, 0.05  # a long table that would be this large and this empty
 WRITE_DATES = "Write dates as 2020-01-31."
@@ -42,11 +43,10 @@ class Grid:
     def spot(self, block: Block, i: int, j: int) -> dict[str, Any]:
         """Row, column and date of a cell, for a finding."""
         line = int(self.lines[i, j])
-        return {
-            "row": self.table.first_row + line if line >= 0 else None,
-            "column": self.table.names[block.columns[j]],
-            "date": None if np.isnat(self.dates[i]) else day(self.dates[i]),
-        }
+        spot = self.table.spot(line, block.columns[j])
+        if line < 0:
+            spot["row"] = None
+        return {**spot, "date": None if np.isnat(self.dates[i]) else day(self.dates[i])}
 
     def subject(self, block: Block, j: int) -> str:
         """The subject of a finding: the price, or in a long table the price of an asset."""
@@ -80,7 +80,12 @@ def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
             f"prices are in several currencies: {' and '.join(signs)}",
             advice="Convert all prices to one currency.",
         )
-    moments, complaints = dates(table.columns[columns.date])
+    cells = table.columns[columns.date]
+    if columns.time is not None:
+        cells = with_times(cells, table.columns[columns.time])
+    moments, complaints, unit = read_dates(cells)
+    if unit:
+        findings.note(f"dates are read as {unit.name}", column=table.names[columns.date])
     used = [*prices, *(j for feature in columns.features for j in feature.columns)]
     values, wrong = _read_numbers(table, used)
     undated = np.array([complaints.get(i) == NO_DATE for i in range(len(moments))], dtype=bool)
@@ -103,10 +108,9 @@ def _wide(
     values: np.ndarray, wrong: np.ndarray, blank: np.ndarray, findings: Findings,
 ) -> Grid:  # fmt: skip
     lines = np.flatnonzero(~blank)
-    name = table.names[columns.date]
     complaints = {line: said for line, said in complaints.items() if not blank[line]}
-    findings.rows(table.first_row, name, complaints, WRITE_DATES)
-    lines = _in_order(table, name, moments, lines, findings)
+    findings.rows(complaints, lambda line: table.spot(line, columns.date), WRITE_DATES)
+    lines = _in_order(table, columns.date, moments, lines, findings)
     values, wrong, moments = values[lines], wrong[lines], moments[lines]
     blocks: list[Block] = []
     start = 0
@@ -120,28 +124,34 @@ def _wide(
 
 
 def _in_order(
-    table: Table, name: str, moments: np.ndarray, lines: np.ndarray, findings: Findings
+    table: Table, date: int, moments: np.ndarray, lines: np.ndarray, findings: Findings
 ) -> np.ndarray:
     """The rows, reversed if the newest comes first; errors if they are not in order."""
+
+    def spot(line: int) -> dict[str, Any]:
+        return table.spot(line, date)
+
+    name, one = table.names[date], "column" if table.turned else "row"
     known = lines[~np.isnat(moments[lines])]
     steps = np.diff(moments[known]).astype(np.int64)
     if (steps > 0).all():
         return lines
     if len(steps) > 1 and (steps <= 0).all() and (steps < 0).any():
-        findings.note("the newest row comes first; the rows are read in reverse order", column=name)
+        said = f"the newest {one} comes first; the {one}s are read in reverse order"
+        findings.note(said, column=name)
         lines, known, steps = lines[::-1], known[::-1], -steps[::-1]
     first: dict[Any, int] = {}
     repeated, unsorted = {}, {}
     for line in known.tolist():
         before = first.setdefault(moments[line], line)
         if before != line:
-            row = table.first_row + before
-            repeated[line] = f"the date {day(moments[line])} is already in row {row}"
+            where = quote(spot(before)["column"]) if table.turned else spot(before)["row"]
+            repeated[line] = f"the date {day(moments[line])} is already in {one} {where}"
     for line in known[1:][steps < 0].tolist():
         if line not in repeated:
             unsorted[line] = f"the date {day(moments[line])} comes after a later one"
-    findings.rows(table.first_row, name, repeated, "Remove one of the two rows.")
-    findings.rows(table.first_row, name, unsorted, "Sort the rows, oldest first.")
+    findings.rows(repeated, spot, f"Remove one of the two {one}s.")
+    findings.rows(unsorted, spot, f"Sort the {one}s, oldest first.")
     return lines
 
 
@@ -151,16 +161,19 @@ def _long(
 ) -> Grid | None:  # fmt: skip
     import pandas as pd
 
-    assert columns.asset is not None
-    names = table.names
-    labels = np.array([label(c) for c in table.columns[columns.asset].tolist()], dtype=object)
+    asset = columns.asset
+    assert asset is not None
+
+    def spot(line: int) -> dict[str, Any]:
+        return table.spot(line, asset)
+
+    labels = np.array([label(c) for c in table.columns[asset].tolist()], dtype=object)
     nameless = labels == ""
     blank = blank & nameless
     complaints = {line: said for line, said in complaints.items() if not blank[line]}
-    findings.rows(table.first_row, names[columns.date], complaints, WRITE_DATES)
+    findings.rows(complaints, lambda line: table.spot(line, columns.date), WRITE_DATES)
     unnamed = {int(i): "the asset has no name" for i in np.flatnonzero(nameless & ~blank)}
-    advice = "Name the asset in every row."
-    findings.rows(table.first_row, names[columns.asset], unnamed, advice)
+    findings.rows(unnamed, spot, "Name the asset in every row.")
 
     lines = np.flatnonzero(~nameless & ~np.isnat(moments))
     days, i = np.unique(moments[lines], return_inverse=True)
@@ -177,11 +190,10 @@ def _long(
     _, first, back = np.unique(place, return_index=True, return_inverse=True)
     repeated = {
         int(lines[k]): f"{quote(assets[j[k]])} on {day(days[i[k]])} is already in row "
-        f"{table.first_row + int(lines[first[back[k]]])}"
+        f"{spot(int(lines[first[back[k]]]))['row']}"
         for k in np.flatnonzero(first[back] != np.arange(len(place))).tolist()
     }
-    advice = "Remove one of the two rows."
-    findings.rows(table.first_row, names[columns.asset], repeated, advice)
+    findings.rows(repeated, spot, "Remove one of the two rows.")
 
     def pivot(column: np.ndarray, empty: Any) -> np.ndarray:
         grid = np.full(size, empty, dtype=column.dtype)

@@ -1,11 +1,20 @@
 """Names of columns, on one level or, as yfinance's downloads have them, on two."""
 
+import itertools
 import re
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from qfolio.portfolio.prices.cells import is_missing, is_number, readable_date
-from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, DATE_NAMES, is_price, plain
+from qfolio.portfolio.prices.cells import is_missing, is_number
+from qfolio.portfolio.prices.dates import readable_date
+from qfolio.portfolio.prices.vocabulary import (
+    ASSET_NAMES,
+    DATE_NAMES,
+    SETTINGS,
+    is_price,
+    kind,
+    plain,
+)
 
 _PAIR = re.compile(r"""\((["'])(.*?)\1, (["'])(.*?)\3\)""")  # how pandas writes a pair of names
 
@@ -36,9 +45,12 @@ def parse_header(records: list[list[str]]) -> Header:
 
     pandas writes columns with two levels as two lines, with the levels' names in the first column
     (Price, Close, High, … above Ticker, AAPL, AAPL, …); if the index has a name, it stands alone
-    on a third line.
+    on a third line. Bloomberg's exports have settings above, and then tickers above fields.
     """
-    first, second, third = ([cell.strip() for cell in r] for r in (*records, [], [])[:3])
+    records = [[cell.strip() for cell in record] or [""] for record in records]
+    if header := _below_settings(records):
+        return header
+    first, second, third = (*records, [], [])[:3]
     pairs: list[Any] = list(first)
     above = ""
     for j in range(1, min(len(first), len(second))):
@@ -57,6 +69,38 @@ def parse_header(records: list[list[str]]) -> Header:
     elif second[0]:  # the names of the two levels, unless it is that of the column
         pairs[0] = second[0] if plain(second[0]) in DATE_NAMES else ""
     return name_columns(pairs)._replace(lines=2 + alone)
+
+
+def _below_settings(records: list[list[str]]) -> Header | None:
+    """The header below lines such as Start Date,2024-01-02; None if the first line is none."""
+    if _setting(records[0]) not in SETTINGS:
+        return None
+    begins = (
+        k
+        for k, (record, below) in enumerate(itertools.pairwise(records))
+        if readable_date(below[0]) or plain(record[0]) in DATE_NAMES
+    )
+    if not (k := next(begins, 0)):
+        return None
+    above = [
+        r
+        for r in records[:k]
+        if _setting(r) in ("", "security", "securities")
+        and any(r[1:])
+        and not any(map(kind, r[1:]))
+    ]
+    names: list[Any] = list(records[k])
+    if above:
+        tickers, ticker = above[-1], ""
+        for j in range(1, len(names)):
+            ticker = (tickers[j] if j < len(tickers) else "") or ticker
+            names[j] = (ticker, names[j]) if names[j] else ""
+    names[0] = names[0] or "date"
+    return name_columns(names)._replace(lines=k + 1)
+
+
+def _setting(record: list[str]) -> str:
+    return plain(record[0]).rstrip(": ")
 
 
 def _text(name: Any) -> str:

@@ -35,7 +35,7 @@ def check_cells(grid: Grid, findings: Findings) -> None:
             said = _complaint(grid, block, int(block.wrong[:, j].argmax()), j)
             findings.error(
                 f"there are no numbers: {said}", column=table.names[block.columns[j]],
-                advice="Remove the column.",
+                advice="Remove the column, or write its numbers as 1234.5.",
             )  # fmt: skip
         if (rest := int(texts.sum()) - LISTED) > 0:
             findings.error(f"and {amount(rest, 'more column')} without numbers", count=rest)
@@ -81,7 +81,9 @@ def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:
         findings.warn(
             f"the previous row is {day(dates[k])}, {steps[k]:.4g} days earlier "
             f"(usual: {usual:.4g})",
-            row=None if grid.long else grid.spot(grid.prices, rest.head + int(k) + 1, 0)["row"],
+            row=None
+            if grid.long or grid.table.turned
+            else grid.spot(grid.prices, rest.head + int(k) + 1, 0)["row"],
             date=day(dates[k + 1]),
         )
     if (more := len(long) - LISTED) > 0:

@@ -2,17 +2,21 @@
 
 import re
 
-DATE_NAMES = ("date", "datetime", "timestamp", "time")
+DATE_NAMES = ("date", "dates", "datetime", "timestamp", "time")
 ASSET_NAMES = ("asset", "ticker", "symbol", "name")
 ADJUSTED_NAMES = ("adjusted close", "adj close", "adjclose", "adjusted price", "adj price")
 PRICE_NAMES = ("close", "price", "value")
+SETTINGS = (
+    "security", "securities", "start date", "end date", "period", "periodicity", "currency",
+)  # fmt: skip
+"""What exports name in the lines above their column names."""
 KINDS = {
     "adjusted": (*ADJUSTED_NAMES, "adjusted"),
-    "close": ("close", "closing price", "close/last", "price", "last"),
-    "open": ("open",),
-    "high": ("high",),
-    "low": ("low",),
-    "volume": ("volume", "vol"),
+    "close": ("close", "closing price", "close/last", "price", "last", "last price", "px last"),
+    "open": ("open", "px open"),
+    "high": ("high", "px high"),
+    "low": ("low", "px low"),
+    "volume": ("volume", "vol", "px volume"),
     "other": (
         "adj open", "adj high", "adj low", "adj volume", "adjopen", "adjhigh", "adjlow",
         "adjvolume", "vwap", "trades", "transactions", "trade count", "number of trades",

@@ -1,0 +1,313 @@
+"""Exports as programs write them: read to the last digit, or refused with what to do."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.prices.table import Prices, check, load
+
+DAYS = pd.bdate_range("2024-01-29", periods=4)
+ISO = [f"{day:%Y-%m-%d}" for day in DAYS]
+
+
+def write(folder: Path, text: str | bytes) -> Path:
+    path = folder / "prices.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(QfolioError) as raised:
+        load(path)
+    return str(raised.value)
+
+
+def attempt(path: Path, **options: str) -> Prices | str:
+    """The prices, or why they are refused; any other error is the caller's."""
+    try:
+        return load(path, **options)
+    except QfolioError as error:
+        return str(error)
+
+
+def notes(path: Path) -> list[str]:
+    return [str(finding) for finding in check(path) if finding.severity == "note"]
+
+
+# Whole tables: a random one in each format.
+
+Cells = list[list[str]]
+Writer = Callable[[pd.DatetimeIndex, list[str], Cells], str | bytes]
+STOOQ = "<TICKER>,<PER>,<DATE>,<TIME>,<OPEN>,<HIGH>,<LOW>,<CLOSE>,<VOL>,<OPENINT>"
+
+
+def rows(first: list[str], cells: Cells, mark: str = ",") -> str:
+    return "".join(mark.join([day, *row]) + "\n" for day, row in zip(first, cells, strict=True))
+
+
+def head(label: str, names: list[str], mark: str = ",") -> str:
+    return mark.join([label, *names]) + "\n"
+
+
+def comma(cells: Cells) -> Cells:
+    """European: 1.234,50."""
+    swap = str.maketrans(",.", ".,")
+    return [[cell.translate(swap) for cell in row] for row in cells]
+
+
+def plain(cells: Cells) -> Cells:
+    return [[cell.replace(",", "") for cell in row] for row in cells]
+
+
+def stooq(days: pd.DatetimeIndex, names: list[str], cells: Cells) -> str:
+    lines = [
+        f"{name}.US,D,{day:%Y%m%d},000000,9,9,9,{row[j]},100,0"
+        for j, name in enumerate(names)
+        for day, row in zip(days, plain(cells), strict=True)
+    ]
+    return "\n".join([STOOQ, *lines])
+
+
+def bloomberg(days: pd.DatetimeIndex, names: list[str], cells: Cells) -> str:
+    blanks = "," * len(names)
+    above = f"Start Date,01/13/2024{blanks}\nEnd Date,12/31/2024{blanks}\n,{blanks}\n"
+    titles = head("", [f"{name} US Equity" for name in names])
+    titles += head("Dates", ["PX_LAST"] * len(names))
+    return above + titles + rows([f"{day:%m/%d/%Y}" for day in days], plain(cells))
+
+
+def security(days: pd.DatetimeIndex, names: list[str], cells: Cells) -> str:
+    titles = head("Security", [f"{name} US Equity" for name in names])
+    titles += "Start Date,1/2/2024\nPeriod,D\nCurrency,USD\n\n"
+    titles += head("Date", ["Last Price"] * len(names))
+    return titles + rows([f"{day:%Y-%m-%d}" for day in days], plain(cells))
+
+
+def european(days: pd.DatetimeIndex, names: list[str], cells: Cells) -> str:
+    return head("Datum", names, ";") + rows([f"{d:%d.%m.%Y}" for d in days], comma(cells), ";")
+
+
+def excel(days: pd.DatetimeIndex, names: list[str], cells: Cells) -> bytes:
+    """Excel's declared separator, serial dates, and Unicode text."""
+    serial = [str((day - pd.Timestamp("1899-12-30")).days) for day in days]
+    text = "sep=;\n" + head("Date", names, ";") + rows(serial, comma(plain(cells)), ";")
+    return text.replace("\n", "\r\n").encode("utf-16")
+
+
+def american(days: pd.DatetimeIndex, names: list[str], cells: Cells) -> str:
+    quoted = [[f'"{cell}"' for cell in row] for row in cells]
+    return head("Date", names) + rows([f"{day:%m/%d/%Y}" for day in days], quoted)
+
+
+def unix(factor: int) -> Writer:
+    def write(days: pd.DatetimeIndex, names: list[str], cells: Cells) -> str:
+        seconds = [str(int(day.timestamp()) * factor) for day in days]
+        return head("timestamp", names) + rows(seconds, plain(cells))
+
+    return write
+
+
+def turned(days: pd.DatetimeIndex, names: list[str], cells: Cells) -> str:
+    columns = [list(column) for column in zip(*plain(cells), strict=True)]
+    return head("Ticker", [f"{day:%Y-%m-%d}" for day in days]) + rows(names, columns)
+
+
+WRITERS: dict[str, Writer] = {
+    "stooq": stooq, "bloomberg": bloomberg, "security": security, "european": european,
+    "excel": excel, "american": american, "unix": unix(1), "milliseconds": unix(1000),
+    "turned": turned,
+}  # fmt: skip
+
+
+def sample(rng: np.random.Generator) -> tuple[pd.DatetimeIndex, list[str], Cells]:
+    """Dates, names and cells such as 1,234.50; a column has its own size and decimals."""
+    count, assets = int(rng.integers(3, 9)), int(rng.integers(1, 5))
+    days = pd.bdate_range("2024-01-10", periods=count) + pd.Timedelta(days=7 * rng.integers(500))
+    columns = []
+    for _ in range(assets):
+        sizes = 10 ** rng.uniform(-1, 6) * rng.uniform(0.8, 1.2, count)
+        decimals = int(rng.choice([0, 1, 2, 2, 3, 4]))
+        columns.append([f"{max(size, 1):,.{decimals}f}" for size in sizes])
+    return days, [f"A{j}" for j in range(assets)], [list(row) for row in zip(*columns, strict=True)]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_what_is_read_is_what_was_written(tmp_path: Path, name: str):
+    """Random tables: exactly the numbers and dates that were written, or a refusal."""
+    rng = np.random.default_rng(7)
+    read = 0
+    for _ in range(40):
+        days, names, cells = sample(rng)
+        path = write(tmp_path, WRITERS[name](days, names, cells))
+        prices = attempt(path)
+        if isinstance(prices, str):
+            # A decimal mark or a group of thousands, or which number is the day.
+            assert " may mean " in prices or "the day" in prices
+            continue
+        read += 1
+        np.testing.assert_array_equal(prices.values, np.array(plain(cells), dtype=float))
+        np.testing.assert_array_equal(prices.dates, days.to_numpy("datetime64[s]"))
+        assert [asset.split(" ")[0].removesuffix(".US") for asset in prices.assets] == names
+    assert read >= (10 if name in ("european", "american", "excel") else 25)
+
+
+def mutated(rng: np.random.Generator, text: bytes) -> bytes:
+    """The bytes with a few of them replaced, removed, or repeated elsewhere."""
+    content = bytearray(text)
+    alphabet = b"0123456789,;.-\"'\n\r\t xeE+/\xff\x00=%"
+    for _ in range(int(rng.integers(1, 3))):
+        place, length = int(rng.integers(len(content) + 1)), int(rng.integers(0, 12))
+        fresh = bytes(rng.choice(list(alphabet), int(rng.integers(0, 4))).tolist())
+        if rng.random() < 0.3:
+            start = int(rng.integers(len(content) + 1))
+            fresh = bytes(content[start : start + 30])
+        content[place : place + length] = fresh
+    return bytes(content)
+
+
+def test_damaged_exports_are_read_or_refused(tmp_path: Path):
+    """1,000 mutations of all formats; anything but a QfolioError fails the test."""
+    rng = np.random.default_rng(11)
+    read = 0
+    for k in range(1000):
+        writer = list(WRITERS.values())[k % len(WRITERS)]
+        text = writer(*sample(rng))
+        path = write(tmp_path, mutated(rng, text if isinstance(text, bytes) else text.encode()))
+        prices = attempt(path, missing="forward-fill", late="join")
+        assert isinstance(prices, Prices) or (len(prices) > 10 and "\n" not in prices)
+        read += isinstance(prices, Prices)
+    assert read > 50  # so both ends are reached
+
+
+# Each of them.
+
+
+def test_stooq_by_the_minute(tmp_path: Path):
+    times = ["153000", "153500", "154000"]
+    lines = [f"AAPL.US,5,20240131,{time},1,1,1,{k}.5,9,0" for k, time in enumerate(times, 1)]
+    prices = load(write(tmp_path, "\n".join([STOOQ, *lines])))
+    assert prices.assets == ("AAPL.US",)
+    assert [str(day) for day in prices.dates] == [f"2024-01-31T15:{m}:00" for m in (30, 35, 40)]
+    metatrader = "<DATE>\t<TIME>\t<OPEN>\t<HIGH>\t<LOW>\t<CLOSE>\t<TICKVOL>\n"
+    metatrader = metatrader.replace("<TICKVOL>", "<VOL>")
+    metatrader += "".join(f"2024.01.31\t{h}:30:00\t1\t1\t1\t2\t9\n" for h in (15, 16, 17))
+    assert str(load(write(tmp_path, metatrader)).dates[1]) == "2024-01-31T16:30:00"
+
+
+def test_a_security_of_bloomberg_with_several_fields(tmp_path: Path):
+    text = "Security,AAPL US Equity\nStart Date,1/2/2024\n\nDate,PX_LAST,PX_VOLUME\n"
+    text += rows(ISO, [["1.5", "100"], ["1.6", "#N/A N/A"], ["1.7", "90"], ["1.8", "80"]])
+    path = write(tmp_path, text)
+    assert load(path).assets == ("AAPL US Equity",)
+    assert "left out: 'AAPL US Equity PX_VOLUME'" in notes(path)[0]
+    prices = load(path, features=("PX_VOLUME",), missing="forward-fill")
+    assert prices.features[:, 0, 0].tolist() == [100, 100, 90, 80]
+    assert "row 6 (2024-01-30), column 'AAPL US Equity PX_LAST': the price is negative" in refusal(
+        write(tmp_path, text.replace("1.6", "-1.6"))
+    )
+
+
+def test_bloomberg_with_a_column_of_dates_for_each_asset(tmp_path: Path):
+    text = "Start Date,1/2/2024,,\n,AAPL US Equity,,MSFT US Equity\nDate,PX_LAST,Date,PX_LAST\n"
+    text += "".join(f"{day},1,{day},2\n" for day in ISO)
+    said = refusal(write(tmp_path, text.replace("\n,AAPL", "\nAAPL").replace(",,MSFT", ",,MSFT")))
+    assert "Give one column of dates for all assets, or one file for each asset" in said
+
+
+def test_numbers_in_groups_of_thousands(tmp_path: Path):
+    text = "date;A;B\n" + rows(ISO, [["1.234,50", "7"]] * 3 + [["1.250", "8"]], ";")
+    prices = load(write(tmp_path, text))
+    assert prices.values[:, 0].tolist() == [1234.5, 1234.5, 1234.5, 1250]
+    for group in ("'", "’", " ", "\u00a0", "\u202f"):
+        text = "date;A\n" + rows(ISO, [[f"1{group}234{group}567,25"]] * 4, ";")
+        assert load(write(tmp_path, text)).values[0, 0] == 1234567.25
+
+
+def test_points_that_may_be_either(tmp_path: Path):
+    """A column of 1.234 beside decimal commas, and a whole table of them."""
+    cells = [["1.234", "12,5"]] * 4
+    said = refusal(write(tmp_path, "date;A;B\n" + rows(ISO, cells, ";")))
+    assert "column 'A': there are no numbers: '1.234' may mean 1234 or 1.234" in said
+    assert "write its numbers as 1234.5" in said
+    cells = [["1.234", "900"], ["1.250", "905"], ["1.270", "903"], ["1.290", "901"]]
+    said = refusal(write(tmp_path, "date;A;B\n" + rows(ISO, cells, ";")))
+    assert "'1.234' may mean 1234 or 1.234, and no other number tells which" in said
+    assert "separate the columns by commas" in said
+    text = "date,A,B\n" + rows(ISO, cells)
+    assert load(write(tmp_path, text)).values[0].tolist() == [1.234, 900]
+    cells[0][1] = "900.5"
+    text = "date;A;B\n" + rows(ISO, cells, ";")
+    assert load(write(tmp_path, text)).values[0].tolist() == [1.234, 900.5]
+
+
+@pytest.mark.parametrize("first", ["sep=;", '"sep=;"', "SEP=;", "sep=;;"])
+def test_a_declared_separator(tmp_path: Path, first: str):
+    text = f"{first}\r\ndate;A\r\n" + rows(ISO, [["1,5"], ["2,5"], ["-1"], ["2"]], ";")
+    assert "row 5 (2024-01-31), column 'A': the price is negative" in refusal(write(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("cells", "name", "first"),
+    [
+        (["45320", "45321", "45322", "45323"], "Excel's serial numbers", "2024-01-29T00:00:00"),
+        (["45320.6875", "45321.6875", "45322.6875", "45323.6875"], "Excel's serial numbers",
+         "2024-01-29T16:30:00"),
+        (["1706545800", "1706632200", "1706718600", "1706805000"], "Unix seconds",
+         "2024-01-29T16:30:00"),
+        (["-86400000", "0", "1000000000", "1706805000"], None, ""),
+        (["1706545800123", "1706632200123", "1706718600123", "1706805000123"],
+         "Unix milliseconds", "2024-01-29T16:30:00"),
+        (["1706545800", "1706632200", "1706718600000", "1706805000000"], None, ""),
+        (["20240129", "20240130", "1706718600", "1706805000"], None, ""),
+        (["19751", "19752", "19753", "19754"], None, ""),  # days since 1970, or of 1954 in Excel
+        (["1", "2", "3", "4"], None, ""),
+    ],
+)  # fmt: skip
+def test_dates_that_are_numbers(tmp_path: Path, cells: list[str], name: str | None, first: str):
+    path = write(tmp_path, "Date,A\n" + rows(cells, [["1"], ["2"], ["3"], ["4"]]))
+    if name is None:
+        said = refusal(path)
+        assert "is not a date that can be read" in said
+        assert "Write dates as 2020-01-31" in said
+        return
+    assert str(load(path).dates[0]) == first
+    assert notes(path) == [f"column 'Date': dates are read as {name}"]
+    frame = pd.read_csv(path)  # as numbers
+    assert load(frame).digest == load(path).digest
+    # Without the name they may be prices.
+    assert "Name it 'date'" in refusal(write(tmp_path, path.read_text().replace("Date", "X")))
+
+
+def test_nanoseconds_of_a_data_frame():
+    frame = pd.DataFrame({"date": DAYS.as_unit("ns").astype("int64"), "A": [1.0, 2, 3, 4]})
+    np.testing.assert_array_equal(load(frame).dates, DAYS.to_numpy("datetime64[s]"))
+
+
+def test_faults_of_a_turned_table_are_named_where_they_are(tmp_path: Path):
+    def table(cells: Cells, days: list[str] = ISO) -> Path:
+        return write(tmp_path, head("Ticker", days) + rows(["AAPL", "MSFT"], cells))
+
+    said = refusal(table([["1", "2", "3", "4"], ["1", "2", "-3", "4"]]))
+    assert "row 3 (2024-01-31), column '2024-01-31': the price is negative" in said
+    said = refusal(table([["1", "2", "3", "4"], ["1", "", "x", "4"]]))
+    assert "row 3 (2024-01-31), column '2024-01-31': the price: 'x' is not a number" in said
+    said = refusal(table([["1", "2", "3", "4"]] * 2, [*ISO[:3], ISO[1]]))
+    assert f"column '{ISO[1]}': the date {ISO[1]} is already in column '{ISO[1]}'" in said
+    newest = table([["1", "2", "3", "4"]] * 2, ISO[::-1])
+    assert load(newest).values[:, 0].tolist() == [4, 3, 2, 1]
+    assert "the newest column comes first" in notes(newest)[0]
+    named = head("Ticker,Name", ISO) + rows(["AAPL,Apple", "MSFT,Microsoft"], [["1"] * 4] * 2)
+    assert "but also the column 'Name'; keep one column of assets" in refusal(
+        write(tmp_path, named)
+    )
+    frame = pd.DataFrame([[1.0, 2, 3, 4]], index=["AAPL"], columns=DAYS)
+    assert load(frame).values[:, 0].tolist() == [1, 2, 3, 4]
+
+
+def test_lines_above_the_table(tmp_path: Path):
+    text = "Data of a vendor\n\ndate,A\n" + rows(ISO, [["1"]] * 4)
+    assert "remove the lines above the names of the columns" in refusal(write(tmp_path, text))
