@@ -1,9 +1,8 @@
 """What a market knows at each row besides prices, as cost models use it: dates and columns."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +19,7 @@ MEMORY = 21
 Floats = NDArray[np.float64]
 
 
-class Conditions(eqx.Module):
+class Conditions(NamedTuple):
     """Dates and columns of a table, in numpy or jax arrays; empty if a cost model reads none.
 
     years: time of each row since the first, shape (row,). values: each column at each row, of shape

@@ -260,13 +260,13 @@ def _replay(
             wanted = np.where(source[:, None] < 0, start[who], ordered)
             moved = market.moved(np.maximum(source, 0), when + low)
             after[:, who, when] = (wanted * _by_sign(wanted, moved)).T
-        broke = _settled(after)
+        broke = False if market.long_only else _settled(after)
         after /= after.sum(0)
 
         growing = _by_sign(after, [growth[..., now] for growth in market.after_trade])
         grown = np.concatenate([worth.T[..., None], after * growing], axis=-1)
         worth = grown[..., -1].T
-        lost = _settled(grown)
+        lost = False if market.long_only else _settled(grown)[:, 1:]
         growth = grown.sum(0)
         before = grown[..., :-1] / growth[:, :-1]
 
@@ -284,7 +284,7 @@ def _replay(
             entries = np.moveaxis(after, -1, 0)
             income = _by_sign(entries, [rate[..., now] for rate in market.income])
             result.financing[here] = (entries * income).sum(0)
-        lost = broke | lost[:, 1:] | (remainder <= 0)
+        lost = broke | lost | (remainder <= 0)
         if lost.any() or ruined.any():
             ruined = _stop(result, here, lost, ruined)
 
@@ -304,13 +304,13 @@ def _traded(
     from no costs, each repetition is right for one more day at least, and far sooner in practice.
     """
     remainder = np.ones(given.shape)
-    for _ in range(ROUNDS):
-        path = wealth * np.cumprod(remainder * growth, axis=1)
-        paths = np.concatenate([wealth, path[:, :-1]], axis=1)
+    for _ in range(ROUNDS if market.costs.depends_on_wealth else 1):
+        before_trades = (remainder * growth)[:, :-1].cumprod(1)
+        paths = wealth * np.concatenate([np.ones_like(wealth), before_trades], axis=1)
         last = remainder
         remainder, costs = market.costs.trade(before, after, market.trades(now, paths))
         remainder = np.where(given, remainder, 1)
-        if not market.costs.depends_on_wealth or np.array_equal(last, remainder):
+        if np.array_equal(last, remainder):
             break
     return remainder, costs, wealth * np.prod(remainder * growth, axis=1, keepdims=True)
 
