@@ -43,6 +43,8 @@ class Options:
         cap: Largest weight of one asset, from 0 to 1.
         cost_model: Cost of trading and holding: proportional, itemized or your own as module:Name;
             settings follow in brackets, as in "itemized(fixed=5, cash_rate=0.03)".
+        calendar: When all strategies may trade: weekly, monthly, quarterly, yearly, or a number of
+            rows (default: at every row, and baselines by their own calendars).
         signals: Signals that agents observe beside returns, separated by commas, each with the rows
             that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
             own as module:Name (default: the preset's).
@@ -76,6 +78,7 @@ class Options:
     rolling: bool = False
     cap: float = 1.0
     cost_model: str = "proportional"
+    calendar: str = ""
     signals: Name = None
     baselines: Name = None
     seeds: Count = None
@@ -129,6 +132,7 @@ class Options:
             "expanding": not self.rolling,
             "cap": self.cap,
             "cost_model": _known("cost", settings.called(self.cost_model)[0]) and self.cost_model,
+            "calendar": self.calendar,
             "baselines": list(registry.BASELINES)
             if self.baselines is None
             else [_known("baseline", name) for name in _split(self.baselines).values()],
@@ -208,7 +212,7 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
 
     used = set()
     changed = {}
-    own_options = {"lag", "cost", "cost_model", "max_weight"}
+    own_options = {"lag", "cost", "cost_model", "max_weight", "calendar"}
     for name, preset in presets.items():
         kind = registry.find("agent", preset.agent)
         own, task = {}, {}

@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Position, Simplex
 from qfolio.portfolio import anchors, signals
+from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import grown
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
@@ -43,12 +44,14 @@ class Portfolio(Market):
     center: Float[Array, " channel"]  # of the observed channels, from the rows of the part
     scale: Float[Array, " channel"]
     conditions: Conditions  # the columns that the cost model reads; empty if it reads none
+    decides: Bool[Array, " decision"]  # whether a row is for decisions; no rows if all are
     first_decision: Row
     last_decision: Row
     window: int = static(60)  # rows that are observed
     lag: int = static(1)  # rows from a decision to its execution
     cost: float = constant(0.001)  # one way, as a share of the value traded
     cost_model: str = static("proportional")
+    calendar: str = static("")  # of decisions, see portfolio.calendars; between them nothing trades
     max_weight: float = constant(1.0)  # of one asset
     menu: str = static("")
     signals: str = static("")  # names of signals that are observed, see portfolio.signals
@@ -80,6 +83,7 @@ class Portfolio(Market):
             center=jnp.zeros(1 + channels),
             scale=jnp.ones(1 + channels),
             conditions=Conditions(jnp.zeros(0), {}, {}),
+            decides=jnp.zeros(0, bool),
             first_decision=jnp.array(0, jnp.int32),
             last_decision=jnp.array(0, jnp.int32),
             **settings,
@@ -97,10 +101,18 @@ class Portfolio(Market):
         computed = signals.compute(chosen, prices.values, self.signal_scale, columns)
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
         followed = anchors.path(self.anchor, prices) if self.anchor else logs[:0]
-        where = lambda t: (t.log_relatives, t.extra, t.anchors, t.conditions)  # noqa: E731
+        where = lambda t: (t.log_relatives, t.extra, t.anchors, t.conditions, t.decides)  # noqa: E731
         known = Conditions.of(prices, self.costs.columns)
         arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (logs, extra, followed, known))
-        return eqx.tree_at(where, self, arrays)
+        decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)
+        decides[-1:] = True  # tomorrow's weights may be asked for on any day
+        return eqx.tree_at(where, self, (*arrays, jnp.asarray(decides)))
+
+    def deciding_at(self, row: int) -> "Portfolio":
+        """The same task with a decision at a row, whatever the calendar says."""
+        if not self.calendar:
+            return self
+        return eqx.tree_at(lambda t: t.decides, self, self.decides.at[row].set(True))
 
     def __check_init__(self) -> None:
         require(self, "window horizon", lambda x: 1 <= x <= 100_000, "from 1 to 100,000")
@@ -108,6 +120,7 @@ class Portfolio(Market):
         require(self, "max_weight", lambda x: 0 < x <= 1, "above 0 and at most 1")
         require(self, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
         require(self, "tracking_aversion", lambda x: 0 <= x <= 1e4, "from 0 to 10,000")
+        _ = decision_rows(self.calendar, np.zeros(0, "datetime64[s]"))
         _ = self.parts  # which check their own settings
         if self.active and not self.anchor:
             raise QfolioError(
@@ -161,6 +174,16 @@ class Portfolio(Market):
         anchor = anchors.made(self.anchor) if self.anchor else None
         named = [*signals.parse(self.signals), *([] if anchor is None else [anchor])]
         return [self.costs, self.reward_function, *named]
+
+    def target(
+        self, market: Row, held: Float[Array, " entry"], action: Array
+    ) -> Float[Array, " entry"]:
+        """As in any market; what is held where the calendar has no decision."""
+        wanted = super().target(market, held, action)
+        if not self.calendar:
+            return wanted
+        decides = lax.dynamic_index_in_dim(self.decides, market, keepdims=False)
+        return jnp.where(decides, wanted, held)
 
     @property
     def actions(self) -> Actions:

@@ -120,6 +120,7 @@ class BacktestConfig(Config, frozen=True):
     device: str
     versions: dict[str, str]
     started: str
+    calendar: str = ""
 
     def __post_init__(self) -> None:
         seed_range(self.seeds, self.seed)

@@ -47,6 +47,7 @@ def orders(
     tradable: ArrayLike | None = None,
     cap: float = 1.0,
     month: int = 21,
+    decides: Bools | None = None,
 ) -> Orders:
     """Ask a baseline for its decisions on every row of the folds.
 
@@ -61,6 +62,7 @@ def orders(
             all of its training rows).
         cap: Largest weight of one asset when it is ordered.
         month: Rows in a month.
+        decides: Which rows are for decisions, of shape (rows,), instead of the baseline's calendar.
 
     Returns:
         Decisions for all rows of the folds, and notes that name the fold.
@@ -82,7 +84,7 @@ def orders(
         part = np.full((len(rows), len(ordered)), np.nan)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            for row in _asked(baseline, rows, folds[0].decisions.start, month):
+            for row in _asked(baseline, rows, folds[0].decisions.start, month, decides):
                 known = slice(0, row + 1)
                 history = History(dates[known], prices[known], fold.train, allowed, cap, month)
                 held = _drifted(ordered, prices[row_ordered], prices[row])
@@ -90,19 +92,24 @@ def orders(
                 if wanted is not None:
                     ordered, row_ordered = checked(name, wanted, history), row
                     part[row - rows[0]] = ordered
-        if baseline.calendar == "fold":
-            part[:] = part[0]
-            row_ordered = row_ordered if np.isnan(part[0]).any() else rows[-1]
+        if baseline.calendar == "fold" and not np.isnan(part[0]).any():
+            trading = np.ones(len(rows), bool) if decides is None else decides[fold.decisions]
+            part[:] = np.where(trading[:, None], part[0], np.nan)
+            row_ordered = rows[np.flatnonzero(trading)[-1]] if trading.any() else row_ordered
         said = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
         notes += [f"{name}, fold {fold.name}: {note}" for note in said]
         parts.append(part)
     return Orders(np.concatenate(parts), tuple(notes))
 
 
-def _asked(baseline: Baseline, rows: range, first: int, month: int) -> range:
+def _asked(
+    baseline: Baseline, rows: range, first: int, month: int, decides: Bools | None
+) -> Sequence[int]:
     """The rows of a fold at which a baseline decides; months count from the first of the test."""
     if baseline.calendar == "fold":
         return rows[:1]
+    if decides is not None:
+        return [row for row in rows if decides[row]]
     return rows[(first - rows[0]) % month :: month] if baseline.calendar == "month" else rows
 
 

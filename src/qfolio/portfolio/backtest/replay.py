@@ -47,6 +47,8 @@ class Stretch(NamedTuple):
 def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: bool) -> np.ndarray:
     """Decisions over all folds, (seed, day, entry); each fold starts with the last one's holding.
 
+    NaN where the calendar has no decision.
+
     With ``together`` one portfolio follows the mean of all seeds, and ``seeds`` is 1. The agents
     see their portfolio in float32; the replay is in float64.
     """
@@ -58,7 +60,11 @@ def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: 
         # One length for all folds, so that one program serves all; the surplus is cut off.
         start = fold.decisions.start
         targets, after = follow(task, agent, members, start, held, max(days), together=together)
-        parts.append(targets[:, :count])
+        given = targets[:, :count]
+        if task.calendar:
+            no_order = ~np.asarray(task.decides)[start : start + count]
+            given = np.where(no_order[:, None], np.nan, given)
+        parts.append(given)
         held = after[:, count - 1]
     return np.concatenate(parts, axis=1)
 
@@ -115,6 +121,7 @@ class Replay(NamedTuple):
             table.values,
             cap=self.cap,
             month=table.month,
+            decides=np.asarray(self.task.decides) if self.task.calendar else None,
         )
         return self.entry(kind, given.decisions[None]), given.notes
 

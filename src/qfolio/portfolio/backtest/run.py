@@ -102,6 +102,7 @@ class Backtest:
         cost: float = 0.001,
         cap: float = 1.0,
         cost_model: str = "proportional",
+        calendar: str = "",
         baselines: Sequence[str] = tuple(BASELINES),
         seeds: int = 5,
         seed: int = 0,
@@ -124,6 +125,9 @@ class Backtest:
             cap: Largest weight of one asset.
             cost_model: Cost of trading and holding, in training and replay: a name of the registry,
                 or your own as ``module:Name``, with its settings as in "itemized(fixed=5)".
+            calendar: When all strategies may trade: weekly, monthly, quarterly or yearly, on the
+                first row of each, or a number of rows (default: at every row, and baselines by
+                their own calendars). All may trade on the first row of the test.
             baselines: Names of the baselines, likewise; equal weights are always included.
             seeds: Agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
             episodes: Training episodes in a fold of each agent without a preset.
@@ -146,6 +150,7 @@ class Backtest:
             cost=float(cost),
             cap=float(cap),
             cost_model=cost_model,
+            calendar=calendar,
             baselines=list(dict.fromkeys([EQUAL_WEIGHT, *baselines])),
             seeds=int(seeds),
             seed=int(seed),
@@ -371,9 +376,11 @@ class Backtest:
             "cost": config.cost,
             "cost_model": config.cost_model,
             "max_weight": config.cap,
+            "calendar": config.calendar,
         }
         entry = config.agents[name].task
-        return Portfolio.of(self.prices, **settings.convert(Portfolio, {**entry, **own}))
+        task = Portfolio.of(self.prices, **settings.convert(Portfolio, {**entry, **own}))
+        return task.deciding_at(self.folds[0].decisions.start)
 
     def _part(self, task: Portfolio, job: Fold) -> Portfolio:
         values = self.prices.values

@@ -1,0 +1,36 @@
+"""Calendars: at which rows of a table an account may trade."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qfolio.core.errors import QfolioError
+
+PERIODS = {"weekly": "W", "monthly": "M", "quarterly": "Q", "yearly": "Y"}
+"""Calendars by name, and the periods that they are named after."""
+
+
+def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bool_]:
+    """Which rows are for decisions, of shape (row,).
+
+    Args:
+        calendar: "weekly", "monthly", "quarterly" or "yearly" for the first row of each period,
+            which is known without later rows; a number k for every k-th row; "" for every row.
+        dates: Dates of the rows.
+
+    Raises:
+        QfolioError: There is no such calendar.
+    """
+    rows = np.arange(len(dates))
+    if not calendar:
+        return rows >= 0
+    if calendar in PERIODS:
+        days = dates.astype("datetime64[D]").astype(int)
+        months = dates.astype("datetime64[M]").astype(int)
+        weeks = (days + 3) // 7  # 1970-01-01 was a Thursday; weeks begin on Monday
+        period = {"W": weeks, "M": months, "Q": months // 3, "Y": months // 12}[PERIODS[calendar]]
+        return np.diff(period, prepend=period[:1] - 1) > 0
+    if calendar.isdecimal() and int(calendar) > 0:
+        return rows % int(calendar) == 0
+    raise QfolioError(
+        f"calendar is {calendar!r}; it must be {', '.join(PERIODS)} or a number of rows."
+    )
