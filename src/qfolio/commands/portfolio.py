@@ -45,12 +45,15 @@ def prices(
     console.print_prices(describe(table))
 
 
-def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> None:
+def backtest(
+    file: Positional[File] = None, *, options: Shared = DEFAULTS, title: Name = None
+) -> None:
     """Train agents walk-forward on a price table and compare them with classical allocators.
 
     Args:
         file: CSV or Parquet with prices, which qfolio prices checks (default: 20 US stocks that
             come with skfolio).
+        title: Title of the report (default: the agents, the table and its years).
     """
     from qfolio.core import devices
 
@@ -73,10 +76,11 @@ def backtest(file: Positional[File] = None, *, options: Shared = DEFAULTS) -> No
             options.presets(),
             lag=options.lag,
             cost=basis_points("--cost-bps", options.cost_bps),
+            title=title or "",
             out=folder,
             **options.settings(),
         )
-    elif file is None and options.only_resumes:
+    elif file is None and title is None and options.only_resumes:
         run, folder = Backtest.open(options.resume), options.resume
     else:
         raise QfolioError(

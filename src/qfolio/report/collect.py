@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 from qfolio.core.evaluation import greedy, play, start_keys
 from qfolio.core.mdp import Agent, Policy, Position
 from qfolio.core.training import episode_steps
+from qfolio.experiments.comparison.conclusion import listed
 from qfolio.experiments.run import Run
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
@@ -25,7 +26,16 @@ from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.contrast import contrast_of
-from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
+from qfolio.report.data import (
+    Curve,
+    Episode,
+    Floats,
+    Maps,
+    MarketData,
+    ReportData,
+    Responses,
+    Weights,
+)
 from qfolio.report.words import agent_name, words_of
 from qfolio.solvers.followed import FollowedOptimum
 from qfolio.tasks.pendulum import Pendulum, PendulumState
@@ -80,8 +90,11 @@ def backtest_data(
     config, dates = backtest.config, backtest.prices.dates
     shift = config.lag + 1
     day = lambda row: str(dates[row])[:10]  # noqa: E731
+    first, last = (str(backtest.dates[i])[:4] for i in (0, -1))
+    table = str(config.prices["source"]).rpartition(": ")[2]  # without its vendor
+    named = f"{listed(list(backtest.agents))} on {table}, {first} to {last}"
     return BacktestData(
-        title=f"{' and '.join(backtest.agents)} on {len(backtest.prices.assets)} assets",
+        title=config.title or named,
         command=config.command,
         assessment=assessment,
         dates=backtest.dates,
@@ -115,7 +128,15 @@ def backtest_data(
         notes=list(notes),
         training={name: folds for name in backtest.agents if (folds := _training(backtest, name))},
         why=why,
+        moves=_moves(backtest),
     )
+
+
+def _moves(backtest: Backtest) -> Floats:
+    """Simple returns of the assets on the days of the test; 0 before an asset's start."""
+    begin = backtest.folds[0].decisions.start + backtest.config.lag
+    values = backtest.prices.values[begin : begin + 1 + len(backtest.dates)]
+    return np.nan_to_num(values[1:] / values[:-1] - 1)
 
 
 def _training(backtest: Backtest, agent: str) -> list[FoldTraining]:

@@ -63,13 +63,6 @@ CSS_VARIABLES = {
 AGENTS = 6
 """Number of colours for agents; further agents reuse them with dashed lines."""
 
-ASSETS = (
-    *("#4c78a8", "#d98c3f", "#5fa37a", "#b66a8f", "#8c7bb5", "#c9b04e", "#6db0bf", "#b5695a"),
-    *("#7f8f4e", "#9fb3d1", "#e0b48a", "#a3cfae", "#cf9fba", "#bdb3d8", "#e3d497", "#a9d3dc"),
-    *("#dba79b", "#b9c48d", "#5a7391", "#a0703f"),
-)
-"""Calm colours for stacked areas, the same in both schemes."""
-
 MARKERS = ("o", "s", "D", "^", "v", "p")
 """Markers of agents, in matplotlib's notation."""
 

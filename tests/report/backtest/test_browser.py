@@ -8,7 +8,7 @@ import pytest
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.backtest.page import render_backtest
 
-from backtests import ATTACK
+from backtests import ATTACK, usual
 from browser import Browser
 
 DRAWN = "location.protocol === 'file:' && document.querySelectorAll('.chart .main-svg').length >= 3"
@@ -87,6 +87,75 @@ def test_choosing_a_strategy(browser: Browser, folder: Path) -> None:
     picture = "Plotly.toImage(document.getElementById('wealth'), {format: 'png'})"
     assert browser.evaluate(picture).startswith("data:image/png;base64,")
     assert browser.complaints == []
+
+
+def test_names_stand_where_lines_end(browser: Browser, folder: Path) -> None:
+    browser.complaints.clear()
+    browser.show((folder / "report.html").as_uri(), 1280, DRAWN)
+    names = "[...document.querySelectorAll('#wealth-labels span')].map(s => s.textContent)"
+    browser.wait(f"{names}.length === 5")  # three agents, the reference and the best baseline
+    assert f"DQN {ATTACK}" in browser.evaluate(names)
+    tops = browser.evaluate(
+        "[...document.querySelectorAll('#wealth-labels span')].map(s => parseFloat(s.style.top))"
+    )
+    assert min(np.diff(sorted(tops))) > 10  # none covers another
+    browser.click("table[data-legend=wealth] button[data-strategy='0']")
+    browser.wait(f"{names}.length === 4")
+    assert f"DQN {ATTACK}" not in browser.evaluate(names)
+    assert browser.complaints == []
+
+
+def test_tear_sheet_opens_and_draws(browser: Browser, tmp_path: Path) -> None:
+    browser.complaints.clear()
+    (tmp_path / "report.html").write_text(render_backtest(usual(400)), encoding="utf-8")
+    browser.show((tmp_path / "report.html").as_uri(), 1280, DRAWN)
+    drawn = "document.querySelectorAll('#rolling .main-svg').length > 0"
+    assert not browser.evaluate(drawn)
+    browser.click("#sheet summary")
+    browser.wait(drawn)
+    parts = "[...document.querySelectorAll('[data-sheet]')].filter(p => p.offsetHeight > 0)"
+    assert browser.evaluate(f"{parts}.map(p => p.dataset.sheet)") == ["0"]
+    browser.evaluate(
+        "(() => { const list = document.getElementById('sheet-strategy'); list.value = '3';"
+        "list.dispatchEvent(new Event('change', {bubbles: true})); })()"
+    )
+    assert browser.evaluate(f"{parts}.map(p => p.dataset.sheet)") == ["3"]
+    browser.click("table[data-legend=rolling] button[data-strategy='1']")
+    assert set(browser.evaluate(f"({VISIBLE % 'rolling'})(1)")) == {False}
+    assert browser.complaints == []
+
+
+def test_the_other_baselines_are_one_click_away(browser: Browser, folder: Path) -> None:
+    browser.show((folder / "report.html").as_uri(), 1280, DRAWN)
+    rows = "[...document.querySelectorAll('table[data-legend=wealth] tr[data-rest]')]"
+    shown = f"{rows}.filter(r => r.offsetHeight > 0).length"
+    assert browser.evaluate(shown) == 0
+    browser.click(".rest")
+    assert browser.evaluate(shown) == browser.evaluate(f"{rows}.length") > 0
+    last = browser.evaluate(f"{rows}.at(-1).querySelector('button').dataset.strategy")
+    browser.click(f"table[data-legend=wealth] button[data-strategy='{last}']")
+    assert set(browser.evaluate(f"({VISIBLE % 'wealth'})({last})")) == {True}
+
+
+def test_intervals_are_bars_until_numbers_are_wanted(browser: Browser, folder: Path) -> None:
+    browser.show((folder / "report.html").as_uri(), 1280, DRAWN)
+    shown = "document.querySelector('.wide-table td small').offsetHeight > 0"
+    assert not browser.evaluate(shown)
+    browser.click("#numbers")
+    assert browser.evaluate(shown)
+
+
+def test_wide_tables_say_so_on_a_phone(browser: Browser, folder: Path) -> None:
+    browser.show((folder / "report.html").as_uri(), 375, DRAWN, phone=True)
+    frame = "document.querySelector('[aria-label=\"Table of statistics\"]')"
+    assert browser.evaluate(f"[...{frame}.classList].includes('more')")
+    browser.evaluate(f"{frame}.scrollTo(10000, 0)")
+    browser.wait(f"!{frame}.classList.contains('more')")
+    name, frame_left = browser.evaluate(
+        f"[{frame}.querySelector('tbody th').getBoundingClientRect().left,"
+        f"{frame}.getBoundingClientRect().left]"
+    )
+    assert name == pytest.approx(frame_left, abs=1)  # names stay in sight
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

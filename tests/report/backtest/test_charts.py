@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qfolio.report.backtest.charts import AREAS, NAMED, POINTS
-from qfolio.report.backtest.data import DISTINCT, BacktestData
+from qfolio.report.backtest.charts import POINTS
+from qfolio.report.backtest.data import BacktestData, shown_order
+from qfolio.report.backtest.holdings import BLOCKS, NAMED
 from qfolio.report.backtest.page import render_backtest, write_backtest_report
 
 from backtests import Page, make_data, make_series, usual, weekdays
@@ -52,10 +53,9 @@ def test_weights_are_grouped_and_add_up() -> None:
         assert len(entry["names"]) == NAMED + 2 == len(entry["values"])
         assert entry["names"][-1] == f"{30 - NAMED} others"
         np.testing.assert_allclose(np.sum(entry["values"], axis=0), 1, atol=0.01)
-        assert sum(entry["average"]) == pytest.approx(1)
     agent = shown["weights"]["series"][0]
     assert agent["names"][:2] == ["Cash", "asset 7"]
-    assert agent["average"][:2] == [0.25, 0.75]
+    assert [row[0] for row in agent["values"][:2]] == [0.25, 0.75]
 
 
 def test_troughs_survive_thinning() -> None:
@@ -66,7 +66,7 @@ def test_troughs_survive_thinning() -> None:
     strategies = {**data.strategies, "equal weight": replace(series, returns=returns)}
     chart = Page(render_backtest(replace(data, strategies=strategies))).data
     assert len(chart["dates"]) <= POINTS + 1
-    assert len(chart["weights"]["dates"]) <= AREAS
+    assert len(chart["weights"]["dates"]) <= BLOCKS
     assert chart["dates"][-1] == str(data.dates[-1])[:10]
     assert min(chart["strategies"][3]["drawdown"]) == -0.5
 
@@ -88,27 +88,63 @@ def test_page_of_a_long_backtest_stays_small(tmp_path: Path) -> None:
     assert len(page.scripts[0]) < 1e6
 
 
-def test_many_baselines_are_hidden_at_first() -> None:
-    """But in the tables and in the lists they stand, one select away."""
+def test_only_what_matters_is_bright_at_first() -> None:
+    """Agents, the reference and the best baseline; lists have the others."""
     rng = np.random.default_rng(2)
     kinds = {"agent": "agent", "equal weight": "baseline", "slow": "rebalancing"}
-    kinds |= {f"other {i}": "baseline" for i in range(DISTINCT + 2)}
+    kinds |= {f"other {i}": "baseline" for i in range(4)}
     series = {
         name: make_series(rng, kind, 1, 40, 2, 0.01 if name == "other 0" else 0.0)
         for name, kind in kinds.items()
     }
     data = make_data(series, weekdays("2020-01-01", 40), ("A", "B"))
     page = Page(render_backtest(data))
-    main = 2 + (data.assessment.rebalanced == "slow") + 1  # other 0 is the best baseline
+    names = shown_order(data)
     assert data.assessment.best_baseline == "other 0"
-    assert page.data["hidden"] == list(range(main, main + DISTINCT + 1))
-    assert len(page.data["strategies"]) == main + DISTINCT + 1
+    bright = [name for place, name in enumerate(names) if place not in page.data["hidden"]]
+    assert bright == ["agent", "equal weight", "other 0"]
     pressed = [
         attributes["aria-pressed"] for tag, attributes in page.tags if "aria-pressed" in attributes
     ]
-    assert pressed[: main + 1] == ["true"] * main + ["false"]
-    assert "7 other baselines" in page.text
-    assert "The other baselines are hidden at first" in page.text
-    del series["other 1"]
-    fewer = Page(render_backtest(make_data(series, data.dates, data.assets)))
-    assert fewer.data["hidden"] == []
+    assert pressed[: len(names)] == [str(name in bright).lower() for name in names]
+    looks = {name: page.data["strategies"][names.index(name)] for name in names}
+    assert looks["equal weight"]["colour"] == looks["other 0"]["colour"] == "ink"
+    assert looks["equal weight"]["dash"] != looks["other 0"]["dash"]
+    assert looks["other 1"]["colour"] == "faint"
+    assert "3 other baselines" in page.text
+    assert f"{len(names) - 3} more" in page.text
+
+
+def test_holdings_are_weights_against_the_reference() -> None:
+    rng = np.random.default_rng(0)
+    series = {
+        "agent": make_series(rng, "agent", 2, 40, 3, 0.0),
+        "equal weight": make_series(rng, "baseline", 1, 40, 3, 0.0),
+    }
+    held = {"agent": [0.5, 0.0, 0.1, 0.4], "equal weight": [0.25, 0.25, 0.25, 0.25]}
+    series = {
+        name: replace(each, weights=np.tile(held[name], (40, 1))) for name, each in series.items()
+    }
+    data = make_data(series, weekdays("2020-01-01", 40), ("A", "B", "C"))
+    shown = Page(render_backtest(data)).data["weights"]
+    agent, reference = shown["series"]
+    assert agent["names"] == ["Cash", "A", "B", "C"]
+    assert [row[0] for row in agent["active"]] == [0.25, -0.25, -0.15, 0.15]
+    assert [row[-1] for row in agent["values"]] == [0.5, 0, 0.1, 0.4]
+    assert agent["effective"][0] == 1.47  # 0.5² / (0.1² + 0.4²)
+    assert shown["effective"][0] == reference["effective"][0] == 3
+    assert shown["reference"] == 1
+    assert reference["active"] == reference["values"]
+
+
+def test_rolling_figures_begin_after_a_year() -> None:
+    data = usual(400)
+    chart = Page(render_backtest(data)).data
+    dqn, equal = chart["strategies"][0], chart["strategies"][3]
+    assert dqn["sharpe"][:252] == [None] * 252
+    assert len(dqn["sharpe"]) == len(chart["dates"]) == 401
+    last = data.strategies["DQN"].returns[:, -252:]
+    ratio = np.mean(np.sqrt(252) * last.mean(axis=1) / last.std(axis=1, ddof=1))
+    assert dqn["sharpe"][-1] == pytest.approx(ratio, rel=1e-2)
+    assert equal["beta"][-1] == 1
+    assert "sharpe" not in Page(render_backtest(usual(300))).data["strategies"][0]

@@ -82,7 +82,8 @@ def test_table_has_every_figure_with_its_intervals(data: BacktestData) -> None:
     cell = rows[0][2].split("<td>")[3].replace("\N{MINUS SIGN}", "-").replace("\u202f", "")
     low, high = sharpe.over_time
     left, right = min(sharpe.per_seed), max(sharpe.per_seed)
-    assert cell.startswith(f"{sharpe.mean:.2f}<small>{low:.2f} … {high:.2f}</small>")
+    assert cell.startswith(f"{sharpe.mean:.2f}<span")  # a bar of the interval over time
+    assert f"</span><small>{low:.2f} … {high:.2f}</small>" in cell
     assert f'<small class="seeds">{left:.2f} … {right:.2f}</small>' in cell
     assert "seeds" not in rows[3][2]
     assert "the range over seeds, which are too few for an interval" in Page(page).text

@@ -5,9 +5,10 @@ import hashlib
 import re
 from pathlib import Path
 
+from qfolio.report.backtest.page import SCRIPTS, render_backtest
 from qfolio.report.rendering import source
 
-from backtests import ATTACK, Page
+from backtests import ATTACK, Page, usual
 
 
 def test_everything_is_escaped(folder: Path) -> None:
@@ -31,7 +32,7 @@ def test_page_needs_nothing_else(folder: Path) -> None:
     for tag, attributes in page.tags:
         assert tag not in ("link", "iframe", "object", "embed")
         assert "src" not in attributes
-    script = source("backtest.js")
+    script = "".join(map(source, SCRIPTS))
     for word in ("http", "fetch", "eval(", "innerHTML", "insertAdjacentHTML", "import("):
         assert word not in script
 
@@ -46,10 +47,12 @@ def test_only_the_two_scripts_may_run(folder: Path) -> None:
     assert rules["script-src"].split() == [f"'sha256-{value.decode()}'" for value in hashes]
 
 
-def test_identifiers_are_unique_and_found(page: Page) -> None:
+def test_identifiers_are_unique_and_found() -> None:
+    page = Page(render_backtest(usual(400)))  # long enough for rolling figures
     identifiers = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
     assert len(identifiers) == len(set(identifiers))
-    assert set(re.findall(r'byId\("([\w-]+)"\)', source("backtest.js"))) <= set(identifiers)
+    script = "".join(map(source, SCRIPTS))
+    assert set(re.findall(r'byId\("([\w-]+)"\)', script)) <= set(identifiers)
     labelled = {attributes["for"] for tag, attributes in page.tags if tag == "label"}
-    assert labelled == {a["id"] for tag, a in page.tags if tag == "select"}
+    assert labelled == {a["id"] for tag, a in page.tags if tag in ("select", "input")}
     assert all("aria-label" in a for _, a in page.tags if a.get("role") in ("img", "region"))

@@ -121,6 +121,7 @@ class BacktestConfig(Config, frozen=True):
     versions: dict[str, str]
     started: str
     calendar: str = ""
+    title: str = ""
 
     def __post_init__(self) -> None:
         seed_range(self.seeds, self.seed)

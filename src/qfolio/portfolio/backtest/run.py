@@ -110,6 +110,7 @@ class Backtest:
         task: Mapping[str, Any] | None = None,
         trials: int = 0,
         command: str = "",
+        title: str = "",
         out: Path | str | None = None,
     ) -> "Backtest":
         """A backtest before its first fold.
@@ -135,6 +136,7 @@ class Backtest:
             trials: Earlier trials on these prices, for the deflated Sharpe ratio; those of the
                 default table (``prices.table.DEFAULT_TRIALS``) are added to them.
             command: The command that started it, for the report.
+            title: The report's title (default: agents, table and years).
             out: A new or empty folder; without it nothing is written.
         """
         if not agents:
@@ -156,6 +158,7 @@ class Backtest:
             seed=int(seed),
             trials=int(trials),
             command=command,
+            title=title,
             agents={
                 name: AgentConfig.of(name, agent, episodes, task or {})
                 for name, agent in agents.items()

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
+from qfolio.portfolio.backtest.folder import followed
 from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.data import Floats
-
-DISTINCT = 6
-"""Most baselines, beside those that agents are compared with, that a chart tells apart."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +55,8 @@ class BacktestData:
         notes: Problems of the backtest, in sentences.
         training: The training of each fold, by agent; none if records are missing.
         why: What explains the agents' returns; without it, the page has no such section.
+        moves: Simple returns of the assets on these days, shape (D, N), 0 before an asset's start;
+            without them, the page does not say what each asset contributed.
     """
 
     title: str
@@ -71,6 +71,7 @@ class BacktestData:
     notes: list[str]
     training: dict[str, list[FoldTraining]] = field(default_factory=dict)
     why: Why | None = None
+    moves: Floats | None = None
 
 
 def require_fit(data: BacktestData) -> None:
@@ -88,6 +89,16 @@ def require_fit(data: BacktestData) -> None:
             raise QfolioError(
                 f"The series of {name} do not fit {days[0]} dates and {len(data.assets)} assets."
             )
+    if data.moves is not None and data.moves.shape != (*days, len(data.assets)):
+        raise QfolioError(
+            f"The assets' returns do not fit {days[0]} dates and {len(data.assets)} assets."
+        )
+
+
+def followed_names(data: BacktestData) -> list[str]:
+    """The strategies that ``allocate`` follows: an agent's ensemble, or the agent without one."""
+    names = data.strategies
+    return list(dict.fromkeys(followed(n, names) for n, s in names.items() if s.kind == "agent"))
 
 
 def main_names(data: BacktestData) -> list[str]:
@@ -105,7 +116,8 @@ def shown_order(data: BacktestData) -> list[str]:
 
 
 def faint_names(data: BacktestData) -> list[str]:
-    """The other baselines, if they are too many to be told apart; charts hide them at first."""
-    main = main_names(data)
-    others = [name for name in shown_order(data) if name not in main]
-    return others if len(others) > DISTINCT else []
+    """All but the agents, the reference and the best baseline; charts hide them at first."""
+    test = data.assessment
+    bright = (test.reference, test.best_baseline)
+    kinds = {name: series.kind for name, series in data.strategies.items()}
+    return [n for n in shown_order(data) if kinds[n] not in JUDGED and n not in bright]

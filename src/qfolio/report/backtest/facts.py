@@ -1,4 +1,4 @@
-"""Key figures of a test, and its settings, seeds and trials in words."""
+"""Key facts of a test, and its settings, seeds and trials in words."""
 
 from __future__ import annotations
 
@@ -11,29 +11,22 @@ from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import THIN_SPACE, number
 
 
-def key_facts(data: BacktestData) -> list[tuple[str, str, str]]:
-    """Return the key figures of the test: name, value and a remark."""
+def key_facts(data: BacktestData) -> list[str]:
+    """What was tested on what, in a few words each."""
     test, settings, unit = data.assessment, data.config, unit_of(data.assessment.periods_per_year)
+    years = number(test.periods / test.periods_per_year)
     facts = [
-        (
-            "Tested over",
-            f"{number(test.periods / test.periods_per_year)} years",
-            f"{test.first_date[:4]} to {test.last_date[:4]}",
-        ),
-        ("Assets", number(len(data.assets), 0), "and cash, long only"),
+        str(data.prices["source"]),
+        f"{test.first_date} to {test.last_date} ({years} years)",
+        f"{_counted(len(data.assets), 'asset')} and cash",
     ]
     if "cost" in settings:
-        facts.append(("Cost", _basis_points(settings["cost"]), "of each trade’s value"))
+        facts.append(f"{_basis_points(settings['cost'])} a trade")
     if "lag" in settings:
-        facts.append(("Lag", _counted(settings["lag"], unit), "from decision to trade"))
+        facts.append(f"lag of {_counted(settings['lag'], unit)}")
     if data.folds:
-        remark = "walk-forward"
-        if "train" in settings and "test" in settings:
-            remark = f"train {settings['train']}, test {settings['test']}"
-        facts.append(("Folds", str(len(data.folds)), remark))
-    earlier = f", {number(test.earlier_trials, 0)} earlier" if test.earlier_trials else ""
-    facts.append(("Trials", number(test.trials, 0), _counts(test) + earlier))
-    return facts
+        facts.append(_counted(len(data.folds), "fold"))
+    return [*facts, _counted(test.trials, "trial")]
 
 
 def _counted(count: int, noun: str) -> str:

@@ -15,7 +15,7 @@ SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "penta
 
 @dataclass(frozen=True)
 class Look:
-    """The line style of a strategy: agents and ensembles coloured, baselines thin and grey."""
+    """The line style of a strategy: agents and ensembles coloured, most baselines thin and grey."""
 
     colour: str  # a key of palette.LIGHT and palette.DARK
     width: float
@@ -33,9 +33,9 @@ def looks_of(names: list[str], data: BacktestData) -> dict[str, Look]:
             looks[name] = Look(colour, 2.2, dash, agents % len(SYMBOLS))
             agents += 1
         elif name == data.assessment.reference:
-            looks[name] = Look("muted", 1.5, "", None)
+            looks[name] = Look("ink", 1.6, "", None)
         elif name == data.assessment.best_baseline:
-            looks[name] = Look("muted", 1.5, _DASHES[0], None)
+            looks[name] = Look("ink", 1.4, _DASHES[0], None)
         elif name == data.assessment.rebalanced:
             looks[name] = Look("muted", 1.5, _DASHES[1], None)
         else:

@@ -19,11 +19,24 @@ from markupsafe import Markup
 from qfolio.portfolio.backtest.assessment import JUDGED
 from qfolio.portfolio.backtest.verdict import bound_sentence
 from qfolio.report import palette
-from qfolio.report.backtest.charts import AREAS, chart_data, days_per_point, latest_values
+from qfolio.report.backtest.charts import (
+    chart_data,
+    days_per_point,
+    latest_values,
+    rolling_window,
+)
 from qfolio.report.backtest.convergence import convergence_sentences, draw_convergence
 from qfolio.report.backtest.data import BacktestData, main_names, require_fit, shown_order
 from qfolio.report.backtest.facts import account, few_seeds, key_facts, unit_of
+from qfolio.report.backtest.holdings import BLOCKS
 from qfolio.report.backtest.looks import looks_of
+from qfolio.report.backtest.opening import (
+    best_sentence,
+    conclusion,
+    lead_name,
+    tiles,
+    verdict_lines,
+)
 from qfolio.report.backtest.tables import (
     HEADINGS,
     difference_headings,
@@ -34,11 +47,15 @@ from qfolio.report.backtest.tables import (
     rebalancing_rows,
     statistics_rows,
 )
+from qfolio.report.backtest.tearsheet import tear_sheet
 from qfolio.report.backtest.verdicts import verdict_rows
 from qfolio.report.backtest.wealth import draw_wealth
 from qfolio.report.backtest.why import diagnoses, why_sections
 from qfolio.report.figures.style import LEAD, save_png, svgs
 from qfolio.report.rendering import render, setting_groups, source
+
+SCRIPTS = ("tools.js", "backtest.js", "holdings.js")
+"""The page's own script, in this order."""
 
 
 def write_backtest_report(folder: Path, data: BacktestData) -> None:
@@ -67,7 +84,8 @@ def render_backtest(data: BacktestData) -> str:
     names, lead = shown_order(data), main_names(data)
     looks = looks_of(names, data)
     payload = chart_data(names, looks, data)
-    scripts = [get_plotlyjs().replace("\r\n", "\n"), source("backtest.js").replace("\r\n", "\n")]
+    own = "\n".join(source(name) for name in SCRIPTS)
+    scripts = [script.replace("\r\n", "\n") for script in (get_plotlyjs(), own)]
     return render(
         "backtest.html",
         data=data,
@@ -81,7 +99,14 @@ def render_backtest(data: BacktestData) -> str:
         ],
         hidden=payload["hidden"],
         markers=palette.MARKER_PATHS,
+        conclusion=conclusion(data),
+        best=best_sentence(data),
+        leading=lead_name(data),
+        tiles=tiles(data),
+        lines=verdict_lines(data),
         verdicts=verdict_rows(names, data),
+        sheet=tear_sheet(lead, data),
+        rolling=rolling_window(data),
         facts=key_facts(data),
         why=why_sections(data),
         diagnoses=diagnoses(data),
@@ -107,7 +132,7 @@ def render_backtest(data: BacktestData) -> str:
         settings=setting_groups(data.config),
         thinned=days_per_point(len(data.dates)),
         few_seeds=few_seeds(data.assessment),
-        averaged=math.ceil(len(data.dates) / AREAS),
+        averaged=math.ceil(len(data.dates) / BLOCKS),
         unit=unit_of(data.assessment.periods_per_year),
     )
 

@@ -1,6 +1,9 @@
-"""Paths of a strategy over the days of the test, summarised over its seeds."""
+"""Paths of a strategy over the days of the test, summarised over its seeds, and their numbers."""
+
+import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from qfolio.portfolio.backtest.measures import drawdown
 from qfolio.report.backtest.data import StrategySeries
@@ -25,3 +28,20 @@ def median_drawdown(series: StrategySeries) -> Floats:
 def cost_share(series: StrategySeries) -> Floats:
     """Cumulative cost as a share of wealth, the mean over the seeds, of shape (days,)."""
     return np.asarray((1 - np.cumprod(1 - series.cost, axis=1)).mean(axis=0))
+
+
+def texts(dates: NDArray[np.datetime64]) -> list[str]:
+    """Dates as text for plotly and readers, with the time of day if there is one."""
+    whole = (dates == dates.astype("datetime64[D]")).all()
+    texts = np.datetime_as_string(dates, unit="D" if whole else "m").tolist()
+    return [text.replace("T", " ") for text in texts]
+
+
+def compact(values: Floats, digits: int = 4, *, positive: bool = False) -> list[float | None]:
+    """Numbers with few digits; None for those that cannot be drawn."""
+    return [
+        float(f"{value:.{digits}g}")
+        if math.isfinite(value) and (value > 0 or not positive)
+        else None
+        for value in values.tolist()
+    ]

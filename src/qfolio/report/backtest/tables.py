@@ -13,7 +13,7 @@ from qfolio.portfolio.backtest.differences import Difference
 from qfolio.portfolio.backtest.estimates import MEASURED, Measured
 from qfolio.portfolio.backtest.measures import monthly
 from qfolio.portfolio.backtest.verdict import luck, shown
-from qfolio.report.backtest.data import BacktestData
+from qfolio.report.backtest.data import BacktestData, main_names
 from qfolio.report.rendering import number, percent
 
 HEADINGS = {
@@ -38,7 +38,8 @@ _PERCENT = ("growth", "volatility", "drawdown", "cost_drag")
 _Year = tuple[int, list[tuple[str, str]]]
 
 
-def statistics_rows(name: str, data: BacktestData) -> list[dict[str, str]]:
+def statistics_rows(name: str, data: BacktestData) -> list[dict[str, Any]]:
+    """A strategy's figures with their intervals, as text and as bars on an axis for each column."""
     entry = data.assessment.strategies[name]
 
     def written(key: str, value: float) -> str:
@@ -49,9 +50,33 @@ def statistics_rows(name: str, data: BacktestData) -> list[dict[str, str]]:
             "value": written(key, measure.mean),
             "time": " … ".join(written(key, end) for end in measure.over_time),
             "seeds": " … ".join(written(key, end) for end in _over_seeds(measure)),
+            "bar": _interval(
+                measure.mean,
+                measure.over_time,
+                [data.assessment.strategies[n].measures[key] for n in main_names(data)],
+            ),
         }
         for key, measure in ((key, entry.measures[key]) for key in HEADINGS)
     ]
+
+
+def _interval(
+    value: float, interval: tuple[float, float], column: list[Measure]
+) -> tuple[float, float, float] | None:
+    """Left end, width and middle of an interval, in percent of the axis of its column.
+
+    The axis is that of the main strategies; others may be cut off at its ends.
+    """
+    ends = [end for each in column for end in each.over_time if math.isfinite(end)]
+    if not all(map(math.isfinite, (value, *interval))):
+        return None
+    low, high = min(ends), max(ends)
+
+    def place(end: float) -> float:
+        return round(min(max(100 * (end - low) / ((high - low) or 1.0), 0.0), 100.0), 1)
+
+    left, right = map(place, interval)
+    return left, round(right - left, 1), place(value)
 
 
 def _over_seeds(measure: Measure) -> tuple[float, ...]:

@@ -88,10 +88,10 @@ def _parts(parts: Decomposition) -> list[dict[str, Any]]:
         ("Costs", -parts.cost, "of all trades"),
         ("Net of equal weights", parts.net - parts.equal, "the sum"),
     ]
-    bars = _bars([value for _, value, _ in rows])
+    places = bars([value for _, value, _ in rows])
     return [
         {"name": name, "note": note, "value": percent(value, digits, sign=True), "bar": bar}
-        for (name, value, note), bar in zip(rows, bars, strict=True)
+        for (name, value, note), bar in zip(rows, places, strict=True)
     ]
 
 
@@ -153,13 +153,13 @@ def _signals(why: AgentWhy) -> list[dict[str, Any]]:
     """A row for each channel: its worth, how far it moves weights, and its place in the rule."""
     worth = [*why.importance.signals, why.importance.everything]
     order = [*sorted(worth[:-1], key=lambda each: -each.lost), worth[-1]]
-    bars = _bars([each.lost for each in order], [(each.low, each.high) for each in order])
+    places = bars([each.lost for each in order], [(each.low, each.high) for each in order])
     pulls = {each.name: each for each in why.gradients.pulls} if why.gradients else {}
     terms = {each.name: each for each in why.rule.terms}
     longest = max((each.size for each in pulls.values()), default=0.0) or 1.0
     digits = _digits([each.lost for each in order])
     rows = []
-    for each, bar in zip(order, bars, strict=True):
+    for each, bar in zip(order, places, strict=True):
         pull, term = pulls.get(each.name), terms.get(each.name)
         rows.append(
             {
@@ -266,7 +266,7 @@ def _tick(value: float, width: float) -> str:
     return number(value, digits)
 
 
-def _bars(
+def bars(
     values: Sequence[float], whiskers: Sequence[tuple[float, float]] = ()
 ) -> list[dict[str, Any]]:
     """Places of bars from a common zero, in percent of their track."""
@@ -277,7 +277,7 @@ def _bars(
     def place(value: float) -> float:
         return round(100 * (value - low) / width, 2)
 
-    bars = []
+    found = []
     for i, value in enumerate(values):
         left, right = sorted((place(0), place(value)))
         bar: dict[str, Any] = {
@@ -290,5 +290,5 @@ def _bars(
         if whiskers:
             ends_of = [place(end) for end in whiskers[i]]
             bar["whisker"] = (ends_of[0], round(ends_of[1] - ends_of[0], 2))
-        bars.append(bar)
-    return bars
+        found.append(bar)
+    return found

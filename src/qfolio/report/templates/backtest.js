@@ -1,116 +1,13 @@
-/* The charts of a backtest report. Names that users give never reach plotly, which would read
-   markup in them: the charts carry numbers only, and names stand in the page beside them. */
+/* The lines of all strategies: wealth, drawdown, costs, rolling ratios; their legends and choices. */
 "use strict";
 (() => {
-  const data = JSON.parse(document.getElementById("data").textContent);
-  const dark = matchMedia("(prefers-color-scheme: dark)");
-  const narrow = matchMedia("(max-width: 40rem)");
-  const coarse = matchMedia("(pointer: coarse)");
+  const { data, dark, narrow, coarse, state, byId, last, colour, translucent, dashes, percent,
+    times, ratio, layout, options, logTicks, tidy, inView, extent, room, label } = tools;
   const hidden = new Set(data.hidden);
-  let printing = false;
-  let chosen = 0;
-
-  const MARGIN = 44; // left of an axis, for its numbers
-  const SPACE = "\u202f", MINUS = "\u2212";
-  const SANS = getComputedStyle(document.documentElement).getPropertyValue("--sans").trim();
-  const byId = (id) => document.getElementById(id);
-  const last = (values) => values[values.length - 1];
-  const colour = (name) => data.themes[dark.matches && !printing ? "dark" : "light"][name] || name;
-  const translucent = (hex, alpha) => hex + Math.round(255 * alpha).toString(16).padStart(2, "0");
-  const dashes = (pattern) => pattern && pattern.split(" ").map((part) => part + "px").join(",");
-
-  function number(value, digits) {
-    if (value === null || value === undefined) return "–";
-    const text = Math.abs(value).toFixed(digits).replace(/\B(?=(\d{3})+(?!\d))/g, SPACE);
-    return (value < 0 && /[1-9]/.test(text) ? MINUS : "") + text;
-  }
-  const percent = (value, digits = 1) =>
-    value === null || value === undefined ? "–" : number(100 * value, digits) + SPACE + "%";
-  const times = (value) => number(value, value >= 100 ? 0 : value >= 10 ? 1 : 2);
-  const FORMATS = { wealth: times, drawdown: percent, cost: percent, turnover: percent };
-
-  // Axes ------------------------------------------------------------------------------------
-
-  function layout(height, more) {
-    const text = colour("muted");
-    return {
-      height, width: printing ? 660 : undefined,
-      paper_bgcolor: colour("paper"), plot_bgcolor: colour("paper"),
-      font: { family: SANS, size: 12, color: text },
-      margin: { l: MARGIN, r: 10, t: 26, b: 40 },
-      showlegend: false, hovermode: "x", hoverdistance: -1, spikedistance: -1,
-      dragmode: coarse.matches ? false : "zoom", uirevision: "kept",
-      xaxis: {
-        type: "date", showgrid: false, linecolor: text, ticks: "outside", tickcolor: text,
-        ticklen: 4, nticks: narrow.matches ? 5 : 9,
-        showspikes: true, spikemode: "across", spikesnap: "hovered data", spikedash: "solid",
-        spikethickness: 1, spikecolor: colour("faint"), fixedrange: coarse.matches, ...more.xaxis,
-      },
-      ...Object.fromEntries(["yaxis", "yaxis2"].filter((name) => more[name]).map((name) => [name, {
-        gridcolor: colour("hairline"), zeroline: false, fixedrange: true, ...more[name],
-      }])),
-      shapes: (more.shapes || []).map((shape) => ({
-        type: "line", xref: "paper", x0: 0, x1: 1, layer: "below",
-        line: { color: text, width: 1 }, ...shape,
-      })),
-      annotations: (more.titles || []).map(([title, y]) => ({
-        text: title, x: 0, y, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom",
-        yshift: 5, xshift: -MARGIN, showarrow: false, font: { size: 12.5, color: colour("ink") },
-      })),
-    };
-  }
-
-  function options(name) {
-    return {
-      responsive: true, displaylogo: false, showTips: false, displayModeBar: coarse.matches ? false : "hover",
-      modeBarButtons: [["toImage", "resetScale2d"]], doubleClick: "reset",
-      toImageButtonOptions: { format: "png", filename: `qfolio-${name}`, scale: 2 },
-    };
-  }
-
-  /** Round numbers between two positive ones, evenly spread on a log axis. */
-  function logTicks(low, high) {
-    const decades = Math.log10(high / low);
-    const steps = decades > 4 ? [1] : decades > 1.6 ? [1, 2, 5] : decades > 0.7
-      ? [1, 1.5, 2, 3, 5, 7] : [1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 3.5, 4, 5, 6, 7, 8, 9];
-    const ticks = [];
-    for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power += 1) {
-      for (const step of steps) {
-        const tick = step * 10 ** power;
-        if (tick >= low && tick <= high) ticks.push(tick);
-      }
-    }
-    if (ticks.length > 2) return ticks;
-    const rough = (high - low) / 4; // so near to each other that a plain axis would do
-    const power = 10 ** Math.floor(Math.log10(rough));
-    const step = power * [1, 2, 5, 10].find((factor) => factor * power >= rough);
-    const from = Math.ceil(low / step);
-    return Array.from({ length: Math.floor(high / step) - from + 1 }, (_, i) => (from + i) * step);
-  }
-  const tidy = (value) => String(Number(value.toPrecision(5))).replace("-", MINUS);
-
-  /** The places of the dates that the chart shows now, from first to one after the last. */
-  function inView(chart, dates) {
-    const axis = chart.layout && chart.layout.xaxis;
-    if (!axis || axis.autorange !== false || !axis.range) return [0, dates.length];
-    const [left, right] = axis.range.map((end) => new Date(end).getTime());
-    const at = dates.map((date) => new Date(date).getTime());
-    const inside = at.map((time, i) => (time >= left && time <= right ? i : -1)).filter((i) => i >= 0);
-    return inside.length > 1 ? [inside[0], last(inside) + 1] : [0, dates.length];
-  }
-
-  function extent(lists, [from, to]) {
-    let low = Infinity, high = -Infinity;
-    for (const list of lists) {
-      for (let i = from; i < to; i += 1) {
-        if (list[i] === null) continue;
-        if (list[i] < low) low = list[i];
-        if (list[i] > high) high = list[i];
-      }
-    }
-    return low <= high ? [low, high] : null;
-  }
-
+  const names = [...document.querySelectorAll("table[data-legend=wealth] button")]
+    .map((button) => button.textContent.trim());
+  const FORMATS = { wealth: times, drawdown: percent, cost: percent, turnover: percent,
+    sharpe: ratio, beta: ratio };
   const shown = () => data.strategies.filter((_, index) => !hidden.has(index));
 
   // Lines of all strategies -----------------------------------------------------------------
@@ -159,6 +56,7 @@
     return Plotly.react(chart,
       [...lines("wealth", data.dates, "y", true), ...lines("drawdown", data.dates, "y2", false)],
       layout(narrow.matches ? 480 : 590, {
+        margin: { r: room() },
         titles: [["Wealth, starting at 1 (log scale)", 1], ["Drawdown", 0.26]],
         xaxis: { anchor: "y2" },
         yaxis: { type: "log", domain: [0.36, 1], tickvals: ticks, ticktext: ticks.map(tidy),
@@ -166,7 +64,37 @@
         yaxis2: { domain: [0, 0.26], range: [Math.min(1.08 * deepest, -0.001), 0],
           tickformat: ".0%", nticks: 5 },
         shapes: [{ yref: "y", y0: 1, y1: 1 }, { yref: "y2", y0: 0, y1: 0 }],
-      }), options("wealth"));
+      }), options("wealth")).then(() => nameEnds("wealth", "yaxis", "wealth", view, (value) =>
+      Math.log10(value / (low / margin)) / Math.log10(high / low * margin ** 2)));
+  }
+
+  /** Names the lines of a chart where they leave the view; share: a value's height on the axis. */
+  function nameEnds(id, axis, key, [, to], share) {
+    const entries = data.strategies.map((strategy, index) => ({
+      name: names[index], colour: strategy.colour, value: strategy[key][to - 1], index,
+    })).filter((entry) => !hidden.has(entry.index) && entry.value !== null);
+    label(`${id}-labels`, byId(id), axis,
+      entries.map((entry) => ({ ...entry, at: 1 - Math.min(Math.max(share(entry.value), 0), 1) })));
+  }
+
+  /** The Sharpe ratio and the beta of the last year; drawn when the tear sheet is open. */
+  function drawRolling() {
+    const chart = byId("rolling");
+    if (!chart || !byId("sheet").open) return undefined;
+    const view = inView(chart, data.dates);
+    const [low, high] = extent(shown().map((s) => s.sharpe), view) || [0, 1];
+    const edge = 0.06 * (high - low) || 0.1;
+    return Plotly.react(chart,
+      [...lines("sharpe", data.dates, "y", false), ...lines("beta", data.dates, "y2", false)],
+      layout(narrow.matches ? 440 : 470, {
+        margin: { r: room() },
+        titles: [["Sharpe ratio of the last year", 1], ["Beta of the last year", 0.36]],
+        xaxis: { anchor: "y2" },
+        yaxis: { domain: [0.46, 1], range: [low - edge, high + edge], nticks: 6 },
+        yaxis2: { domain: [0, 0.36], nticks: 5 },
+        shapes: [{ yref: "y", y0: 0, y1: 0 }],
+      }), options("rolling")).then(() => nameEnds("rolling", "yaxis", "sharpe", view,
+      (value) => (value - low + edge) / (high - low + 2 * edge)));
   }
 
   function drawCosts() {
@@ -219,93 +147,65 @@
     }
     drawWealth();
     drawCosts();
-  }
-
-  // Weights ---------------------------------------------------------------------------------
-
-  function drawWeights() {
-    const series = data.weights.series[chosen];
-    const traces = series.values.map((values, i) => {
-      const cash = series.colours[i] === "cash";
-      const area = {
-        x: data.weights.dates, y: values, type: "scatter", mode: "lines", stackgroup: "weights",
-        hoverinfo: "none", meta: i, line: { width: 0 },
-        fillcolor: cash ? colour("wash") : colour(series.colours[i]),
-      };
-      if (cash) {
-        area.fillpattern = { shape: "/", size: 7, solidity: 0.2, fgcolor: colour("muted"),
-          bgcolor: colour("wash") };
-      }
-      return area;
-    });
-    return Plotly.react(byId("weights"), traces, layout(narrow.matches ? 350 : 510, {
-      titles: [["Share of the wealth", 1]],
-      yaxis: { range: [0, 1], tickformat: ".0%", nticks: 5, layer: "above traces" },
-    }), options("weights"));
-  }
-
-  function listWeights() {
-    const series = data.weights.series[chosen];
-    const body = byId("weights-list");
-    body.replaceChildren();
-    for (let i = series.names.length - 1; i >= 0; i -= 1) { // as they are stacked
-      const row = body.insertRow();
-      const head = document.createElement("th");
-      head.scope = "row";
-      const patch = document.createElement("span");
-      patch.className = series.colours[i] === "cash" ? "patch cash" : "patch";
-      if (series.colours[i] !== "cash") {
-        patch.style.background = series.colours[i].startsWith("#")
-          ? series.colours[i] : `var(--${series.colours[i]})`;
-      }
-      head.append(patch, series.names[i]);
-      row.append(head);
-      row.insertCell().textContent = percent(series.average[i]);
-      row.insertCell().className = "now";
-    }
-    readWeights(data.weights.dates.length - 1);
-  }
-
-  function readWeights(index) {
-    const series = data.weights.series[chosen];
-    byId("weights-date").textContent = data.weights.dates[index];
-    const cells = byId("weights-list").querySelectorAll(".now");
-    cells.forEach((cell, row) => {
-      cell.textContent = percent(series.values[series.names.length - 1 - row][index]);
-    });
+    drawRolling();
   }
 
   // All together ----------------------------------------------------------------------------
 
-  const charts = [drawWealth, drawWeights, drawCosts];
-  const redraw = () => charts.forEach((draw) => draw());
+  const redraw = () => [drawWealth, drawRolling, drawCosts].forEach((draw) => draw());
   const atEnd = () => data.dates.length - 1;
+
+  /** Shows one of several alternatives, as chosen in a list. */
+  function choose(list, attribute) {
+    byId(list).addEventListener("change", (event) => {
+      for (const part of document.querySelectorAll(`[data-${attribute}]`)) {
+        part.hidden = part.dataset[attribute] !== event.target.value;
+      }
+    });
+  }
+
+  /** Marks the tables that reach beyond their frame, and those with more to the right. */
+  function cue() {
+    for (const frame of document.querySelectorAll(".scroll")) {
+      frame.classList.toggle("wide", frame.scrollWidth > frame.clientWidth + 1);
+      frame.classList.toggle("more",
+        frame.scrollLeft + frame.clientWidth < frame.scrollWidth - 2);
+    }
+  }
 
   for (const button of document.querySelectorAll("button[data-strategy]")) {
     button.addEventListener("click", () => toggle(Number(button.dataset.strategy)));
   }
-  byId("weights-strategy").addEventListener("change", (event) => {
-    chosen = Number(event.target.value);
-    listWeights();
-    drawWeights();
-  });
-  byId("months-strategy").addEventListener("change", (event) => {
-    for (const table of document.querySelectorAll("table[data-months]")) {
-      table.hidden = table.dataset.months !== event.target.value;
-    }
-  });
-  listWeights();
+  for (const button of document.querySelectorAll("button.rest")) {
+    button.addEventListener("click", () => {
+      button.setAttribute("aria-expanded", "true");
+      for (const row of button.parentElement.querySelectorAll("[data-rest]")) row.hidden = false;
+    });
+  }
+  choose("months-strategy", "months");
+  choose("sheet-strategy", "sheet");
   document.documentElement.classList.add("drawn");
   redraw();
   follow("wealth", data.dates, (i) => read("wealth", i), () => read("wealth", atEnd()));
   follow("costs", data.dates, (i) => read("costs", i), () => read("costs", atEnd()));
-  follow("weights", data.weights.dates, readWeights,
-    () => readWeights(data.weights.dates.length - 1));
   byId("wealth").on("plotly_relayout", (event) => {
     // The height follows what is in view; a range of the height alone is our own answer.
     if (Object.keys(event).some((key) => key.startsWith("xaxis"))) drawWealth();
   });
+  byId("sheet").addEventListener("toggle", () => {
+    const first = byId("rolling") && !byId("rolling").data;
+    drawRolling();
+    if (first && byId("rolling").data) {
+      follow("rolling", data.dates, (i) => read("rolling", i), () => read("rolling", atEnd()));
+    }
+    cue();
+  });
   for (const query of [dark, narrow, coarse]) query.addEventListener("change", redraw);
-  addEventListener("beforeprint", () => { printing = true; redraw(); });
-  addEventListener("afterprint", () => { printing = false; redraw(); });
+  addEventListener("resize", () => { cue(); drawWealth(); drawRolling(); });
+  document.addEventListener("scroll", cue, { capture: true, passive: true });
+  document.addEventListener("toggle", cue, { capture: true });
+  document.addEventListener("change", cue);
+  cue();
+  addEventListener("beforeprint", () => { state.printing = true; redraw(); });
+  addEventListener("afterprint", () => { state.printing = false; redraw(); });
 })();

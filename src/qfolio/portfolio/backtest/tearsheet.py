@@ -1,0 +1,227 @@
+"""The figures of a tear sheet: tails, months, drawdowns, rolling ratios, contributions of assets.
+
+They describe a track record and test nothing; ``measures.py`` has what is tested. Definitions
+follow quantstats and pyfolio where these agree.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qfolio.portfolio.backtest.measures import (
+    Floats,
+    checked_dates,
+    drawdown,
+    log_growth,
+    monthly,
+    ratio_or_zero,
+)
+from qfolio.portfolio.backtest.sharpe import skewness_and_kurtosis
+
+TAIL = 0.05
+"""The share of the worst returns that value at risk and its mean, CVaR, look at."""
+
+
+class Fall(NamedTuple):
+    """A fall below a peak and its recovery; places are periods, −1 is the start of the record."""
+
+    start: int  # the peak
+    trough: int
+    end: int | None  # the first period at the old peak again; none if it has not recovered
+    depth: float  # between 0 and 1
+    length: int  # periods from the peak to the end, or to the end of the record
+
+
+def falls(returns: ArrayLike, count: int) -> list[Fall]:
+    """Return the deepest drawdowns of one track record, deepest first.
+
+    Args:
+        returns: Simple returns of shape (periods,).
+        count: The most drawdowns to return.
+    """
+    depth = drawdown(returns)
+    below = np.concatenate([[False], depth > 0, [False]])
+    edges = np.flatnonzero(below[1:] != below[:-1])
+    found = []
+    for first, after in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        trough = first + int(depth[first:after].argmax())
+        end = after if after < len(depth) else None
+        length = (len(depth) - 1 if end is None else end) - (first - 1)
+        found.append(Fall(first - 1, trough, end, float(depth[trough]), length))
+    return sorted(found, key=lambda fall: -fall.depth)[:count]
+
+
+def value_at_risk(returns: ArrayLike, tail: float = TAIL) -> tuple[float, float]:
+    """Return the historical value at risk and the expected loss beyond it (CVaR), as losses.
+
+    Value at risk is the loss that a share ``tail`` of the returns exceed (the quantile with linear
+    interpolation); CVaR is the mean loss of the returns at or below that quantile.
+    """
+    values = np.asarray(returns, dtype=float)
+    edge = np.quantile(values, tail)
+    return float(-edge), float(-values[values <= edge].mean())
+
+
+def rolling_sharpe(returns: ArrayLike, window: int, periods_per_year: float) -> Floats:
+    """Return the annualised Sharpe ratio of the last ``window`` returns, NaN before there are any.
+
+    Args:
+        returns: Simple returns of shape (..., periods).
+        window: At least 2.
+        periods_per_year: For example 252 for days of trading.
+    """
+    (mean, variance), _ = _rolling(np.asarray(returns, dtype=float), None, window)
+    ratio = ratio_or_zero(mean, np.sqrt(variance * window / (window - 1)))
+    return _padded(math.sqrt(periods_per_year) * ratio, window)
+
+
+def rolling_beta(returns: ArrayLike, reference: ArrayLike, window: int) -> Floats:
+    """Return the slope of the last ``window`` returns on those of a reference.
+
+    NaN before there are so many, and where the reference did not move.
+
+    Args:
+        returns: Simple returns of shape (..., periods).
+        reference: Those of the reference, shape (periods,).
+        window: At least 2.
+    """
+    other = np.asarray(reference, dtype=float)
+    _, covariance = _rolling(np.asarray(returns, dtype=float), other, window)
+    (_, variance), _ = _rolling(other, None, window)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _padded(np.where(variance > 0, covariance / variance, np.nan), window)
+
+
+def effective_number(weights: ArrayLike) -> Floats:
+    """Return the effective number of assets: one over the sum of squared shares.
+
+    Shares are those of the assets in what is invested; 0 if all is cash.
+
+    Args:
+        weights: Of shape (..., assets + 1), cash first.
+    """
+    risky = np.asarray(weights, dtype=float)[..., 1:]
+    invested = np.abs(risky).sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(invested > 1e-9, invested**2 / (risky**2).sum(axis=-1), 0.0)
+
+
+def contributions(
+    returns: ArrayLike, weights: ArrayLike, moves: ArrayLike, periods_per_year: float
+) -> tuple[Floats, float]:
+    """Return what each asset added to the mean return a year, and the rest.
+
+    An asset's contribution is the mean of its weight times its return; the rest is what the mean
+    net return lacks: trading costs, and interest and fees if there are any. All parts add up to
+    the arithmetic mean return.
+
+    Args:
+        returns: Simple net returns of shape (seeds, periods).
+        weights: Weights after each trade, the mean over the seeds, (periods, assets + 1), cash
+            first.
+        moves: Simple returns of the assets over the same periods, shape (periods, assets).
+        periods_per_year: For example 252 for days of trading.
+
+    Returns:
+        Contributions of shape (assets,), and the rest.
+    """
+    held, moved = np.asarray(weights, dtype=float)[:, 1:], np.asarray(moves, dtype=float)
+    parts = periods_per_year * np.einsum("pa,pa->a", held, moved) / len(held)
+    net = periods_per_year * float(np.asarray(returns, dtype=float).mean())
+    return parts, net - float(parts.sum())
+
+
+def figures(returns: ArrayLike, dates: ArrayLike, periods_per_year: float) -> dict[str, float]:
+    """Return the usual figures of a tear sheet for one track record; returns are simple and net.
+
+    ``growth`` is the compound annual rate (CAGR), ``kurtosis`` is 3 for a normal distribution,
+    ``longest`` is the longest drawdown in years, ``time_below`` the share of the time below a peak,
+    ``tail_ratio`` the 95 % quantile over the size of the 5 % quantile, ``omega`` the sum of gains
+    over that of losses, ``payoff`` the mean gain over the mean loss, ``hit_rate`` the share of
+    periods with a gain among those that moved, ``ulcer`` the root mean square of drawdowns.
+
+    Args:
+        returns: Of shape (periods,).
+        dates: Days on which the returns were earned, shape (periods,), strictly increasing.
+        periods_per_year: For example 252 for days of trading.
+    """
+    values = np.asarray(returns, dtype=float)
+    checked_dates(dates, len(values))
+    depth, annual = drawdown(values), math.sqrt(periods_per_year)
+    table = monthly(values, dates)[1]
+    months = table[~np.isnan(table)]
+    years = np.nanprod(1 + table, axis=-1)[~np.isnan(table).all(axis=-1)] - 1
+    total = float(log_growth(values).sum())
+    growth = math.expm1(total * periods_per_year / len(values))
+    spread = float(values.std(ddof=1)) if len(values) > 1 else math.nan
+    downside = math.sqrt(float((np.minimum(values, 0) ** 2).mean()))
+    gains, losses = values[values > 0], values[values < 0]
+    skewness, kurtosis = skewness_and_kurtosis(values[None])
+    low, high = np.quantile(values, [TAIL, 1 - TAIL])
+    day, month = value_at_risk(values), value_at_risk(months)
+    longest = max((fall.length for fall in falls(values, len(values))), default=0)
+
+    def over(above: float, below: float) -> float:
+        return float(ratio_or_zero(above, below))
+
+    return {
+        "growth": growth,
+        "total": math.expm1(total),
+        "volatility": annual * spread,
+        "sharpe": annual * over(float(values.mean()), spread),
+        "sortino": annual * over(float(values.mean()), downside),
+        "calmar": over(growth, float(depth.max())),
+        "omega": over(float(gains.sum()), abs(float(losses.sum()))),
+        "drawdown": float(depth.max()),
+        "longest": longest / periods_per_year,
+        "time_below": float((depth > 0).mean()),
+        "ulcer": math.sqrt(float((depth**2).mean())),
+        "var": day[0],
+        "cvar": day[1],
+        "var_month": month[0],
+        "cvar_month": month[1],
+        "skewness": skewness,
+        "kurtosis": kurtosis,
+        "tail_ratio": over(float(abs(high)), float(abs(low))),
+        "hit_rate": over(len(gains), len(gains) + len(losses)),
+        "hit_rate_month": float((months > 0).mean()),
+        "payoff": over(
+            float(gains.mean()) if len(gains) else 0.0,
+            abs(float(losses.mean())) if len(losses) else 0.0,
+        ),
+        "best": float(values.max()),
+        "worst": float(values.min()),
+        "best_month": float(months.max()),
+        "worst_month": float(months.min()),
+        "best_year": float(years.max()),
+        "worst_year": float(years.min()),
+    }
+
+
+def _rolling(values: Floats, other: Floats | None, window: int) -> tuple[NDArray, Floats]:
+    """Mean and variance of each window, stacked, and the covariance with another series."""
+    centre = values.mean(axis=-1, keepdims=True)  # or differences of sums would lose precision
+    moved = values - centre
+    mean = _means(moved, window)
+    variance = np.maximum(_means(moved**2, window) - mean**2, 0)
+    variance = np.where(variance > 1e-18, variance, 0)
+    both = np.stack([mean + centre, variance])
+    if other is None:
+        return both, variance
+    beside = other - other.mean()
+    return both, _means(moved * beside, window) - mean * _means(beside, window)
+
+
+def _means(values: Floats, window: int) -> Floats:
+    sums = np.cumsum(values, axis=-1)
+    before = np.concatenate(
+        [np.zeros_like(sums[..., :1]), sums[..., :-window]], axis=-1
+    )  # the sum up to each window
+    return np.asarray((sums[..., window - 1 :] - before) / window)
+
+
+def _padded(values: Floats, window: int) -> Floats:
+    missing = np.full((*values.shape[:-1], window - 1), np.nan)
+    return np.concatenate([missing, values], axis=-1)

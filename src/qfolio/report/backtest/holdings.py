@@ -1,0 +1,72 @@
+"""The data of the picture of holdings: weights against the reference over time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qfolio.portfolio.backtest.tearsheet import effective_number
+from qfolio.report.backtest.data import BacktestData
+from qfolio.report.backtest.paths import compact, texts
+from qfolio.report.data import Floats
+
+BLOCKS = 200
+"""Most points in time; each is a mean over consecutive days."""
+
+NAMED = 12
+"""How many assets have a row of their own; the others are added up."""
+
+
+def holdings(names: list[str], data: BacktestData) -> dict[str, Any]:
+    """Return, for each strategy, its weights by block of days: cash, the largest, and the rest.
+
+    The largest assets are those whose weights differ most from the reference's, on average. The
+    reference itself is shown without comparison.
+    """
+    days = len(data.dates)
+    blocks = np.arange(0, days, math.ceil(days / BLOCKS))
+    centres = (blocks + np.append(blocks[1:], days) - 1) // 2
+    reference = data.strategies[data.assessment.reference].weights
+    base = _averages(reference, blocks)
+    effective = compact(_averages(effective_number(reference), blocks), 3)
+    return {
+        "dates": texts(data.dates[centres]),
+        "reference": names.index(data.assessment.reference),
+        "effective": effective,
+        "series": [_rows(data.strategies[name].weights, base, data.assets, blocks, name
+                         == data.assessment.reference) for name in names],
+    }  # fmt: skip
+
+
+def _rows(
+    weights: Floats, base: Floats, assets: tuple[str, ...], blocks: NDArray[np.intp], alone: bool
+) -> dict[str, Any]:
+    table = _averages(weights, blocks)
+    beside = np.zeros_like(table) if alone else base
+    size = np.abs(table - beside)[:, 1:].mean(axis=0)
+    ranked = (np.argsort(-size, kind="stable") + 1).tolist()
+    # A single remaining asset is named instead of called others.
+    count = NAMED if len(ranked) > NAMED + 1 else len(ranked)
+    top, rest = ranked[:count], ranked[count:]
+    groups = [[0], *([asset] for asset in top), *([rest] if rest else [])]
+    values = [table[:, group].sum(axis=1) for group in groups]
+    active = [
+        value - beside[:, group].sum(axis=1) for value, group in zip(values, groups, strict=True)
+    ]
+    return {
+        "names": ["Cash", *(assets[asset - 1] for asset in top)]
+        + [f"{len(rest)} others"] * bool(rest),
+        "values": [compact(value, 3) for value in values],
+        "active": [np.round(each, 4).tolist() for each in active],
+        "effective": compact(_averages(effective_number(weights), blocks), 3),
+    }
+
+
+def _averages(values: Floats, blocks: NDArray[np.intp]) -> Floats:
+    """Means over consecutive days, along the first axis."""
+    counts = np.diff(np.append(blocks, len(values)))
+    sums = np.add.reduceat(values, blocks, axis=0)
+    return np.asarray(sums / counts.reshape(-1, *[1] * (values.ndim - 1)))

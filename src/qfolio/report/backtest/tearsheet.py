@@ -1,0 +1,209 @@
+"""The page's tear sheet: figures, drawdowns, tails and contributions of the main strategies."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from qfolio.portfolio.backtest.tearsheet import (
+    contributions,
+    falls,
+    figures,
+    value_at_risk,
+)
+from qfolio.report.backtest.data import BacktestData, StrategySeries
+from qfolio.report.backtest.facts import unit_of
+from qfolio.report.backtest.why import bars
+from qfolio.report.data import Floats
+from qfolio.report.rendering import number, percent
+
+DRAWDOWNS = 5
+"""Drawdowns that are listed."""
+
+LISTED = 12
+"""Assets whose contributions are listed; those of the others are added up."""
+
+BINS = 41
+"""Bars of a histogram; the outermost hold all returns beyond."""
+
+PERIODS = {"day": "daily", "week": "weekly", "month": "monthly"}
+"""Units as adjectives."""
+
+
+def tear_sheet(names: list[str], data: BacktestData) -> dict[str, Any]:
+    """Return the tear sheet of some strategies; means over the seeds, where there are several."""
+    year, unit = data.assessment.periods_per_year, unit_of(data.assessment.periods_per_year)
+    found = [_means(data.strategies[name], data, year) for name in names]
+    edges = _edges([data.strategies[name].returns for name in names])
+    reference = data.strategies[data.assessment.reference].returns
+    return {
+        "names": names,
+        "groups": _groups(found, unit),
+        "every": PERIODS.get(unit, "single"),
+        "each": [
+            {
+                "name": name,
+                "drawdowns": _drawdowns(data.strategies[name], data),
+                "histogram": _histogram(data.strategies[name].returns, reference, edges),
+                "assets": _assets(data.strategies[name], data, year),
+            }
+            for name in names
+        ],
+    }
+
+
+def _means(series: StrategySeries, data: BacktestData, year: float) -> dict[str, float]:
+    each = [figures(row, data.dates, year) for row in series.returns]
+    return {key: float(np.mean([found[key] for found in each])) for key in each[0]}
+
+
+def _groups(found: list[dict[str, float]], unit: str) -> list[tuple[str, list[Any]]]:
+    """Groups of rows: a name, and a cell for each strategy."""
+    every = PERIODS.get(unit, "of a period")
+
+    def row(name: str, key: str, form: str) -> tuple[str, list[str]]:
+        return name, [_written(each[key], form) for each in found]
+
+    return [
+        (
+            "Return",
+            [
+                row("Growth a year (CAGR)", "growth", "%"),
+                row("Total return", "total", "%"),
+                row(f"Best {unit}", "best", "+%"),
+                row(f"Worst {unit}", "worst", "+%"),
+                row("Best month", "best_month", "+%"),
+                row("Worst month", "worst_month", "+%"),
+                row("Best year", "best_year", "+%"),
+                row("Worst year", "worst_year", "+%"),
+                row(f"{unit.capitalize()}s with a gain", "hit_rate", "%"),
+                row("Months with a gain", "hit_rate_month", "%"),
+            ],
+        ),
+        (
+            "Risk",
+            [
+                row("Volatility a year", "volatility", "%"),
+                row("Deepest drawdown", "drawdown", "%"),
+                row("Longest drawdown, years", "longest", "1"),
+                row("Time below a peak", "time_below", "%"),
+                row("Ulcer index", "ulcer", "%"),
+                row(f"Value at risk, 95\u202f%, {every}", "var", "%2"),
+                row(f"CVaR, 95\u202f%, {every}", "cvar", "%2"),
+                row("Value at risk, 95\u202f%, monthly", "var_month", "%"),
+                row("CVaR, 95\u202f%, monthly", "cvar_month", "%"),
+                row("Skewness", "skewness", "2"),
+                row("Kurtosis (normal: 3)", "kurtosis", "1"),
+            ],
+        ),
+        (
+            "Return for the risk",
+            [
+                row("Sharpe ratio", "sharpe", "2"),
+                row("Sortino ratio", "sortino", "2"),
+                row("Calmar ratio", "calmar", "2"),
+                row("Omega ratio", "omega", "2"),
+                row("Tail ratio", "tail_ratio", "2"),
+                row("Payoff (mean gain over mean loss)", "payoff", "2"),
+            ],
+        ),
+    ]
+
+
+def _written(value: float, form: str) -> str:
+    if "%" in form:
+        return percent(value, 2 if "2" in form else 1, sign="+" in form)
+    return number(value, int(form))
+
+
+def _drawdowns(series: StrategySeries, data: BacktestData) -> list[list[str]]:
+    """The deepest drawdowns; of several seeds, those of their mean return."""
+    days = data.dates
+    before = min(np.timedelta64(1, "D"), *np.diff(days[:2]))
+
+    def spelled(place: int | None) -> str:
+        if place is None:
+            return "not yet"
+        return str((days[0] - before if place < 0 else days[place]).astype("datetime64[D]"))
+
+    unit = unit_of(data.assessment.periods_per_year)
+    return [
+        [
+            spelled(fall.start),
+            spelled(fall.trough),
+            spelled(fall.end),
+            percent(fall.depth),
+            f"{number(fall.length, 0)} {unit}{'' if fall.length == 1 else 's'}",
+        ]
+        for fall in falls(series.returns.mean(axis=0), DRAWDOWNS)
+    ]
+
+
+def _edges(returns: list[Floats]) -> Floats:
+    """The histograms' common bins, around zero."""
+    sizes = np.concatenate([np.abs(table).ravel() for table in returns])
+    reach = float(np.quantile(sizes, 0.99)) or 0.01
+    return np.linspace(-reach, reach, BINS + 1)
+
+
+def _histogram(returns: Floats, reference: Floats, edges: Floats) -> dict[str, Any]:
+    """Bars of the returns and the outline of the reference's, in percent of the highest."""
+
+    def shares(values: Floats) -> Floats:
+        counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
+        return np.asarray(100 * counts / values.size)
+
+    own, other = shares(returns), shares(reference)
+    highest = float(max(own.max(), other.max()))
+    width = 100 / BINS
+    steps = [
+        f"{x:.4g},{100 - 100 * height / highest:.4g}"
+        for i, height in enumerate(other.tolist())
+        for x in (i * width, (i + 1) * width)
+    ]
+    reach = float(edges[-1])
+
+    def place(value: float) -> float:
+        return round(100 * min(max((value + reach) / (2 * reach), 0.0), 1.0), 2)
+
+    var, cvar = value_at_risk(returns)
+    return {
+        "bars": [
+            (round(i * width, 3), round(100 * height / highest, 2))
+            for i, height in enumerate(own.tolist())
+        ],
+        "width": round(0.86 * width, 3),
+        "outline": " ".join(steps),
+        "reach": percent(reach),
+        "highest": percent(highest / 100, 0),
+        "marks": [(place(-cvar), "CVaR"), (place(-var), "VaR")],
+        "label": f"95 % of the returns are above {percent(-var, 2)}; "
+        f"the mean of the others is {percent(-cvar, 2)}",
+    }
+
+
+def _assets(series: StrategySeries, data: BacktestData, year: float) -> list[dict[str, Any]]:
+    """Contributions to the mean return a year, largest first, then the rest and the sum."""
+    if data.moves is None:
+        return []
+    parts, rest = contributions(series.returns, series.weights, data.moves, year)
+    order = np.argsort(-np.abs(parts), kind="stable").tolist()
+    count = LISTED if len(order) > LISTED + 1 else len(order)
+    rows = [(data.assets[i], float(parts[i])) for i in order[:count]]
+    rows.sort(key=lambda row: -row[1])
+    if others := order[count:]:
+        rows.append((f"{number(len(others), 0)} others", float(parts[others].sum())))
+    rows.append(("Costs and interest", rest))
+    largest = max(abs(value) for _, value in rows)
+    digits = 2 if largest < 0.01 else 1
+    total = float(parts.sum()) + rest
+    if not math.isfinite(total):
+        return []
+    places = bars([value for _, value in rows])
+    shown = [
+        {"name": name, "bar": place, "value": percent(value, digits, sign=True)}
+        for (name, value), place in zip(rows, places, strict=True)
+    ]
+    return [*shown, {"name": "Mean return a year", "bar": None, "value": percent(total, digits)}]

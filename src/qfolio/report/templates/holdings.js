@@ -1,0 +1,109 @@
+/* The picture of holdings: a row for each asset, its weight against the reference's in colour, and
+   the effective number of assets below. Names and weights stand beside the rows. */
+"use strict";
+(() => {
+  const { data, dark, narrow, coarse, state, byId, last, colour, percent, number, layout,
+    options } = tools;
+  const { dates, series: all, reference, effective } = data.weights;
+  const ROW = 23, BELOW = 130, TOP = 26, BOTTOM = 40;
+  let chosen = 0;
+
+  /** The rows from top to bottom: the largest first, cash at the end. */
+  const rows = (series) => [...series.names.keys()].slice(1).concat(0);
+  const margin = () => (narrow.matches ? { l: 92, r: 58 } : { l: 150, r: 66 });
+
+  /** Half of the width of the colours: most values are within it. */
+  function reach(series) {
+    const sizes = series.active.flat().map(Math.abs).sort((a, b) => a - b);
+    return Math.max(sizes[Math.floor(0.99 * (sizes.length - 1))], 0.005);
+  }
+
+  function draw() {
+    const series = all[chosen], order = rows(series), alone = chosen === reference;
+    const inner = ROW * order.length + 40 + BELOW;
+    const edge = reach(series);
+    const share = (ROW * order.length) / inner;
+    const map = {
+      type: "heatmap", x: dates, y: order.map((_, place) => place),
+      z: order.map((row) => series.active[row]), zmin: alone ? 0 : -edge, zmax: edge,
+      colorscale: alone ? [[0, colour("paper")], [1, colour("accent")]]
+        : [[0, colour("second")], [0.5, colour("paper")], [1, colour("accent")]],
+      showscale: false, hoverinfo: "none", ygap: 2,
+    };
+    const line = (y, ink, width) => ({
+      x: dates, y, yaxis: "y2", type: "scatter", mode: "lines", hoverinfo: "none",
+      line: { color: colour(ink), width },
+    });
+    const below = (BELOW / inner);
+    const traces = [map, ...(alone ? [] : [line(effective, "ink", 1)]),
+      line(series.effective, "accent", 1.8)];
+    say(alone, edge);
+    return Plotly.react(byId("weights"), traces, layout(inner + TOP + BOTTOM, {
+      margin: margin(),
+      titles: [[alone ? "Weight" : "Active weight", 1], ["Effective number of assets", below]],
+      xaxis: { anchor: "y2" },
+      yaxis: { domain: [1 - share, 1], range: [order.length - 0.5, -0.5], visible: false,
+        showgrid: false },
+      yaxis2: { domain: [0, below], rangemode: "tozero", nticks: 4 },
+    }), { ...options("holdings"), displayModeBar: false }).then(() => list(order));
+  }
+
+  /** Says what the colours mean. */
+  function say(alone, edge) {
+    byId("weights-what").textContent = alone ? "Weights after each trade"
+      : "Weights after each trade, less those of the reference: blue is more, orange is less";
+    const scale = byId("weights-scale"), [low, high] = scale.querySelectorAll("span");
+    scale.classList.toggle("alone", alone);
+    low.textContent = percent(alone ? 0 : -edge);
+    high.textContent = percent(edge) + (alone ? "" : ", against the reference");
+  }
+
+  /** Names at the left of the rows, and weights at the right. */
+  function list(order) {
+    const place = byId("weights-list"), chart = byId("weights");
+    const { _offset: top, _length: height } = chart._fullLayout.yaxis;
+    const { l, r } = margin();
+    const width = chart.clientWidth;
+    const add = (text, kind, at, left, wide) => {
+      const span = document.createElement("span");
+      span.className = kind;
+      span.textContent = text;
+      Object.assign(span.style,
+        { top: `${at}px`, left: `${left}px`, width: `${wide}px` });
+      place.append(span);
+    };
+    place.replaceChildren();
+    add("", "now head", top - 12, 0, width);
+    order.forEach((row, i) => {
+      const at = top + ((i + 0.5) * height) / order.length;
+      add(all[chosen].names[row], "row", at, 0, l - 8);
+      add("", "now", at, width - r, r);
+    });
+    read(dates.length - 1);
+  }
+
+  /** Shows the weights at a date. */
+  function read(index) {
+    const series = all[chosen], order = rows(series);
+    const [head, ...cells] = byId("weights-list").querySelectorAll(".now");
+    head.textContent = dates[index];
+    cells.forEach((cell, i) => { cell.textContent = percent(series.values[order[i]][index]); });
+  }
+
+  byId("weights-strategy").addEventListener("change", (event) => {
+    chosen = Number(event.target.value);
+    draw();
+  });
+  draw();
+  const reached = (event) => {
+    const index = dates.findIndex((date) => date >= String(event.points[0].x).slice(0, dates[0].length));
+    read(index < 0 ? dates.length - 1 : index);
+  };
+  byId("weights").on("plotly_hover", reached);
+  byId("weights").on("plotly_click", reached); // all that a tap causes
+  byId("weights").on("plotly_unhover", () => read(dates.length - 1));
+  for (const query of [dark, narrow, coarse]) query.addEventListener("change", draw);
+  addEventListener("resize", draw);
+  addEventListener("beforeprint", draw);
+  addEventListener("afterprint", draw);
+})();

@@ -1,0 +1,128 @@
+"""The first screen of the page: conclusion, tiles, verdicts in a line, the best strategy."""
+
+from dataclasses import replace
+
+import pytest
+
+from qfolio.portfolio.backtest.differences import Finding
+from qfolio.report.backtest.data import BacktestData, followed_names
+from qfolio.report.backtest.opening import (
+    best_sentence,
+    conclusion,
+    lead_name,
+    standing,
+    tiles,
+    verdict_lines,
+)
+from qfolio.report.rendering import number, percent
+
+from backtests import make_data, usual
+
+
+def found(data: BacktestData, **findings: tuple[Finding, Finding]) -> BacktestData:
+    """The same backtest with other findings of growth and Sharpe ratio, by agent.
+
+    They hold against the reference and at its best speed.
+    """
+    strategies = dict(data.assessment.strategies)
+    for name, entry in strategies.items():
+        if name not in followed_names(data):
+            continue
+        growth, sharpe = findings.get(name.removesuffix("-together"), ("none", "none"))
+        assert entry.to_reference is not None
+        assert entry.to_rebalanced is not None
+        changed = {
+            field: replace(
+                difference,
+                growth=replace(difference.growth, finding=growth),
+                sharpe=replace(difference.sharpe, finding=sharpe),
+            )
+            for field, difference in (
+                ("to_reference", entry.to_reference),
+                ("to_rebalanced", entry.to_rebalanced),
+            )
+        }
+        strategies[name] = replace(entry, **changed)
+    return replace(data, assessment=replace(data.assessment, strategies=strategies))
+
+
+def growth(data: BacktestData, name: str) -> str:
+    return percent(data.assessment.strategies[name].measures["growth"].mean)
+
+
+@pytest.fixture(scope="module")
+def plain() -> BacktestData:
+    return usual()
+
+
+def test_the_agents_are_those_that_allocate_follows(plain: BacktestData) -> None:
+    assert followed_names(plain) == ["DQN-together", "pathwise"]
+
+
+def test_the_conclusion_says_who_beats_the_reference(plain: BacktestData) -> None:
+    data = found(plain, pathwise=("better", "better"))
+    assert lead_name(data) == "pathwise"
+    assert conclusion(data) == (
+        "pathwise beats equal weight in growth and Sharpe ratio: it grew "
+        f"{growth(data, 'pathwise')} a year after costs, equal weight "
+        f"{growth(data, 'equal weight')}."
+    )
+    both = found(plain, pathwise=("better", "none"), DQN=("better", "none"))
+    assert conclusion(both).startswith(
+        "DQN-together and pathwise beat equal weight in growth: DQN-together grew "
+    )
+    risk = found(plain, DQN=("none", "better"))
+    assert conclusion(risk).startswith(
+        "DQN-together beats equal weight in return for the risk, but not in growth: it grew"
+    )
+
+
+def test_the_conclusion_says_that_nobody_does(plain: BacktestData) -> None:
+    data = found(plain, pathwise=("worse", "none"))
+    assert lead_name(data) == "DQN-together"  # not the one that grew most: that may be luck
+    assert conclusion(data).startswith("No agent clearly beats equal weight: DQN-together grew")
+    worse = found(plain, pathwise=("worse", "worse"), DQN=("worse", "none"))
+    assert conclusion(worse).startswith("All agents fall short of equal weight: ")
+
+
+def test_better_than_the_reference_only_as_it_was_rebalanced(plain: BacktestData) -> None:
+    entry = found(plain, DQN=("better", "better")).assessment.strategies["DQN-together"]
+    assert entry.to_rebalanced is not None
+    slower = replace(
+        entry.to_rebalanced, growth=replace(entry.to_rebalanced.growth, finding="none")
+    )
+    assert standing(replace(entry, to_rebalanced=slower), "growth") == "mixed"
+    assert standing(replace(entry, to_rebalanced=slower), "sharpe") == "better"
+    assert standing(replace(entry, to_rebalanced=None), "growth") == "better"
+
+
+def test_tiles_stand_beside_the_reference(plain: BacktestData) -> None:
+    data = found(plain, pathwise=("better", "none"))
+    shown = {tile["name"]: tile for tile in tiles(data)}
+    own, other = (data.assessment.strategies[n].measures for n in ("pathwise", "equal weight"))
+    assert shown["Sharpe ratio"]["value"] == number(own["sharpe"].mean, 2)
+    assert shown["Sharpe ratio"]["other"] == number(other["sharpe"].mean, 2)
+    assert shown["Deepest drawdown"]["value"] == percent(own["drawdown"].mean)
+    assert shown["Turnover a year"]["value"] == f"{number(own['turnover'].mean)} ×"
+    assert [tile["side"] for tile in shown.values()] == ["better", "none", "", "", ""]
+
+
+def test_each_agent_has_one_line_of_two_verdicts(plain: BacktestData) -> None:
+    lines = verdict_lines(found(plain, pathwise=("better", "none")))
+    assert [name for name, _ in lines["agents"]] == ["DQN", "DQN-together", "pathwise"]
+    pathwise = lines["agents"][2][1]
+    assert [cell["word"] for cell in pathwise] == ["better", "no evidence"]
+    left, width, middle = pathwise[0]["span"]
+    assert lines["zeros"][0] < left < middle < left + width <= 100
+
+
+def test_the_best_strategies_are_named(plain: BacktestData) -> None:
+    assert best_sentence(plain).startswith("Best of all 7 strategies, seen in hindsight: pathwise,")
+
+
+def test_without_agents_the_reference_leads(plain: BacktestData) -> None:
+    series = {n: s for n, s in plain.strategies.items() if s.kind == "baseline"}
+    alone = make_data(series, plain.dates, plain.assets)
+    assert lead_name(alone) is None
+    assert conclusion(alone).startswith("No agent was tested")
+    assert all(tile["other"] == "" for tile in tiles(alone))

@@ -1,0 +1,87 @@
+"""The tear sheet of the page."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.tearsheet import contributions
+from qfolio.report.backtest.page import render_backtest
+from qfolio.report.backtest.tearsheet import BINS, LISTED, tear_sheet
+from qfolio.report.rendering import percent
+
+from backtests import Page, make_data, make_series, usual, weekdays
+
+
+def test_figures_are_means_over_seeds() -> None:
+    data = usual(300)
+    sheet = tear_sheet(["DQN", "equal weight"], data)
+    rows = {name: cells for _, group in sheet["groups"] for name, cells in group}
+    returns = data.strategies["DQN"].returns
+    assert rows["Best day"][0] == percent(returns.max(axis=1).mean(), sign=True)
+    assert rows["Growth a year (CAGR)"][0] == percent(
+        data.assessment.strategies["DQN"].measures["growth"].mean
+    )
+    assert rows["Value at risk, 95\u202f%, daily"][1] == percent(
+        -np.quantile(data.strategies["equal weight"].returns, 0.05), 2
+    )
+    assert len(rows) == 27
+
+
+def test_drawdowns_have_dates() -> None:
+    days = np.array(["2020-01-01", "2020-01-02", "2020-01-03", "2020-01-06"], "datetime64[s]")
+    series = make_series(np.random.default_rng(0), "baseline", 1, 4, 1, 0.0)
+    series = replace(series, returns=np.array([[-0.1, 0.2, -0.5, 0.1]]))
+    data = make_data({"equal weight": series}, days, ("A",))
+    (only,) = tear_sheet(["equal weight"], data)["each"]
+    assert only["drawdowns"] == [
+        ["2020-01-02", "2020-01-03", "not yet", "50.0\u202f%", "2 days"],
+        ["2019-12-31", "2020-01-01", "2020-01-02", "10.0\u202f%", "2 days"],
+    ]
+    assert only["assets"] == []  # nothing is known of the assets' returns
+
+
+def test_histogram_counts_every_return() -> None:
+    data = usual(300)
+    histogram = tear_sheet(["DQN"], data)["each"][0]["histogram"]
+    heights = np.array([height for _, height in histogram["bars"]])
+    assert len(heights) == BINS
+    assert heights.max() <= 100
+    shares = heights * float(histogram["highest"].split("\u202f")[0]) / heights.max()
+    assert 80 < shares.sum() < 120  # the highest is rounded
+
+
+def test_contributions_add_up_on_the_page() -> None:
+    rng = np.random.default_rng(0)
+    names = tuple(f"asset {i}" for i in range(40))
+    series = make_series(rng, "baseline", 1, 100, 40, 0.001)
+    moves = 0.01 * rng.normal(size=(100, 40))
+    data = make_data({"equal weight": series}, weekdays("2020-01-01", 100), names, moves=moves)
+    rows = tear_sheet(["equal weight"], data)["each"][0]["assets"]
+    assert len(rows) == LISTED + 3
+    assert [row["name"] for row in rows[-3:]] == [
+        "28 others", "Costs and interest", "Mean return a year",
+    ]  # fmt: skip
+    parts, rest = contributions(series.returns, series.weights, moves, 252)
+    assert rows[0]["value"] == percent(parts.max(), sign=True)
+    assert rows[-2]["value"] == percent(rest, sign=True)
+    assert rows[-1]["value"] == percent(252 * series.returns.mean())
+    with pytest.raises(QfolioError, match="assets' returns do not fit 100 dates"):
+        render_backtest(replace(data, moves=moves[1:]))
+
+
+def test_a_thousand_assets_keep_the_page_small() -> None:
+    rng = np.random.default_rng(0)
+    names = tuple(f"a rather long name of asset {i}" for i in range(1000))
+    series = {
+        name: make_series(rng, kind, 2 if kind == "agent" else 1, 600, 1000, 0.0003)
+        for name, kind in {
+            "equal weight": "baseline", "agent": "agent", "agent-together": "ensemble",
+            **{f"baseline {i}": "baseline" for i in range(12)},
+        }.items()
+    }  # fmt: skip
+    moves = 0.01 * rng.normal(size=(600, 1000))
+    page = render_backtest(make_data(series, weekdays("2020-01-01", 600), names, moves=moves))
+    assert len(page.encode()) < 7e6
+    assert "988 others" in Page(page).text
