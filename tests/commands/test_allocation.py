@@ -27,6 +27,10 @@ def allocation(folder, monkeypatch, capsys, *options):
 def test_allocate_from_cash(folder, monkeypatch, capsys):
     plan = allocation(folder, monkeypatch, capsys, "--capital", 10_000)
     assert plan["wealth"] == 10_000
+    reason = plan["reasons"][0]
+    explained = sum(driver["weight"] for driver in reason["drivers"]) + reason["rest"]
+    assert explained == pytest.approx(reason["change"])
+    assert len({each["asset"] for each in plan["reasons"]}) == 3
     weights = [row["weight"] for row in plan["assets"]]
     assert sum(weights) + plan["cash_weight"] == pytest.approx(1, abs=1e-5)
 
@@ -103,6 +107,7 @@ def test_an_allocation_names_agent_date_and_verdict(folder, copy, monkeypatch, c
     printed = capsys.readouterr().out
     assert "Agent: pathwise, trained on prices up to 2020-09-16." in printed
     assert "In its backtest: No evidence of \\x1b[2Jskill." in printed
+    assert printed.count("\nWhy ") == 3
 
 
 @pytest.mark.parametrize("against", ["to_reference", "to_rebalanced"])

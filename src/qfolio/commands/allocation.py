@@ -72,6 +72,7 @@ def allocate(
         date: Column of dates (default: found by its name).
         as_json: Print JSON instead of a table.
     """
+    import msgspec
     import numpy as np
 
     from qfolio.core import devices
@@ -81,6 +82,7 @@ def allocate(
     registry.trust(trust)
     from qfolio.commands import console
     from qfolio.portfolio.allocation import Allocation, require_fresh
+    from qfolio.portfolio.backtest.attribution.drivers import reasons, sentence
     from qfolio.portfolio.backtest.desk import Desk
     from qfolio.portfolio.backtest.standing import Standing
     from qfolio.portfolio.holdings import read_holdings
@@ -120,8 +122,9 @@ def allocate(
     if orders is not None and rows is not None:
         write_csv(orders, *rows)
         said += f" {orders} has {amount(len(rows[1]), 'order')}."
-    trained = None
+    trained, why = None, []
     if isinstance(followed, Policy):
+        why = reasons(followed, table, allocation)
         trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
     if as_json:
         of = {
@@ -131,9 +134,12 @@ def allocate(
             "worse": standing.worse,
             "record": number,
         }
-        print(json.dumps({**of, **allocation.to_json()}, indent=2))
+        because = {"reasons": msgspec.to_builtins(why)}
+        print(json.dumps({**of, **allocation.to_json(), **because}, indent=2))
     else:
         console.print_allocation(allocation, standing, trained)
+        for reason in why:
+            console.say(f"Why {sentence(reason)}")
         console.say(said)
 
 

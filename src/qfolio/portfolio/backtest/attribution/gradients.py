@@ -66,7 +66,7 @@ def integrated_gradients(
         )
         holding = jnp.asarray(held[rows - begin], jnp.float32)
         given = jnp.asarray(rows, jnp.int32), holding
-        moved, latest, change = (np.asarray(x) for x in _integrated(task, agent, members, *given))
+        moved, latest, change = (np.asarray(x) for x in integrated(task, agent, members, *given))
         open_to = np.asarray(task.limits) > 0
         parts.append(moved[..., open_to].swapaxes(1, 2).reshape(-1, len(names)))
         seen.append(latest[:, open_to].reshape(-1, len(names)))
@@ -85,11 +85,15 @@ def integrated_gradients(
 
 
 @eqx.filter_jit(donate="none")
-def _integrated(
+def integrated(
     task: Portfolio, agent: Agent, members: PyTree, rows: Array, held: Array
 ) -> tuple[
     Float[Array, "day channel asset"], Float[Array, "day asset channel"], Float[Array, "day asset"]
 ]:
+    """What each channel moves at some rows, the channels' latest values, and the whole change.
+
+    members: the agents' weights, with a leading seed axis. held: weights at the rows.
+    """
     places = (jnp.arange(STEPS) + 0.5) / STEPS
 
     def day(given: tuple[Array, Array]) -> tuple[Array, Array, Array]:
