@@ -8,16 +8,24 @@ from qfolio.experiments.run import Run
 MARKETS = [(task, agent) for task, agent in PRESETS if task.startswith("market/")]
 
 
+TOLERANCE = {
+    "market/no-trade": (0.02, 0.0),
+    "market/garleanu-pedersen": (0.0, 0.03),
+    "market/liquidation": (0.03, 0.0),
+}
+"""Of each number of a learned rule, absolute and relative."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "agent"), MARKETS)
 def test_every_seed_is_within_a_percent_of_the_optimum(task, agent):
     preset = PRESETS[task, agent]["fast"]
     market = settings.build(find("task", task), preset.task)
-    run = Run.create(market, preset.build(), episodes=preset.episodes, seeds=2, seed=100)
+    run = Run.create(market, preset.build(), budget=preset.budget, seeds=2, seed=100)
     run.train()
     result = run.grade()
     assert max(result["regret_per_seed"]) <= 0.01
-    tolerance = {"market/no-trade": (0.02, 0.0), "market/garleanu-pedersen": (0.0, 0.03)}.get(task)
+    tolerance = TOLERANCE.get(task)
     if tolerance is not None:
         exact = result["rule"]["exact"]
         absolute, relative = tolerance
@@ -47,6 +55,20 @@ def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps):
     assert max(result["regret_per_seed"]) <= 0.01
     for learned in result["rule"]["per_seed"]:
         assert learned == pytest.approx(result["rule"]["exact"], abs=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("risk_aversion", [1.0, 4.0])
+def test_borrowing_and_lending_are_found(risk_aversion):
+    """Beside the preset's regime, without cash."""
+    preset = PRESETS["market/leverage", "pathwise"]["fast"]
+    market = find("task", "market/leverage")(risk_aversion=risk_aversion)
+    run = Run.create(market, preset.build(), budget=preset.budget, seeds=2, seed=100)
+    run.train()
+    result = run.grade()
+    assert max(result["regret_per_seed"]) <= 0.01
+    for learned in result["rule"]["per_seed"]:
+        assert learned["weight of cash"] * result["rule"]["exact"]["weight of cash"] > 0
 
 
 @pytest.mark.slow

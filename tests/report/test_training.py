@@ -22,9 +22,9 @@ from PIL import Image
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.market import View
-from qfolio.core.mdp import Position
+from qfolio.core.mdp import Box, Position
 from qfolio.experiments.run import Run
-from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
+from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen, Signals
 from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.portfolio.synthetic.regime import Regime
 from qfolio.report import Curve, Episode, Maps, ReportData, write_report
@@ -567,7 +567,12 @@ def test_a_market_is_collected() -> None:
 
 @pytest.mark.parametrize(
     ("task", "agent"),
-    [(NoTrade(), PATHWISE), (GarleanuPedersen(), PATHWISE), (Regime(menu="grid:4"), CHOOSER)],
+    [
+        (NoTrade(), PATHWISE),
+        (GarleanuPedersen(), PATHWISE),
+        (Signals(), PATHWISE),
+        (Regime(menu="grid:4"), CHOOSER),
+    ],
 )
 def test_learned_and_exact_policies(task, agent) -> None:
     """Seed by seed as by hand."""
@@ -575,13 +580,14 @@ def test_learned_and_exact_policies(task, agent) -> None:
     seeds = [agent.weights(agent.init(task, key)) for key in keys]
     members = jax.tree.map(lambda *x: jnp.stack(x), *seeds)
     drawn = responses(task, agent, members, task.optimum().policy, "in {}")
-    position = isinstance(task, GarleanuPedersen)
+    position = isinstance(task.actions, Box)
     if isinstance(task, NoTrade):
         assert drawn.region is not None
         np.testing.assert_allclose(drawn.exact[0], np.clip(drawn.held, *drawn.region), atol=1e-6)
     elif position:
         slopes = np.diff(drawn.exact) / np.diff(drawn.held)
-        np.testing.assert_allclose(slopes, 0.6457, atol=1e-3)
+        own = 0.6457 if isinstance(task, GarleanuPedersen) else 0.5523
+        np.testing.assert_allclose(slopes, own, atol=1e-3)
     else:
         assert drawn.scenes == ("in bad", "in good")
         assert (drawn.exact == [[0], [1]]).all()
@@ -589,10 +595,13 @@ def test_learned_and_exact_policies(task, agent) -> None:
         for scene, (_, market) in enumerate(task.scenes()):
             for i in (0, 50, 200):
                 held = jnp.array([drawn.held[i]], jnp.float32)
-                holding = held if position else task.hold(jnp.concatenate([1 - held, held]))
+                others = jnp.zeros(task.actions.n - 1 if position else 0)
+                holding = jnp.concatenate([held, others])
+                if not position:
+                    holding = task.hold(jnp.concatenate([1 - held, held]))
                 view = task.observe(Position(market, holding))
                 action = agent.policy(weights, View(view.features[None], view.holding[None]))[0]
-                wanted = task.intent(Position(market, holding), action)[-1]
+                wanted = task.intent(Position(market, holding), action)[0 if position else -1]
                 assert drawn.learned[seed, scene, i] == pytest.approx(float(wanted), abs=1e-5)
 
 

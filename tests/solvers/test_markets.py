@@ -8,7 +8,6 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.solvers.ar1 import Ar1Optimum, ar1
-from qfolio.solvers.garleanu_pedersen import garleanu_pedersen
 from qfolio.solvers.kelly import kelly
 from qfolio.solvers.merton import growth_optimal, lognormal_scenarios, merton
 from qfolio.solvers.no_trade import no_trade_growth, no_trade_region, no_trade_region_discrete
@@ -297,14 +296,17 @@ def test_no_trade_limits() -> None:
     assert (tiny.high - tiny.low) / 2 == pytest.approx((1.5e-6 / 16) ** (1 / 3), rel=1e-3)
 
 
-def band_gain(low: float, high: float, cost: float, dt: float) -> float:
-    """Growth a year of a band for θ = .02, σ = .2, by a chain on a fine grid of weights."""
+def band_gain(low: float, high: float, cost: float, dt: float, rate: float = 0.0) -> float:
+    """Growth a year of a band for θ = .02, σ = .2, by a chain on a fine grid of weights.
+
+    Cash earns ``rate``, and the asset's drift is that much higher.
+    """
     points = 1501
     w = np.linspace(low, high, points)
     z, chances = np.polynomial.hermite_e.hermegauss(40)
     chances = chances / chances.sum()
-    x = np.exp((0.02 - 0.02) * dt + 0.2 * math.sqrt(dt) * z)
-    grown = 1 - w[:, None] + w[:, None] * x
+    x = np.exp((0.02 + rate - 0.02) * dt + 0.2 * math.sqrt(dt) * z)
+    grown = (1 - w[:, None]) * math.exp(rate * dt) + w[:, None] * x
     moved = w[:, None] * x / grown
     kept = np.clip(moved, low, high)
     sold = np.where(moved > high, np.log((1 - cost * moved) / (1 - cost * high)), 0)
@@ -326,9 +328,10 @@ def band_gain(low: float, high: float, cost: float, dt: float) -> float:
     return float(states @ reward) / dt
 
 
-def test_discrete_no_trade_region_is_the_best_band() -> None:
-    region = no_trade_region_discrete(0.02, 0.2, 0.01, 1 / 4)
-    gain = lambda low, high: band_gain(low, high, 0.01, 1 / 4)  # noqa: E731
+@pytest.mark.parametrize("rate", [0.0, 0.05])
+def test_discrete_no_trade_region_is_the_best_band(rate: float) -> None:
+    region = no_trade_region_discrete(0.02, 0.2, 0.01, 1 / 4, rate=rate)
+    gain = lambda low, high: band_gain(low, high, 0.01, 1 / 4, rate)  # noqa: E731
     assert gain(region.low, region.high) == pytest.approx(region.growth, abs=1e-9)
     for shift in (-0.02, 0.02):
         assert gain(region.low + shift, region.high) < region.growth - 1e-7
@@ -355,85 +358,6 @@ def test_discrete_no_trade_region_without_costs_is_growth_optimal() -> None:
     region = no_trade_region_discrete(0.03, 0.2, 0.0, 0.25, rate=0.01)
     assert region.low == region.high == pytest.approx(optimum.weights[1], abs=1e-6)
     assert region.growth == pytest.approx(0.01 + optimum.growth / 0.25, abs=1e-10)
-
-
-# ----------------------------------------------------------------------------- Gârleanu–Pedersen
-
-PAPER = {"risk_aversion": 1.0, "cost_scale": 5.0, "variance": 0.04, "rho": 0.01}
-
-
-def riccati(
-    phi: np.ndarray, loading: np.ndarray, risk_aversion: float, cost_scale: float,
-    variance: float, rho: float,
-) -> np.ndarray:  # fmt: skip
-    """Coefficients of (previous position, factors), by value iteration on a general quadratic."""
-    n, keep = 1 + len(phi), 1 - rho
-    # State y = (x before, f), control x: reward ½ y'Qy + x c·y − ½ h x²; then y' = A y + e x.
-    a = np.diag(np.concatenate([[0.0], 1 - phi]))
-    e = np.eye(n)[0]
-    q = np.zeros((n, n))
-    q[0, 0] = -cost_scale * variance
-    c = np.concatenate([[cost_scale * variance], keep * loading])
-    h = cost_scale * variance + keep * risk_aversion * variance
-    value = np.zeros((n, n))
-    for _ in range(6000):
-        pull = c + keep * a.T @ value @ e
-        drag = h - keep * e @ value @ e
-        value = q + keep * a.T @ value @ a + np.outer(pull, pull) / drag
-    return np.asarray(pull / drag)
-
-
-def test_garleanu_pedersen_figures() -> None:
-    rule = garleanu_pedersen(0.25, loading=1.0, **PAPER)
-    assert rule.previous == pytest.approx(0.645664384, abs=5e-10)
-    assert rule.factors == pytest.approx([6.139213092], abs=5e-10)
-
-
-@pytest.mark.parametrize("phi", [[0.25], [0.05, 0.5, 1.0]])
-def test_garleanu_pedersen_agrees_with_a_riccati_iteration(phi: list[float]) -> None:
-    loading = np.array([1.0, -0.7, 0.3])[: len(phi)]
-    expected = riccati(np.array(phi), loading, **PAPER)
-    rule = garleanu_pedersen(phi, loading=loading, **PAPER)
-    found = np.concatenate([[rule.previous], rule.factors])
-    assert found == pytest.approx(expected, rel=1e-12)
-
-
-def test_garleanu_pedersen_value_by_moments() -> None:
-    # The rule is linear, so that the expected reward of each step follows from the covariance of
-    # (x before, f), which is moved forward step by step.
-    phi, loading = np.array([0.25, 0.1]), np.array([1.0, 0.5])
-    noise = np.array([[0.02, 0.005], [0.005, 0.01]])
-    rule = garleanu_pedersen(phi, loading=loading, innovation=noise, **PAPER)
-
-    def utility(previous: float, factors: np.ndarray) -> float:
-        decay = 1 - phi
-        moments = np.zeros((3, 3))
-        moments[1:, 1:] = noise / (1 - np.outer(decay, decay))
-        law = np.concatenate([[previous], factors])
-        move = np.vstack([law, np.column_stack([np.zeros(2), np.diag(decay)])])
-        shock = np.zeros((3, 3))
-        shock[1:, 1:] = noise
-        change, gain = law - [1, 0, 0], np.concatenate([[0], loading])
-        total = 0.0
-        for t in range(4000):
-            earned = law @ moments @ gain - 0.5 * 0.04 * law @ moments @ law
-            total += 0.99**t * (0.99 * earned - 0.5 * 5 * 0.04 * change @ moments @ change)
-            moments = move @ moments @ move.T + shock
-        return float(total)
-
-    assert utility(rule.previous, rule.factors) == pytest.approx(rule.value, rel=1e-12)
-    for other in (0.97, 1.03):
-        assert utility(rule.previous * other, rule.factors) < rule.value
-        assert utility(rule.previous, rule.factors * other) < rule.value
-
-
-def test_garleanu_pedersen_limits() -> None:
-    free = garleanu_pedersen(0.25, 2.0, 0.0, 1.0, 0.04, 0.01)
-    assert free.previous == 0
-    assert free.factors == pytest.approx([1 / (2 * 0.04)])  # Markowitz
-    dear = garleanu_pedersen(0.25, 1.0, 1e9, 1.0, 0.04, 0.01)
-    assert dear.previous == pytest.approx(1, abs=1e-6)
-    assert dear.factors == pytest.approx([0], abs=1e-6)
 
 
 # ---------------------------------------------------------------------------------------- errors
@@ -471,10 +395,6 @@ def test_garleanu_pedersen_limits() -> None:
         lambda: no_trade_region(0.02, 0.2, 1.0),
         lambda: no_trade_growth(0.5, 0.5, 0.02, 0.2, 0.01),
         lambda: no_trade_region_discrete(0.02, 0.2, 0.01, 0.0),
-        lambda: garleanu_pedersen(0.0, 1.0, 1.0, 1.0, 1.0, 0.1),
-        lambda: garleanu_pedersen(0.1, 0.0, 1.0, 1.0, 1.0, 0.1),
-        lambda: garleanu_pedersen([0.1, 0.2], 1.0, 1.0, 1.0, 1.0, 0.1),
-        lambda: garleanu_pedersen(0.1, 1.0, 1.0, 1.0, 1.0, 0.1, innovation=-1.0),
     ],
 )
 def test_parameters_without_an_optimum(call: object) -> None:

@@ -35,6 +35,9 @@ TASKS = {
     "market/ar1": "qfolio.portfolio.synthetic.ar1:Ar1",
     "market/no-trade": "qfolio.portfolio.synthetic.no_trade:NoTrade",
     "market/garleanu-pedersen": "qfolio.portfolio.synthetic.garleanu_pedersen:GarleanuPedersen",
+    "market/signals": "qfolio.portfolio.synthetic.garleanu_pedersen:Signals",
+    "market/leverage": "qfolio.portfolio.synthetic.leverage:Leverage",
+    "market/liquidation": "qfolio.portfolio.synthetic.liquidation:Liquidation",
 }
 AGENTS = {
     "dqn": "qfolio.agents.dqn:DQN",

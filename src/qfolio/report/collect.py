@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from qfolio.core.evaluation import greedy, play, start_keys
-from qfolio.core.mdp import Agent, Policy, Position
+from qfolio.core.mdp import Agent, Box, Policy, Position
 from qfolio.core.training import episode_steps
 from qfolio.experiments.comparison.conclusion import listed
 from qfolio.experiments.run import Run
@@ -210,15 +210,15 @@ def responses(
     """
     names, markets = zip(*task.scenes(), strict=True)
     scenes = jax.tree.map(lambda *leaves: jnp.stack(leaves), *markets)
-    ends = (0.0, 1.0) if isinstance(task, OneAsset) else (-2.0, 2.0)
     # Between its levels, an exact policy would have to round.
-    held = jnp.linspace(*ends, task.levels if isinstance(task, Ar1) else _HELD)
+    held = jnp.linspace(*task.drawn, task.levels if isinstance(task, Ar1) else _HELD)
 
     def wanted(policy: Policy, market: Any, held: Array) -> Array:
-        holding: Any = held[None]
         if isinstance(task, OneAsset):
             holding = task.hold(jnp.stack([1 - held, held]))
-        return policy(Position(market, holding))[-1]  # of weights, the asset's
+            return policy(Position(market, holding))[1]
+        assert isinstance(task.actions, Box)
+        return policy(Position(market, jnp.eye(task.actions.n)[0] * held))[0]  # of the first asset
 
     def table(policy: Policy) -> Array:
         each = jax.vmap(partial(wanted, policy), (None, 0))

@@ -68,6 +68,35 @@ TASKS = {
         rule="The target is a sum of two parts. The coefficient of the position held is one minus "
         "the trading rate; the other is that of the factor, the signal.",
     ),
+    "market/signals": Words(
+        "in a market of several signals",
+        "Four signals that fade at different rates predict the returns of three assets, and costs "
+        "grow with the square of a trade, more so where liquidity is low. The best policy trades "
+        "part of the way to its aim, slower in some portfolios than in others (Gârleanu and "
+        "Pedersen, 2013). The figure shows the first asset, with nothing in the others.",
+        "It is the discounted sum of the positions’ gains, minus their risk and the costs of "
+        "trading.",
+        rule="Each asset’s target is a sum over the positions held and the factors, the signals; "
+        "these are their coefficients.",
+        scene="factor 1 at {}",
+    ),
+    "market/leverage": Words(
+        "in a market with leverage",
+        "Three assets and cash with the same return distribution at every step, of which any may "
+        "be sold short, and borrowing costs more than lending earns. The best weights never change "
+        "(Merton, 1969): bold investors borrow, careful ones lend, and those between do neither.",
+        "It is the sum of the steps’ utilities.",
+        rule="A negative weight is sold short, or borrowed in the case of cash.",
+    ),
+    "market/liquidation": Words(
+        "in a sale that moves the price",
+        "A position must be sold within a few steps. A fast sale lowers the price, a slow one is "
+        "exposed to it for longer. The best policy sells a share of what is left that depends on "
+        "the time that remains (Almgren and Chriss, 2000).",
+        "It is minus the expected shortfall and, weighted by the risk aversion, its variance, in "
+        "million dollars.",
+        rule="Each number is what is left of a position of one million shares.",
+    ),
 }
 """The texts of each task, by its name."""
 

@@ -1,4 +1,4 @@
-"""The growth-optimal portfolio on the simplex, and Merton's for returns in continuous time."""
+"""The growth-optimal portfolio on the simplex, and Merton's, who may borrow and sell short."""
 
 import math
 from typing import NamedTuple
@@ -143,25 +143,155 @@ def _newton_on_support(
 
 
 def merton(
-    drift: ArrayLike, covariance: ArrayLike, risk_aversion: float = 1.0, rate: float = 0.0
+    drift: ArrayLike,
+    covariance: ArrayLike,
+    risk_aversion: float = 1.0,
+    rate: float = 0.0,
+    borrowing: float | None = None,
 ) -> Float[np.ndarray, " asset"]:
     """Weights Σ⁻¹(μ − r)/γ of the assets; the rest is cash. Not restricted to the simplex.
 
     Source: R. C. Merton, "Lifetime Portfolio Selection under Uncertainty" (1969). Prices follow
     dS/S = μ dt + dB with covariance Σ, utility has constant relative risk aversion γ (1 is log).
+    If borrowing costs more than lending earns, r is the rate at which the assets' weights sum to 1
+    (neither lends nor borrows), but at least the rate of lending and at most that of borrowing.
 
     Args:
         drift: Shape (asset,), a year.
         covariance: Shape (asset, asset), a year, positive definite.
         risk_aversion: γ > 0.
-        rate: Interest rate of cash, a year.
+        rate: Interest rate that cash earns, a year.
+        borrowing: Interest rate that debt costs, a year, at least ``rate`` (default: ``rate``).
 
     Raises:
-        QfolioError: γ is not positive, or the shapes or the covariance are invalid.
+        QfolioError: γ is not positive, debt costs less than cash earns, or the shapes or the
+            covariance are invalid.
     """
     mean, sigma = drift_and_covariance(drift, covariance)
+    borrowing = rate if borrowing is None else borrowing
     require(0 < risk_aversion < math.inf, f"risk aversion must be positive; not {risk_aversion}")
-    return np.asarray(np.linalg.solve(sigma, mean - rate) / risk_aversion)
+    _require_rates(rate, borrowing)
+    each, total = np.linalg.solve(sigma, mean), np.linalg.solve(sigma, np.ones_like(mean))
+    even = (each.sum() - risk_aversion) / total.sum()
+    return np.asarray((each - min(max(even, rate), borrowing) * total) / risk_aversion)
+
+
+class LeveragedOptimum(NamedTuple):
+    weights: Float[np.ndarray, " asset"]
+    """Of the assets; the rest, which may be negative, is cash."""
+    utility: float
+    """E u of the wealth's relative."""
+    violation: float
+    """Largest slope that is left, E[u'(g) ∂g] / E u'(g), of those that should be 0."""
+
+
+def leveraged_optimal(
+    relatives: ArrayLike,
+    probabilities: ArrayLike | None = None,
+    risk_aversion: float = 1.0,
+    cash: float = 1.0,
+    debt: float | None = None,
+) -> LeveragedOptimum:
+    """The best weights over finitely many scenarios, for an investor who may borrow and short.
+
+    Wealth grows by g = w·x + c R, where c = 1 − Σw is cash and R its relative: ``cash`` for c ≥ 0,
+    else ``debt``, which is no less. E u(g), with u(g) = (g^(1−γ) − 1)/(1−γ) (log g for γ = 1), is
+    concave in w and has a kink where c = 0. The best weights without cash would neither lend nor
+    borrow at R = E[u'(g) g] / E u'(g). If that lies between the two relatives they are optimal;
+    else the optimum is that for the nearer one. Newton's method finds each.
+
+    Args:
+        relatives: Shape (scenario, asset), above 0.
+        probabilities: Shape (scenario,), summing to 1 (default: equal).
+        risk_aversion: γ > 0.
+        cash: Relative of cash over the step.
+        debt: Relative of what is borrowed, at least ``cash`` (default: ``cash``).
+
+    Raises:
+        QfolioError: The arguments are not valid scenarios, or a portfolio exists that never loses
+            against cash or debt, so that no optimum does.
+    """
+    x = np.asarray(relatives, dtype=float)
+    require(
+        x.ndim == 2 and x.size > 0 and bool(np.all(np.isfinite(x) & (x > 0))),
+        "relatives must be a table (scenario, asset) of finite numbers above 0",
+    )
+    p = np.full(len(x), 1 / len(x)) if probabilities is None else np.asarray(probabilities, float)
+    require(
+        p.shape == (len(x),) and bool(np.all(p >= 0)) and abs(p.sum() - 1) < 1e-9,
+        f"probabilities must be {len(x)} numbers, not negative, that sum to 1",
+    )
+    require(0 < risk_aversion < math.inf, f"risk aversion must be positive; not {risk_aversion}")
+    debt = cash if debt is None else debt
+    require(0 < cash < math.inf, f"the relative of cash must be positive; not {cash}")
+    _require_rates(cash, debt)
+    x, p = x[p > 0], p[p > 0]
+    # Without cash, the first asset takes what the others leave.
+    others, utility, violation = _unconstrained(x[:, 0], x[:, 1:] - x[:, :1], p, risk_aversion)
+    weights = np.insert(others, 0, 1 - others.sum())
+    g = x @ weights
+    marginal = p * (g / g.min()) ** -risk_aversion
+    even = float(marginal @ g / marginal.sum())
+    if cash <= even <= debt:
+        return LeveragedOptimum(weights, utility, violation)
+    relative = cash if even < cash else debt
+    return _unconstrained(np.full(len(x), relative), x - relative, p, risk_aversion)
+
+
+def _unconstrained(
+    base: Float[np.ndarray, " s"],
+    excess: Float[np.ndarray, "s n"],
+    p: Float[np.ndarray, " s"],
+    gamma: float,
+) -> LeveragedOptimum:
+    """The maximum of E u(base + excess·w), by Newton's method with shorter steps near ruin."""
+
+    def utility(g: np.ndarray) -> float:
+        each = np.log(g) if gamma == 1 else np.expm1((1 - gamma) * np.log(g)) / (1 - gamma)
+        return float(p @ each)
+
+    def slope(g: np.ndarray) -> np.ndarray:
+        """E[u'(g) excess] / E u'(g)"""
+        marginal = p * (g / g.min()) ** -gamma
+        return np.asarray(marginal @ excess / marginal.sum())
+
+    w, g = np.zeros(excess.shape[1]), base
+    for _ in range(200):
+        marginal = p * (g / g.min()) ** -gamma
+        scaled = excess * np.sqrt(gamma * marginal / marginal.sum() / g)[:, None]
+        # Redundant assets leave the step undetermined; the shortest one will do.
+        step = np.linalg.lstsq(scaled.T @ scaled, slope(g), rcond=1e-13)[0]
+        length = 1.0
+        while length > 1e-12:
+            tried = base + excess @ (w + length * step)
+            # Where utility has no digits left to improve, the slope has.
+            if tried.min() > 0 and (
+                utility(tried) > utility(g)
+                or (utility(tried) > utility(g) - 1e-13 and _size(slope(tried)) < _size(slope(g)))
+            ):
+                break
+            length /= 2
+        else:
+            break  # rounding: no step improves any more
+        w, g = w + length * step, tried
+    require(
+        _size(slope(g)) < 1e-9,
+        "no best weights were found; some portfolio never, or hardly ever, loses against cash or "
+        "debt in these scenarios",
+    )
+    return LeveragedOptimum(w, utility(g), _size(slope(g)))
+
+
+def _size(slope: Float[np.ndarray, " n"]) -> float:
+    return float(np.abs(slope).max(initial=0.0))
+
+
+def _require_rates(cash: float, debt: float) -> None:
+    require(
+        math.isfinite(cash) and cash <= debt < math.inf,
+        f"debt must cost at least what cash earns, else borrowing to lend pays; not {debt} and "
+        f"{cash}",
+    )
 
 
 def lognormal_scenarios(

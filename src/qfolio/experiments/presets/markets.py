@@ -35,6 +35,10 @@ def _all_actions(episodes: int, menu: str, **changes: Any) -> dict[str, Preset]:
     return {"fast": Preset("dqn", changes, episodes, seeds=5, task={"menu": menu})}
 
 
+def _sac(steps: int, **changes: Any) -> dict[str, Preset]:
+    return {"fast": Preset("sac", changes, steps=steps, seeds=5)}
+
+
 PRESETS: Presets = {
     ("market/kelly", "pathwise"): _pathwise(
         307_200, num_envs=1024, rollout_length=5, learning_rate_steps=300.0, reward_scale=10.0
@@ -97,5 +101,35 @@ PRESETS: Presets = {
         learning_rate_steps=400.0,
         reward_scale=10.0,
         max_grad_norm=0.3,
+    ),
+    ("market/signals", "pathwise"): _pathwise(
+        25_600,
+        num_envs=64,
+        rollout_length=50,
+        tail=20,
+        learning_rate_steps=400.0,
+        reward_scale=10.0,
+        max_grad_norm=0.3,
+    ),
+    ("market/leverage", "pathwise"): _pathwise(
+        153_600, num_envs=512, rollout_length=5, learning_rate_steps=300.0, reward_scale=10.0
+    ),
+    ("market/liquidation", "pathwise"): _pathwise(
+        25_600, num_envs=64, rollout_length=5, learning_rate_steps=400.0
+    ),
+    ("market/liquidation", "sac"): _sac(
+        30_000,
+        hidden=(64, 64),
+        num_envs=16,
+        gradient_steps=4,
+        batch_size=256,
+        replay_capacity=32_768,
+        discount=1.0,
+        tau=0.02,
+        learning_rate=3e-3,
+        learning_rate_steps=7500.0,
+        learning_rate_final=0.0,
+        initial_temperature=0.01,
+        spread=0.02,
     ),
 }

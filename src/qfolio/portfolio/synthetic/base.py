@@ -29,6 +29,9 @@ class Synthetic(ExogenousTask):
     def best(self) -> Policy:
         """The exact policy."""
 
+    drawn = (-2.0, 2.0)
+    """The least and the largest holding to draw a policy for, of the first asset."""
+
     @abc.abstractmethod
     def scenes(self) -> list[tuple[str, Any]]:
         """Names and market states in which to draw a policy."""
@@ -52,6 +55,8 @@ class SyntheticMarket(Market, Synthetic):
 
 class OneAsset(SyntheticMarket):
     """Cash and one asset."""
+
+    drawn = (0.0, 1.0)
 
     @property
     def limits(self) -> Float[Array, " asset"]:

@@ -1,5 +1,6 @@
 """Decaying signals with quadratic costs; ``solvers/garleanu_pedersen.py`` solves it."""
 
+import abc
 from typing import Any, NamedTuple
 
 import jax
@@ -14,82 +15,158 @@ from qfolio.portfolio.synthetic.base import Synthetic
 from qfolio.solvers.garleanu_pedersen import garleanu_pedersen
 
 
-class Factor(NamedTuple):
-    factor: Float[Array, ""]
+class Factors(NamedTuple):
+    factors: Float[Array, " factor"]
     weight: Float[Array, ""]  # (1 − ρ)ᵗ
 
 
-class GarleanuPedersen(Synthetic):
-    """A position in one asset with a fading signal, quadratic risk and quadratic trading costs.
+class Tables(NamedTuple):
+    """The numbers of a market of several assets and factors; the names are the solver's."""
 
-    Gârleanu & Pedersen (2013): the return is loading · f, f' = (1 − φ)f + ε; holding x costs
-    ½γσ²x² of risk, a trade Δx costs ½λσ²Δx². Rewards include their discount, so that the return is
-    the paper's objective.
+    phi: Float[Any, " factor"]
+    loading: Float[Any, "asset factor"]
+    noise: Float[Any, " factor"]  # standard deviations of independent ε
+    covariance: Float[Any, "asset asset"]
+    cost: Float[Any, "asset asset"]
+
+    @property
+    def spread(self) -> Float[Any, " factor"]:
+        """Standard deviation of each factor."""
+        return self.noise / (1 - (1 - self.phi) ** 2) ** 0.5
+
+
+class QuadraticCosts(Synthetic):
+    """Positions in assets with fading signals, quadratic risk and quadratic trading costs.
+
+    Gârleanu & Pedersen (2013): returns are B f, with f' = (1 − φ)f + ε; holding x costs ½γ x'Σx of
+    risk, a trade Δx costs ½Δx'ΛΔx. Rewards include their discount, so that the return is the
+    paper's objective.
     """
 
-    loading: float = number(1.0)
-    phi: float = number(0.25)
-    noise: float = number(0.066)
     risk_aversion: float = number(1.0)
-    cost_scale: float = number(5.0)
-    variance: float = number(0.04)
     rho: float = number(0.01)
     horizon: int = static(300)
 
     def __check_init__(self) -> None:
-        require(self, "phi", lambda x: 0 < x <= 1, "above 0 and at most 1")
         require(self, "rho", lambda x: 0 < x < 1, "above 0 and below 1")
-        positive = "noise risk_aversion cost_scale variance"
-        require(self, positive, lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")
+        require(self, "risk_aversion", lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")
+
+    @property
+    @abc.abstractmethod
+    def tables(self) -> Tables:
+        """The market's numbers."""
 
     @property
     def actions(self) -> Box:
-        return Box(1)
+        return Box(len(self.tables.loading))
 
-    @property
-    def spread(self) -> Float[Array, ""] | float:
-        """Standard deviation of the factor."""
-        return self.noise / (1 - (1 - self.phi) ** 2) ** 0.5
+    def reset_market(self, key: PRNGKeyArray) -> Factors:
+        spread = jnp.asarray(self.tables.spread)
+        return Factors(spread * jax.random.normal(key, spread.shape), jnp.array(1.0))
 
-    def reset_market(self, key: PRNGKeyArray) -> Factor:
-        return Factor(self.spread * jax.random.normal(key), jnp.array(1.0))
-
-    def next_market(self, market: Factor, key: PRNGKeyArray) -> Factor:
-        factor = (1 - self.phi) * market.factor + self.noise * jax.random.normal(key)
-        return Factor(factor, (1 - self.rho) * market.weight)
+    def next_market(self, market: Factors, key: PRNGKeyArray) -> Factors:
+        shocks = jax.random.normal(key, market.factors.shape)
+        factors = (1 - self.tables.phi) * market.factors + self.tables.noise * shocks
+        return Factors(factors, (1 - self.rho) * market.weight)
 
     def draw_holding(self, key: PRNGKeyArray) -> Float[Array, " asset"]:
-        return jax.random.normal(key, (1,))
+        return jax.random.normal(key, (self.actions.n,))
 
     def observe(self, state: Position) -> View:
-        return View((state.market.factor / self.spread).reshape(1, 1, 1), state.holding)
+        # Each asset has channels of its own, so that a network that all share can tell them apart.
+        scaled = state.market.factors / self.tables.spread
+        blocks = jnp.einsum("ij,k->ijk", jnp.eye(self.actions.n), scaled)
+        return View(blocks.reshape(self.actions.n, 1, -1), state.holding)
 
     def settle(
-        self, market: Factor, next_market: Factor, holding: Array, action: Array
+        self, market: Factors, next_market: Factors, holding: Array, action: Array
     ) -> tuple[Float[Array, ""], Float[Array, " asset"]]:
-        trade = action[0] - holding[0]
-        cost = self.cost_scale * self.variance * trade**2 / 2
-        risk = self.risk_aversion * self.variance * action[0] ** 2 / 2
-        gain = self.loading * market.factor * action[0] - risk
+        tables, trade = self.tables, action - holding
+        cost = trade @ jnp.asarray(tables.cost) @ trade / 2
+        risk = self.risk_aversion * action @ jnp.asarray(tables.covariance) @ action / 2
+        gain = action @ jnp.asarray(tables.loading) @ market.factors - risk
         return market.weight * ((1 - self.rho) * gain - cost), action
 
     def best(self) -> Policy:
-        of_position, of_factor, *_ = garleanu_pedersen(
-            self.phi, self.risk_aversion, self.cost_scale, self.loading, self.variance, self.rho
-        )
-        return lambda state: of_position * state.holding + of_factor * state.market.factor
+        phi, loading, _, covariance, cost = self.tables
+        rule = garleanu_pedersen(phi, self.risk_aversion, cost, loading, covariance, self.rho)
+        previous, factors = (jnp.asarray(x, jnp.float32) for x in rule[:2])
+        return lambda state: previous @ state.holding + factors @ state.market.factors
 
-    def rule(self, policy: Policy) -> dict[str, float]:
-        """Least-squares coefficients of the policy over two standard deviations."""
-        x, f = np.meshgrid(np.linspace(-2, 2, 21), np.linspace(-2, 2, 21) * self.spread)
-        points = np.column_stack([x.ravel(), f.ravel()]).astype(np.float32)
-        at = lambda p: policy(Position(Factor(p[1], jnp.array(1.0)), p[:1]))[0]  # noqa: E731
-        targets = np.asarray(jax.jit(jax.vmap(at))(jnp.asarray(points)))
-        coefficients = np.linalg.lstsq(points, targets, rcond=None)[0]
-        return {"of the position": float(coefficients[0]), "of the factor": float(coefficients[1])}
+    def coefficients(self, policy: Policy) -> Float[np.ndarray, "asset entry"]:
+        """Least-squares coefficients of positions and factors, over two standard deviations."""
+        n, spread = self.actions.n, np.asarray(self.tables.spread)
+        points = np.random.default_rng(2013).uniform(-2, 2, (500, n + len(spread)))
+        points[:, n:] *= spread
+        one = jnp.array(1.0)
+        at = lambda p: policy(Position(Factors(p[n:], one), p[:n]))  # noqa: E731
+        targets = np.asarray(jax.jit(jax.vmap(at))(jnp.asarray(points, jnp.float32)))
+        return np.linalg.lstsq(points, targets, rcond=None)[0].T
 
     def scenes(self) -> list[tuple[str, Any]]:
+        """The first factor at its mean and a standard deviation from it; the others at theirs."""
         values = (-1.0, 0.0, 1.0)
         names = [f"{k:+.0f} σ" if k else "0" for k in values]
-        states = [Factor(jnp.array(k * self.spread), jnp.array(1.0)) for k in values]
+        first = np.eye(len(self.tables.phi))[0] * self.tables.spread
+        states = [Factors(jnp.asarray(k * first, jnp.float32), jnp.array(1.0)) for k in values]
         return list(zip(names, states, strict=True))
+
+
+class GarleanuPedersen(QuadraticCosts):
+    """One asset and one signal; costs are ``cost_scale`` times the variance."""
+
+    loading: float = number(1.0)
+    phi: float = number(0.25)
+    noise: float = number(0.066)
+    cost_scale: float = number(5.0)
+    variance: float = number(0.04)
+
+    def __check_init__(self) -> None:
+        require(self, "phi", lambda x: 0 < x <= 1, "above 0 and at most 1")
+        require(self, "noise cost_scale variance", lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")
+
+    @property
+    def tables(self) -> Tables:
+        table = lambda x: jnp.reshape(x, (1, 1))  # noqa: E731
+        phi, noise = jnp.reshape(self.phi, (1,)), jnp.reshape(self.noise, (1,))
+        cost = self.cost_scale * self.variance
+        return Tables(phi, table(self.loading), noise, table(self.variance), table(cost))
+
+    def rule(self, policy: Policy) -> dict[str, float]:
+        of_position, of_factor = self.coefficients(policy)[0]
+        return {"of the position": float(of_position), "of the factor": float(of_factor)}
+
+
+class Signals(QuadraticCosts):
+    """Three assets that differ in liquidity, and four signals that fade at different rates.
+
+    The costs are not proportional to the covariance, so that no two portfolios of the assets are
+    traded equally fast, and a position in one asset depends on those in the others.
+    """
+
+    cost_scale: float = number(1.0)
+
+    def __check_init__(self) -> None:
+        require(self, "cost_scale", lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")
+
+    @property
+    def tables(self) -> Tables:
+        volatility = np.array([0.2, 0.15, 0.3])
+        correlation = np.array([[1.0, 0.5, 0.3], [0.5, 1.0, 0.1], [0.3, 0.1, 1.0]])
+        loading = np.array([[1.0, 0.0, 0.5, 0.3], [0.5, -0.5, 0.0, 0.4], [0.0, 1.0, -0.8, 0.5]])
+        return Tables(
+            phi=np.array([0.05, 0.15, 0.4, 0.8]),
+            loading=loading,
+            noise=np.array([0.03, 0.05, 0.1, 0.15]),
+            covariance=correlation * np.outer(volatility, volatility),
+            cost=self.cost_scale * np.diag([0.1, 0.2, 1.0]),
+        )
+
+    def rule(self, policy: Policy) -> dict[str, float]:
+        coefficients = self.coefficients(policy)
+        columns = [f"position {i}" for i in (1, 2, 3)] + [f"factor {k}" for k in (1, 2, 3, 4)]
+        return {
+            f"{i + 1}: of {column}": float(coefficients[i, j])
+            for i in range(3)
+            for j, column in enumerate(columns)
+        }

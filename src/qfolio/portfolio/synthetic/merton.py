@@ -15,6 +15,21 @@ from qfolio.portfolio.synthetic.base import SyntheticMarket
 from qfolio.solvers.merton import growth_optimal
 
 
+@cache
+def lognormal_table(
+    means: tuple[float, ...], volatilities: tuple[float, ...], correlation: float, scenarios: int
+) -> np.ndarray:
+    """Relatives of each scenario, shape (scenario, asset), with exactly the given moments."""
+    n = len(means)
+    normal = np.random.default_rng(1969).standard_normal((scenarios, n))
+    normal -= normal.mean(0)
+    normal = np.linalg.solve(np.linalg.cholesky(np.cov(normal.T)), normal.T)
+    sigma = np.array(volatilities)
+    correlations = np.full((n, n), correlation) + (1 - correlation) * np.eye(n)
+    shocks = np.linalg.cholesky(correlations) @ normal * sigma[:, None]
+    return np.exp(np.array(means) - sigma**2 / 2 + shocks.T)
+
+
 class Merton(SyntheticMarket):
     """Three assets whose returns are drawn from a fixed set of log-normal scenarios, with cash.
 
@@ -36,16 +51,11 @@ class Merton(SyntheticMarket):
         return jnp.ones(3)
 
     @staticmethod
-    @cache
     def table() -> np.ndarray:
-        """Relatives of each scenario, shape (scenario, asset), with exactly the given moments."""
-        normal = np.random.default_rng(1969).standard_normal((Merton.scenarios, 3))
-        normal -= normal.mean(0)
-        normal = np.linalg.solve(np.linalg.cholesky(np.cov(normal.T)), normal.T)
-        sigma = np.array(Merton.volatilities)
-        correlations = np.full((3, 3), Merton.correlation) + (1 - Merton.correlation) * np.eye(3)
-        shocks = np.linalg.cholesky(correlations) @ normal * sigma[:, None]
-        return np.exp(np.array(Merton.means) - sigma**2 / 2 + shocks.T)
+        """Relatives of each scenario, shape (scenario, asset)."""
+        return lognormal_table(
+            Merton.means, Merton.volatilities, Merton.correlation, Merton.scenarios
+        )
 
     def reset_market(self, key: PRNGKeyArray) -> Int[Array, ""]:
         return jnp.array(0, jnp.int32)

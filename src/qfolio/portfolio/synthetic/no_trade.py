@@ -11,7 +11,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Policy, Position
 from qfolio.portfolio.costs import Context, grown
-from qfolio.portfolio.market import Holding, Relatives
+from qfolio.portfolio.market import Contexts, Holding, Relatives
 from qfolio.portfolio.synthetic.base import OneAsset, require_cost
 from qfolio.solvers.no_trade import NoTradeRegion, no_trade_region_discrete
 
@@ -26,10 +26,12 @@ class NoTrade(OneAsset):
     """One asset with constant drift over cash; proportional costs make it best not to trade within
     a region. The reward is the *expected* log growth of each step, net of costs.
 
-    Rates are a year; ``dt`` years pass in a step.
+    Rates are a year; ``dt`` years pass in a step. ``rate`` is the asset's drift above that of cash,
+    which is ``cash_rate``.
     """
 
     rate: float = number(0.02)
+    cash_rate: float = constant(0.0)
     volatility: float = number(0.2)
     cost: float = constant(0.01)
     dt: float = number(1 / 12)
@@ -40,6 +42,7 @@ class NoTrade(OneAsset):
 
     def __check_init__(self) -> None:
         require(self, "volatility", lambda x: 0.01 <= x <= 2, "from 0.01 to 2")
+        require(self, "cash_rate", lambda x: -1 <= x <= 1, "from -1 to 1, a year")
         require(self, "dt", lambda x: 0.001 <= x <= 1, "from 0.001 to 1 years")
         require_cost(self)
         if not 0.01 <= self.rate / self.volatility**2 <= 0.99:
@@ -47,6 +50,14 @@ class NoTrade(OneAsset):
                 f"The best weight without costs is {self.rate / self.volatility**2:.3g}; rate and "
                 "volatility must leave it between 0.01 and 0.99."
             )
+
+    @property
+    def cost_model(self) -> str:  # type: ignore[override]
+        return f"itemized(cash_rate={self.cash_rate})" if self.cash_rate else "proportional"
+
+    def contexts(self, market: Array, next_market: Array) -> Contexts:
+        period = Context(years=self.dt)
+        return Contexts(earning=period, coming=period)
 
     def reset_market(self, key: PRNGKeyArray) -> Float[Array, ""]:
         return jnp.array(0.0)
@@ -59,7 +70,7 @@ class NoTrade(OneAsset):
         return 2 * self._log_relative(jnp.array(0.0)) - market
 
     def _log_relative(self, shock: Array) -> Array:
-        mean = (self.rate - self.volatility**2 / 2) * self.dt
+        mean = (self.cash_rate + self.rate - self.volatility**2 / 2) * self.dt
         return mean + self.volatility * self.dt**0.5 * shock
 
     def features(self, market: Array) -> Float[Array, "asset time channel"]:
@@ -73,17 +84,22 @@ class NoTrade(OneAsset):
         self, market: Array, next_market: Array, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
         target = self.target(market, holding.weights, action)
-        remainder, _ = self.costs.trade(holding.weights, target, Context())
+        at = self.contexts(market, next_market)
+        remainder, _ = self.costs.trade(holding.weights, target, at.trade)
         nodes, chances = np.polynomial.hermite_e.hermegauss(self.NODES)
-        gains = jnp.expm1(self._log_relative(jnp.asarray(nodes, jnp.float32)))
         weights = jnp.asarray(chances / chances.sum(), jnp.float32)
-        growth = (weights * jnp.log1p(target[1] * gains)).sum()
-        moved = self.costs.carry(jnp.exp(next_market)[None], Context())
+        # Over cash, so that no digits are lost: steps may be days.
+        interest = self.cash_rate * self.dt
+        gains = jnp.expm1(self._log_relative(jnp.asarray(nodes, jnp.float32)) - interest)
+        growth = interest + (weights * jnp.log1p(target[1] * gains)).sum()
+        moved = self.costs.growth(target, jnp.exp(next_market)[None], at.coming)
         return jnp.log(remainder) + growth, self.hold(grown(target, moved))
 
     def region(self) -> NoTradeRegion:
         """The exact region, for steps of ``dt``."""
-        return no_trade_region_discrete(self.rate, self.volatility, self.cost, self.dt)
+        return no_trade_region_discrete(
+            self.rate, self.volatility, self.cost, self.dt, self.cash_rate
+        )
 
     def best(self) -> Policy:
         low, high, _ = self.region()

@@ -147,7 +147,8 @@ def _draw_weights(drawn: Weights, width: float) -> Figure:
     )
     axes.set_yticks(rows, drawn.names)
     axes.set_ylim(count - 0.5, -0.5)
-    axes.set_xlim(left=0)
+    if min(drawn.exact.min(), drawn.learned.min()) >= 0:
+        axes.set_xlim(left=0)
     axes.grid(axis="x")
     axes.set_xlabel("weight")
     legend_above(figure, marks, few=width <= NARROW)
