@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from qfolio.agents.paths import OnPaths, unchanged
+from qfolio.agents.paths import Onlooker
 from qfolio.core import quadratic
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, static
@@ -110,7 +110,7 @@ class MeanVarianceState(eqx.Module):
     evidence: Evidence
 
 
-class MeanVariance(OnPaths):
+class MeanVariance(Onlooker):
     """Gradient ascent on mean return less realised variance and costs."""
 
     returns: bool = static(True)  # learn expected returns, too
@@ -186,11 +186,6 @@ class MeanVariance(OnPaths):
 
     def policy(self, weights: Efficient, observation: View) -> Float[Array, "batch entry"]:
         return weights(observation)
-
-    def act(
-        self, state: MeanVarianceState, observation: View, key: PRNGKeyArray
-    ) -> Float[Array, "batch entry"]:
-        return unchanged(observation)
 
     def learn(
         self, task: Task, state: MeanVarianceState, rollout: Transition, key: PRNGKeyArray

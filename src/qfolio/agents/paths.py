@@ -12,11 +12,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
-from qfolio.core.mdp import Agent, ExogenousTask, Position, Task, Transition
+from qfolio.core.mdp import Agent, ExogenousTask, Metrics, Position, Task, Transition
 from qfolio.core.training import episode_steps
 from qfolio.learning.optimizer import CosineSchedule
 from qfolio.learning.trading import Trading
@@ -125,6 +125,16 @@ class OnPaths(Agent):
         return lax.scan(jax.checkpoint(step), (start,) * len(trades), moves)[1]
 
 
-def unchanged(view: View) -> Float[Array, "*batch entry"]:
-    """The order that trades nothing, for agents that learn from the market's moves alone."""
-    return jnp.concatenate([1 - view.holding.sum(-1, keepdims=True), view.holding], -1)
+class Onlooker(OnPaths):
+    """Learns from the market's moves alone: its rollouts trade nothing, and nothing of them is
+    logged."""
+
+    def act(
+        self, state: State, observation: View, key: PRNGKeyArray
+    ) -> Float[Array, "batch entry"]:
+        """The order that changes nothing."""
+        held = observation.holding
+        return jnp.concatenate([1 - held.sum(-1, keepdims=True), held], -1)
+
+    def measure(self, task: Task, step: Transition) -> Metrics:
+        return {}

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from qfolio.agents.paths import OnPaths, unchanged
+from qfolio.agents.paths import Onlooker
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, static
@@ -131,7 +131,7 @@ class TiltsState(eqx.Module):
     evidence: Evidence
 
 
-class Tilts(OnPaths):
+class Tilts(Onlooker):
     """Gradient ascent on net utility, with a penalty on tracking error and on tilts."""
 
     network: str = static("linear")  # or hidden or attention, which are added to linear scores
@@ -195,11 +195,6 @@ class Tilts(OnPaths):
 
     def policy(self, weights: TiltPolicy, observation: View) -> Float[Array, "batch entry"]:
         return weights(observation)
-
-    def act(
-        self, state: TiltsState, observation: View, key: PRNGKeyArray
-    ) -> Float[Array, "batch entry"]:
-        return unchanged(observation)
 
     def learn(
         self, task: Task, state: TiltsState, rollout: Transition, key: PRNGKeyArray

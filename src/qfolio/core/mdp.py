@@ -287,6 +287,10 @@ class Agent(eqx.Module):
     def act(self, state: Any, observation: PyTree, key: PRNGKeyArray) -> Array:
         """Actions for a batch of observations, with exploration."""
 
+    def measure(self, task: Task, step: Transition) -> Metrics:
+        """What the log says of a step of training: what the task measures of it (default)."""
+        return task.measure(step)
+
     @abc.abstractmethod
     def observe(self, state: Any, rollout: Transition) -> Any:
         """Stores experience and learns nothing."""

@@ -78,7 +78,7 @@ def begin(task: Task, agent: Agent, seed: UInt32[Array, ""]) -> TrainingState:
         step = Transition(state.task, observation, action, zeros, state.task, observation, no, no)
         time = agent.rollout_steps
         rollout = jax.tree.map(lambda x: jnp.broadcast_to(x, (time, *x.shape)), step)
-        measured = jax.vmap(task.measure)(step)
+        measured = jax.vmap(partial(agent.measure, task))(step)
         tally = state.tally._replace(measured=dict.fromkeys(measured, zeros))
         state = eqx.tree_at(lambda s: s.tally, state, tally)
         return absorb(task, agent, state, rollout, learning=True)[2], measured
@@ -197,7 +197,7 @@ def absorb(
         tally = Tally(tally.steps + 1, learned, reward, sums, totals)
         return jax.tree.map(lambda x: jnp.where(finished, jnp.zeros_like(x), x), tally), record
 
-    measured = jax.vmap(jax.vmap(task.measure))(rollout)
+    measured = jax.vmap(jax.vmap(partial(agent.measure, task)))(rollout)
     tally, records = _scan(count, state.tally, (rollout, measured))
     finite = [jnp.isfinite(metric).all() for metric in metrics.values()]
     state = TrainingState(
