@@ -21,7 +21,7 @@ def run() -> NoReturn:
     """Runs the command line; a QfolioError becomes one sentence and exit code 2."""
     import tyro
 
-    from qfolio.commands.allocation import allocate
+    from qfolio.commands.allocation import allocate, follow
     from qfolio.commands.board import board
     from qfolio.commands.comparison import compare
     from qfolio.commands.continual import continual
@@ -32,9 +32,9 @@ def run() -> NoReturn:
     from qfolio.core.errors import QfolioError
 
     commands: dict[str, Callable[..., Any]] = {
-        "backtest": backtest, "allocate": allocate, "prices": prices, "study": study,
-        "train": train, "compare": compare, "evaluate": evaluate, "watch": watch, "tune": tune,
-        "continual": continual, "board": board,
+        "backtest": backtest, "allocate": allocate, "follow": follow, "prices": prices,
+        "study": study, "train": train, "compare": compare, "evaluate": evaluate, "watch": watch,
+        "tune": tune, "continual": continual, "board": board,
     }  # fmt: skip
     try:
         try:

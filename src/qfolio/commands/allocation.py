@@ -143,6 +143,51 @@ def allocate(
         console.say(said)
 
 
+def follow(
+    folder: Positional[Path],
+    *,
+    prices: File = None,
+    out: File = None,
+    trust: Modules = (),
+    missing: Missing = "error",
+    features: Names = (),
+    date: Name = None,
+    as_json: Annotated[bool, arg(name="json")] = False,
+) -> None:
+    """Show what the allocations of a ledger have earned, beside what the backtest promised.
+
+    The ledger is marked to market at every row of the prices. A sequential test says whether live
+    returns are still consistent with the backtest, and a sentence says when a retrain is due.
+
+    Args:
+        folder: Folder of a backtest with a ledger.
+        prices: Prices with all rows since the first allocation, CSV or Parquet (default: the
+            prices of the backtest).
+        out: CSV file with a row for each row of the prices (default: follow.csv in the folder).
+        trust: Modules of your own code that the folder may name (default: none).
+        missing: How to treat missing prices.
+        features: Columns that hold features (default: those of the backtest).
+        date: Column of dates (default: found by its name).
+        as_json: Print JSON instead of a table.
+    """
+    from qfolio.core import devices
+
+    devices.configure()
+    registry.trust(trust)
+    from qfolio.commands import console
+    from qfolio.portfolio.backtest.desk import Desk
+    from qfolio.portfolio.backtest.follow import follow as marked
+
+    following = marked(Desk.open(folder, missing=missing, features=features, date=date), prices)
+    path = folder / "follow.csv" if out is None else out
+    following.write(path)
+    if as_json:
+        print(json.dumps(following.to_json(), indent=2))
+        return
+    console.print_following(following)
+    console.say(f"Rows: {path}")
+
+
 def _reproduce(
     desk: "Desk",
     date: str,

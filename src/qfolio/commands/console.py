@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from qfolio.experiments.tuning.run import Tuning
     from qfolio.portfolio.allocation import Allocation
     from qfolio.portfolio.backtest.assessment import Assessment
+    from qfolio.portfolio.backtest.follow import Following
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.portfolio.backtest.standing import Standing
     from qfolio.portfolio.prices.findings import Finding
@@ -301,6 +302,27 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
         f"{allocation.cost:,.2f}{f' ({kinds})' if len(allocation.costs) > 1 else ''}, cash left "
         f"{allocation.cash_after:,.2f}. Assets that are neither held nor wanted are not shown."
     )
+
+
+def print_following(following: "Following") -> None:
+    """A row for live, equal weights and the backtest, and what is to be said of them."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("net")
+    for name in ("growth", "a year", "volatility", "Sharpe", "drawdown"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, found in following.rows().items():
+        cells = ["–"] * 5
+        if found:
+            growth, year, volatility, sharpe, drawdown = found.values()
+            cells = [f"{x:.1%}" for x in (growth, year, volatility)]
+            cells += [f"{sharpe:.2f}", f"{drawdown:.1%}"]
+        table.add_row(Text(name), *cells)
+    console.print(table)
+    for sentence in following.sentences():
+        if sentence.startswith("ALARM"):
+            console.print(Text(printable(sentence), style="bold red"))
+        else:
+            say(sentence)
 
 
 def print_ranking(content: dict[str, Any]) -> None:

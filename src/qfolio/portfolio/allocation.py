@@ -84,8 +84,8 @@ class Allocation:
         targets = policy.weights(prices, dict(zip(names, held.tolist(), strict=True)))
         weights = _ordered(np.array([targets[name] for name in names]), held)
         trades = np.zeros(len(shares))
-        context = _context(policy.costs, prices, wealth)
-        after = partial(_settled, policy.costs, context, held, wealth, shares, known)
+        context = context_of(policy.costs, prices, wealth)
+        after = partial(settled, policy.costs, context, held, wealth, shares, known)
         if not np.array_equal(weights, held):
             remainder = float(policy.costs.trade(held, weights, context)[0])
             money = remainder * weights[1:] * wealth
@@ -167,14 +167,14 @@ def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
     return np.asarray(weights / weights.sum())
 
 
-def _context(model: CostModel, prices: Prices, wealth: float) -> Context:
+def context_of(model: CostModel, prices: Prices, wealth: float) -> Context:
     """The circumstances of a trade as the table's last row has them."""
     known = Conditions.of(prices, model.columns)
     capital = model.capital if isinstance(model, Itemized) else wealth
     return known.trade(len(prices) - 1, 1, wealth / capital)
 
 
-def _settled(
+def settled(
     model: CostModel,
     context: Context,
     held: np.ndarray,

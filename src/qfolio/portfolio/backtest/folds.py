@@ -95,6 +95,14 @@ def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) ->
     return Fold(name, slice(begin, end), slice(end, end), slice(recent, end))
 
 
+def overdue(learned: np.datetime64, test: str, dates: np.ndarray) -> bool:
+    """Whether a table goes on for the length of a test, or longer, after the last row learned."""
+    count, unit = parse_length(test)
+    if unit == "d":
+        return int((dates > learned).sum()) >= count
+    return bool(dates[-1] >= _shift(learned, count, unit))
+
+
 def spell(date: np.datetime64, dates: np.ndarray) -> str:
     """A date as text, with the time if rows are less than a day apart."""
     return spell_all(np.array([date]), dates)[0]

@@ -1,0 +1,87 @@
+"""Whether live returns are still those that a backtest promised, tested at every row.
+
+Live returns x, cut to the range of nearly all of the backtest's and divided by its width, are bet
+against: capital K = mean over bets b of Π (1 + b (m − x)), where m is a lower confidence limit of
+the backtest's mean. While their expectation, given the past, is at least m, K is a nonnegative
+supermartingale, whatever their variance. By Ville's inequality it ever reaches 2/α with probability
+α/2 at most; the limit m is wrong with another α/2. So an alarm is false with probability α at most,
+however often one looks (I. Waudby-Smith and A. Ramdas, "Estimating means of bounded random
+variables by betting", 2024). Both limits hold for returns whose expectation does not depend on the
+past; where it does, they are approximate.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from qfolio.portfolio.backtest.bootstrap import block_length, stationary_bootstrap_indices
+
+Floats = NDArray[np.float64]
+
+ALPHA = 0.05
+"""Probability of a false alarm, over all time."""
+
+ALARM = 2 / ALPHA
+"""The evidence at which the alarm is given."""
+
+TAIL = 0.005
+"""Share of the backtest's returns that is cut off at each end."""
+
+BETS = (0.02, 0.05, 0.1, 0.2, 0.4)
+"""Shares of the largest bet that keeps the capital positive."""
+
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What a backtest's returns say of those to come.
+
+    low, high: the range that returns are cut to. least: lower limit of the mean of cut returns.
+    """
+
+    low: float
+    high: float
+    least: float
+
+    @staticmethod
+    def of(tested: ArrayLike, rng: np.random.Generator, resamples: int = RESAMPLES) -> "Promise":
+        """From the net returns of a backtest, shape (T,); the limit is by stationary bootstrap."""
+        returns = np.asarray(tested, dtype=float)
+        low, high = np.quantile(returns, (TAIL, 1 - TAIL))
+        cut = np.clip(returns, low, high)
+        block = block_length(cut)
+        days = stationary_bootstrap_indices(len(cut), block, resamples, rng)
+        return Promise(float(low), float(high), float(np.quantile(cut[days].mean(1), ALPHA / 2)))
+
+
+def evidence(promise: Promise, live: ArrayLike) -> Floats:
+    """Evidence against the promise after each live return, shape (n,): 1 is none, see ``ALARM``."""
+    width = promise.high - promise.low
+    if width <= 0:
+        return np.ones(np.shape(live))
+    lost = (promise.least - np.clip(live, promise.low, promise.high)) / width
+    largest = width / max(promise.high - promise.least, 1e-12 * width)
+    bets = largest * np.array(BETS)[:, None]
+    return np.asarray(np.cumprod(1 + bets * lost, axis=1).mean(0))
+
+
+def together(parts: list[Floats]) -> Floats:
+    """The evidence of several tests: their mean, which is evidence itself (Vovk & Wang 2021)."""
+    return np.asarray(np.mean(parts, axis=0))
+
+
+def band(tested: ArrayLike, rows: int, rng: np.random.Generator) -> Floats:
+    """Growth of wealth over the rows to come, if they are as the backtest's.
+
+    Returns:
+        Of shape (3, rows): 2.5 %, 50 % and 97.5 % of the histories that the stationary bootstrap
+        draws.
+    """
+    returns = np.asarray(tested, dtype=float)
+    block = block_length(returns)
+    draws = -(-rows // len(returns))
+    days = [stationary_bootstrap_indices(len(returns), block, RESAMPLES, rng) for _ in range(draws)]
+    paths = np.cumsum(np.log1p(returns)[np.concatenate(days, 1)[:, :rows]], axis=1)
+    return np.asarray(np.exp(np.quantile(paths, (0.025, 0.5, 0.975), axis=0)))

@@ -1,0 +1,252 @@
+"""Live performance of a run's ledger beside what its backtest promised."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.files import write_csv
+from qfolio.portfolio.backtest import consistency
+from qfolio.portfolio.backtest.desk import Desk
+from qfolio.portfolio.backtest.folder import BacktestFolder, followed
+from qfolio.portfolio.backtest.folds import overdue, spell_all
+from qfolio.portfolio.backtest.measures import drawdown
+from qfolio.portfolio.backtest.run import EQUAL_WEIGHT
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.calendars import decision_rows
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.ledger import Record
+from qfolio.portfolio.live import Live, mark
+from qfolio.portfolio.prices.findings import amount, day
+from qfolio.portfolio.prices.table import Prices
+
+SEED = 0
+"""Of the bootstrap: the same ledger gives the same evidence whenever one looks."""
+
+
+@dataclass(frozen=True)
+class Following:
+    """A ledger marked to market; arrays have an entry for each live row.
+
+    tested: what its agent (that of the last allocation) earned in the backtest, net, shape (T,).
+    reference: live net returns of equal weights. band: growth of wealth by the backtest, shape
+    (3, rows). evidence: against the backtest. learned: the last row that the policy knows, or None
+    for a baseline. overdue: whether that is a test length ago or more.
+    """
+
+    agent: str
+    records: list[Record]
+    live: Live
+    tested: np.ndarray
+    reference: np.ndarray
+    band: np.ndarray
+    evidence: np.ndarray
+    periods_per_year: float
+    learned: np.datetime64 | None
+    overdue: bool
+    test: str
+
+    @cached_property
+    def growth(self) -> np.ndarray:
+        """Wealth over that before the first trade."""
+        return np.asarray(np.cumprod(1 + self.live.returns))
+
+    @property
+    def alarm(self) -> np.datetime64 | None:
+        """The date from which on the backtest is refuted."""
+        over = np.flatnonzero(self.evidence >= consistency.ALARM)
+        return self.live.dates[over[0]] if over.size else None
+
+    def sentences(self) -> list[str]:
+        """What is to be said of it."""
+        live, count = self.live, len(self.records)
+        agents = ", ".join(dict.fromkeys(record.agent for record in self.records))
+        since = f"{amount(count, 'allocation')} of {agents} since {self.records[0].date}"
+        if not len(live.returns):
+            return [f"{since}: no trade has earned a return yet.", self._retrain()]
+        low, middle, high = (f"{x - 1:+.1%}" for x in self.band[:, -1])
+        earned, equal = self.growth[-1], np.prod(1 + self.reference)
+        place = " Live is below the band." if earned < self.band[0, -1] else ""
+        place = " Live is above the band." if earned > self.band[2, -1] else place
+        said = [
+            f"{since}, {amount(len(live.returns), 'row')} up to {day(live.dates[-1])}: "
+            f"{earned - 1:+.1%} after costs, and equal weights {equal - 1:+.1%}.",
+            f"Of histories like the backtest's, 95 % end between {low} and {high}, half of them "
+            f"above {middle}.{place}",
+        ]
+        level = f"evidence against it {self.evidence[-1]:.2g}, alarm at {consistency.ALARM:.0f}"
+        if self.alarm is None:
+            said.append(f"Live returns are consistent with the backtest ({level}).")
+        else:
+            said.append(
+                f"ALARM since {day(self.alarm)}: live returns are worse than the backtest's "
+                f"({level})."
+            )
+        said.append(self._retrain())
+        flows = live.flows[abs(live.flows) > 1e-6 * live.wealth]
+        if flows.size:
+            said.append(
+                f"Holdings differed from those expected {amount(flows.size, 'time')}, by "
+                f"{flows.sum():+,.2f} in all (deposits, other fills); this counts as no return."
+            )
+        if live.short:
+            said.append(
+                f"After {amount(live.short, 'allocation')} prices rose before the trades were "
+                "filled, and cash was negative."
+            )
+        return said
+
+    def _retrain(self) -> str:
+        if self.learned is None:
+            return f"{self.agent} is a baseline, so there is nothing to train."
+        why = ["the alarm"] * (self.alarm is not None)
+        why += [f"its age of {self.test} or more, the backtest's test length"] * self.overdue
+        until = f"The policy has learned from prices up to {day(self.learned)}"
+        return (
+            f"{until}; a retrain is due for {' and '.join(why)}."
+            if why
+            else (f"{until}; no retrain is due before it is {self.test} old.")
+        )
+
+    def rows(self) -> dict[str, dict[str, float]]:
+        """Growth since the start and a year, volatility, Sharpe ratio and drawdown, by name."""
+        return {
+            "live": _measures(self.live.returns, self.periods_per_year),
+            "equal-weight, live": _measures(self.reference, self.periods_per_year),
+            f"{self.agent}, backtest": _measures(self.tested, self.periods_per_year),
+        }
+
+    def write(self, path: Path) -> None:
+        """A CSV file with a row for each live row."""
+        live = self.live
+        header = [
+            "date", "return", "wealth", "cash", "cost", "flow", "growth", "equal_weight",
+            "band_low", "band_middle", "band_high", "evidence",
+        ]  # fmt: skip
+        columns = (
+            live.returns, live.wealth, live.cash, live.costs, live.flows, self.growth,
+            np.cumprod(1 + self.reference), *self.band, self.evidence,
+        )  # fmt: skip
+        days = spell_all(live.dates, live.dates) if len(live.dates) else []
+        write_csv(path, header, zip(days, *(x.tolist() for x in columns), strict=True))
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "agent": self.agent,
+            "allocations": len(self.records),
+            "rows": len(self.live.returns),
+            "growth": float(self.growth[-1]) if len(self.growth) else None,
+            "band": self.band[:, -1].tolist() if len(self.growth) else None,
+            "evidence": float(self.evidence[-1]) if len(self.growth) else None,
+            "alarm_at": consistency.ALARM,
+            "alarm_since": None if self.alarm is None else day(self.alarm),
+            "retrain_due": self.overdue or self.alarm is not None,
+            "flows": float(self.live.flows.sum()),
+            "costs": float(self.live.costs.sum()),
+            "sentences": self.sentences(),
+        }
+
+
+def follow(desk: Desk, prices: Path | None = None) -> Following:
+    """Marks a run's ledger to market and compares it with the backtest.
+
+    Args:
+        desk: The run.
+        prices: A table with the rows since the first allocation (default: the backtest's).
+
+    Raises:
+        QfolioError: The ledger is empty, prices do not fit it, or the backtest is not finished.
+    """
+    records, run = desk.ledger.current(), desk.run
+    if not records:
+        raise QfolioError(
+            f"The ledger of {desk.folder} is empty; record an allocation with qfolio allocate."
+        )
+    agent, lag = records[-1].agent, run.config.lag
+    known = desk.followed(agent, records[-1].policy)
+    table = run.prices if prices is None else known.table(desk.load(prices))
+    live = mark(records, table, known.costs, lag)
+    tested, equal = _tested(desk, agent), _tested(desk, EQUAL_WEIGHT)
+    reference = _equal_weights(desk, table, live, lag)
+    rng = np.random.default_rng(SEED)
+    count = len(live.returns)
+    band, evidence = np.ones((3, count)), np.ones(count)
+    if count:
+        band = consistency.band(tested, count, rng)
+        pairs = [(tested, live.returns)]
+        if agent != EQUAL_WEIGHT:
+            pairs.append((tested - equal, live.returns - reference))
+        evidence = consistency.together(
+            [
+                consistency.evidence(consistency.Promise.of(before, rng), now)
+                for before, now in pairs
+            ]
+        )
+    learned = getattr(known, "learned", None)
+    return Following(
+        agent,
+        records,
+        live,
+        tested,
+        reference,
+        band,
+        evidence,
+        table.periods_per_year,
+        learned,
+        learned is not None and overdue(learned, run.config.test, table.dates),
+        run.config.test,
+    )
+
+
+def _tested(desk: Desk, name: str) -> np.ndarray:
+    """The net returns of a strategy in the backtest, all seeds of an agent together."""
+    _, columns = BacktestFolder(desk.folder).read_returns()
+    column = followed(name, columns)
+    if column not in columns:
+        column = f"{name}/{desk.run.config.seed}"
+    if column not in columns:
+        raise QfolioError(
+            f"returns.csv has no {name}; write it again with qfolio backtest --resume "
+            f"{desk.folder}."
+        )
+    return columns[column]
+
+
+def _equal_weights(desk: Desk, table: Prices, live: Live, lag: int) -> np.ndarray:
+    """Net returns of equal weights over the live rows, under the run's costs and calendar."""
+    count = len(live.returns)
+    if not count:
+        return np.zeros(0)
+    rule, task = desk.followed(EQUAL_WEIGHT), next(iter(desk.run.tasks.values()))
+    first = live.first - lag
+    wanted = list(rule.weights(table.between(None, first + 1)).values())
+    decisions = np.tile(wanted, (count, 1))
+    if task.calendar:
+        decides = decision_rows(task.calendar, table.dates)[first : first + count]
+        decides[0] = True
+        decisions[~decides] = np.nan
+    return simulate(
+        table.values,
+        decisions,
+        first=first,
+        cost=rule.costs,
+        lag=lag,
+        conditions=Conditions.of(table, rule.costs.columns),
+    ).returns
+
+
+def _measures(returns: np.ndarray, year: float) -> dict[str, float]:
+    if len(returns) < 2:
+        return {}
+    growth = float(np.log1p(returns).sum())
+    deviation = float(returns.std(ddof=1))
+    return {
+        "growth": float(np.expm1(growth)),
+        "a year": float(np.expm1(growth * year / len(returns))),
+        "volatility": deviation * year**0.5,
+        "sharpe": float(returns.mean()) / deviation * year**0.5 if deviation else 0.0,
+        "drawdown": float(drawdown(returns).max()),
+    }

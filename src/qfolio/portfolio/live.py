@@ -1,0 +1,117 @@
+"""The ledger marked to market: what its allocations have earned since."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.allocation import context_of, settled
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import CostModel
+from qfolio.portfolio.ledger import Record
+from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.table import Prices
+
+
+@dataclass(frozen=True)
+class Live:
+    """Rows since the first trade; arrays of shape (rows,)."""
+
+    dates: np.ndarray
+    returns: np.ndarray  # net; the cost of a trade is charged to the row after it
+    wealth: np.ndarray  # money at each row, before its trades
+    cash: np.ndarray  # of it
+    costs: np.ndarray  # money paid for the trades of the row before
+    flows: np.ndarray  # money by which an allocation at the row before was given more than expected
+    first: int  # row of the table before the first return
+    short: int  # trades after which cash was negative: prices rose before they were filled
+
+
+def mark(records: Sequence[Record], prices: Prices, model: CostModel, lag: int) -> Live:
+    """Follows the allocations of a ledger along a price table.
+
+    Trades of an allocation are filled ``lag`` rows after it, at the close, in the shares of the
+    ledger and at the costs of the model. Each allocation begins with the holdings that it was
+    given; what they differ from those expected (deposits, other fills) is a flow and earns nothing.
+    Shares count in units of the table: where an adjusted price differs from the ledger's, after a
+    split or a dividend, the value at the allocation is the same.
+
+    Args:
+        records: One for each date, by date.
+        prices: With a row for each of these dates; the assets are those of the records.
+        model: Costs of trading and holding.
+        lag: Rows from an allocation to its trades.
+
+    Raises:
+        QfolioError: The ledger is empty, or prices do not fit it.
+    """
+    if not records:
+        raise QfolioError("The ledger is empty; record an allocation with qfolio allocate first.")
+    rows = np.searchsorted(prices.dates, [record.moment for record in records])
+    known = Conditions.of(prices, model.columns)
+    values = np.nan_to_num(prices.values)
+    at: dict[int, Record] = {}
+    for row, record in zip(rows.tolist(), records, strict=True):
+        if row == len(prices) or prices.dates[row] != record.moment:
+            raise QfolioError(
+                f"The prices, {day(prices.dates[0])} to {day(prices.dates[-1])}, have no row of "
+                f"{record.date}, on which record {record.number} was made; give a table with it."
+            )
+        if tuple(record.assets) != prices.assets:
+            raise QfolioError(f"Record {record.number} has other assets than the price table.")
+        at[row] = record
+    first = int(rows[0])
+    units, cash = np.zeros(values.shape[1]), 0.0
+    base = total = paid = flow = 0.0
+    due: dict[int, np.ndarray] = {}
+    table: list[tuple[float, ...]] = []
+    short = 0
+    for row in range(first, len(prices)):
+        if row > first:
+            before = np.append(cash, units * values[row - 1])
+            relatives = np.divide(
+                values[row], values[row - 1], out=np.ones(len(units)), where=values[row - 1] > 0
+            )
+            growth = model.growth(before, relatives, known.holding(row - 1, row))
+            # What holding earns besides the price is paid in cash.
+            cash = cash * growth[0] + float(before[1:] @ (growth[1:] - relatives))
+            total = cash + float(units @ values[row])
+            if row > first + lag:
+                table.append((total / base - 1, total, cash, paid, flow))
+        paid, flow, after = 0.0, 0.0, total
+        if row in due:
+            units, cash, paid = _filled(due.pop(row), units, cash, prices, row, model)
+            after, short = total - paid, short + (cash < -1e-9 * total)
+        if row in at:
+            record = at[row]
+            scale = np.divide(
+                np.array([price or 0.0 for price in record.prices]), values[row],
+                out=np.ones(len(units)), where=values[row] > 0,
+            )  # fmt: skip
+            units, cash = np.array(record.shares) * scale, record.cash
+            flow = cash + float(units @ values[row]) - after
+            if row == first:
+                total, flow = total + flow, 0.0
+            due = {row + lag: np.array(record.trades) * scale}
+            if lag == 0:
+                units, cash, more = _filled(due.pop(row), units, cash, prices, row, model)
+                paid, short = paid + more, short + (cash < -1e-9 * total)
+        base = total + flow
+    returns, wealth, money, costs, flows = np.array(table).reshape(-1, 5).T
+    dates = prices.dates[first + lag + 1 :]
+    return Live(dates, returns, wealth, money, costs, flows, first + lag, int(short))
+
+
+def _filled(
+    trades: np.ndarray, units: np.ndarray, cash: float, prices: Prices, row: int, model: CostModel
+) -> tuple[np.ndarray, float, float]:
+    """Units and cash after trades at a row's prices, and what they cost."""
+    values = np.nan_to_num(prices.values[row])
+    wealth = cash + float(units @ values)
+    if not trades.any() or wealth <= 0:
+        return units, cash, 0.0
+    held = np.append(cash, units * values) / wealth
+    context = context_of(model, prices.between(None, row + 1), wealth)
+    left, costs = settled(model, context, held, wealth, units, values, trades)
+    return units + trades, left, sum(costs.values())

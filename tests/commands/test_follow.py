@@ -1,0 +1,114 @@
+"""qfolio follow: a ledger marked to market."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from shell import qfolio
+from tables import write_table
+
+DAYS = ["2020-09-16", "2020-10-16", "2020-11-15"]
+
+
+def table(path, rows, fall=0.0):
+    """The backtest's prices, and more of the same; falling from the first allocation on."""
+    write_table(path, rows=rows)
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    for i, line in enumerate(lines[261:]):
+        line[1:] = [repr(float(price) * (1 - fall) ** (i + 1)) for price in line[1:]]
+    path.write_text("\n".join(map(",".join, lines)) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(folder, tmp_path_factory):
+    """A copy with three monthly allocations, the last of them twice."""
+    place = tmp_path_factory.mktemp("follow")
+    run = shutil.copytree(folder, place / "run")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        for i, date in enumerate(DAYS):
+            prices = table(place / f"{i}.csv", 260 + 30 * i)
+            for capital in (900, 1000)[i < 2 :]:
+                code = qfolio(
+                    monkeypatch, "allocate", run, "--prices", prices, "--as-of", date,
+                    "--capital", capital,
+                )  # fmt: skip
+                assert code == 0
+    return run
+
+
+def test_follow_shows_live_beside_the_backtest(folder, monkeypatch, capsys, tmp_path):
+    prices = table(tmp_path / "later.csv", 335)
+    assert qfolio(monkeypatch, "follow", folder, "--prices", prices, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    with (folder / "follow.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert (found["allocations"], found["rows"], len(rows)) == (3, 335 - 260 - 1, 74)
+    assert (rows[0]["date"], rows[-1]["date"]) == ("2020-09-18", "2020-11-30")
+    returns = np.array([float(row["return"]) for row in rows])
+    assert found["growth"] == pytest.approx(np.prod(1 + returns))
+    assert float(rows[-1]["growth"]) == pytest.approx(found["growth"])
+    low, middle, high = found["band"]
+    assert low < middle < high
+    assert found["alarm_since"] is None
+    assert found["costs"] == pytest.approx(sum(float(row["cost"]) for row in rows))
+    assert found["costs"] > 0.5
+    # All is sold, and bought again with what was paid in: no return.
+    assert abs(found["flows"]) > 1
+    assert qfolio(monkeypatch, "follow", folder, "--prices", prices) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "3 allocations of pathwise since 2020-09-16, 74 rows up to 2020-11-30: " in printed
+    assert "Live returns are consistent with the backtest (evidence against it" in printed
+    assert "no retrain is due before it is 80d old." in printed
+    assert "Holdings differed from those expected 2 times" in printed
+
+
+def test_a_loss_at_every_row_raises_the_alarm(folder, monkeypatch, capsys, tmp_path):
+    prices = table(tmp_path / "fall.csv", 420, fall=0.02)
+    out = tmp_path / "fall-follow.csv"
+    options = ["--prices", prices, "--out", out]
+    assert qfolio(monkeypatch, "follow", folder, *options, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["evidence"] > found["alarm_at"] == 40
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    first = next(row["date"] for row in rows if float(row["evidence"]) >= 40)
+    assert found["alarm_since"] == first
+    assert found["retrain_due"]
+    assert qfolio(monkeypatch, "follow", folder, *options) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"ALARM since {first}: live returns are worse than the backtest's" in printed
+    assert "Live is below the band." in printed
+    assert "a retrain is due for the alarm and its age of 80d or more" in printed
+
+
+def test_before_the_first_return(folder, monkeypatch, capsys):
+    """The ledger's second allocation is later than the backtest's own prices."""
+    assert qfolio(monkeypatch, "follow", folder) == 2
+    assert "have no row of 2020-10-16, on which record 2 was made" in capsys.readouterr().err
+
+
+def test_a_ledger_without_returns_or_records(folder, monkeypatch, capsys, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    for number in (2, 3, 4):
+        (copy / "ledger" / f"{number:04d}.json").unlink()
+    assert qfolio(monkeypatch, "follow", copy) == 0
+    printed = capsys.readouterr().out
+    assert "1 allocation of pathwise since 2020-09-16: no trade has earned a return yet." in printed
+    assert len((copy / "follow.csv").read_text().splitlines()) == 1
+    (copy / "ledger" / "0001.json").unlink()
+    assert qfolio(monkeypatch, "follow", copy) == 2
+    assert "is empty; record an allocation with qfolio allocate" in capsys.readouterr().err
+
+
+def test_a_baseline_is_followed_without_training(folder, monkeypatch, capsys, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    shutil.rmtree(copy / "ledger")
+    prices = table(tmp_path / "later.csv", 340)
+    of = ["--as-of", "2020-09-16", "--capital", 1000, "--agent", "equal-weight"]
+    assert qfolio(monkeypatch, "allocate", copy, *of) == 0
+    assert qfolio(monkeypatch, "follow", copy, "--prices", prices) == 0
+    assert "equal-weight is a baseline, so there is nothing to train." in capsys.readouterr().out

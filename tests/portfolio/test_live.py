@@ -1,0 +1,138 @@
+"""The ledger marked to market, against replays and by hand."""
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.allocation import Allocation
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import Proportional
+from qfolio.portfolio.itemized import Itemized
+from qfolio.portfolio.ledger import Record
+from qfolio.portfolio.live import mark
+from qfolio.portfolio.prices.table import Prices
+
+NAMES = ("A", "B", "C")
+
+
+def table(rows=60, seed=0):
+    rng = np.random.default_rng(seed)
+    values = 50 * np.exp(rng.normal(0, 0.02, (rows, 3)).cumsum(0))
+    return Prices(np.datetime64("2024-01-01") + np.arange(rows), NAMES, values)
+
+
+class Fixed:
+    def __init__(self, wanted, costs):
+        self.wanted, self.costs = wanted, costs
+
+    def weights(self, prices, holdings=None):
+        return dict(zip(("cash", *prices.assets), self.wanted.tolist(), strict=True))
+
+
+def record(allocation, number):
+    """As the ledger has it."""
+    return Record(
+        number=number,
+        date=allocation.date,
+        made="",
+        version="",
+        agent="x",
+        policy=None,
+        digests={},
+        whole_shares=False,
+        assets=list(allocation.assets),
+        prices=allocation.prices.tolist(),
+        shares=allocation.shares.tolist(),
+        cash=float(allocation.cash),
+        trades=allocation.trades.tolist(),
+        cash_after=allocation.cash_after,
+        weights_before=allocation.held.tolist(),
+        target=allocation.weights.tolist(),
+        weights_after=allocation.reached.tolist(),
+        costs=allocation.costs,
+    )
+
+
+def traded(prices, model, rows, targets):
+    """Allocations at some rows without lag, each from what the one before has left."""
+    shares, cash, last = np.zeros(3), 1000.0, None
+    records: list[Record] = []
+    for row, target in zip(rows, targets, strict=True):
+        if last is not None:
+            before = np.append(cash, shares * prices.values[last])
+            known = Conditions.of(prices, model.columns)
+            relatives = prices.values[row] / prices.values[last]
+            cash *= float(model.growth(before, relatives, known.holding(last, row))[0])
+        plan = Allocation.of(Fixed(target, model), prices.between(None, row + 1), shares, cash)
+        records.append(record(plan, len(records) + 1))
+        shares, cash, last = shares + plan.trades, plan.cash_after, row
+    return records
+
+
+@pytest.mark.parametrize("model", [Proportional(0.002), Itemized(0.001, cash_rate="0.05")])
+@pytest.mark.parametrize("seed", range(5))
+def test_returns_equal_the_replay_of_the_same_decisions(model, seed):
+    prices = table(seed=seed)
+    rng = np.random.default_rng(seed)
+    rows = [10, 11, 25, 40]
+    targets = rng.dirichlet(np.ones(4), 4)
+    found = mark(traded(prices, model, rows, targets), prices, model, lag=0)
+    decisions = np.full((len(prices) - 1 - 10, 4), np.nan)
+    decisions[np.array(rows) - 10] = targets
+    replay = simulate(
+        prices.values, decisions, first=10, cost=model, lag=0,
+        conditions=Conditions.of(prices, model.columns),
+    )  # fmt: skip
+    np.testing.assert_allclose(found.returns, replay.returns, atol=1e-12)
+    np.testing.assert_array_equal(found.dates, prices.dates[11:])
+    np.testing.assert_allclose(found.flows, 0, atol=1e-9)
+    earned = 1000 * np.prod(1 + replay.returns)
+    assert found.wealth[-1] == pytest.approx(earned)
+
+
+def by_hand(values, shares, cash, trades):
+    prices = Prices(np.datetime64("2024-01-01") + np.arange(len(values)), ("A",), np.array(values))
+    plan = Allocation(
+        "2024-01-01", ("A",), prices.values[0], np.array([shares]), cash,
+        np.array([0.5, 0.5]), np.array([trades]), {}, 0.0,
+    )  # fmt: skip
+    return prices, record(plan, 1)
+
+
+def test_a_trade_that_waits_a_row_by_hand():
+    """10 shares are bought at 20 instead of 10, at 1 %: the cost is in the row after."""
+    prices, one = by_hand([[10.0], [20.0], [30.0], [30.0]], 0.0, 1000.0, 10.0)
+    found = mark([one], prices, Proportional(0.01), lag=1)
+    cost = 200 / 0.99 - 200
+    np.testing.assert_allclose(found.wealth, [1100 - cost] * 2)
+    np.testing.assert_allclose(found.returns, [(1100 - cost) / 1000 - 1, 0])
+    np.testing.assert_allclose(found.costs, [cost, 0])
+    assert found.short == 0
+    poor = mark(
+        [by_hand([[10.0], [20.0], [30.0]], 0.0, 100.0, 10.0)[1]], prices, Proportional(0.0), 1
+    )
+    assert poor.short == 1
+
+
+def test_a_split_and_a_deposit_earn_nothing():
+    """The table is adjusted for a split of 2 after the first record; 500 are paid in later."""
+    prices, one = by_hand([[5.0], [5.0], [6.0], [6.0]], 100.0, 0.0, 0.0)
+    one = Record(**{f: getattr(one, f) for f in one.__struct_fields__} | {"prices": [10.0]})
+    two = {"number": 2, "date": "2024-01-03", "prices": [6.0], "shares": [200.0], "cash": 500.0}
+    again = Record(**{f: getattr(one, f) for f in one.__struct_fields__} | two)
+    found = mark([one, again], prices, Proportional(0.0), lag=0)
+    np.testing.assert_allclose(found.wealth, [1000, 1200, 1700])
+    np.testing.assert_allclose(found.returns, [0, 0.2, 0])
+    np.testing.assert_allclose(found.flows, [0, 0, 500])
+
+
+def test_a_ledger_that_does_not_fit_is_refused():
+    prices, one = by_hand([[10.0], [20.0]], 1.0, 0.0, 0.0)
+    with pytest.raises(QfolioError, match="empty"):
+        mark([], prices, Proportional(0.0), 1)
+    with pytest.raises(QfolioError, match="have no row of 2024-01-01, on which record 1"):
+        mark([one], prices.between(1, None), Proportional(0.0), 1)
+    with pytest.raises(QfolioError, match="other assets"):
+        mark([one], table(), Proportional(0.0), 1)
+    assert len(mark([one], prices, Proportional(0.0), lag=1).returns) == 0
