@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from qfolio.commands.arguments import File, Modules, Name, Names
-from qfolio.commands.backtesting import Missing
+from qfolio.commands.tables import Missing, Returns
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
@@ -36,6 +36,7 @@ def allocate(
     trust: Modules = (),
     missing: Missing = "error",
     features: Names = (),
+    returns: Returns = None,
     date: Name = None,
     as_json: Annotated[bool, arg(name="json")] = False,
 ) -> None:
@@ -69,6 +70,8 @@ def allocate(
         trust: Modules of your own code that the folder may name (default: none).
         missing: How to treat missing prices.
         features: Columns that hold features (default: those of the backtest).
+        returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
+            shares and orders need prices (default: they are prices).
         date: Column of dates (default: found by its name).
         as_json: Print JSON instead of a table.
     """
@@ -90,7 +93,12 @@ def allocate(
     from qfolio.portfolio.policy import Policy
     from qfolio.portfolio.prices.findings import amount, day
 
-    desk = Desk.open(folder, missing=missing, features=features, date=date)
+    if returns and (holdings or whole_shares or orders):
+        raise QfolioError(
+            "--returns gives no prices of shares; leave out --holdings, --whole-shares and "
+            "--orders, or bring prices."
+        )
+    desk = Desk.open(folder, missing=missing, features=features, returns=returns, date=date)
     if reproduce is not None:
         if agent is not None or update or orders is not None:
             raise QfolioError(

@@ -5,11 +5,12 @@ import datetime
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Names, Trackers
+from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Trackers
+from qfolio.commands.tables import Reading
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
@@ -19,17 +20,13 @@ if TYPE_CHECKING:
     from qfolio.portfolio.backtest.attribution.why import Why
     from qfolio.portfolio.backtest.replay import Entry
     from qfolio.portfolio.backtest.run import Backtest
-    from qfolio.portfolio.prices.table import Prices
-
-Missing = Literal["error", "drop-asset", "forward-fill"]
-Late = Literal["error", "drop-asset", "trim", "join"]
 
 BASIS_POINT = 1e-4
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
-    """How agents are trained and tested on a table.
+class Options(Reading):
+    """How agents are trained and tested on a table, and how it is read.
 
     Args:
         agents: Agents, separated by commas: tilts, mean-variance-learned, minimum-variance-learned,
@@ -63,10 +60,6 @@ class Options:
         track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
             module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
-        missing: How to treat missing prices.
-        late: How to treat assets that start later than the table.
-        features: Columns that hold features for agents instead of prices.
-        date: Column of dates (default: found by its name).
     """
 
     agents: str = "tilts,dqn"
@@ -91,10 +84,6 @@ class Options:
     on: str = "here"
     track: Trackers = ()
     trust: Modules = ()
-    missing: Missing = "error"
-    late: Late = "error"
-    features: Names = ()
-    date: Name = None
 
     @property
     def only_resumes(self) -> bool:
@@ -105,14 +94,6 @@ class Options:
     def folder(self, kind: str) -> Path:
         """The new folder."""
         return self.out or Path("runs") / f"{kind}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-
-    def load(self, file: Path | None) -> "Prices":
-        """A price table; the 20 US stocks without a file."""
-        from qfolio.portfolio.prices.table import load
-
-        return load(
-            file, missing=self.missing, late=self.late, features=self.features, date=self.date
-        )
 
     def presets(self) -> "dict[str, Preset]":
         """The agents by their short names, with all settings; imports their modules."""

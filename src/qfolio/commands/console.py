@@ -139,6 +139,8 @@ def print_prices(facts: dict[str, Any]) -> None:
     )
     if facts["features"]:
         say(f"Features: {printable(', '.join(facts['features']))}.")
+    if facts["columns"]:
+        say(f"Columns of the market: {printable(', '.join(facts['columns']))}.")
     if facts["note"]:
         say(f"Note: {facts['note']}")
 

@@ -4,41 +4,24 @@ import sys
 
 from tyro.conf import Positional
 
-from qfolio.commands.arguments import File, Name, Names, again
-from qfolio.commands.backtesting import (
-    DEFAULTS,
-    Late,
-    Missing,
-    Shared,
-    basis_points,
-    write_report,
-)
+from qfolio.commands.arguments import File, Name, again
+from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points, write_report
+from qfolio.commands.tables import READING, Read
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 
-def prices(
-    file: Positional[File] = None,
-    *,
-    missing: Missing = "error",
-    late: Late = "error",
-    features: Names = (),
-    date: Name = None,
-) -> None:
+def prices(file: Positional[File] = None, *, reading: Read = READING) -> None:
     """Check a price table and report errors, warnings and notes by row and column.
 
     Args:
         file: CSV or Parquet file, wide (a column per asset), long (date, asset, price) or as
             yfinance saves it (default: the 20 US stocks that come with qfolio).
-        missing: How to treat missing prices.
-        late: How to treat assets that start later than the table.
-        features: Columns that hold features instead of prices.
-        date: Column of dates (default: found by its name).
     """
     from qfolio.commands import console
     from qfolio.portfolio.prices.table import describe, inspect
 
-    table, findings = inspect(file, missing=missing, late=late, features=features, date=date)
+    table, findings = inspect(file, **reading.reading)
     console.print_findings(findings)
     if table is None:
         sys.exit(2)

@@ -64,12 +64,14 @@ def _column(name: str, prices: Prices) -> Floats:
         return np.nan_to_num(prices.values)
     if name in prices.feature_names:
         return np.nan_to_num(prices.features[..., prices.feature_names.index(name)])
+    if name in prices.market_names:
+        return prices.market[:, [prices.market_names.index(name)]]
     if name == "volatility":
         return _volatility(prices.values)
-    known = ", ".join(prices.feature_names) or "none"
+    known = ", ".join(prices.feature_names + prices.market_names) or "none"
     raise QfolioError(
         f"The cost model reads the column {name!r}, which the price table does not have (it has "
-        f"{known}); load it as a feature, or give a number instead."
+        f"{known}); load it as a feature or as a column, or give a number instead."
     )
 
 

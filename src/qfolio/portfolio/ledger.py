@@ -156,7 +156,10 @@ class Ledger:
         try:
             dates = arrays["dates"].astype("datetime64[s]")
             assets, features = tuple(record.assets), known.feature_names
-            table = Prices(dates, assets, arrays["values"], arrays["features"], features)
+            table = Prices(
+                dates, assets, arrays["values"], arrays["features"], features,
+                market=arrays.get("market", np.empty(0)), market_names=known.market_names,
+            )  # fmt: skip
         except (KeyError, ValueError, QfolioError) as error:
             raise QfolioError(f"{path} is damaged ({error}); give the prices again.") from None
         if table.sha256 != wanted:
@@ -168,7 +171,7 @@ class Ledger:
         if not path.exists():
             seconds = prices.dates.astype("datetime64[s]").astype(np.int64)
             arrays = {"dates": seconds, "values": prices.values, "features": prices.features}
-            write_arrays(path, arrays)
+            write_arrays(path, {**arrays, "market": prices.market})
 
     def _prices(self, digest: str) -> Path:
         return self.folder / "prices" / f"{digest[:16]}.safetensors"

@@ -39,6 +39,7 @@ class Desk:
         """The desk of a finished backtest; options are those of ``prices.load``."""
         run = Backtest.open(folder)
         known = {**options, "features": options.get("features") or tuple(run.config.feature_names)}
+        known.setdefault("columns", tuple(run.config.prices.get("columns", ())))
         # What is followed looks at the last rows only; assets may start at any row before.
         return Desk(run, Path(folder), lambda source: load(source, late="join", **known))
 

@@ -148,6 +148,7 @@ class BacktestFolder:
             "dates": prices.dates.astype("datetime64[s]").astype(np.int64),
             "values": prices.values,
             "features": prices.features,
+            "market": prices.market,
         }
         write_arrays(self.path / "prices.safetensors", arrays)
 
@@ -168,6 +169,8 @@ class BacktestFolder:
                 tuple(config.feature_names),
                 source=str(config.prices["source"]),
                 note=str(config.prices.get("note", "")),
+                market=arrays.get("market", np.empty(0)),
+                market_names=tuple(config.prices.get("columns", ())),
             )
         except (KeyError, ValueError, QfolioError) as error:
             raise QfolioError(f"{path} is damaged ({error}); restore it or start over.") from None

@@ -1,53 +1,94 @@
 """Runs all checks of a price table, in order."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
 from qfolio.portfolio.prices.columns import find_columns
-from qfolio.portfolio.prices.findings import Finding, Findings
+from qfolio.portfolio.prices.findings import Finding, Findings, day
 from qfolio.portfolio.prices.gaps import complete
 from qfolio.portfolio.prices.grid import arrange
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.moves import check_moves
 from qfolio.portfolio.prices.plausibility import FEWEST_ROWS, check_cells, check_size
+from qfolio.portfolio.prices.returns import UNITS, cumulate
 
 MISSING = ("error", "drop-asset", "forward-fill")
 LATE = ("error", "drop-asset", "trim", "join")
 
 
-def examine(
-    table: Table, missing: str, late: str, features: tuple[str, ...], date: str | None
-) -> tuple[dict[str, Any], list[Finding]]:
-    """The arguments of ``Prices`` (none if the table has errors), and all findings.
+@dataclass(frozen=True)
+class Choices:
+    """How a table is read; cf. ``table.load``."""
 
-    Raises:
-        QfolioError: ``missing`` or ``late`` is not one of the choices.
-    """
-    for name, value, known in (("missing", missing, MISSING), ("late", late, LATE)):
-        if value not in known:
-            raise QfolioError(f"{name} is {quote(value)}; it must be one of {', '.join(known)}.")
+    missing: str = "error"
+    late: str = "error"
+    features: Sequence[str] = ()
+    columns: Sequence[str] = ()
+    returns: str | None = None
+    date: str | None = None
+
+    def __post_init__(self) -> None:
+        known = {"missing": MISSING, "late": LATE, "returns": (None, *UNITS)}
+        for name, choices in known.items():
+            if (value := getattr(self, name)) not in choices:
+                listed = ", ".join(choice for choice in choices if choice)
+                raise QfolioError(f"{name} is {quote(value)}; it must be one of {listed}.")
+        for name in ("features", "columns"):
+            given = getattr(self, name)
+            names = (given,) if isinstance(given, str) else tuple(given)
+            object.__setattr__(self, name, names)
+
+
+def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Finding]]:
+    """The arguments of ``Prices`` (none if the table has errors), and all findings."""
     findings = Findings()
-    columns = find_columns(table, features, date, findings)
+    features, shared = tuple(choices.features), tuple(choices.columns)
+    columns = find_columns(table, features + shared, choices.date, findings)
     grid = None if columns is None else arrange(table, columns, findings)
     if grid is None:
         return {}, findings
     ordered = not findings.bad
+    if choices.returns:
+        grid = cumulate(grid, choices.returns, findings)
     check_cells(grid, findings)
     if not ordered or not grid.assets or len(grid.dates) < FEWEST_ROWS:
         return {}, findings
-    rest = complete(grid, missing, late, findings)
+    rest = complete(grid, choices.missing, choices.late, findings)
     if not len(rest.assets):
         return {}, findings
     check_moves(grid, rest, findings)
     check_size(grid, rest, findings)
+    dates = grid.dates[rest.head :]
+    market = _shared(rest.features[..., len(features) :], dates, shared, findings)
     if findings.bad:
         return {}, findings
     content = {
-        "dates": grid.dates[rest.head :],
+        "dates": dates,
         "assets": tuple(grid.assets[j] for j in rest.assets),
         "values": rest.values,
-        "features": rest.features,
+        "features": rest.features[..., : len(features)],
         "feature_names": features,
+        "market": market,
+        "market_names": shared,
     }
     return content, findings
+
+
+def _shared(
+    values: np.ndarray, dates: np.ndarray, names: tuple[str, ...], findings: Findings
+) -> np.ndarray:
+    """Numbers that all assets share, of shape (rows, names), from (rows, assets, names)."""
+    shared = np.fmax.reduce(values, axis=1)
+    differs = (values != shared[:, None]) & ~np.isnan(values)
+    for k in np.flatnonzero(differs.any(axis=(0, 1))).tolist():
+        row = int(differs[..., k].any(axis=1).argmax())
+        findings.error(
+            "has several numbers on one date", column=names[k], date=day(dates[row]),
+            advice="Give one for all assets, or name the column as a feature.",
+        )  # fmt: skip
+    return shared

@@ -8,6 +8,7 @@ from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day
 from qfolio.portfolio.prices.frequency import every_day, spacing
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Block, Grid, report_cells
+from qfolio.portfolio.prices.returns import look_like_returns
 
 FEWEST_ROWS, FEW_ROWS = 3, 60
 
@@ -46,6 +47,13 @@ def check_cells(grid: Grid, findings: Findings) -> None:
         report_cells(grid, block, block.wrong & ~texts, said_of, advice, findings)
         report_cells(grid, block, np.isinf(block.values), "is infinite", advice, findings)
     values = grid.prices.values
+    if look_like_returns(values):
+        findings.error(
+            f"the numbers look like returns: {(values < 0).sum() / np.isfinite(values).sum():.0%} "
+            "are negative",
+            advice="Give prices, or choose returns='percent' or 'fraction' (--returns).",
+        )
+        return
     report_cells(
         grid, grid.prices, values == 0, "is zero",
         "Leave the cell empty where there was no trade; a worthless asset must be dropped.",

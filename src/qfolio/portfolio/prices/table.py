@@ -15,7 +15,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
 from qfolio.portfolio.prices import reading
-from qfolio.portfolio.prices.checks import examine
+from qfolio.portfolio.prices.checks import Choices, examine
 from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.findings import Finding, day, hint
 from qfolio.portfolio.prices.frequency import periods_per_year
@@ -42,6 +42,9 @@ class Prices:
         feature_names: Names of the channels.
         source: The origin of the table.
         note: A caveat for readers of results on the table.
+        market: float64 of shape (rows, names), finite: columns of the whole market, such as a cash
+            rate, which agents do not see.
+        market_names: Names of these columns.
 
     Raises:
         QfolioError: The arrays break one of these rules.
@@ -54,6 +57,8 @@ class Prices:
     feature_names: tuple[str, ...] = ()
     source: str = ""
     note: str = ""
+    market: np.ndarray = field(default_factory=lambda: np.empty(0))
+    market_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         dates = np.array(self.dates, dtype="datetime64[s]")
@@ -68,8 +73,17 @@ class Prices:
                 f"prices of shape {values.shape} and features of shape {features.shape} do not fit "
                 f"{shape[0]} dates, {shape[1]} assets and {len(channels)} feature names."
             )
-        if len(set(assets)) < len(assets) or len(set(channels)) < len(channels):
-            raise QfolioError("names of assets and features must not repeat.")
+        shared = tuple(self.market_names)
+        market = np.array(self.market, dtype=np.float64, order="C")
+        if market.ndim == 1:
+            market = market.reshape(len(dates), len(shared) if not market.size else 1)
+        if market.shape != (len(dates), len(shared)) or not np.isfinite(market).all():
+            raise QfolioError(
+                f"columns of the market of shape {market.shape} do not fit {len(dates)} dates and "
+                f"{len(shared)} names, or are not finite."
+            )
+        if len(set(assets)) < len(assets) or len({*channels, *shared}) < len(channels + shared):
+            raise QfolioError("names of assets, features and columns must not repeat.")
         if "cash" in map(str.lower, assets):
             raise QfolioError("an asset cannot be called cash, which is money; rename the column.")
         if np.isnat(dates).any() or (np.diff(dates) <= np.timedelta64(0, "s")).any():
@@ -79,11 +93,13 @@ class Prices:
             raise QfolioError("prices must be finite and positive from an asset's first row on.")
         if np.isinf(features).any() or np.isnan(features[started]).any():
             raise QfolioError("features must be finite from an asset's first row on.")
-        for name, array in (("dates", dates), ("values", values), ("features", features)):
+        arrays = {"dates": dates, "values": values, "features": features, "market": market}
+        for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         object.__setattr__(self, "assets", assets)
         object.__setattr__(self, "feature_names", channels)
+        object.__setattr__(self, "market_names", shared)
 
     @classmethod
     def from_frame(cls, frame: Any, **options: Any) -> "Prices":
@@ -130,6 +146,9 @@ class Prices:
         sha.update(self.dates.astype("<i8").tobytes())
         for array in (self.values, self.features):
             sha.update(np.where(np.isnan(array), np.nan, array).astype("<f8").tobytes())
+        if self.market_names:
+            sha.update(repr(self.market_names).encode("utf-8", "surrogatepass"))
+            sha.update(self.market.astype("<f8").tobytes())
         return sha.hexdigest()
 
     def select(self, assets: Sequence[str]) -> "Prices":
@@ -156,7 +175,7 @@ class Prices:
         return Prices(
             self.dates[rows], tuple(np.array(self.assets, dtype=object)[columns]),
             self.values[rows][:, columns], self.features[rows][:, columns], self.feature_names,
-            self.source, self.note,
+            self.source, self.note, self.market[rows], self.market_names,
         )  # fmt: skip
 
 
@@ -166,6 +185,8 @@ def load(
     missing: str = "error",
     late: str = "error",
     features: Sequence[str] = (),
+    columns: Sequence[str] = (),
+    returns: str | None = None,
     date: str | None = None,
 ) -> Prices:
     """Read and check a price table.
@@ -187,6 +208,10 @@ def load(
         features: Columns that hold features: in a long table one number for each asset and date,
             in a wide table one for the whole market, or, under a header on two levels, a kind such
             as Volume, which has a column per asset.
+        columns: Columns that hold one number for the whole market, such as a cash rate; agents do
+            not see them.
+        returns: "percent" or "fraction" if the table holds simple returns over the row before;
+            they are cumulated to prices that start at 100 (default: it holds prices).
         date: Column of dates (default: found by its name).
 
     Raises:
@@ -194,7 +219,10 @@ def load(
     """
     if isinstance(source, Prices):
         return source
-    prices, findings = inspect(source, missing=missing, late=late, features=features, date=date)
+    prices, findings = inspect(
+        source, missing=missing, late=late, features=features, columns=columns, returns=returns,
+        date=date,
+    )  # fmt: skip
     if prices is None:
         errors = [finding for finding in findings if finding.severity == "error"]
         shown = "; ".join(str(finding) for finding in errors[:2])
@@ -211,14 +239,7 @@ def check(source: Any = None, **options: Any) -> list[Finding]:
     return inspect(source, **options)[1]
 
 
-def inspect(
-    source: Any = None,
-    *,
-    missing: str = "error",
-    late: str = "error",
-    features: Sequence[str] = (),
-    date: str | None = None,
-) -> tuple[Prices | None, list[Finding]]:
+def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Finding]]:
     """The prices, and all errors, warnings and notes on a table, by row and column.
 
     The arguments are ``load``'s. At most five cells of one kind are named, the others are counted.
@@ -234,9 +255,9 @@ def inspect(
         from skfolio.datasets import load_sp500_dataset
 
         source, label, note = load_sp500_dataset(), DEFAULT_SOURCE, DEFAULT_NOTE
-    table = reading.read(source, lambda names: text_columns(names, date))
-    channels = (features,) if isinstance(features, str) else tuple(features)
-    content, findings = examine(table, missing, late, channels, date)
+    chosen = Choices(**choices)
+    table = reading.read(source, lambda names: text_columns(names, chosen.date))
+    content, findings = examine(table, chosen)
     if not content:
         return None, findings
     return Prices(**content, source=label or table.source, note=note), findings
@@ -252,6 +273,7 @@ def describe(prices: Prices) -> dict[str, Any]:
         "last": day(prices.dates[-1]) if len(prices) else None,
         "periods_per_year": prices.periods_per_year,
         "features": list(prices.feature_names),
+        "columns": list(prices.market_names),
         "late_assets": int((prices.first_rows > 0).sum()),
         "digest": prices.digest,
         "note": prices.note,

@@ -1,0 +1,59 @@
+"""How the commands read price tables: their shared options."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import arg
+
+from qfolio.commands.arguments import Name, Names
+
+if TYPE_CHECKING:
+    from qfolio.portfolio.prices.table import Prices
+
+Missing = Literal["error", "drop-asset", "forward-fill"]
+Late = Literal["error", "drop-asset", "trim", "join"]
+Returns = Annotated[
+    Literal["percent", "fraction"] | None, arg(metavar="percent|fraction", help_behavior_hint="")
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """How a price table is read.
+
+    Args:
+        missing: How to treat missing prices.
+        late: How to treat assets that start later than the table.
+        features: Columns that hold features for agents instead of prices.
+        columns: Columns that hold a number for the whole market, such as a cash rate, which costs
+            may use and agents do not see.
+        returns: Unit of the table's numbers, if they are returns over the row before; they are
+            cumulated to prices that start at 100 (default: they are prices).
+        date: Column of dates (default: found by its name).
+    """
+
+    missing: Missing = "error"
+    late: Late = "error"
+    features: Names = ()
+    columns: Names = ()
+    returns: Returns = None
+    date: Name = None
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """The options, as ``prices.table.load`` takes them."""
+        names = [field.name for field in dataclasses.fields(Reading)]
+        return {name: getattr(self, name) for name in names}
+
+    def load(self, file: Path | None) -> "Prices":
+        """A price table; the 20 US stocks without a file."""
+        from qfolio.portfolio.prices.table import load
+
+        return load(file, **self.reading)
+
+
+READING = Reading()
+
+Read = Annotated[Reading, arg(name="")]
+"""The options, without a prefix on the command line."""

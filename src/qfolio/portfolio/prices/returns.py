@@ -1,0 +1,64 @@
+"""Turns returns into prices that start at 100, and tells returns from prices."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from qfolio.portfolio.prices.findings import Findings
+from qfolio.portfolio.prices.grid import Grid, report_cells
+
+START = 100.0
+UNITS = {"percent": 0.01, "fraction": 1.0}
+USUAL = {"percent": (0.02, np.inf), "fraction": (0.0, 0.2)}
+"""The range of a usual return, in its unit: from a bar of minutes to a year."""
+SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
+
+
+def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
+    """The grid with prices in place of simple returns over the row before.
+
+    An asset's price is 100 in the row before its first return. If that row is not in the table,
+    it is 100 in the row of its first return, which is then not used.
+    """
+    block = replace(grid.prices, name="return")
+    with np.errstate(over="ignore", under="ignore"):
+        rates = block.values * UNITS[unit]
+        known = np.isfinite(rates)
+        report_cells(grid, block, np.isinf(rates), "is infinite", "Correct the cell.", findings)
+        report_cells(
+            grid, block, known & (rates <= -1), "is −100 % or less",
+            "Check the unit, returns='percent' or 'fraction' (--returns); an asset that lost "
+            "everything must be dropped.",
+            findings,
+        )  # fmt: skip
+        growth = np.cumprod(1 + np.where(known & (rates > -1), rates, 0.0), axis=0)
+        present = ~np.isnan(rates) | block.wrong
+        first = present.argmax(axis=0)
+        values = np.where(np.isnan(rates), np.nan, START * growth)
+        unused = present.any(axis=0) & (first == 0)
+        values[:, unused] /= growth[0, unused] if len(growth) else 1.0
+    for j in np.flatnonzero(first > 0).tolist():
+        values[first[j] - 1, j] = START
+    if unused.any():
+        findings.note(
+            f"prices are cumulated from returns and start at {START:g}; the first row's returns "
+            "are not used, because the row before them is not in the table"
+        )
+    else:
+        findings.note(f"prices are cumulated from returns and start at {START:g}")
+    sizes = np.abs(block.values[known & (block.values != 0)])
+    low, high = USUAL[unit]
+    if sizes.size and not low <= (usual := float(np.median(sizes))) <= high:
+        other = "fraction" if unit == "percent" else "percent"
+        findings.warn(
+            f"the usual return is {usual:.2g}, taken as {unit}",
+            advice=f"Check the unit: perhaps it is {other}.",
+        )
+    return replace(grid, prices=replace(block, values=values, name="price"))
+
+
+def look_like_returns(values: np.ndarray) -> bool:
+    """True for numbers of which many are negative and many are not."""
+    known = values[np.isfinite(values)]
+    low, high = SIGNED
+    return bool(known.size and low <= (known < 0).mean() <= high)

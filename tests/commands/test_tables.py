@@ -1,0 +1,63 @@
+"""Every command that reads prices reads returns and columns of the market, too."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from qfolio.commands.backtesting import Options
+from qfolio.experiments.presets import preset
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.prices.table import load
+
+from shell import qfolio
+
+NAMES = ["A", "B", "C"]
+
+
+@pytest.fixture
+def table(tmp_path):
+    """A file of returns in percent, beside a cash rate."""
+    rates = np.random.default_rng(0).normal(0.01, 1, (260, 3)).round(4)
+    frame = pd.DataFrame(rates, pd.date_range("2020-01-01", periods=260), NAMES)
+    frame["rate"] = np.linspace(0.01, 0.03, 260)
+    path = tmp_path / "returns.csv"
+    frame.rename_axis("date").to_csv(path)
+    return path
+
+
+def test_the_check_of_returns(monkeypatch, capsys, table):
+    assert qfolio(monkeypatch, "prices", table, "--columns", "rate") == 2
+    assert "look like returns" in (printed := " ".join(capsys.readouterr().out.split()))
+    assert "returns='percent' or 'fraction' (--returns)" in printed
+    given = ["--returns", "percent", "--columns", "rate"]
+    assert qfolio(monkeypatch, "prices", table, *given) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "260 rows of 3 assets" in printed
+    assert "start at 100" in printed
+    assert "Columns of the market: rate." in printed
+
+
+def test_a_backtest_keeps_what_it_computed(tmp_path, table):
+    """The folder has the cumulated prices and the column of the market."""
+    prices = Options(returns="percent", columns=("rate",)).load(table)
+    assert prices.digest == load(table, returns="percent", columns=("rate",)).digest
+    assert (prices.values[0] == 100).all()
+    agents = {"tilts": preset("fast", "portfolio", "tilts")}
+    Backtest.create(prices, agents, train="100d", test="50d", seeds=2, out=tmp_path / "run")
+    kept = Backtest.open(tmp_path / "run").prices
+    assert kept.digest == prices.digest
+    assert kept.market_names == ("rate",)
+    np.testing.assert_array_equal(kept.market[:, 0], np.linspace(0.01, 0.03, 260))
+
+
+def test_costs_read_a_column_of_the_market(table):
+    prices = Options(returns="percent", columns=("rate",)).load(table)
+    known = Conditions.of(prices, ["rate"]).values["rate"]
+    np.testing.assert_array_equal(known, prices.market)
+
+
+def test_shares_need_prices(monkeypatch, capsys, tmp_path):
+    given = ["--returns", "fraction", "--whole-shares"]
+    assert qfolio(monkeypatch, "allocate", tmp_path, *given) == 2
+    assert "--returns gives no prices of shares" in " ".join(capsys.readouterr().err.split())

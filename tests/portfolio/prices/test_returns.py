@@ -1,0 +1,181 @@
+"""Returns become prices with the same returns, and are told from prices."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.prices.findings import Finding
+from qfolio.portfolio.prices.table import Prices, check, describe, load
+
+ROWS = 80
+DAYS = pd.bdate_range("2020-01-01", periods=ROWS)
+NAN = np.nan
+
+
+def prices(seed: int = 0) -> pd.DataFrame:
+    moves = np.random.default_rng(seed).normal(0, 0.01, (ROWS, 3))
+    return pd.DataFrame(50 * np.exp(moves.cumsum(0)), index=DAYS, columns=list("ABC"))
+
+
+def found(source: Any, severity: str, **options: Any) -> list[Finding]:
+    return [finding for finding in check(source, **options) if finding.severity == severity]
+
+
+def test_returns_of_prices_give_the_prices_back():
+    """In the row before the first return the price is 100."""
+    table = prices()
+    expected = 100 * table.to_numpy() / table.to_numpy()[0]
+    back = load(table.pct_change(), returns="fraction")
+    assert len(back) == ROWS
+    np.testing.assert_allclose(back.values, expected, rtol=1e-12)
+    percent = load(100 * table.pct_change(), returns="percent")
+    np.testing.assert_allclose(percent.values, expected, rtol=1e-12)
+    (note,) = found(table.pct_change(), "note", returns="fraction")
+    assert note.message == "prices are cumulated from returns and start at 100"
+
+
+def test_the_first_return_is_lost_without_the_row_before_it():
+    table = prices()
+    rates = table.pct_change().iloc[1:]
+    back = load(rates, returns="fraction")
+    assert len(back) == ROWS - 1
+    assert (back.values[0] == 100).all()
+    np.testing.assert_allclose(back.relatives, 1 + rates.to_numpy()[1:], rtol=1e-12)
+    (note,) = found(rates, "note", returns="fraction")
+    assert "the first row's returns are not used" in note.message
+
+
+def test_every_form_of_table(tmp_path):
+    rates = prices().pct_change().iloc[1:].rename_axis("date")
+    expected = load(rates, returns="fraction")
+    long = rates.reset_index().melt("date", var_name="asset", value_name="price")
+    np.testing.assert_array_equal(load(long, returns="fraction").values, expected.values)
+    newest_first = rates.iloc[::-1]
+    np.testing.assert_array_equal(load(newest_first, returns="fraction").values, expected.values)
+    rates.to_csv(tmp_path / "r.csv")
+    assert load(tmp_path / "r.csv", returns="fraction").digest == expected.digest
+
+
+def test_late_assets_and_gaps():
+    rates = prices().pct_change()
+    rates.iloc[:20, 1] = NAN
+    rates.iloc[40, 2] = NAN
+    with pytest.raises(QfolioError, match="'C': the price is missing"):
+        load(rates, returns="fraction", late="join")
+    table = load(rates, returns="fraction", late="join", missing="forward-fill")
+    assert table.first_rows.tolist() == [0, 19, 0]
+    assert table.values[19, 1] == 100
+    np.testing.assert_allclose(table.relatives[19:, 1], 1 + rates["B"].to_numpy()[20:], rtol=1e-12)
+    assert table.relatives[39, 2] == 1  # the last price stands
+    np.testing.assert_allclose(table.relatives[40, 2], 1 + rates["C"].iloc[41], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("cell", "unit", "message"),
+    [
+        (-1.0, "fraction", "row 7 (2020-01-10), column 'B': the return is −100 % or less"),
+        (-1.5, "fraction", "column 'B': the return is −100 % or less. Check the unit"),
+        (-100.0, "percent", "column 'B': the return is −100 % or less"),
+        (np.inf, "fraction", "column 'B': the return is infinite"),
+        (1e7, "fraction", "the price goes from"),
+    ],
+)
+def test_returns_that_cannot_be(cell: float, unit: str, message: str):
+    rates = prices().pct_change() * (100 if unit == "percent" else 1)
+    rates.iloc[7, 1] = cell
+    with pytest.raises(QfolioError) as raised:
+        load(rates, returns=unit)
+    assert message in str(raised.value)
+
+
+def test_a_unit_that_is_unlikely():
+    rates = prices().pct_change()
+    assert found(rates, "warning", returns="fraction") == []
+    assert found(100 * rates, "warning", returns="percent") == []
+    (warning,) = found(rates, "warning", returns="percent")
+    assert (warning.message[:19], warning.advice) == (
+        "the usual return is", "Check the unit: perhaps it is fraction."
+    )  # fmt: skip
+    with pytest.raises(QfolioError, match="−100 % or less"):
+        load(100 * rates, returns="fraction")
+    with pytest.raises(QfolioError, match="returns is 'log'; it must be one of percent, fraction"):
+        load(rates, returns="log")
+
+
+def test_returns_are_told_from_prices():
+    rates = prices().pct_change().iloc[1:]
+    for table in (rates, 100 * rates):
+        (error,) = found(table, "error")
+        assert error.message.startswith("the numbers look like returns: ")
+        assert error.advice == (
+            "Give prices, or choose returns='percent' or 'fraction' (--returns)."
+        )
+    table = prices()
+    table.iloc[5, 1] = -1
+    (error,) = found(table, "error")
+    assert error.message == "the price is negative"
+
+
+# Columns of the whole market.
+
+
+def test_a_column_of_the_market():
+    table = prices()
+    table.insert(1, "rate", np.linspace(0.01, 0.05, ROWS))
+    loaded = load(table, columns=("rate",))
+    assert (loaded.assets, loaded.market_names) == (("A", "B", "C"), ("rate",))
+    np.testing.assert_array_equal(loaded.market[:, 0], table["rate"])
+    assert loaded.feature_names == ()
+    assert describe(loaded)["columns"] == ["rate"]
+    part = loaded.select(["B"]).between(10, 20)
+    np.testing.assert_array_equal(part.market, loaded.market[10:20])
+    other = load(table.assign(rate=0.02), columns="rate")
+    bare = load(table.drop(columns="rate"))
+    assert len({loaded.digest, other.digest, bare.digest}) == 3
+    both = load(table.assign(beta=2.0), columns=("rate",), features=("beta",))
+    assert (both.feature_names, both.market_names) == (("beta",), ("rate",))
+    np.testing.assert_array_equal(both.features[..., 0], np.full((ROWS, 3), 2.0))
+
+
+def test_a_column_of_the_market_in_a_long_table():
+    table = prices().rename_axis("date").reset_index().melt("date", var_name="asset")
+    table = table.rename(columns={"value": "price"})
+    table["rate"] = table.groupby("date")["price"].transform("size") * 0.01
+    late = table.drop(table.index[(table["asset"] == "B") & (table["date"] < DAYS[5])])
+    late["rate"] = 0.03
+    np.testing.assert_array_equal(
+        load(late, columns=("rate",), late="join").market, np.full((ROWS, 1), 0.03)
+    )
+    table.loc[7, "rate"] = 0.9
+    with pytest.raises(QfolioError, match=r"2020-01-10, column 'rate': has several numbers on one"):
+        load(table, columns=("rate",))
+
+
+def test_columns_of_the_market_must_be_finite_and_named_once():
+    table = prices()
+    table["rate"] = [0.01, NAN, *[0.02] * (ROWS - 2)]
+    with pytest.raises(QfolioError, match=r"row 1 .*'rate': the feature is missing"):
+        load(table, columns=("rate",))
+    filled = load(table, columns=("rate",), missing="forward-fill")
+    assert filled.market[:3, 0].tolist() == [0.01, 0.01, 0.02]
+    with pytest.raises(QfolioError, match="named twice"):
+        load(table, columns=("rate",), features=("rate",))
+    with pytest.raises(QfolioError, match="there is no column 'rates'"):
+        load(table, columns=("rates",))
+    values = prices().to_numpy()
+    with pytest.raises(QfolioError, match="do not fit"):
+        Prices(DAYS.to_numpy(), ("A", "B", "C"), values, market=values, market_names=("r",))
+
+
+def test_columns_that_costs_use_load_by_asset():
+    """Volume, spread and borrow fee in a long table are features by name."""
+    table = prices().rename_axis("date").reset_index().melt("date", var_name="asset")
+    names = ("volume", "spread", "borrow_fee")
+    for k, name in enumerate(names):
+        table[name] = k + np.arange(len(table)) / 1000
+    loaded = load(table, features=names)
+    assert loaded.feature_names == names
+    np.testing.assert_array_equal(loaded.features[:, 1, 2], 2 + np.arange(ROWS, 2 * ROWS) / 1000)
