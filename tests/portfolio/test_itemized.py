@@ -298,3 +298,42 @@ def test_settings_that_do_not_fit(text: str, said: str) -> None:
 
     with pytest.raises(QfolioError, match=said):
         settle()
+
+
+def test_later_rows_change_no_earlier_return() -> None:
+    for case in range(60):
+        rng = np.random.default_rng(case)
+        prices, model = table(case, rows=40), random_model(rng)
+        lag = int(rng.integers(0, 3))
+        orders = random_weights(rng, 40 - lag - 1, ASSETS + 1, short=True)
+        last = int(rng.integers(lag + 2, 39))  # the last row that stays as it is
+        values, features = prices.values.copy(), prices.features.copy()
+        values[last + 1 :] *= rng.uniform(0.5, 2, values[last + 1 :].shape)
+        features[last + 1 :] *= rng.uniform(0.5, 2, features[last + 1 :].shape)
+        other = Prices(prices.dates, prices.assets, values, features, COLUMNS)
+        one, two = (
+            simulate(
+                each.values,
+                orders,
+                first=0,
+                cost=model,
+                lag=lag,
+                conditions=Conditions.of(each, model.columns),
+                long_only=False,
+            )
+            for each in (prices, other)
+        )
+        known = last - lag  # returns up to the row `last`
+        # Newton's method stops for all trades at once, so that the last digit may differ.
+        np.testing.assert_allclose(one.returns[:known], two.returns[:known], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(one.cost[: known + 1], two.cost[: known + 1], rtol=0, atol=1e-14)
+
+
+def test_fees_that_exceed_the_wealth_wipe_an_account_out() -> None:
+    prices, model = table(2), Itemized(fixed=400, capital=1000)
+    orders = np.tile([0.1, 0.3, 0.3, 0.3], (ROWS - 1, 1))
+    known = Conditions.of(prices, model.columns)
+    replayed = simulate(prices.values, orders, first=0, cost=model, lag=0, conditions=known)
+    assert replayed.returns.tolist() == [-1, *[0] * (ROWS - 2)]
+    assert replayed.cost[0] == pytest.approx(1, abs=1e-5)
+    assert replayed.cost[1:].max() == 0

@@ -161,7 +161,9 @@ class _Rates:
         # Spending m buys (1 − c)m, so that buying v costs v·c/(1 − c).
         kept = 1 - sum(buying.values())
         self.buying = {kind: rate / kept for kind, rate in buying.items()}
-        self.money = model.capital * xp.asarray(context.wealth, dtype=dtype)[..., None]
+        # An account that fees have wiped out still gives orders.
+        self.money = xp.maximum(model.capital * xp.asarray(context.wealth, dtype=dtype), TINY)
+        self.money = self.money[..., None]
         if model.impact > 0:
             volume = known(model.volume) * context.columns["price"]
             share = self.money / xp.maximum(xp.asarray(volume, dtype=dtype), TINY)

@@ -333,7 +333,8 @@ class Market(ExogenousTask):
     def _earn(
         self, market: PyTree, next_market: PyTree, holding: Holding, target: Float[Array, " entry"]
     ) -> tuple[Float[Array, ""], Holding]:
-        costs, wealth_may_end = self.costs, not self.feasible.long_only
+        costs = self.costs
+        wealth_may_end = costs.depends_on_wealth or not self.feasible.long_only
         moved, at = self.relatives(market, next_market), self.contexts(market, next_market)
         before = grown(holding.weights, costs.growth(holding.weights, moved.waiting, at.waiting))
         after = grown(target, costs.growth(target, moved.waiting, at.waiting))

@@ -27,6 +27,9 @@ TOLERANCE = 1e-6
 ROUNDS = 100
 """Most repetitions until costs and the wealth that they depend on agree."""
 
+MOST = 1 - 1e-6
+"""Largest cost of a trade, as a share of wealth, also if its fees exceed the wealth."""
+
 BLOCK = 60_000
 """Numbers per array in a block: several such arrays fit into a core's cache."""
 
@@ -275,11 +278,13 @@ def _replay(
         here = some, now
         result.returns[here] = remainder * growth[:, 1:] - 1
         result.turnover[here] = np.where(given, traded(before, after, remainder), 0)
-        result.cost[here] = np.where(given, sum(costs.values()), 0)
+        total = sum(costs.values())
+        charged = given * MOST / np.maximum(total, MOST)
+        result.cost[here] = charged * total
         result.weights[here] = after
         for kind, paid in costs.items():
             of_kind = result.costs.setdefault(kind, np.zeros_like(result.cost))
-            of_kind[here] = np.where(given, paid, 0)
+            of_kind[here] = charged * paid
         if result.financing is not None and market.income is not None:
             entries = np.moveaxis(after, -1, 0)
             income = _by_sign(entries, [rate[..., now] for rate in market.income])
