@@ -12,6 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from qfolio.portfolio.holdings import read_holdings
+from qfolio.portfolio.prices.table import load
+
 from shell import qfolio
 
 ROOT = Path(__file__).parents[1]
@@ -164,3 +167,20 @@ def test_the_examples_of_the_readme(prices, tmp_path):
     assert (tmp_path / "runs/mine/config.json").exists()
     assert len(names["portfolio"].returns) == 150
     assert names["environment"].reset(seed=0)[1] is not None
+
+
+def test_the_tables_that_are_shown_are_read(tmp_path):
+    """Those of the README and of the page, and their numbers are those of skfolio's table."""
+    whole = load().to_frame()
+    for page in ("README.md", "docs/tables.md"):
+        *tables, held = [code for _, code in blocks(page, "csv")]
+        for table in tables:
+            path = tmp_path / "prices.csv"
+            path.write_text(table)
+            shown = load(path).to_frame()
+            expected = whole.loc[shown.index, shown.columns].round(2)
+            pd.testing.assert_frame_equal(shown, expected, check_names=False)
+        path = tmp_path / "holdings.csv"
+        path.write_text(held)
+        shares, cash = read_holdings(path, ("AAPL", "BAC", "JNJ"), None)
+        assert (shares[0], cash) == (120, 2500)
