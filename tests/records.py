@@ -1,6 +1,7 @@
 """Made-up track records of strategies, for tests of a backtest's statistics."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from qfolio.portfolio.backtest.assessment import Strategy
 
@@ -18,3 +19,10 @@ def strategy(
         rng.random((seeds, count)) / 10,
         rng.random((seeds, count)) / 1000,
     )
+
+
+def record(entry: Strategy) -> tuple[ArrayLike, ArrayLike, ArrayLike]:
+    """Returns, turnover and cost of a strategy of which they are known."""
+    assert entry.turnover is not None
+    assert entry.cost is not None
+    return entry.returns, entry.turnover, entry.cost

@@ -43,6 +43,51 @@ def test_resuming_a_finished_backtest_reports_again(folder, monkeypatch, capsys)
     assert "equal-weight" in capsys.readouterr().out
 
 
+def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    write_table(tmp_path / "prices.csv")
+    days = (np.datetime64("2020-01-01") + np.arange(260)).astype(str)
+    index = ["date,level", *(f"{day},{100 + i % 7}" for i, day in enumerate(days))]
+    (tmp_path / "world.csv").write_text("\n".join(index))
+    (tmp_path / "mine.csv").write_text("date,A,cash\n2020-06-01,0.5,0.5\n")
+    returns = ["date,return", *(f"{day},0.001" for day in days)]
+    (tmp_path / "fund.csv").write_text("\n".join(returns))
+    own = ["--strategy", "mine=mine.csv", "--strategy", "fund=fund.csv"]
+    tiny = ["--set", "window=10", "horizon=20", "hidden=4", "num_envs=2", "rollout_length=10"]
+    options = [
+        "prices.csv", "--agents", "pathwise", "--train", "100d", "--test", "80d", "--seeds", 1,
+        "--episodes", 4, "--baselines", "momentum", *own, *tiny,
+    ]  # fmt: skip
+    made = ["backtest", *options, "--benchmark", "world.csv", "--out", "run"]
+    assert qfolio(monkeypatch, *made) == 0
+    printed = capsys.readouterr().out
+    assert "to world, a year" in printed
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["reference"] == "world"
+    assert list(summary["verdicts"]) == ["pathwise", "mine", "fund"]
+    assert all("world" in sentences[0] for sentences in summary["verdicts"].values())
+    assert {name: entry["kind"] for name, entry in summary["strategies"].items()} == {
+        "pathwise": "agent", "mine": "strategy", "fund": "strategy", "world": "baseline",
+        "equal-weight": "baseline", "momentum": "baseline",
+    }  # fmt: skip
+    assert summary["strategies"]["mine"]["relative"]["beta"]["over_time"]
+    assert summary["strategies"]["fund"]["measures"]["turnover"]["mean"] is None
+    assert json.loads((tmp_path / "run" / "why.json").read_text())["reference"] == "world"
+    assert "fund" in (tmp_path / "run" / "report.html").read_text()
+    for file in ("world.csv", "mine.csv", "fund.csv"):
+        (tmp_path / file).unlink()
+    before = (tmp_path / "run" / "returns.csv").read_text()
+    assert qfolio(monkeypatch, "backtest", "--resume", "run") == 0
+    assert (tmp_path / "run" / "returns.csv").read_text() == before
+    for more, message in (
+        (["--resume", "run", "--benchmark", "A"], "--resume keeps the backtest's settings"),
+        ([*options[:-len(own) - len(tiny)], "--strategy", "mine"], "it must be NAME=FILE"),
+        ([*options[:-len(own) - len(tiny)], "--benchmark", "Z"], "no asset and no file"),
+    ):  # fmt: skip
+        assert qfolio(monkeypatch, "backtest", *more) == 2
+        assert message in capsys.readouterr().err
+
+
 def test_backtest_explains_its_agents(folder):
     why = Why.read(BacktestFolder(folder).read_why())
     assert list(why.agents) == ["pathwise-together"]

@@ -43,7 +43,7 @@ def allocate(
     """Compute tomorrow's target weights, and the trades to reach them.
 
     The verdict of the backtest on the agent is printed, too. If the first agent did worse than
-    equal weights, nothing is allocated without --agent or --anyway. Each allocation is recorded in
+    the benchmark, nothing is allocated without --agent or --anyway. Each allocation is recorded in
     the ledger of the folder.
 
     Args:
@@ -55,8 +55,8 @@ def allocate(
         capital: Cash, unless the holdings include it.
         agent: Agent to follow, or a baseline such as equal-weight (default: the first agent of the
             backtest).
-        anyway: Allocate even if the backtest is not finished, or found the agent worse than equal
-            weights.
+        anyway: Allocate even if the backtest is not finished, or found the agent worse than the
+            benchmark.
         whole_shares: Trade whole shares only.
         as_of: Day of the allocation; prices may be up to a week older (default: today).
         update: Update the policy on the new rows first, and store the updated policy beside those

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg
+from tyro.conf import UseAppendAction, arg
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import own_modules
@@ -18,9 +18,25 @@ Modules = Annotated[tuple[str, ...], arg(metavar="MODULE …", help_behavior_hin
 Trackers = Annotated[
     tuple[str, ...], arg(metavar="tensorboard|wandb|trackio …", help_behavior_hint="")
 ]
+Sources = Annotated[
+    tuple[str, ...], arg(metavar="NAME=FILE", help_behavior_hint="(repeatable)"), UseAppendAction
+]
 Assignments = Annotated[
     tuple[str, ...], arg(name="set", metavar="NAME=VALUE …", help_behavior_hint="")
 ]
+
+
+def sources(options: tuple[str, ...]) -> dict[str, str]:
+    """The files of ``--strategy NAME=FILE``, by name."""
+    found: dict[str, str] = {}
+    for option in options:
+        name, equals, file = option.partition("=")
+        if not (name and equals and file):
+            raise QfolioError(f"--strategy is {option!r}; it must be NAME=FILE, as in mine=my.csv.")
+        if name in found:
+            raise QfolioError(f"--strategy names {name} twice; give each its own name.")
+        found[name] = file
+    return found
 
 
 def budget_of(episodes: int | None, steps: int | None) -> Budget | None:

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from qfolio.portfolio.backtest.assessment import Assessment
     from qfolio.portfolio.backtest.follow import Following
     from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.portfolio.backtest.sampled import Measure
     from qfolio.portfolio.backtest.standing import Standing
     from qfolio.portfolio.prices.findings import Finding
     from qfolio.portfolio.study.folder import Result, Variant
@@ -184,7 +185,7 @@ def describe_backtest(backtest: "Backtest") -> str:
 
 
 def print_assessment(assessment: "Assessment") -> None:
-    """A row for each strategy, and the verdicts."""
+    """A row for each strategy, those of interest beside the benchmark, and the verdicts."""
     from qfolio.portfolio.backtest.assessment import JUDGED
     from qfolio.portfolio.backtest.verdict import bound_sentence, verdicts
 
@@ -192,27 +193,55 @@ def print_assessment(assessment: "Assessment") -> None:
     table.add_column("a year, net")
     for name in ("growth", "vol.", "Sharpe", "drawdown", "turnover", "cost drag"):
         table.add_column(name, justify="right", no_wrap=True)
+    shown = {
+        "growth": ".2%",
+        "volatility": ".1%",
+        "sharpe": ".2f",
+        "drawdown": ".1%",
+        "turnover": ".1f",
+        "cost_drag": ".2%",
+    }
     for name, strategy in assessment.strategies.items():
         if strategy.kind == "rebalancing" and name != assessment.rebalanced:
             continue
-        value = {key: measure.mean for key, measure in strategy.measures.items()}
         style = "bold" if strategy.kind in JUDGED else None
-        table.add_row(
-            name,
-            f"{value['growth']:.2%}",
-            f"{value['volatility']:.1%}",
-            f"{value['sharpe']:.2f}",
-            f"{value['drawdown']:.1%}",
-            f"{value['turnover']:.1f}",
-            f"{value['cost_drag']:.2%}",
-            style=style,
-        )
+        table.add_row(name, *_written(strategy.measures, shown), style=style)
     console.print(table)
+    _print_relative(assessment)
     if bound := bound_sentence(assessment):
         say(bound)
     for sentences in verdicts(assessment).values():
         for sentence in sentences:
             say(sentence)
+
+
+def _print_relative(assessment: "Assessment") -> None:
+    """A row for agents, the user's own strategies and the best baseline, beside the benchmark."""
+    from qfolio.portfolio.backtest.assessment import JUDGED
+
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column(f"to {assessment.reference}, a year", no_wrap=True)
+    for name in ("active", "tracking", "IR", "beta", "up", "down", "share"):
+        table.add_column(name, justify="right", no_wrap=True)
+    shown = {
+        "active_return": "+.2%",
+        "tracking_error": ".1%",
+        "information_ratio": ".2f",
+        "beta": ".2f",
+        "up_capture": ".0%",
+        "down_capture": ".0%",
+        "active_share": ".0%",
+    }
+    for name, strategy in assessment.strategies.items():
+        if strategy.relative and (strategy.kind in JUDGED or name == assessment.best_baseline):
+            table.add_row(name, *_written(strategy.relative, shown))
+    console.print(table)
+
+
+def _written(measures: "Mapping[str, Measure]", formats: dict[str, str]) -> list[str]:
+    """The means of some measures; a dash for what is not known."""
+    means = {key: measures[key].mean for key in formats}
+    return ["–" if math.isnan(x) else f"{x:{formats[key]}}" for key, x in means.items()]
 
 
 def describe_study(study: "Study") -> str:

@@ -52,6 +52,8 @@ def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
 
 def percent(fraction: float, digits: int = 1, *, sign: bool = False) -> str:
     """Return a fraction as a percentage."""
+    if math.isnan(fraction):
+        return "–"
     return f"{number(100 * fraction, digits, sign=sign)}{THIN_SPACE}%"
 
 

@@ -13,7 +13,7 @@ from qfolio.portfolio.backtest.bootstrap import block_length
 from qfolio.portfolio.backtest.measures import MEASURES, measures
 from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe, probabilistic_sharpe
 
-from records import days, strategy
+from records import days, record, strategy
 
 
 def test_assess_by_hand_on_one_block() -> None:
@@ -24,7 +24,7 @@ def test_assess_by_hand_on_one_block() -> None:
     strong = strong._replace(returns=np.asarray(strong.returns) + 0.01)
     everything = {"equal weight": weak, "strong": strong, "dqn": agent}
     result = assess(everything, days(300), periods_per_year=252, earlier_trials=2)
-    table = measures(agent.returns, agent.turnover, agent.cost, 252)
+    table = measures(*record(agent), 252)
     dqn = result.strategies["dqn"]
     assert result.best_baseline == "strong"
     assert (result.first_date, result.last_date) == ("2001-01-01", "2001-10-27")
@@ -40,7 +40,7 @@ def test_assess_by_hand_on_one_block() -> None:
         assert result.strategies["strong"].measures[name].over_seeds is None
         assert measure.over_time[0] < measure.over_time[1]
 
-    baseline = measures(weak.returns, weak.turnover, weak.cost, 252)
+    baseline = measures(*record(weak), 252)
     difference = dqn.to_reference
     assert difference is not None
     assert difference.growth.value == pytest.approx(
@@ -87,15 +87,20 @@ def test_skewness_and_kurtosis_by_hand() -> None:
 
 def test_order_of_seeds_changes_nothing() -> None:
     rng = np.random.default_rng(10)
-    base, agent = strategy(rng, "baseline", 1), strategy(rng, seeds=5)
+    base, agent = (
+        strategy(rng, kind, seeds)._replace(weights=rng.dirichlet(np.ones(3), (seeds, 300)))
+        for kind, seeds in (("baseline", 1), ("agent", 5))
+    )
     order = [3, 0, 4, 2, 1]
     shuffled = Strategy("agent", *(np.asarray(values)[order] for values in agent[1:]))
     first, second = (
         assess({"equal weight": base, "dqn": entry}, days(300), periods_per_year=252)
         for entry in (agent, shuffled)
     )
-    for name, measure in first.strategies["dqn"].measures.items():
-        other = second.strategies["dqn"].measures[name]
+    one, two = ({**x.measures, **x.relative} for x in
+                (first.strategies["dqn"], second.strategies["dqn"]))  # fmt: skip
+    for name, measure in one.items():
+        other = two[name]
         assert [measure.per_seed[seed] for seed in order] == list(other.per_seed)
         assert measure == dataclasses.replace(other, per_seed=measure.per_seed)
     for field in ("to_reference", "to_best_baseline", "sharpe_test"):
@@ -119,8 +124,8 @@ def test_many_trials_raise_the_threshold_however_alike_the_seeds_are() -> None:
     one = strategy(rng, seeds=1)
     alike = one._replace(
         returns=np.asarray(one.returns) + rng.normal(0, 1e-6, (5, 300)),
-        turnover=np.repeat(one.turnover, 5, 0),
-        cost=np.repeat(one.cost, 5, 0),
+        turnover=np.repeat(record(one)[1], 5, 0),
+        cost=np.repeat(record(one)[2], 5, 0),
     )
     strategies = {"equal weight": strategy(rng, "baseline", 1), "dqn": alike}
     result = assess(strategies, days(300), periods_per_year=252, earlier_trials=1000)
@@ -205,7 +210,7 @@ def refusals() -> list[tuple[dict[str, object], dict[str, object], str]]:
         (
             {"equal weight": good, "dqn": ("robot", *good[1:])},
             {},
-            "dqn is of kind 'robot'; it must be agent or ensemble or baseline or rebalancing",
+            "dqn is of kind 'robot'; it must be agent or ensemble or strategy or baseline or",
         ),
         ({"equal weight": good, "dqn": flat}, {}, r"dqn have the shape \(4,\)"),
         ({"equal weight": good, "dqn": long}, {}, "same periods.*equal weight 4, dqn 5"),

@@ -13,22 +13,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.statistics import mean_interval
 from qfolio.portfolio.backtest.bootstrap import (
     LEVEL,
     block_length,
     bootstrap_measures,
-    percentile_interval,
 )
 from qfolio.portfolio.backtest.differences import Difference, Rival, compare
 from qfolio.portfolio.backtest.measures import (
-    MEASURES,
     Floats,
-    Range,
     checked_dates,
     checked_track,
     measures,
 )
+from qfolio.portfolio.backtest.relative import (
+    RELATIVE,
+    active_share,
+    bootstrap_relative,
+    relative,
+)
+from qfolio.portfolio.backtest.sampled import Measure, Sampled, mean_over_seeds
 from qfolio.portfolio.backtest.sharpe import (
     deflated_sharpe,
     expected_maximum_sharpe,
@@ -37,11 +40,11 @@ from qfolio.portfolio.backtest.sharpe import (
     skewness_and_kurtosis,
 )
 
-KINDS = ("agent", "ensemble", "baseline", "rebalancing")
-"""An ensemble is all seeds of an agent, traded as one. A rebalancing is the reference at another
-speed of rebalancing."""
+KINDS = ("agent", "ensemble", "strategy", "baseline", "rebalancing")
+"""An ensemble is all seeds of an agent, traded as one. A strategy is of the user's own; as the
+reference it is a baseline. A rebalancing is the reference at another speed of rebalancing."""
 
-JUDGED = ("agent", "ensemble")
+JUDGED = ("agent", "ensemble", "strategy")
 """The kinds that are tested."""
 
 
@@ -53,18 +56,9 @@ class Strategy(NamedTuple):
 
     kind: str  # one of KINDS
     returns: ArrayLike  # (seeds, periods), simple, net of costs
-    turnover: ArrayLike  # (seeds, periods), bought plus sold over wealth
-    cost: ArrayLike  # (seeds, periods), share of the wealth
-
-
-@dataclasses.dataclass(frozen=True)
-class Measure:
-    """One measure of one strategy, with both of its 95 % intervals."""
-
-    mean: float  # over seeds
-    per_seed: tuple[float, ...]
-    over_time: Range  # stationary bootstrap of the mean over seeds
-    over_seeds: Range | None  # Student's t of the mean; none below FEWEST_SEEDS
+    turnover: ArrayLike | None  # (seeds, periods), bought plus sold over wealth; none: not known
+    cost: ArrayLike | None  # (seeds, periods), share of the wealth; none: not known
+    weights: Floats | None = None  # (seeds, periods, N + 1), cash first; none: not known
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,6 +85,7 @@ class StrategyAssessment:
     to_rebalanced: Difference | None  # none for it, and if only one speed was replayed
     to_best_baseline: Difference | None  # none for it, and if the reference is the best
     sharpe_test: SharpeTest
+    relative: dict[str, Measure]  # to the reference, by the names in RELATIVE; empty for itself
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,12 +99,12 @@ class Assessment:
     level: float  # of all intervals
     resamples: int
     block_length: float  # mean, in periods
-    trials: int  # every seed of every agent, the ensembles, and earlier trials
+    trials: int  # every seed of every agent, ensembles, own strategies, and earlier trials
     earlier_trials: int
     comparisons: int  # that Holm's correction counts
     reference: str
     rebalanced: str  # the reference or its rebalancing, whichever grew most over the same days
-    best_baseline: str  # by growth over the same days
+    best_baseline: str  # or strategy of the user's own; by growth over the same days
     strategies: dict[str, StrategyAssessment]
     bound: float | None = None  # annual growth that no constant weights exceed, even without costs
 
@@ -132,8 +127,9 @@ def assess(
 ) -> Assessment:
     """Compute every statistic of a backtest.
 
-    Agents and ensembles are compared with a reference, with the rebalancing of the reference that
-    grew most over the days of the test, and with the baseline that did; see ``differences.py``.
+    Agents, ensembles and strategies of the user's own are compared with a reference, with the
+    rebalancing of the reference that grew most over the days of the test, and with the baseline or
+    other strategy that did; see ``differences.py``.
 
     All strategies share the resampled days and so one block length: the longest that their returns
     (mean over seeds) or squared returns require. Squared returns are autocorrelated for months, and
@@ -147,7 +143,7 @@ def assess(
         periods_per_year: For example 252 for days of trading.
         reference: The name of the baseline chosen in advance for comparison.
         earlier_trials: Number of earlier trials on these days, in addition to every seed of every
-            agent and every ensemble.
+            agent, every ensemble and every strategy of the user's own.
         resamples: Number of histories that the bootstrap draws.
         seed: Seed of the drawing.
 
@@ -155,8 +151,9 @@ def assess(
         QfolioError: Shapes do not fit, numbers are missing or out of range, there are fewer than
             two periods, or the reference is not a baseline.
     """
-    tracks = _tracks(strategies)
-    baselines = [name for name, entry in strategies.items() if entry[0] == "baseline"]
+    known = {name: Strategy(*entry) for name, entry in strategies.items()}
+    tracks = _tracks(known)
+    baselines = [name for name, entry in known.items() if entry.kind == "baseline"]
     if reference not in baselines:
         raise QfolioError(
             f"{reference!r} is not among the baselines, so nothing can be compared with it; "
@@ -181,26 +178,28 @@ def assess(
     for name, track in tracks.items():
         seeds = track.shape[1]
         start, end = end, end + seeds
-        sampled[name] = _Sampled(
+        sampled[name] = Sampled(
             measures(track[0], track[1], track[2], periods_per_year),
             {key: values[:, start:end] for key, values in drawn.items()},
         )
 
     def growth(name: str) -> float:
-        return _mean_over_seeds(sampled[name].observed["growth"])
+        return mean_over_seeds(sampled[name].observed["growth"])
 
-    family = [reference, *(name for name, entry in strategies.items() if entry[0] == "rebalancing")]
-    rebalanced, best = max(family, key=growth), max(baselines, key=growth)
-    judged = [name for name, entry in strategies.items() if entry[0] in JUDGED]
+    family = [reference, *(name for name, each in known.items() if each.kind == "rebalancing")]
+    classical = [name for name, each in known.items() if each.kind in ("baseline", "strategy")]
+    rebalanced, best = max(family, key=growth), max(classical, key=growth)
+    judged = [name for name, each in known.items() if each.kind in JUDGED]
     trials = earlier_trials + sum(tracks[name].shape[1] for name in judged)
-    known = [sharpe for name in judged for sharpe in sampled[name].observed["sharpe"]]
-    variance = _trial_variance(known, periods, periods_per_year)
+    sharpes = [sharpe for name in judged for sharpe in sampled[name].observed["sharpe"]]
+    variance = _trial_variance(sharpes, periods, periods_per_year)
     rivals = {"reference": Rival(reference, (reference,))}
     if len(family) > 1:
         rivals["rebalanced"] = Rival(rebalanced, tuple(family))
     if best != reference:
-        rivals["best"] = Rival(best, tuple(baselines), tested=("growth",))
+        rivals["best"] = Rival(best, tuple(classical), tested=("growth",))
     returns = {name: _canonical(track)[0] for name, track in tracks.items()}
+    compared = _relative(known, tracks, reference, periods_per_year, block, resamples, seed)
     differences = compare(returns, rivals, judged, periods_per_year, seed)
 
     return Assessment(
@@ -224,41 +223,76 @@ def assess(
         best_baseline=best,
         strategies={
             name: StrategyAssessment(
-                kind=strategies[name][0],
+                kind=known[name].kind,
                 seeds=track.shape[1],
-                measures={key: _measure(sampled[name], key) for key in MEASURES},
+                measures=sampled[name].measures(unknown=known[name].turnover is None),
                 to_reference=differences["reference"].get(name),
                 to_rebalanced=differences.get("rebalanced", {}).get(name),
                 to_best_baseline=differences.get("best", {}).get(name),
                 sharpe_test=_sharpe_test(
                     returns[name],
-                    _mean_over_seeds(sampled[name].observed["sharpe"]),
+                    mean_over_seeds(sampled[name].observed["sharpe"]),
                     trials if name in judged else 1,  # baselines were not selected among trials
                     variance,
                     periods_per_year,
                 ),
+                relative=compared.get(name, {}),
             )
             for name, track in tracks.items()
         },
     )
 
 
-class _Sampled(NamedTuple):
-    """The measures of one strategy by seed, observed and resampled."""
-
-    observed: dict[str, Floats]  # (seeds,)
-    drawn: dict[str, Floats]  # (resamples, seeds): the same days for all
-
-
-def _measure(strategy: _Sampled, key: str) -> Measure:
-    values = strategy.observed[key]
-    low, high = percentile_interval(strategy.drawn[key].mean(axis=1))
-    return Measure(
-        mean=_mean_over_seeds(values),
-        per_seed=tuple(values.tolist()),
-        over_time=(float(low), float(high)),
-        over_seeds=mean_interval(np.sort(values), LEVEL) if np.isfinite(values).all() else None,
+def _relative(
+    strategies: Mapping[str, Strategy],
+    tracks: Mapping[str, Floats],
+    reference: str,
+    periods_per_year: float,
+    block: float,
+    resamples: int,
+    seed: int,
+) -> dict[str, dict[str, Measure]]:
+    """Measures to the reference of all but itself and its rebalancings, by strategy."""
+    names = [
+        name
+        for name, each in strategies.items()
+        if name != reference and each.kind != "rebalancing"
+    ]
+    if not names:
+        return {}
+    theirs, held = tracks[reference][0].mean(axis=0), strategies[reference].weights
+    returns = [tracks[name][0] for name in names]
+    shares = [
+        np.full_like(ours, np.nan)
+        if weights is None or held is None
+        else np.stack([active_share(each, held[0]) for each in weights])
+        for ours, weights in ((tracks[name][0], strategies[name].weights) for name in names)
+    ]
+    observed = relative(np.concatenate(returns), theirs, periods_per_year, np.concatenate(shares))
+    # With the seeds in an order of their own, as above.
+    orders = [_seed_order(tracks[name]) for name in names]
+    returns, shares = (
+        [each[order] for each, order in zip(tables, orders, strict=True)]
+        for tables in (returns, shares)
     )
+    drawn = bootstrap_relative(
+        np.concatenate(returns),
+        theirs,
+        periods_per_year,
+        np.concatenate(shares),
+        block,
+        resamples,
+        seed,
+    )
+    result, end = {}, 0
+    for name in names:
+        start, end = end, end + len(tracks[name][0])
+        sampled = Sampled(
+            {key: values[start:end] for key, values in observed.items()},
+            {key: values[:, start:end] for key, values in drawn.items()},
+        )
+        result[name] = {key: sampled.measure(key) for key in RELATIVE}
+    return result
 
 
 def _sharpe_test(
@@ -276,12 +310,6 @@ def _sharpe_test(
         deflated=deflated_sharpe(sharpe / year, periods, *moments, trials, variance),
         trials=trials,
     )
-
-
-def _mean_over_seeds(values: Floats) -> float:
-    return float(
-        np.sort(values).mean()
-    )  # so that the order of the seeds cannot move the last digit
 
 
 def _trial_variance(annual: list[float], periods: int, periods_per_year: float) -> float:
@@ -306,7 +334,11 @@ def _common_block(series: list[Floats]) -> float:
 
 def _canonical(track: Floats) -> Floats:
     """The seeds sorted by their values: (3, seeds, periods)."""
-    return track[:, sorted(range(track.shape[1]), key=lambda seed: track[:, seed].tobytes())]
+    return track[:, _seed_order(track)]
+
+
+def _seed_order(track: Floats) -> list[int]:
+    return sorted(range(track.shape[1]), key=lambda seed: track[:, seed].tobytes())
 
 
 def _plain(value: Any) -> Any:
@@ -318,14 +350,16 @@ def _plain(value: Any) -> Any:
 
 
 def _tracks(
-    strategies: Mapping[str, tuple[str, ArrayLike, ArrayLike, ArrayLike]],
+    strategies: Mapping[str, Strategy],
 ) -> dict[str, Floats]:
-    """Every strategy as an array (returns, turnover and cost; seeds; periods)."""
+    """Every strategy as an array (returns, turnover and cost; seeds; periods); 0 if not known."""
     tracks = {}
-    for name, (kind, *series) in strategies.items():
-        if kind not in KINDS:
-            raise QfolioError(f"{name} is of kind {kind!r}; it must be {' or '.join(KINDS)}.")
-        track = tracks[name] = checked_track(series[0], series[1], series[2], name)
+    for name, each in strategies.items():
+        if each.kind not in KINDS:
+            raise QfolioError(f"{name} is of kind {each.kind!r}; it must be {' or '.join(KINDS)}.")
+        nothing = np.zeros_like(np.asarray(each.returns, float))
+        turnover, cost = (nothing if x is None else x for x in (each.turnover, each.cost))
+        track = tracks[name] = checked_track(each.returns, turnover, cost, name)
         if track.ndim != 3:
             raise QfolioError(
                 f"The returns of {name} have the shape {track.shape[1:]}; "

@@ -1,6 +1,7 @@
 """The stationary bootstrap of track records."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -87,6 +88,24 @@ def stationary_bootstrap_indices(
     return np.where(shift >= periods, shift - np.int32(periods), shift)
 
 
+def histories(
+    periods: int, block: float, resamples: int, rng: np.random.Generator
+) -> Iterator[tuple[NDArray[np.int32], Floats]]:
+    """Draw resampled histories some at a time; the arguments are those above.
+
+    Yields:
+        Their days, and how often each day was drawn, both of shape (some, periods). Averages over a
+        history depend on the latter alone, so they are one matrix product.
+    """
+    chunk = max(_TOGETHER, _CHUNK // periods)
+    for start in range(0, resamples, chunk):
+        size = min(chunk, resamples - start)
+        days = stationary_bootstrap_indices(periods, block, size, rng)
+        cells = days + periods * np.arange(size)[:, None]
+        counts = np.bincount(cells.ravel(), minlength=size * periods).reshape(size, periods)
+        yield days, counts.astype(float)
+
+
 def bootstrap_measures(
     returns: ArrayLike,
     turnover: ArrayLike,
@@ -98,9 +117,7 @@ def bootstrap_measures(
 ) -> dict[str, Floats]:
     """Compute ``measures`` on histories resampled by the stationary bootstrap.
 
-    The same days are drawn for all series. Averages over a resampled history depend only on how
-    often each day was drawn, so they are one matrix product; only the drawdown depends on the
-    order.
+    The same days are drawn for all series. Only the drawdown depends on their order.
 
     Args:
         returns, turnover, cost: As in ``measures``, shape (series, periods), at least two periods.
@@ -115,14 +132,9 @@ def bootstrap_measures(
     centre = track[0].mean(axis=-1)
     features = per_period(track, centre).reshape(-1, periods).T
     steps = np.ascontiguousarray(log_growth(track[0]).T)
-    chunk = max(_TOGETHER, _CHUNK // periods)
     parts = []
-    for start in range(0, resamples, chunk):
-        size = min(chunk, resamples - start)
-        days = stationary_bootstrap_indices(periods, block, size, rng)
-        cells = days + periods * np.arange(size)[:, None]
-        counts = np.bincount(cells.ravel(), minlength=size * periods).reshape(size, periods)
-        moments = (counts.astype(float) @ features / periods).reshape(size, -1, series)
+    for days, counts in histories(periods, block, resamples, rng):
+        moments = (counts @ features / periods).reshape(len(days), -1, series)
         parts.append(
             from_moments(
                 moments.swapaxes(0, 1),

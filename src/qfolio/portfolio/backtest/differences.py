@@ -1,12 +1,13 @@
 """Differences of strategies on the same days: intervals, p-values and corrected findings.
 
-Agents and ensembles are tested in growth, Sharpe ratio and volatility against the reference, which
-was chosen in advance, and against the reference at its best speed of rebalancing, which is known
-only in hindsight; and in growth against the best baseline, likewise. The tests account for such a
-choice: beating the best means beating all that it was chosen from, so the largest of their p-values
-applies (an intersection–union test, Berger 1982); falling short of the best has the p-value of
-White's reality check (2000), which asks how far ahead the luckiest of them would be if none were
-better. Holm's correction for all of these comparisons decides.
+Agents, ensembles and the user's own strategies are tested in growth, Sharpe ratio and volatility
+against the reference, which was chosen in advance, and against the reference at its best speed of
+rebalancing, which is known only in hindsight; and in growth against the best baseline (or strategy
+of the user's own), likewise. The tests account for such a choice: beating the best means beating
+all that it was chosen from, so the largest of their p-values applies (an intersection–union test,
+Berger 1982); falling short of the best has the p-value of White's reality check (2000), which asks
+how far ahead the luckiest of them would be if none were better. Holm's correction for all of these
+comparisons decides.
 """
 
 import dataclasses
@@ -76,6 +77,10 @@ class Rival:
     among: tuple[str, ...]
     tested: tuple[Measured, ...] = MEASURED
 
+    def without(self, name: str) -> tuple[str, ...]:
+        """All of them but one, which may be what is compared."""
+        return tuple(other for other in self.among if other != name)
+
 
 def compare(
     returns: Mapping[str, Floats],
@@ -102,7 +107,7 @@ def compare(
         others = {
             other: estimate(ours, returns[other], periods_per_year)
             for rival in rivals.values()
-            for other in (rival.among if name in judged else (rival.name,))
+            for other in (rival.without(name) if name in judged else (rival.name,))
         }
         for role, rival in rivals.items():
             if name == rival.name:
@@ -114,7 +119,7 @@ def compare(
             if name in judged:
                 for key in rival.tested:
                     rng = np.random.default_rng(seed)
-                    among = [others[other][key] for other in rival.among]
+                    among = [others[other][key] for other in rival.without(name)]
                     tails[role, name, key] = tails_to(shown[key], among, key != "volatility", rng)
     p_values = [min(1.0, 2 * min(each)) for each in tails.values()]
     for ((role, name, key), (better, worse)), p, p_holm in zip(

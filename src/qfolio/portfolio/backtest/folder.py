@@ -1,6 +1,7 @@
 """The folder of a backtest.
 
 It holds config.json (settings, written once), prices.safetensors (the table),
+strategies.safetensors (the user's own strategies, if there are any),
 policies/AGENT/FOLD.safetensors (weights, written as soon as a group of folds is trained; for the
 latest policy, the whole learning state, with latest-N.safetensors after its Nth update),
 training/AGENT/FOLD.csv (a row for each training episode) and, at the end, returns.csv, weights.csv,
@@ -8,6 +9,7 @@ summary.json, why.json (what explains the agents) and the report. ledger/ has th
 """
 
 import csv
+import math
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -32,7 +34,11 @@ from qfolio.core.registry import BASELINES, name_of
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Row
 from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.own import KINDS, Own
 from qfolio.portfolio.prices.table import Prices
+
+EQUAL_WEIGHT = "equal-weight"
+"""The benchmark, unless another is named."""
 
 TOGETHER = "-together"
 """Suffix of an agent's ensemble: the mean of all its seeds, which is the policy for tomorrow."""
@@ -40,6 +46,8 @@ TOGETHER = "-together"
 # Names become folders.
 AgentName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")]
 
+
+STRATEGIES = "strategies.safetensors"
 
 MOST_WEIGHTS = 10_000_000
 """Numbers in weights.csv, about 80 MB, beyond which it has fewer rows."""
@@ -122,6 +130,8 @@ class BacktestConfig(Config, frozen=True):
     started: str
     calendar: str = ""
     title: str = ""
+    strategies: tuple[str, ...] = ()
+    benchmark: str = EQUAL_WEIGHT
 
     def __post_init__(self) -> None:
         seed_range(self.seeds, self.seed)
@@ -141,8 +151,8 @@ class BacktestFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def write(self, config: BacktestConfig, prices: Prices) -> None:
-        """Writes the configuration and the prices."""
+    def write(self, config: BacktestConfig, prices: Prices, own: Mapping[str, Own]) -> None:
+        """Writes the configuration, the prices and the user's own strategies."""
         write_config(self.path / "config.json", config)
         arrays = {
             "dates": prices.dates.astype("datetime64[s]").astype(np.int64),
@@ -151,6 +161,8 @@ class BacktestFolder:
             "market": prices.market,
         }
         write_arrays(self.path / "prices.safetensors", arrays)
+        if own:
+            write_arrays(self.path / STRATEGIES, _own_arrays(own))
 
     def read_config(self) -> BacktestConfig:
         """Raises QfolioError if the folder holds no backtest of this version."""
@@ -184,6 +196,24 @@ class BacktestFolder:
 
     def policy_file(self, agent: str, name: str) -> Path:
         return self._policy(agent, name)
+
+    def read_own(self, config: BacktestConfig) -> dict[str, Own]:
+        """The user's own strategies; raises QfolioError if they are damaged."""
+        if not config.strategies:
+            return {}
+        arrays = read_arrays(self.path / STRATEGIES)
+        try:
+            return {
+                name: Own(kind, arrays[f"{name}/dates"].astype("datetime64[s]"), values)
+                for name in config.strategies
+                for kind in KINDS
+                if (values := arrays.get(f"{name}/{kind}")) is not None
+            }
+        except KeyError:
+            raise QfolioError(
+                f"{self.path / STRATEGIES} does not belong to config.json beside it; restore the "
+                "two."
+            ) from None
 
     def has_policy(self, agent: str, fold: str) -> bool:
         return self._policy(agent, fold).exists()
@@ -259,7 +289,7 @@ class BacktestFolder:
             return {}
         try:
             return {
-                name: {key: float(x["mean"]) for key, x in strategy["measures"].items()}
+                name: {key: _number(x["mean"]) for key, x in strategy["measures"].items()}
                 for name, strategy in read_json(path)["strategies"].items()
                 if strategy["kind"] != "rebalancing"
             }
@@ -280,3 +310,19 @@ class BacktestFolder:
 
     def _records(self, agent: str, fold: str) -> Path:
         return self.path / "training" / agent / f"{fold}.csv"
+
+
+def _own_arrays(own: Mapping[str, Own]) -> dict[str, np.ndarray]:
+    return {
+        f"{name}/{part}": array
+        for name, each in own.items()
+        for part, array in (
+            ("dates", each.dates.astype("datetime64[s]").astype(np.int64)),
+            (each.kind, each.values),
+        )
+    }
+
+
+def _number(value: float | None) -> float:
+    """A number of a JSON file, in which those that are not finite are null."""
+    return math.nan if value is None else float(value)

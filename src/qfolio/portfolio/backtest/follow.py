@@ -11,10 +11,9 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import write_csv
 from qfolio.portfolio.backtest import consistency
 from qfolio.portfolio.backtest.desk import Desk
-from qfolio.portfolio.backtest.folder import BacktestFolder, followed
+from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
 from qfolio.portfolio.backtest.measures import drawdown
-from qfolio.portfolio.backtest.run import EQUAL_WEIGHT
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.conditions import Conditions

@@ -1,11 +1,19 @@
 """What a backtest has trained: in its folder or, without one, in memory."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.fit import Row
 from qfolio.portfolio.backtest.folder import BacktestFolder
+
+LATEST = "latest"
+"""Name of the policies trained on the last rows of the table."""
+
+_UPDATED = re.compile(rf"{LATEST}-([0-9]+)")
 
 
 class Kept:
@@ -30,6 +38,12 @@ class Kept:
         if self.folder is None:
             return [fold for name, fold in self._policies if name == agent]
         return self.folder.policies(agent)
+
+    def newest(self, agent: str) -> str:
+        """The name of an agent's newest policy: latest, or latest-N after N updates."""
+        found = map(_UPDATED.fullmatch, self.names(agent))
+        updates = [int(match[1]) for match in found if match]
+        return f"{LATEST}-{max(updates)}" if updates else LATEST
 
     def policy(self, agent: str, fold: str, template: Any) -> Any:
         """A policy, in the structure of the template; raises QfolioError if it is not trained."""
@@ -60,3 +74,9 @@ class Kept:
             self._policies[agent, fold] = policy
         else:
             self.folder.write_policy(agent, fold, policy)
+
+
+def learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, Any]:
+    """The policy for tomorrow as one tree, so that its file is always consistent."""
+    seconds = np.array(learned, "datetime64[s]").astype(np.int64)
+    return {"learner": learner, "updates": np.array(updates), "learned": seconds}

@@ -30,7 +30,7 @@ def needed(prices: Prices, config: BacktestConfig) -> int:
         ).center.size
         for entry in config.agents.values()
     ]
-    others = len(config.baselines) + len(SPEEDS)
+    others = len(config.baselines) + len(config.strategies) + len(SPEEDS)
     return total(len(prices), days, len(prices.assets), channels, config.seeds, others)
 
 

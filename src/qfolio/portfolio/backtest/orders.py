@@ -87,7 +87,7 @@ def orders(
             for row in _asked(baseline, rows, folds[0].decisions.start, month, decides):
                 known = slice(0, row + 1)
                 history = History(dates[known], prices[known], fold.train, allowed, cap, month)
-                held = _drifted(ordered, prices[row_ordered], prices[row])
+                held = drifted(ordered, prices[row_ordered], prices[row])
                 wanted = baseline.decide(history, held)
                 if wanted is not None:
                     ordered, row_ordered = checked(name, wanted, history), row
@@ -124,10 +124,10 @@ def _tradable(fold: Fold, prices: Floats, chosen: Bools | None) -> Bools:
     return allowed
 
 
-def _drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
+def drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
     """Weights ordered at one row's prices, drifted to another's."""
     worth = weights.copy()
-    bought = weights[1:] > 0  # others may have no price yet
+    bought = weights[1:] != 0  # others may have no price yet
     worth[1:][bought] *= now[bought] / then[bought]
     return np.asarray(worth / worth.sum())
 

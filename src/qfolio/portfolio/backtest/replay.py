@@ -9,10 +9,13 @@ import numpy as np
 from jaxtyping import PyTree
 
 from qfolio.core.mdp import Agent
+from qfolio.portfolio.backtest.assessment import Strategy
 from qfolio.portfolio.backtest.baselines import Baseline
-from qfolio.portfolio.backtest.folder import TOGETHER
+from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
+from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
 from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import orders
+from qfolio.portfolio.backtest.own import Placed
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.following import follow
@@ -28,6 +31,20 @@ class Entry:
     kind: str  # one of assessment.KINDS
     decisions: np.ndarray  # (seed, day, entry), cash first
     simulation: Simulation  # of shape (seed, day)
+
+    @property
+    def weighted(self) -> bool:
+        """Whether weights, turnover and costs are known; not if only returns were given."""
+        return not bool(np.isnan(self.simulation.turnover[0, 0]))
+
+    def track(self, days: slice) -> Strategy:
+        """What is assessed of some days."""
+        result = self.simulation
+        returns = result.returns[:, days]
+        if not self.weighted:
+            return Strategy(self.kind, returns, None, None)
+        rest = (result.turnover[:, days], result.cost[:, days], result.weights[:, days])
+        return Strategy(self.kind, returns, *rest)
 
     @cached_property
     def mean_weights(self) -> np.ndarray:
@@ -124,6 +141,31 @@ class Replay(NamedTuple):
             decides=np.asarray(self.task.decides) if self.task.calendar else None,
         )
         return self.entry(kind, given.decisions[None]), given.notes
+
+    def own(self, kind: str, placed: Placed) -> Entry:
+        """A strategy of the user's own; what is not known of returns is NaN."""
+        if placed.returns is None:
+            return self.entry(kind, placed.decisions[None])
+        unknown = np.full((1, len(placed.returns)), np.nan)
+        weights = placed.decisions[None]
+        return Entry(kind, weights, Simulation(placed.returns[None], unknown, unknown, weights))
+
+    def others(
+        self, baselines: Mapping[str, Baseline], own: Mapping[str, Placed], benchmark: str
+    ) -> tuple[dict[str, Entry], list[str]]:
+        """All strategies but the agents, and notes; equal weights as benchmark at every speed."""
+        notes: list[str] = []
+        entries: dict[str, Entry] = {}
+        for name, placed in own.items():
+            entries[name] = self.own("baseline" if name == benchmark else "strategy", placed)
+            notes += placed.notes
+        speeds = SPEEDS if benchmark == EQUAL_WEIGHT else ()
+        slower = {f"{EQUAL_WEIGHT} at {speed:g}": EqualWeightAt(speed) for speed in speeds}
+        for kind, rules in (("baseline", baselines), ("rebalancing", slower)):
+            for name, rule in rules.items():
+                entries[name], said = self.baseline(kind, name, rule)
+                notes += said
+        return entries, notes
 
     def entry(self, kind: str, decisions: np.ndarray) -> Entry:
         """Decisions of shape (seed, day, entry), carried out."""

@@ -1,5 +1,6 @@
 """The files of a finished backtest, beside its report."""
 
+import math
 from collections.abc import Mapping
 
 from qfolio.experiments.log import add_result
@@ -32,7 +33,9 @@ def write_tables(
     }
     folder.write_returns(days, columns)
     weights = {
-        name: entry.mean_weights for name, entry in entries.items() if entry.kind != "rebalancing"
+        name: entry.mean_weights
+        for name, entry in entries.items()
+        if entry.kind != "rebalancing" and entry.weighted
     }
     folder.write_weights(dates, days, backtest.prices.assets, weights)
     summary = {**assessed.to_json(), "verdicts": verdicts(assessed)}
@@ -43,7 +46,10 @@ def write_tables(
     add_result(
         backtest.folder,
         {
-            name: {key: measure.mean for key, measure in strategy.measures.items()}
+            name: {
+                key: measure.mean if math.isfinite(measure.mean) else None
+                for key, measure in strategy.measures.items()
+            }
             for name, strategy in assessed.strategies.items()
             if strategy.kind != "rebalancing"
         },

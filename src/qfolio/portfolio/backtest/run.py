@@ -7,7 +7,6 @@ float64, beside classical allocators under the same rules.
 
 import contextlib
 import dataclasses
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,11 +27,12 @@ from qfolio.experiments.log import Log
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest import assessment, memory
 from qfolio.portfolio.backtest.baselines import baseline
-from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
+from qfolio.portfolio.backtest.benchmark import field_of
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
 from qfolio.portfolio.backtest.folds import Fold, latest, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
-from qfolio.portfolio.backtest.kept import Kept
+from qfolio.portfolio.backtest.kept import LATEST, Kept, learning
+from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.policy import Policy
@@ -40,13 +40,6 @@ from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
-
-LATEST = "latest"
-"""Name of the policies trained on the last rows of the table."""
-
-_UPDATED = re.compile(rf"{LATEST}-([0-9]+)")
-
-EQUAL_WEIGHT = "equal-weight"
 
 FOLDS_AT_ONCE = 8
 """Folds that train at once if members advance in lockstep; results are kept after each group."""
@@ -64,6 +57,7 @@ class Backtest:
         config: BacktestConfig,
         folder: BacktestFolder | None,
         agents: Mapping[str, Agent] | None = None,
+        own: Mapping[str, Own] | None = None,
     ) -> None:
         self.prices, self.config, self._kept = prices, config, Kept(folder)
         dates, length, expanding = prices.dates, config.train, config.expanding
@@ -82,6 +76,11 @@ class Backtest:
             raise QfolioError(
                 f"{min(both)} is an agent and a baseline; give the agent another name."
             )
+        task = next(iter(self.tasks.values()))
+        self._own = {
+            name: place(name, each, prices, self.folds, task, config.cap)
+            for name, each in (own or {}).items()
+        }
         self.interrupted = False
         self._parts = {
             (name, fold.name): self._part(task, fold)
@@ -104,6 +103,8 @@ class Backtest:
         cost_model: str = "proportional",
         calendar: str = "",
         baselines: Sequence[str] = tuple(BASELINES),
+        strategies: Mapping[str, Any] | None = None,
+        benchmark: Any = None,
         seeds: int = 5,
         seed: int = 0,
         episodes: int | None = None,
@@ -130,6 +131,9 @@ class Backtest:
                 first row of each, or a number of rows (default: at every row, and baselines by
                 their own calendars). All may trade on the first row of the test.
             baselines: Names of the baselines, likewise; equal weights are always included.
+            strategies: Strategies of your own by name, as ``own_tables.read_own`` takes them.
+            benchmark: What all are compared with, as ``benchmark.field_of`` takes it (default:
+                equal weights).
             seeds: Agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
             episodes: Training episodes in a fold of each agent without a preset.
             task: Settings of the portfolio task for agents without a preset.
@@ -141,6 +145,7 @@ class Backtest:
         """
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")
+        field = field_of(prices, agents, baselines, strategies or {}, benchmark)
         config = BacktestConfig(
             prices=describe(prices),
             assets=list(prices.assets),
@@ -153,7 +158,9 @@ class Backtest:
             cap=float(cap),
             cost_model=cost_model,
             calendar=calendar,
-            baselines=list(dict.fromkeys([EQUAL_WEIGHT, *baselines])),
+            baselines=field.baselines,
+            strategies=tuple(field.own),
+            benchmark=field.benchmark,
             seeds=int(seeds),
             seed=int(seed),
             trials=int(trials),
@@ -166,11 +173,11 @@ class Backtest:
             **devices.circumstances("python", "jax", "equinox", "numpy", "skfolio"),
         )
         memory.require(prices, config)
-        own = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
-        backtest = cls(prices, config, None, own)
+        given = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
+        backtest = cls(prices, config, None, given, field.own)
         if out is not None:
             with new_folder(Path(out)) as folder:
-                BacktestFolder(folder).write(config, prices)
+                BacktestFolder(folder).write(config, prices, field.own)
             backtest._kept.folder = BacktestFolder(Path(out))
         return backtest
 
@@ -182,7 +189,7 @@ class Backtest:
         """
         files = BacktestFolder(Path(folder))
         config = files.read_config()
-        return cls(files.read_prices(config), config, files, agents)
+        return cls(files.read_prices(config), config, files, agents, files.read_own(config))
 
     def __repr__(self) -> str:
         seeds = f"{self.config.seeds} seed" + "s" * (self.config.seeds > 1)
@@ -261,7 +268,7 @@ class Backtest:
         for fold, result in trained.items():
             policy = result.kept
             if fold == LATEST:
-                policy = _learning(policy, 0, self.prices.dates[-1])
+                policy = learning(policy, 0, self.prices.dates[-1])
             self._kept.write(agent, fold, result.rows, policy)
 
     @property
@@ -279,7 +286,7 @@ class Backtest:
         stored = self.newest(name) if stored is None else stored
         task, trained = self._parts[name, LATEST], self.agents[name]
         state = state_template(task, trained, self.config.seeds)
-        kept = self._kept.policy(name, stored, _learning(state, 0, self.prices.dates[-1]))
+        kept = self._kept.policy(name, stored, learning(state, 0, self.prices.dates[-1]))
         return Policy(
             task,
             trained,
@@ -293,24 +300,20 @@ class Backtest:
 
     def keep(self, agent: str | None, policy: Policy) -> None:
         """Stores an updated policy as the agent's policy for tomorrow, beside those before it."""
-        learning = _learning(policy.learner, policy.updates, policy.learned)
-        self._kept.write_policy(self._name(agent), f"{LATEST}-{policy.updates}", learning)
+        kept = learning(policy.learner, policy.updates, policy.learned)
+        self._kept.write_policy(self._name(agent), f"{LATEST}-{policy.updates}", kept)
 
     def newest(self, agent: str) -> str:
         """The name of the agent's newest policy: latest, or latest-N after N updates."""
-        found = map(_UPDATED.fullmatch, self._kept.names(agent))
-        updates = [int(match[1]) for match in found if match]
-        return f"{LATEST}-{max(updates)}" if updates else LATEST
+        return self._kept.newest(agent)
 
     def stretches(self, agent: str) -> list[Stretch]:
         """The folds with an agent's policies."""
         task, trained = self.tasks[agent], self.agents[agent]
         members = trained.weights(state_template(task, trained, self.config.seeds))
         return [
-            Stretch(
-                self._parts[agent, fold.name], self._kept.policy(agent, fold.name, members), fold
-            )
-            for fold in self.folds
+            Stretch(self._parts[agent, f.name], self._kept.policy(agent, f.name, members), f)
+            for f in self.folds
         ]
 
     def records(self, agent: str, fold: str) -> list[Row]:
@@ -320,15 +323,12 @@ class Backtest:
     def entries(self) -> tuple[dict[str, Entry], list[str]]:
         """Every strategy replayed over all folds, and notes on problems."""
         replay = Replay(self.prices, self.folds, next(iter(self.tasks.values())), self.config.cap)
-        notes, entries = replay.left_out(), dict[str, Entry]()
+        entries: dict[str, Entry] = {}
         for name, agent in self.agents.items():
             entries |= replay.agent(name, agent, self.stretches(name), self.config.seeds)
-        slower = {f"{EQUAL_WEIGHT} at {speed:g}": EqualWeightAt(speed) for speed in SPEEDS}
-        for kind, rules in (("baseline", self.baselines), ("rebalancing", slower)):
-            for name, rule in rules.items():
-                entries[name], said = replay.baseline(kind, name, rule)
-                notes += said
-        return entries, notes + replay.wiped_out(entries)
+        others, notes = replay.others(self.baselines, self._own, self.config.benchmark)
+        entries |= others
+        return entries, [*replay.left_out(), *notes, *replay.wiped_out(entries)]
 
     @property
     def dates(self) -> np.ndarray:
@@ -340,21 +340,12 @@ class Backtest:
     def assess(self, entries: dict[str, Entry], since: str | None = None) -> assessment.Assessment:
         """The statistics of all strategies, over the whole test or from a date on."""
         first = 0 if since is None else int(np.searchsorted(self.dates, np.datetime64(since)))
-        days = slice(first, None)
-        table = self.prices
+        days, table = slice(first, None), self.prices
         assessed = assessment.assess(
-            {
-                name: assessment.Strategy(
-                    entry.kind,
-                    entry.simulation.returns[:, days],
-                    entry.simulation.turnover[:, days],
-                    entry.simulation.cost[:, days],
-                )
-                for name, entry in entries.items()
-            },
+            {name: entry.track(days) for name, entry in entries.items()},
             self.dates[days],
             periods_per_year=table.periods_per_year,
-            reference=EQUAL_WEIGHT,
+            reference=self.config.benchmark,
             earlier_trials=self.config.trials + trials_on(table.source),
         )
         begin = self.folds[0].decisions.start + self.config.lag + 1 + first
@@ -407,9 +398,3 @@ class Backtest:
             LATEST,
             most,
         )
-
-
-def _learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, Any]:
-    """The policy for tomorrow as one tree, so that its file is always consistent."""
-    seconds = np.array(learned, "datetime64[s]").astype(np.int64)
-    return {"learner": learner, "updates": np.array(updates), "learned": seconds}

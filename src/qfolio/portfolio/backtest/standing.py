@@ -15,8 +15,7 @@ class Standing:
     agent: its name, or that of a baseline.
     verdict: the sentence of the report, or the measures of a baseline; empty if the backtest is not
     finished.
-    worse: whether an agent falls short of equal weights in growth, rebalanced at every row or at
-    the best speed.
+    worse: whether an agent falls short of the benchmark in growth, or of its best rebalancing.
     learned: whether it is an agent, not a baseline.
     """
 
@@ -69,7 +68,7 @@ class Standing:
         if not self.verdict:
             raise QfolioError(
                 f"The backtest in {folder} is not finished, so it does not say how {self.agent} "
-                f"compares with equal weights; finish it with qfolio backtest --resume {folder}, "
+                f"compares with its benchmark; finish it with qfolio backtest --resume {folder}, "
                 "or allocate with --anyway."
             )
         if self.worse and not named:

@@ -102,5 +102,8 @@ def latest_values(lines: dict[str, Any]) -> dict[str, str]:
     return {
         **{key: "–" if value is None else number(value, 2) for key, value in rolling.items()},
         "wealth": number(wealth, 0 if wealth >= 100 else 1 if wealth >= 10 else 2),
-        **{key: percent(lines[key][-1]) for key in ("drawdown", "cost", "turnover")},
+        **{
+            key: "–" if (value := lines[key][-1]) is None else percent(value)
+            for key in ("drawdown", "cost", "turnover")
+        },
     }

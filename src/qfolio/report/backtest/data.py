@@ -21,11 +21,12 @@ class StrategySeries:
     """The results of one strategy on D days, with S seeds (1 for a baseline) and N assets.
 
     Attributes:
-        kind: 'agent', 'ensemble', 'baseline' or 'rebalancing'.
+        kind: 'agent', 'ensemble', 'strategy', 'baseline' or 'rebalancing'.
         returns: Simple returns net of costs, shape (S, D).
         turnover: Value bought plus value sold as a share of the wealth, shape (S, D).
         cost: Cost of each day's trade as a share of the wealth, shape (S, D).
-        weights: Weights after the trade, cash first, the mean over the seeds, shape (D, N + 1).
+        weights: Weights after the trade, cash first, the mean over the seeds, shape (D, N + 1);
+            NaN, like turnover and cost, where only returns are known.
     """
 
     kind: str
@@ -33,6 +34,11 @@ class StrategySeries:
     turnover: Floats
     cost: Floats
     weights: Floats
+
+    @property
+    def weighted(self) -> bool:
+        """Whether weights are known."""
+        return not bool(np.isnan(self.weights).any())
 
 
 @dataclass(frozen=True)

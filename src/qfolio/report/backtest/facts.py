@@ -48,8 +48,9 @@ def _counts(test: Assessment) -> str:
         text = f"{_counted(len(seeds), 'agent')} × {_counted(seeds[0], 'seed')}"
     else:
         text = f"{_counted(len(seeds), 'agent')}, {_counted(sum(seeds), 'seed')} in all"
-    ensembles = kinds["ensemble"]
-    return f"{text}, {_counted(ensembles, 'ensemble')}" if ensembles else text
+    if kinds["ensemble"]:
+        text += f", {_counted(kinds['ensemble'], 'ensemble')}"
+    return f"{text}, {kinds['strategy']} of your own" if kinds["strategy"] else text
 
 
 def _basis_points(fraction: float) -> str:

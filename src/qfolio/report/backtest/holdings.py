@@ -24,21 +24,26 @@ def holdings(names: list[str], data: BacktestData) -> dict[str, Any]:
     """Return, for each strategy, its weights by block of days: cash, the largest, and the rest.
 
     The largest assets are those whose weights differ most from the reference's, on average. The
-    reference itself is shown without comparison.
+    reference itself is shown without comparison, and so are all if its weights are not known. There
+    is nothing (None) for a strategy without weights.
     """
     days = len(data.dates)
     blocks = np.arange(0, days, math.ceil(days / BLOCKS))
     centres = (blocks + np.append(blocks[1:], days) - 1) // 2
-    reference = data.strategies[data.assessment.reference].weights
+    name = data.assessment.reference
+    reference, known = data.strategies[name].weights, data.strategies[name].weighted
     base = _averages(reference, blocks)
-    effective = compact(_averages(effective_number(reference), blocks), 3)
     return {
         "dates": texts(data.dates[centres]),
-        "reference": names.index(data.assessment.reference),
-        "effective": effective,
-        "series": [_rows(data.strategies[name].weights, base, data.assets, blocks, name
-                         == data.assessment.reference) for name in names],
-    }  # fmt: skip
+        "reference": names.index(name) if known else None,
+        "effective": compact(_averages(effective_number(reference), blocks), 3) if known else None,
+        "series": [
+            _rows(series.weights, base, data.assets, blocks, not known or each == name)
+            if series.weighted
+            else None
+            for each, series in ((each, data.strategies[each]) for each in names)
+        ],
+    }
 
 
 def _rows(

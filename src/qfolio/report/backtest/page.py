@@ -39,12 +39,14 @@ from qfolio.report.backtest.opening import (
 )
 from qfolio.report.backtest.tables import (
     HEADINGS,
+    RELATIVE_HEADINGS,
     difference_headings,
     difference_rows,
     fold_rows,
     luck_rows,
     month_tables,
     rebalancing_rows,
+    relative_rows,
     statistics_rows,
 )
 from qfolio.report.backtest.tearsheet import tear_sheet
@@ -119,6 +121,9 @@ def render_backtest(data: BacktestData) -> str:
         lead=len(lead),
         bound=bound_sentence(data.assessment),
         statistics=[(name, statistics_rows(name, data)) for name in names],
+        relative_headings=RELATIVE_HEADINGS,
+        relative=[(name, relative_rows(name, data)) for name in names],
+        held=[name for name in names if data.strategies[name].weighted],
         difference_headings=difference_headings(data),
         differences=[(name, difference_rows(name, data)) for name in names],
         rebalancings=rebalancing_rows(data),

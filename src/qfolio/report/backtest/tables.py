@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from qfolio.core.statistics import FEWEST_SEEDS
-from qfolio.portfolio.backtest.assessment import JUDGED, Assessment, Measure
+from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
 from qfolio.portfolio.backtest.differences import Difference
 from qfolio.portfolio.backtest.estimates import MEASURED, Measured
 from qfolio.portfolio.backtest.measures import monthly
+from qfolio.portfolio.backtest.sampled import Measure
 from qfolio.portfolio.backtest.verdict import luck, shown
 from qfolio.report.backtest.data import BacktestData, main_names
 from qfolio.report.rendering import number, percent
@@ -33,31 +34,59 @@ _MEASURED: dict[Measured, str] = {
     "volatility": "Volatility",
 }
 
-_PERCENT = ("growth", "volatility", "drawdown", "cost_drag")
+RELATIVE_HEADINGS = {
+    "active_return": "Active return",
+    "tracking_error": "Tracking error",
+    "information_ratio": "Information ratio",
+    "beta": "Beta",
+    "up_capture": "Up capture",
+    "down_capture": "Down capture",
+    "active_share": "Active share",
+}
+
+_PERCENT = (
+    *("growth", "volatility", "drawdown", "cost_drag"),
+    *("active_return", "tracking_error", "up_capture", "down_capture", "active_share"),
+)
 
 _Year = tuple[int, list[tuple[str, str]]]
 
 
 def statistics_rows(name: str, data: BacktestData) -> list[dict[str, Any]]:
     """A strategy's figures with their intervals, as text and as bars on an axis for each column."""
-    entry = data.assessment.strategies[name]
+    return [
+        _cell(data.assessment.strategies[name].measures, key, "measures", data) for key in HEADINGS
+    ]
 
-    def written(key: str, value: float) -> str:
+
+def relative_rows(name: str, data: BacktestData) -> list[dict[str, Any]]:
+    """Its figures beside the reference, likewise; dashes for the reference itself."""
+    return [
+        _cell(data.assessment.strategies[name].relative, key, "relative", data)
+        for key in RELATIVE_HEADINGS
+    ]
+
+
+def _cell(
+    measures: dict[str, Measure],
+    key: str,
+    table: Literal["measures", "relative"],
+    data: BacktestData,
+) -> dict[str, Any]:
+    measure = measures.get(key)
+    if measure is None or math.isnan(measure.mean):
+        return {"value": "–", "time": "", "seeds": "", "bar": None}
+
+    def written(value: float) -> str:
         return percent(value) if key in _PERCENT else number(value, 1 if key == "turnover" else 2)
 
-    return [
-        {
-            "value": written(key, measure.mean),
-            "time": " … ".join(written(key, end) for end in measure.over_time),
-            "seeds": " … ".join(written(key, end) for end in _over_seeds(measure)),
-            "bar": _interval(
-                measure.mean,
-                measure.over_time,
-                [data.assessment.strategies[n].measures[key] for n in main_names(data)],
-            ),
-        }
-        for key, measure in ((key, entry.measures[key]) for key in HEADINGS)
-    ]
+    column = (getattr(data.assessment.strategies[n], table).get(key) for n in main_names(data))
+    return {
+        "value": written(measure.mean),
+        "time": " … ".join(map(written, measure.over_time)),
+        "seeds": " … ".join(map(written, _over_seeds(measure))),
+        "bar": _interval(measure.mean, measure.over_time, [each for each in column if each]),
+    }
 
 
 def _interval(

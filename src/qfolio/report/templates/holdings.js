@@ -6,7 +6,7 @@
     options } = tools;
   const { dates, series: all, reference, effective } = data.weights;
   const ROW = 23, BELOW = 130, TOP = 26, BOTTOM = 40;
-  let chosen = 0;
+  let chosen = all.findIndex((series) => series !== null);
 
   /** The rows from top to bottom: the largest first, cash at the end. */
   const rows = (series) => [...series.names.keys()].slice(1).concat(0);
@@ -19,7 +19,7 @@
   }
 
   function draw() {
-    const series = all[chosen], order = rows(series), alone = chosen === reference;
+    const series = all[chosen], order = rows(series), alone = reference === null || chosen === reference;
     const inner = ROW * order.length + 40 + BELOW;
     const edge = reach(series);
     const share = (ROW * order.length) / inner;

@@ -21,7 +21,7 @@ from qfolio.portfolio.backtest.attribution.slices import slices
 from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
 from qfolio.portfolio.backtest.folder import followed
 from qfolio.portfolio.backtest.replay import Entry, Stretch
-from qfolio.portfolio.backtest.run import EQUAL_WEIGHT, Backtest
+from qfolio.portfolio.backtest.run import Backtest
 
 
 def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
@@ -34,7 +34,7 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
     }
     year = prices.periods_per_year
     factors = factor_returns(prices.values, backtest.folds, config.lag, year)
-    reference = entries[EQUAL_WEIGHT].simulation.returns[0]
+    reference = entries[config.benchmark].simulation.returns[0]
     agents, diagnosis = {}, {}
     for name, agent in backtest.agents.items():
         traded = followed(name, entries)
@@ -66,7 +66,7 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
             said = diagnose(each, entries[each], list(folds.values()), prices.assets, ignored)
             if said:
                 diagnosis[each] = said
-    return Why(EQUAL_WEIGHT, agents, diagnosis)
+    return Why(config.benchmark, agents, diagnosis)
 
 
 def held_returns(backtest: Backtest, stretch: Stretch, days: int) -> Floats:

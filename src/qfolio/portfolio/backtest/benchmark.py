@@ -1,0 +1,98 @@
+"""What the strategies of a backtest are compared with, and the names of the user's own."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.registry import BASELINES, short
+from qfolio.core.text import quote
+from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
+from qfolio.portfolio.backtest.own import Own, buy_and_hold
+from qfolio.portfolio.backtest.own_tables import read_own
+from qfolio.portfolio.prices.findings import hint
+from qfolio.portfolio.prices.table import Prices
+
+BENCHMARK = "benchmark"
+"""Name of a benchmark that is given as a data frame or an array."""
+
+_NAME = re.compile(r"[\w.&+-][\w.&+ -]{0,59}")
+
+
+class Field(NamedTuple):
+    """The strategies beside the agents.
+
+    benchmark: the name of one of them. baselines: as they are registered. own: by name.
+    """
+
+    benchmark: str
+    baselines: list[str]
+    own: dict[str, Own]
+
+
+def field_of(
+    prices: Prices,
+    agents: Iterable[str],
+    baselines: Sequence[str],
+    strategies: Mapping[str, Any],
+    benchmark: Any = None,
+) -> Field:
+    """Read a user's own strategies, and find the benchmark.
+
+    Args:
+        prices: The table of the backtest.
+        agents: Names of the agents.
+        baselines: Names of the baselines; equal weights are added.
+        strategies: Sources of the user's own by name, as ``read_own`` takes them.
+        benchmark: The name of one of them, of a baseline or of an asset, which is then bought and
+            held; or a source of its own (default: equal weights).
+
+    Raises:
+        QfolioError: A name cannot be used or is used twice, a source cannot be read, or the
+            benchmark is unknown or an agent.
+    """
+    rules = list(dict.fromkeys([EQUAL_WEIGHT, *baselines]))
+    taken = {*agents, *(f"{name}{TOGETHER}" for name in agents), *map(short, rules), *BASELINES}
+    own: dict[str, Own] = {}
+
+    def add(name: str, source: Any) -> None:
+        if not _NAME.fullmatch(name):
+            raise QfolioError(
+                f"A strategy cannot be called {quote(name)}; use up to 60 letters, digits, spaces "
+                "and the signs . & + - _."
+            )
+        if name in taken or name in own or name.startswith(f"{EQUAL_WEIGHT} at "):
+            raise QfolioError(
+                f"The backtest has a strategy {name} already; give yours another name."
+            )
+        own[name] = source if isinstance(source, Own) else read_own(name, source, prices)
+
+    for name, source in strategies.items():
+        add(name, source)
+    if benchmark is None:
+        return Field(EQUAL_WEIGHT, rules, own)
+    if not isinstance(benchmark, str | Path):
+        add(BENCHMARK, benchmark)
+        return Field(BENCHMARK, rules, own)
+    name = str(benchmark)
+    if name in {*agents, *(f"{agent}{TOGETHER}" for agent in agents)}:
+        raise QfolioError(
+            f"The benchmark {name} is an agent, and agents are compared with the benchmark; name a "
+            "baseline, an asset, a strategy of your own or a file."
+        )
+    if name in own:
+        return Field(name, rules, own)
+    if name in prices.assets:
+        add(name, buy_and_hold(name, prices))
+        return Field(name, rules, own)
+    if name in BASELINES or name in rules:
+        return Field(short(name), list(dict.fromkeys([*rules, name])), own)
+    if not Path(name).exists():
+        known = [*own, *BASELINES, *prices.assets]
+        raise QfolioError(
+            f"The benchmark {quote(name)} is no strategy of the backtest, no asset and no "
+            f"file{hint(name, known)}."
+        )
+    add(Path(name).stem, Path(name))
+    return Field(Path(name).stem, rules, own)

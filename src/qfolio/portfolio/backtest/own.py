@@ -1,0 +1,219 @@
+"""Strategies of the user's own: their orders and returns on the days of a test.
+
+``own_tables.py`` reads them from files and data frames.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.folds import Fold, spell
+from qfolio.portfolio.backtest.measures import Floats
+from qfolio.portfolio.backtest.orders import TOLERANCE, drifted
+from qfolio.portfolio.prices.findings import amount, day
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+
+Kind = Literal["weights", "returns", "levels"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+OLDEST = np.timedelta64(7, "D")
+"""How long a level stands for the rows after it, which bridges holidays of other exchanges."""
+
+Dates = NDArray[np.datetime64]
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Own:
+    """A strategy as it was given.
+
+    kind: "weights": targets at the close of a date, executed with the backtest's lag and costs;
+        between them there is no order. "returns": net already. "levels": of an index.
+    dates: increasing, of shape (k,).
+    values: of shape (k, N + 1) for weights, cash first; else of shape (k,).
+    """
+
+    kind: Kind
+    dates: Dates
+    values: Floats
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A strategy on the days of a test, with sentences for the report.
+
+    decisions: (D, N + 1), cash first, NaN for no order. returns: (D,), if it has no weights.
+    """
+
+    decisions: Floats
+    returns: Floats | None
+    notes: tuple[str, ...]
+
+
+def buy_and_hold(asset: str, prices: Prices) -> Own:
+    """One asset, bought at its first price and never sold."""
+    place = prices.assets.index(asset)
+    weights = np.zeros((1, len(prices.assets) + 1))
+    weights[0, place + 1] = 1.0
+    return Own("weights", prices.dates[[prices.first_rows[place]]], weights)
+
+
+def place(
+    name: str, own: Own, prices: Prices, folds: Sequence[Fold], task: Portfolio, cap: float
+) -> Placed:
+    """Put a strategy on the days of a test.
+
+    A date that is no row of the prices counts at the next row, so that nothing is known too early.
+    Before its first order a strategy holds cash. If that order is older than the test, the test
+    begins with an order of what it has drifted to.
+
+    Args:
+        name: Of the strategy, for messages.
+        own: The strategy.
+        prices: The table of the backtest.
+        folds: Of the test.
+        task: Of any agent; all have the same lag, and are long-only or not.
+        cap: Largest weight of one asset that agents may order; a note says where it is exceeded.
+
+    Raises:
+        QfolioError: There is no order in the test or before it, an asset is ordered before its
+            first price or sold short though agents are long-only, a day of the test has no return
+            or no level, or a return is on another day.
+    """
+    days = slice(folds[0].decisions.start, folds[-1].decisions.stop)
+    none = np.full((days.stop - days.start, len(prices.assets) + 1), np.nan)
+    if own.kind == "weights":
+        if task.feasible.long_only:
+            _require_long_only(name, own)
+        return _placed_weights(name, own, prices, days, cap, none)
+    lag = int(task.lag)
+    earned = slice(days.start + lag + 1, days.stop + lag + 1)
+    returns = (_returns if own.kind == "returns" else _growth)(name, own, prices, earned)
+    if not (np.isfinite(returns) & (returns >= -1)).all():
+        worst = int(np.argmin(np.where(np.isfinite(returns), returns, -np.inf)))
+        raise QfolioError(
+            f"{name} returns {returns[worst]:g} on {_day(prices, earned.start + worst)}; returns "
+            "are fractions, at least −1 (0.012 for 1.2 %)."
+        )
+    return Placed(none, returns, ())
+
+
+def _placed_weights(
+    name: str, own: Own, prices: Prices, days: slice, cap: float, decisions: Floats
+) -> Placed:
+    rows, moved = _rows(name, own.dates, prices)
+    notes = []
+    if moved.size:
+        notes.append(
+            f"{name}: {amount(moved.size, 'date')} of its orders, from {moved[0]} to {moved[-1]}, "
+            f"{'is' if moved.size == 1 else 'are'} not among those of the prices; each order is "
+            "decided at the next row."
+        )
+    for row, weights in zip(rows, own.values, strict=True):
+        early = (weights[1:] != 0) & (prices.first_rows > row)
+        if row < days.stop and early.any():
+            asset = prices.assets[int(early.argmax())]
+            raise QfolioError(
+                f"{name} orders {asset} on {_day(prices, row)}, before its first price; give it "
+                "weight 0 until then."
+            )
+        if days.start <= row < days.stop:
+            decisions[row - days.start] = weights
+    before = np.flatnonzero(rows < days.start)
+    if before.size and np.isnan(decisions[0, 0]):
+        last = before[-1]
+        bought = prices.values[rows[last]]
+        decisions[0] = drifted(own.values[last], bought, prices.values[days.start])
+    ordered = ~np.isnan(decisions[:, 0])
+    if not ordered.any():
+        raise QfolioError(
+            f"{name} orders nothing up to {_day(prices, days.stop - 1)}, the last decision of the "
+            "test; give it weights at earlier dates."
+        )
+    first = int(ordered.argmax())
+    if first:
+        notes.append(
+            f"{name} holds cash until its first order, of {_day(prices, days.start + first)}."
+        )
+    if (largest := float(np.nanmax(decisions[:, 1:]))) > cap + TOLERANCE:
+        notes.append(
+            f"{name} orders up to {largest:.4g} of one asset, more than the cap of {cap:g}, which "
+            "holds for agents and baselines."
+        )
+    return Placed(decisions, None, tuple(notes))
+
+
+def _require_long_only(name: str, own: Own) -> None:
+    least = own.values.min(axis=1)
+    if (short := least < 0).any():
+        row = int(short.argmax())
+        raise QfolioError(
+            f"{name} has a weight of {least[row]:.3g} on {day(own.dates[row])}, counting cash; the "
+            "backtest is long-only, so give weights of at least 0 that sum to 1 or less."
+        )
+
+
+def _rows(name: str, dates: Dates, prices: Prices) -> tuple[Rows, Dates]:
+    """The rows at which dates count, the number of rows if they are later, and those in between."""
+    ours, days = prices.dates, dates.astype("datetime64[D]")
+    by_day = ours.astype("datetime64[D]")
+    if (by_day[1:] > by_day[:-1]).all():
+        rows = np.searchsorted(by_day, days)
+        known = rows < len(ours)
+        return rows, days[known][by_day[rows[known]] != days[known]]
+    rows = np.searchsorted(ours, dates)
+    known = rows < len(ours)
+    if (other := dates[known][ours[rows[known]] != dates[known]]).size:
+        raise QfolioError(
+            f"{name}: {str(other[0]).replace('T', ' ')} is no row of the prices; where a day has "
+            "several rows, give the time of one of them."
+        )
+    return rows, dates[:0]
+
+
+def _returns(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
+    """Returns as they are given."""
+    rows, moved = _rows(name, own.dates, prices)
+    first, last = prices.dates[earned][[0, -1]].astype("datetime64[D]")
+    if (inside := moved[(moved > first) & (moved < last)]).size:
+        raise QfolioError(
+            f"{name} has a return on {inside[0]}, which is no row of the prices; give a return for "
+            "each row, from one row to the next."
+        )
+    at = np.full(len(prices) + 1, np.nan)
+    at[rows] = own.values
+    found = at[earned]
+    if (missing := np.isnan(found)).any():
+        raise QfolioError(
+            f"{name} has no return on {_day(prices, earned.start + int(missing.argmax()))} and on "
+            f"{int(missing.sum()):,} of {len(found):,} days of the test in all; give one for each, "
+            f"from {first} to {last}."
+        )
+    return found
+
+
+def _growth(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
+    """Returns between the last levels that were known at each row."""
+    rows = prices.dates[earned.start - 1 : earned.stop]
+    dates = own.dates
+    if (dates == dates.astype("datetime64[D]")).all():
+        rows = rows.astype("datetime64[D]")
+    latest = np.searchsorted(dates, rows, side="right") - 1
+    old = (latest < 0) | (rows - dates[np.maximum(latest, 0)] > OLDEST)
+    if old.any():
+        raise QfolioError(
+            f"{name} has no level on {_day(prices, earned.start - 1 + int(old.argmax()))} or in "
+            f"the week before; it needs levels from {_day(prices, earned.start - 1)} to "
+            f"{_day(prices, earned.stop - 1)}."
+        )
+    levels = own.values[latest]
+    return np.asarray(levels[1:] / levels[:-1] - 1)
+
+
+def _day(prices: Prices, row: int | np.integer) -> str:
+    return spell(prices.dates[row], prices.dates)

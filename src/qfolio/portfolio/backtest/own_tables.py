@@ -1,0 +1,233 @@
+"""Reads strategies of the user's own from files, data frames and arrays.
+
+The columns say what a table holds: target weights (a column an asset, and perhaps cash; or the
+columns date, asset and weight), returns, or the levels of an index.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.text import quote
+from qfolio.portfolio.backtest.measures import Floats
+from qfolio.portfolio.backtest.own import Own
+from qfolio.portfolio.holdings import ASSET_NAMES, CASH, SHARES_NAMES
+from qfolio.portfolio.prices.cells import is_missing, label, not_a_number, numbers
+from qfolio.portfolio.prices.columns import text_columns
+from qfolio.portfolio.prices.dates import read_dates
+from qfolio.portfolio.prices.findings import day, hint
+from qfolio.portfolio.prices.layout import Table
+from qfolio.portfolio.prices.reading import read
+from qfolio.portfolio.prices.table import Prices, load
+from qfolio.portfolio.prices.vocabulary import DATE_NAMES, plain
+
+RETURN_NAMES = ("return", "returns", "ret", "net return", "net returns", "daily return")
+WEIGHT_NAMES = ("weight", "weights", "target", "target weight")
+
+ROUNDING = 1e-3
+"""How far a row of weights may be off a sum of 1, as rounded weights are; it is then scaled."""
+
+FORMS = (
+    "A strategy is a table of weights (date, and a column an asset), of returns (date, return) or "
+    "of an index (date, level)."
+)
+
+
+def read_own(name: str, source: Any, prices: Prices) -> Own:
+    """Read a strategy for a backtest on a table of prices.
+
+    Args:
+        name: Of the strategy, for messages.
+        source: Path of a CSV or Parquet file; a data frame that narwhals knows; or an array with a
+            row for each row of the prices: weights of shape (rows, N + 1), cash first, or (rows,
+            N), NaN for no order, or returns of shape (rows,).
+        prices: The table.
+
+    Raises:
+        QfolioError: The source cannot be read, its columns are those of no such table, weights do
+            not sum to 1 with cash, or a cell is missing or cannot be read.
+    """
+    try:
+        if isinstance(source, list | tuple) or type(source).__module__.partition(".")[0] in (
+            "numpy",
+            "jax",
+            "jaxlib",
+        ):
+            return _from_array(source, prices)
+        return _from_table(source, prices)
+    except QfolioError as error:
+        raise QfolioError(f"Strategy {quote(name)}: {error}") from None
+
+
+def _from_array(source: Any, prices: Prices) -> Own:
+    try:
+        table = np.asarray(source, dtype=float)
+    except (TypeError, ValueError):
+        raise QfolioError("the array does not hold numbers.") from None
+    rows, assets = prices.values.shape
+    if table.shape == (rows,):
+        known = ~np.isnan(table)
+        return Own("returns", prices.dates[known], table[known])
+    if table.shape not in ((rows, assets), (rows, assets + 1)):
+        raise QfolioError(
+            f"the array has the shape {table.shape}; for this table it must be ({rows}, "
+            f"{assets + 1}) for weights, cash first, or ({rows},) for returns."
+        )
+    given = ~np.isnan(table).all(axis=1)
+    table, when = table[given], prices.dates[given]
+    cash = table[:, 0] if table.shape[1] > assets else None
+    return Own("weights", when, _with_cash(table[:, -assets:], cash, [day(d) for d in when]))
+
+
+def _from_table(source: Any, prices: Prices) -> Own:
+    table = read(source, lambda names: text_columns(names, None))
+    names = [plain(name) for name in table.names]
+    when = next((j for j, name in enumerate(names) if name in DATE_NAMES), 0)
+    others = [j for j in range(len(names)) if j != when and names[j]]
+    if not others:
+        raise QfolioError(f"the table has no column beside its dates. {FORMS}")
+    asset = next((j for j in others if names[j] in ASSET_NAMES), None)
+    if asset is not None and any(names[j] in SHARES_NAMES for j in others):
+        raise QfolioError(
+            "the table has orders in shares, which depend on the capital; give target weights "
+            "instead: a column of dates, and a column an asset."
+        )
+    weight = next((j for j in others if names[j] in WEIGHT_NAMES), None)
+    if asset is not None and weight is not None:
+        return _long_weights(table, when, asset, weight, prices)
+    unknown = [table.names[j] for j in others if _asset(table.names[j], prices) is None]
+    if not unknown:
+        return _wide_weights(table, when, others, prices)
+    if len(others) == 1 and names[others[0]] in RETURN_NAMES:
+        rows = _dates(table, when)
+        order = _increasing(rows, table)
+        return Own("returns", rows[order], _numbers(table, others[0], rows)[order])
+    return _levels(source, table, others, unknown, prices)
+
+
+def _levels(
+    source: Any, table: Table, others: list[int], unknown: list[str], prices: Prices
+) -> Own:
+    """An index, read as a table of prices."""
+    try:
+        index = load(source)
+    except QfolioError as error:
+        if len(others) == 1:
+            raise QfolioError(f"the column {quote(unknown[0])} is no index: {error}") from None
+        index = None
+    if index is None or len(index.assets) > 1:
+        raise QfolioError(
+            f"the prices have no asset {quote(unknown[0])}{hint(unknown[0], prices.assets)}. "
+            f"{FORMS}"
+        )
+    return Own("levels", index.dates, index.values[:, 0])
+
+
+def _wide_weights(table: Table, when: int, others: list[int], prices: Prices) -> Own:
+    rows = _dates(table, when)
+    weights, cash = np.zeros((len(rows), len(prices.assets))), None
+    seen = dict.fromkeys(table.names[j] for j in others)
+    if len(seen) < len(others):
+        raise QfolioError("two columns have the same name; give every asset one column.")
+    blank = np.all([[is_missing(c) for c in table.columns[j].tolist()] for j in others], axis=0)
+    for j in others:
+        found = _numbers(table, j, rows, blank)
+        if (place := _asset(table.names[j], prices)) == -1:
+            cash = found
+        elif place is not None:
+            weights[:, place] = found
+    order = _increasing(rows, table)
+    order = order[~blank[order]]
+    if not order.size:
+        raise QfolioError("the table has no row of weights.")
+    weights, rows = weights[order], rows[order]
+    cash = None if cash is None else cash[order]
+    return Own("weights", rows, _with_cash(weights, cash, [day(row) for row in rows]))
+
+
+def _long_weights(table: Table, when: int, asset: int, weight: int, prices: Prices) -> Own:
+    rows, found = _dates(table, when), _numbers(table, weight, _dates(table, when))
+    moments, place = np.unique(rows, return_inverse=True)
+    weights = np.full((len(moments), len(prices.assets) + 1), np.nan)
+    for i, cell in enumerate(table.columns[asset].tolist()):
+        known = _asset(name := label(cell), prices)
+        where = f"row {table.first_row + i} ({day(rows[i])})"
+        if known is None:
+            raise QfolioError(
+                f"{where}: the prices have no asset {quote(name)}{hint(name, prices.assets)}."
+            )
+        if not np.isnan(weights[place[i], known + 1]):
+            raise QfolioError(f"{where}: {quote(name)} appears twice; give it one weight a date.")
+        weights[place[i], known + 1] = found[i]
+    named = ~np.isnan(weights[:, 0])
+    if named.any() and not named.all():
+        moment = day(moments[int((~named).argmax())])
+        raise QfolioError(f"{moment} has no weight of cash, other dates have one; add it.")
+    cash = weights[:, 0] if named.any() else None
+    held = np.nan_to_num(weights[:, 1:])
+    return Own("weights", moments, _with_cash(held, cash, [day(moment) for moment in moments]))
+
+
+def _asset(name: str, prices: Prices) -> int | None:
+    """The place of an asset, −1 for cash, None if it is unknown."""
+    if name in prices.assets:
+        return prices.assets.index(name)
+    return -1 if plain(name) == CASH else None
+
+
+def _dates(table: Table, column: int) -> np.ndarray:
+    moments, complaints, _ = read_dates(table.columns[column])
+    for row, complaint in complaints.items():
+        raise QfolioError(f"row {table.first_row + row}: {complaint}; write dates as 2020-01-31.")
+    if not len(moments):
+        raise QfolioError("the table has no rows.")
+    return moments
+
+
+def _numbers(
+    table: Table, column: int, rows: np.ndarray, blank: np.ndarray | None = None
+) -> Floats:
+    """The numbers of a column; none may be missing, but where a whole row is blank."""
+    cells = table.columns[column]
+    values, wrong = numbers(cells, table.decimal)
+    missing = np.isnan(values) & ~wrong
+    bad = wrong | (missing if blank is None else missing & ~blank)
+    if bad.any():
+        row = int(bad.argmax())
+        reason = not_a_number(cells[row], table.decimal) if wrong[row] else "it is missing"
+        raise QfolioError(
+            f"row {table.first_row + row} ({day(rows[row])}), column {quote(table.names[column])}: "
+            f"{reason}; give a number, 0 for nothing."
+        )
+    return values
+
+
+def _increasing(rows: np.ndarray, table: Table) -> np.ndarray:
+    """The order of rows by date, each different."""
+    order = np.argsort(rows, kind="stable")
+    again = np.flatnonzero(rows[order][1:] == rows[order][:-1])
+    if again.size:
+        row = int(order[again[0] + 1])
+        raise QfolioError(
+            f"row {table.first_row + row}: {day(rows[row])} appears twice; keep one row a date."
+        )
+    return order
+
+
+def _with_cash(weights: Floats, cash: Floats | None, spelled: list[str]) -> Floats:
+    """Weights of shape (k, N) with cash, or what they leave, as (k, N + 1) with sums of 1."""
+    total = weights.sum(axis=1)
+    rest = 1 - total if cash is None else cash
+    if cash is None:
+        rest = np.where((rest < 0) & (rest >= -ROUNDING), 0.0, rest)
+    table = np.column_stack([rest, weights])
+    sums = table.sum(axis=1)
+    wrong = ~(np.abs(sums - 1) <= ROUNDING)
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise QfolioError(
+            f"the weights of {spelled[row]} sum to {sums[row]:.6g}; they are fractions that sum to "
+            "1 with cash."
+        )
+    return np.asarray(np.where(np.abs(sums - 1) > 1e-12, table.T / sums, table.T).T)

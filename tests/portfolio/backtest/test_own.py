@@ -1,0 +1,278 @@
+import numpy as np
+import pandas as pd
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.own import Own
+from qfolio.portfolio.backtest.own_tables import read_own
+from qfolio.portfolio.backtest.results import write_tables
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.prices.table import Prices
+
+AGENTS = {
+    "pathwise": Preset(
+        "pathwise", {"rollout_length": 10, "num_envs": 2, "hidden": (4,)},
+        episodes=4, seeds=1, task={"window": 5, "horizon": 20},
+    )
+}  # fmt: skip
+ROWS, FIRST, LAST = 160, 98, 157  # rows of the table, and of the first and the last decision
+
+
+def table(rows=ROWS, step="D", late=0):
+    rng = np.random.default_rng(0)
+    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0))
+    values[:late, 2] = np.nan
+    dates = np.datetime64("2020-01-01", "s") + np.arange(rows) * np.timedelta64(1, step)
+    return Prices(dates, ("A", "B", "C"), values)
+
+
+def create(prices=None, out=None, **options):
+    prices = table() if prices is None else prices
+    rest = {"train": "100d", "test": "30d", "seeds": 1, "cost": 0.002, "baselines": []}
+    return Backtest.create(prices, AGENTS, out=out, **{**rest, **options})
+
+
+def days(prices=None):
+    return (table() if prices is None else prices).dates.astype("datetime64[D]").astype(str)
+
+
+def weights(rows, **columns):
+    return pd.DataFrame({"date": days()[rows], **columns})
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """With each form of strategy, of which files are deleted before it is replayed."""
+    place = tmp_path_factory.mktemp("own")
+    rng = np.random.default_rng(1)
+    weights([0, 100, 120], A=[0.5, 0.2, 0.0], cash=[0.5, 0.8, 1.0]).to_csv(
+        place / "mine.csv", index=False
+    )
+    returns = pd.DataFrame({"date": days(), "return": rng.normal(0, 0.01, ROWS)})
+    returns.to_csv(place / "fund.csv", index=False)
+    level = pd.DataFrame({"date": days(), "level": table().values.mean(1)}).drop(index=[120, 121])
+    level.to_csv(place / "index.csv", index=False)
+    backtest = create(
+        out=place / "run",
+        strategies={
+            "mine": place / "mine.csv",
+            "fund": place / "fund.csv",
+            "daily": np.full((ROWS, 3), 1 / 3),
+        },
+        benchmark=place / "index.csv",
+    )
+    backtest.run()
+    for file in ("mine.csv", "fund.csv", "index.csv"):
+        (place / file).unlink()
+    return backtest, returns["return"].to_numpy(), level
+
+
+def test_equal_weights_of_ones_own_are_the_baseline(finished):
+    entries, _ = finished[0].entries()
+    ours, theirs = (entries[name].simulation for name in ("daily", "equal-weight"))
+    np.testing.assert_allclose(ours.returns, theirs.returns, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ours.weights, theirs.weights, rtol=0, atol=1e-12)
+
+
+def test_returns_pass_through_exactly(finished):
+    backtest, returns, _ = finished
+    entry = backtest.entries()[0]["fund"]
+    np.testing.assert_array_equal(entry.simulation.returns[0], returns[FIRST + 2 : LAST + 3])
+    assert not entry.weighted
+    assert np.isnan(entry.simulation.turnover).all()
+
+
+def test_an_index_earns_what_its_levels_say(finished):
+    backtest, _, level = finished
+    earned = backtest.entries()[0]["index"].simulation.returns[0]
+    known = pd.Series(level["level"].to_numpy(), level["date"]).reindex(days()).ffill()
+    expected = known.pct_change().to_numpy()[FIRST + 2 : LAST + 3]
+    np.testing.assert_allclose(earned, expected, atol=1e-15)
+    assert earned[120 - FIRST - 2] == 0  # a holiday: the last level stands
+
+
+def test_orders_are_decided_at_their_date_and_executed_after_the_lag(finished):
+    """Half of A in shares from day 0, of which the test begins with what it has drifted to."""
+    entry = finished[0].entries()[0]["mine"]
+    a = table().values[:, 0]
+    grown = 0.5 * a[FIRST] / a[0]
+    start = grown / (grown + 0.5)
+    assert entry.decisions[0, 0, 1] == pytest.approx(start)
+    given = np.flatnonzero(~np.isnan(entry.decisions[0, :, 0])) + FIRST
+    np.testing.assert_array_equal(given, [FIRST, 100, 120])
+    turnover = entry.simulation.turnover[0]
+    np.testing.assert_array_equal(np.flatnonzero(turnover) + FIRST, [FIRST, 100, 120])
+    # Sold at row 121 for what A was worth then, so the return of row 123 is the first of cash.
+    returns = entry.simulation.returns[0]
+    np.testing.assert_array_equal(returns[121 - FIRST :], 0)
+    assert returns[120 - FIRST] == pytest.approx(-entry.simulation.cost[0, 120 - FIRST])
+
+
+def test_a_benchmark_is_the_reference_of_everything(finished, tmp_path):
+    backtest = finished[0]
+    entries, _ = backtest.entries()
+    assert entries["index"].kind == "baseline"
+    assert {entries[name].kind for name in ("mine", "fund", "daily")} == {"strategy"}
+    assert not any(entry.kind == "rebalancing" for entry in entries.values())
+    found = backtest.assess(entries)
+    assert found.reference == "index"
+    assert found.strategies["mine"].to_reference.reference == "index"
+    assert found.strategies["mine"].relative["beta"].mean > 0
+    write_tables(backtest, entries, found)
+    rows = (backtest.folder / "weights.csv").read_text().splitlines()[1:]
+    assert {row.split(",")[1] for row in rows} == {"pathwise", "mine", "daily", "equal-weight"}
+    assert "turnover" in backtest._repr_html_()
+
+
+def test_a_backtest_is_resumed_without_the_files(finished):
+    backtest = finished[0]
+    again = Backtest.open(backtest.folder)
+    assert again.config.strategies == ("mine", "fund", "daily", "index")
+    ours, theirs = backtest.entries(), again.entries()
+    assert ours[1] == theirs[1]
+    for name, entry in ours[0].items():
+        other = theirs[0][name].simulation
+        np.testing.assert_array_equal(entry.simulation.returns, other.returns)
+    assert again.assess(theirs[0]) == again.assess(ours[0])
+
+
+def placed(source, prices=None, **options):
+    """The decisions or returns of a strategy, and its notes."""
+    made = create(prices, strategies={"mine": source}, **options)._own["mine"]
+    return made.decisions if made.returns is None else made.returns, made.notes
+
+
+def test_later_rows_change_nothing_earlier():
+    rng = np.random.default_rng(2)
+    dates, t = np.arange(90, 150, 7), 125
+    shares = rng.dirichlet(np.ones(4), len(dates))
+    changed = np.where((dates > t)[:, None], rng.dirichlet(np.ones(4), len(dates)), shares)
+    moved = table().values.copy()
+    moved[t + 1 :] *= np.exp(rng.normal(0, 0.3, moved[t + 1 :].shape))
+    other = Prices(table().dates, table().assets, moved)
+    known = slice(0, t + 1 - FIRST)
+    before, after, elsewhere = (
+        placed(weights(dates, **dict(zip(("cash", "A", "B", "C"), each.T, strict=True))), prices)[0]
+        for each, prices in ((shares, None), (changed, None), (shares, other))
+    )
+    assert not np.array_equal(before, after, equal_nan=True)
+    np.testing.assert_array_equal(after[known], before[known])
+    np.testing.assert_array_equal(elsewhere, before)
+
+
+def test_cash_until_the_first_order_and_dates_between_rows():
+    prices = table(step="W")  # Wednesdays
+    source = pd.DataFrame({"date": ["2021-12-31", "2022-03-31"], "A": [1.0, 0.5], "B": [0, 0.5]})
+    decisions, notes = placed(source, prices)
+    given = np.flatnonzero(~np.isnan(decisions[:, 0]))
+    rows = [str(prices.dates[FIRST + day])[:10] for day in given]
+    assert rows == ["2022-01-05", "2022-04-06"]  # the Wednesdays after them
+    assert notes == (
+        "mine: 2 dates of its orders, from 2021-12-31 to 2022-03-31, are not among those of the "
+        "prices; each order is decided at the next row.",
+        "mine holds cash until its first order, of 2022-01-05.",
+    )
+    note = placed(weights([100], A=[0.9]), cap=0.5)[1][-1]
+    assert "orders up to 0.9" in note
+    assert "more than the cap of 0.5" in note
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        pd.DataFrame({"date": days()[[110] * 2], "asset": ["A", "B"], "weight": [0.25, 0.75]}),
+        pd.DataFrame({"Date": days()[[110]], "B": ["0.75"], "A": [0.25], "CASH": [0.0]}),
+        pd.DataFrame({"A": [0.25], "B": [0.75]}, index=pd.DatetimeIndex(days()[[110]])),
+        pd.DataFrame({"date": days()[[110, 111]], "A": [0.25, None], "B": [0.75, None]}),
+        pd.DataFrame({"date": days()[[110]], "A": [0.2502], "B": [0.7506]}),  # rounded
+        np.where(np.arange(ROWS)[:, None] == 110, [0.0, 0.25, 0.75, 0.0], np.nan).tolist(),
+    ],
+)
+def test_forms_of_weights(source):
+    own = read_own("mine", source, table())
+    assert own.kind == "weights"
+    np.testing.assert_array_equal(own.dates.astype("datetime64[D]").astype(str), [days()[110]])
+    np.testing.assert_allclose(own.values, [[0, 0.25, 0.75, 0]], atol=1e-12)
+
+
+def test_forms_of_returns():
+    series = pd.Series(np.arange(ROWS) / 1e4, pd.DatetimeIndex(days()), name="return")
+    for source in (series, series.to_numpy()):
+        own = read_own("mine", source, table())
+        assert own.kind == "returns"
+        np.testing.assert_array_equal(own.values, series.to_numpy())
+
+
+HOURS = Prices(np.datetime64("2020-01-01T09:30", "s") + np.arange(ROWS) * np.timedelta64(1, "h"),
+               ("A", "B", "C"), table().values)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("source", "prices", "message"),
+    [
+        (weights([100], A=[1.2]), None, r"long-only, so give weights of at least 0"),
+        (weights([100], A=[0.6], cash=[0.6]), None, r"weights of .* sum to 1.2"),
+        (weights([100], A=[-0.1], B=[0.5]), None, "weight of -0.1 on 2020-04-10.*long-only"),
+        (weights([100, 100], A=[0.1, 0.2]), None, "row 1: 2020-04-10 appears twice"),
+        (weights([100], A=[0.1], AB=[0.2]), None, r"no asset 'AB' \(did you mean"),
+        (weights([100], A=["x"]), None, "row 0 .*column 'A': 'x' is not a number"),
+        (weights([100], A=[0.1], B=[None]), None, "column 'B': it is missing; give a number"),
+        (weights([159], A=[1.0]), None, "orders nothing up to 2020-06-06"),
+        (weights([100], asset=["A"], shares=[3]), None, "orders in shares.*give target weights"),
+        (weights([100], asset=["Z"], weight=[1]), None, "no asset 'Z'"),
+        (weights([100, 100], asset=["A", "A"], weight=[1, 1]), None, "'A' appears twice"),
+        (weights([100, 101], A=[1, 1]).assign(date="soon"), None, "row 0: .*write dates as"),
+        (weights([100], C=[1.0]), table(late=120), "orders C on 2020-04-10, before its first"),
+        (weights([2], A=[1.0]), HOURS, "is no row of the prices; where a day has several"),
+        (weights(np.arange(130), **{"return": 0.01}), None, "has no return on 2020-05-10.* 30 of"),
+        (weights(np.arange(ROWS), **{"return": -1.5}), None, "returns are fractions"),
+        (weights(np.arange(90), level=1.0), None, "no level on 2020-04-09 or in the week before"),
+        (weights(np.arange(ROWS), level=-1.0), None, "'level' is no index: .*negative"),
+        (np.ones((ROWS, 7)), None, r"must be \(160, 4\) for weights, cash first, or \(160,\)"),
+        ({"a": 1}, None, "Strategy 'mine'"),
+        ("nothing.csv", None, "nothing.csv' cannot be read"),
+    ],
+)  # fmt: skip
+def test_strategies_that_are_refused(source, prices, message):
+    with pytest.raises(QfolioError, match=message):
+        create(prices, strategies={"mine": source})
+
+
+def test_a_return_on_a_day_between_rows_is_refused():
+    prices = table(step="W")
+    dates = [*days(prices), "2022-03-31"]
+    with pytest.raises(QfolioError, match="return on 2022-03-31, which is no row"):
+        placed(pd.DataFrame({"date": dates, "return": 0.001}), prices)
+
+
+@pytest.mark.parametrize(
+    ("name", "benchmark", "message"),
+    [
+        ("pathwise", None, "has a strategy pathwise already"),
+        ("pathwise-together", None, "already"), ("momentum", None, "already"),
+        ("equal-weight at 0.3", None, "already"), ("a/b", None, "cannot be called 'a/b'"),
+        ("mine", "pathwise", "benchmark pathwise is an agent"),
+        ("mine", "min", r"'min' is no strategy .* no asset and no file \(did you mean 'mine'\?\)"),
+    ],
+)  # fmt: skip
+def test_names_that_are_refused(name, benchmark, message):
+    with pytest.raises(QfolioError, match=message):
+        create(strategies={name: np.full((ROWS, 3), 0.3)}, benchmark=benchmark)
+
+
+def test_benchmarks_by_name():
+    mine = np.full((ROWS, 3), 0.3)
+    assert create().config.benchmark == "equal-weight"
+    assert create(strategies={"mine": mine}, benchmark="mine").config.benchmark == "mine"
+    other = create(benchmark="risk-budgeting").config
+    assert (other.benchmark, other.baselines) == (
+        "risk-budgeting", ["equal-weight", "risk-budgeting"],
+    )  # fmt: skip
+    held = create(benchmark="B")
+    assert isinstance(held._own["B"].decisions, np.ndarray)
+    np.testing.assert_allclose(held._own["B"].decisions[0], [0, 0, 1, 0])
+    assert np.isnan(held._own["B"].decisions[1:]).all()
+    framed = create(benchmark=weights([0], A=[1.0]))
+    assert framed.config.benchmark == "benchmark"
+    assert isinstance(read_own("x", mine, table()), Own)
