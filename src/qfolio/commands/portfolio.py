@@ -16,7 +16,8 @@ def prices(file: Positional[File] = None, *, reading: Read = READING) -> None:
 
     Args:
         file: CSV or Parquet file, wide (a column per asset), long (date, asset, price) or as
-            yfinance saves it (default: the 20 US stocks that come with qfolio).
+            yfinance saves it, or a folder with a file for each asset (default: the 20 US stocks
+            that come with qfolio).
     """
     from qfolio.commands import console
     from qfolio.portfolio.prices.table import describe, inspect

@@ -311,3 +311,46 @@ def test_faults_of_a_turned_table_are_named_where_they_are(tmp_path: Path):
 def test_lines_above_the_table(tmp_path: Path):
     text = "Data of a vendor\n\ndate,A\n" + rows(ISO, [["1"]] * 4)
     assert "remove the lines above the names of the columns" in refusal(write(tmp_path, text))
+
+
+# Folders.
+
+
+def bars(folder: Path, name: str, closes: list[str], days: list[str] = ISO) -> None:
+    """A file of one asset, as Stooq has it."""
+    text = "Date,Open,High,Low,Close,Volume\n"
+    text += rows(days, [["9", "9", "9", close, f"10{k}"] for k, close in enumerate(closes)])
+    (folder / name).write_text(text)
+
+
+def test_a_folder_of_one_file_an_asset(tmp_path: Path):
+    bars(tmp_path, "aapl.us.csv", ["1", "2", "3", "4"])
+    bars(tmp_path, "msft.us.csv", ["5", "6", "7", "8"])
+    (tmp_path / "notes.md").write_text("not a table")
+    prices = load(tmp_path, features=("Volume",))
+    assert prices.assets == ("aapl.us", "msft.us")
+    assert prices.source == tmp_path.name
+    np.testing.assert_array_equal(prices.values, [[1, 5], [2, 6], [3, 7], [4, 8]])
+    np.testing.assert_array_equal(prices.features[:, 1, 0], [100, 101, 102, 103])
+    bars(tmp_path, "late.csv", ["2", "3", "4"], ISO[1:])
+    assert "'late': the first price is on 2024-01-30, the table starts" in refusal(tmp_path)
+    assert load(tmp_path, late="trim").assets == ("aapl.us", "late", "msft.us")
+    bars(tmp_path, "late.csv", ["2", "3", "4"], [ISO[0], *ISO[2:]])
+    assert "2024-01-30, column 'close': the price of 'late' is missing" in refusal(tmp_path)
+    assert load(tmp_path, missing="forward-fill").values[1, 1] == 2
+
+
+def test_a_folder_of_returns(tmp_path: Path):
+    for name in ("A", "B"):
+        text = f"date,{name}\n" + rows(ISO, [["-0.5"], ["1.5"], ["-1.0"], ["2.0"]])
+        (tmp_path / f"{name}.csv").write_text(text)
+    prices = load(tmp_path, returns="percent")
+    assert prices.assets == ("A", "B")
+    np.testing.assert_allclose(prices.values[:, 0], 100 * np.cumprod([1, 1.015, 0.99, 1.02]))
+
+
+def test_faults_in_a_folder(tmp_path: Path):
+    assert "is a folder without tables" in refusal(tmp_path)
+    bars(tmp_path, "a.csv", ["1", "2", "3", "4"])
+    bars(tmp_path, "b.csv", ["1", "2", "-3", "4"])
+    assert "'b.csv': row 4 (2024-01-31), column 'Close': the price is neg" in refusal(tmp_path)

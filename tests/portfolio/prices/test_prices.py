@@ -296,7 +296,7 @@ def test_sources_that_are_no_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (csv(tmp_path, pickle.dumps(Bomb()), "p.csv"), "is not UTF-8 text"),
         (csv(tmp_path, pickle.dumps(Bomb()), "p.parquet"), "is damaged or not a Parquet file"),
         (csv(tmp_path, "", "p.xlsx"), "export it as CSV"),
-        (tmp_path, "Is a directory"),
+        (tmp_path, "'p.csv' is not UTF-8 text"),  # of a folder's tables the first
         (tmp_path / "none.csv", "No such file or directory"),
         (tmp_path / ("x" * 999 + ".csv"), "cannot be read"),
         ("a\0.csv", "cannot be read"),

@@ -16,7 +16,7 @@ from qfolio.portfolio.prices.delimited import from_text
 from qfolio.portfolio.prices.header import name_columns
 from qfolio.portfolio.prices.layout import Table, upright
 
-TEXT_FILES = (".csv", ".tsv", ".txt", "")
+TEXT_FILES = (".csv", ".tsv", ".txt")
 PARQUET_FILES = (".parquet", ".pq")
 
 
@@ -35,7 +35,7 @@ def read(source: Any, texts: Callable[[tuple[str, ...]], set[int]]) -> Table:
         return upright(_from_frame(source))
     path = Path(source)
     kind = path.suffix.lower()
-    if kind not in TEXT_FILES + PARQUET_FILES:
+    if kind not in ("", *TEXT_FILES, *PARQUET_FILES):
         raise QfolioError(
             f"{quote(path, 300)} is not read: tables come as CSV (.csv, .tsv, .txt) or Parquet "
             "(.parquet); export it as CSV."

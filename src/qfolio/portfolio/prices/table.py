@@ -5,8 +5,9 @@ filled from a later one would leak the future to an agent.
 """
 
 import hashlib
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
-from qfolio.portfolio.prices import reading
+from qfolio.portfolio.prices import folder, reading
 from qfolio.portfolio.prices.checks import Choices, examine
 from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.findings import Finding, day, hint
@@ -192,7 +193,8 @@ def load(
     """Read and check a price table.
 
     Args:
-        source: Path of a CSV or Parquet file; a data frame that narwhals knows (pandas, polars,
+        source: Path of a CSV or Parquet file, or of a folder of such files, each of one asset or
+            more; a data frame that narwhals knows (pandas, polars,
             pyarrow, …); None for skfolio's 20 US stocks, 1990 to 2022, which need no download;
             or Prices, which are returned as they are. A table is wide (a column of dates, then a
             column per asset) or long (columns of dates, assets and prices, found by their names,
@@ -256,8 +258,14 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
 
         source, label, note = load_sp500_dataset(), DEFAULT_SOURCE, DEFAULT_NOTE
     chosen = Choices(**choices)
+    if joined := isinstance(source, str | Path) and os.path.isdir(source):
+        label = Path(source).resolve().name
+        source = folder.join(Path(source), lambda file: load(file, **choices))
+        chosen = replace(chosen, returns=None, date="date")
     table = reading.read(source, lambda names: text_columns(names, chosen.date))
     content, findings = examine(table, chosen)
+    if joined:  # whose rows are those of no file
+        findings = [replace(finding, row=None) for finding in findings]
     if not content:
         return None, findings
     return Prices(**content, source=label or table.source, note=note), findings
