@@ -35,20 +35,23 @@ def test_every_seed_is_within_a_percent_of_the_optimum(task, agent):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("fraction", "cost", "steps"),
+    ("fraction", "cost", "steps", "cash_rate"),
     [
-        (0.1, 0.03, 252),
-        (0.9, 0.03, 252),
-        (0.1, 0.0025, 252),
-        (0.5, 0.01, 252),
-        (0.3, 0.01, 52),
-        (0.8, 0.01, 12),
+        (0.1, 0.03, 252, 0.0),
+        (0.9, 0.03, 252, 0.0),
+        (0.1, 0.0025, 252, 0.0),
+        (0.5, 0.01, 252, 0.0),
+        (0.3, 0.01, 52, 0.0),
+        (0.8, 0.01, 12, 0.0),
+        (0.5, 0.01, 12, 0.03),
     ],
 )
-def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps):
-    """The best weight without costs, the cost, and steps a year."""
+def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps, cash_rate):
+    """The best weight without costs, the cost, steps a year, and what cash earns."""
     preset = PRESETS["market/no-trade", "pathwise"]["fast"]
-    market = find("task", "market/no-trade")(rate=fraction * 0.2**2, cost=cost, dt=1 / steps)
+    market = find("task", "market/no-trade")(
+        rate=fraction * 0.2**2, cost=cost, dt=1 / steps, cash_rate=cash_rate
+    )
     run = Run.create(market, preset.build(), episodes=preset.episodes, seeds=2, seed=100)
     run.train()
     result = run.grade()

@@ -35,10 +35,6 @@ def _all_actions(episodes: int, menu: str, **changes: Any) -> dict[str, Preset]:
     return {"fast": Preset("dqn", changes, episodes, seeds=5, task={"menu": menu})}
 
 
-def _sac(steps: int, **changes: Any) -> dict[str, Preset]:
-    return {"fast": Preset("sac", changes, steps=steps, seeds=5)}
-
-
 PRESETS: Presets = {
     ("market/kelly", "pathwise"): _pathwise(
         307_200, num_envs=1024, rollout_length=5, learning_rate_steps=300.0, reward_scale=10.0
@@ -117,19 +113,26 @@ PRESETS: Presets = {
     ("market/liquidation", "pathwise"): _pathwise(
         25_600, num_envs=64, rollout_length=5, learning_rate_steps=400.0
     ),
-    ("market/liquidation", "sac"): _sac(
-        30_000,
-        hidden=(64, 64),
-        num_envs=16,
-        gradient_steps=4,
-        batch_size=256,
-        replay_capacity=32_768,
-        discount=1.0,
-        tau=0.02,
-        learning_rate=3e-3,
-        learning_rate_steps=7500.0,
-        learning_rate_final=0.0,
-        initial_temperature=0.01,
-        spread=0.02,
-    ),
+    # The critics see how the value curves in the position only if exploration reaches around it.
+    ("market/liquidation", "sac"): {
+        "fast": Preset(
+            "sac",
+            {
+                "hidden": (64, 64),
+                "num_envs": 16,
+                "gradient_steps": 4,
+                "batch_size": 256,
+                "replay_capacity": 32_768,
+                "discount": 1.0,
+                "tau": 0.02,
+                "learning_rate": 3e-3,
+                "learning_rate_steps": 7500.0,
+                "learning_rate_final": 0.0,
+                "initial_temperature": 0.01,
+                "spread": 0.1,
+            },
+            steps=30_000,
+            seeds=5,
+        )
+    },
 }
