@@ -26,6 +26,7 @@ def run() -> NoReturn:
     from qfolio.commands.comparison import compare
     from qfolio.commands.continual import continual
     from qfolio.commands.portfolio import backtest, prices
+    from qfolio.commands.report import report
     from qfolio.commands.study import study
     from qfolio.commands.training import evaluate, train, watch
     from qfolio.commands.tuning import tune
@@ -34,7 +35,7 @@ def run() -> NoReturn:
     commands: dict[str, Callable[..., Any]] = {
         "backtest": backtest, "allocate": allocate, "follow": follow, "prices": prices,
         "study": study, "train": train, "compare": compare, "evaluate": evaluate, "watch": watch,
-        "tune": tune, "continual": continual, "board": board,
+        "tune": tune, "continual": continual, "board": board, "report": report,
     }  # fmt: skip
     try:
         try:

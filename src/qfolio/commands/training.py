@@ -282,6 +282,22 @@ def _contrast(run: "Run", folder: Path, executor: "Executor") -> "Run | None":
     return contrast
 
 
+def write_again(folder: Path) -> None:
+    """Writes the report of a finished run, from the grades in its summary."""
+    from qfolio.core.files import read_json
+    from qfolio.experiments.run import Run
+    from qfolio.report.collect import report_data
+    from qfolio.report.training import write_report
+
+    run, place = Run.open(folder), folder / "contrast"
+    contrast = Run.open(place) if (place / "checkpoint.safetensors").exists() else None
+    path = folder / "summary.json"
+    summary = read_json(path) if path.is_file() else {}
+    if summary.get("episodes") != run.episodes:
+        raise QfolioError(f"The run is not finished; continue with {_resume(run, folder)}.")
+    write_report(folder, report_data(run, summary, contrast, _command(run)))
+
+
 def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
     from qfolio.commands.console import console, print_result, print_rule, say
     from qfolio.report.collect import report_data

@@ -119,6 +119,19 @@ def tune(
         stop(resume)
 
 
+def write_again(folder: Path) -> None:
+    """Writes the report of a finished search."""
+    from qfolio.report.tuning import sweep, write_tuning_report
+
+    tuning = _tuning()
+    if not (folder / "summary.json").is_file():
+        raise QfolioError(f"The search is not finished; continue with qfolio tune --join {folder}.")
+    work = tuning.Tuning.open(folder)
+    summary = work.conclude()
+    resume = again("qfolio tune --join", folder, work.task, work.agent)
+    write_tuning_report(folder, sweep(work, summary, f"{command(work, summary['best'])}\n{resume}"))
+
+
 def _tuning() -> Any:
     try:
         import qfolio.experiments.tuning.run

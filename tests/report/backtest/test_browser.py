@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qfolio.report.backtest.data import BacktestData
+from qfolio.report.backtest.data import BacktestData, shown_order
+from qfolio.report.backtest.opening import lead_name
 from qfolio.report.backtest.page import render_backtest
 
 from backtests import ATTACK, usual
@@ -73,7 +74,7 @@ def test_choosing_a_strategy(browser: Browser, folder: Path) -> None:
     browser.complaints.clear()
     browser.show((folder / "report.html").as_uri(), 1280, DRAWN)
     choose = (
-        "(id) => { const list = document.getElementById(id); list.value = '2';"
+        "(id) => { const list = document.getElementById(id); list.value = '1';"
         "list.dispatchEvent(new Event('change')); }"
     )
     first = browser.evaluate("document.getElementById('weights-list').textContent")
@@ -82,7 +83,7 @@ def test_choosing_a_strategy(browser: Browser, folder: Path) -> None:
     assert browser.evaluate("document.getElementById('weights-list').textContent") != first
     browser.evaluate(f"({choose})('months-strategy')")
     shown = "[...document.querySelectorAll('[data-months]')].filter(t => t.offsetHeight > 0)"
-    assert browser.evaluate(f"{shown}.map(t => t.dataset.months)") == ["2"]
+    assert browser.evaluate(f"{shown}.map(t => t.dataset.months)") == ["1"]
     # A picture can be saved under the policy of the page.
     picture = "Plotly.toImage(document.getElementById('wealth'), {format: 'png'})"
     assert browser.evaluate(picture).startswith("data:image/png;base64,")
@@ -114,7 +115,9 @@ def test_tear_sheet_opens_and_draws(browser: Browser, tmp_path: Path) -> None:
     browser.click("#sheet summary")
     browser.wait(drawn)
     parts = "[...document.querySelectorAll('[data-sheet]')].filter(p => p.offsetHeight > 0)"
-    assert browser.evaluate(f"{parts}.map(p => p.dataset.sheet)") == ["0"]
+    data = usual(400)
+    lead = str(shown_order(data).index(lead_name(data) or ""))
+    assert browser.evaluate(f"{parts}.map(p => p.dataset.sheet)") == [lead]
     browser.evaluate(
         "(() => { const list = document.getElementById('sheet-strategy'); list.value = '3';"
         "list.dispatchEvent(new Event('change', {bubbles: true})); })()"

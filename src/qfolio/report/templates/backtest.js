@@ -86,7 +86,7 @@
     const edge = 0.06 * (high - low) || 0.1;
     return Plotly.react(chart,
       [...lines("sharpe", data.dates, "y", false), ...lines("beta", data.dates, "y2", false)],
-      layout(narrow.matches ? 440 : 470, {
+      layout(state.printing ? 290 : narrow.matches ? 440 : 470, {
         margin: { r: room() },
         titles: [["Sharpe ratio of the last year", 1], ["Beta of the last year", 0.36]],
         xaxis: { anchor: "y2" },
@@ -102,7 +102,7 @@
     const months = data.months.length > 1;
     return Plotly.react(chart,
       [...lines("cost", data.dates, "y", true), ...lines("turnover", data.months, "y2", false)],
-      layout(narrow.matches ? 440 : 510, {
+      layout(state.printing ? 235 : narrow.matches ? 440 : 510, {
         titles: [["Share of the wealth lost to costs so far", 1],
           [months ? "Monthly turnover, over wealth" : "Turnover, over wealth", 0.42]],
         xaxis: { anchor: "y2" },
@@ -206,6 +206,16 @@
   document.addEventListener("toggle", cue, { capture: true });
   document.addEventListener("change", cue);
   cue();
-  addEventListener("beforeprint", () => { state.printing = true; redraw(); });
-  addEventListener("afterprint", () => { state.printing = false; redraw(); });
+  let opened = false;
+  addEventListener("beforeprint", () => {
+    state.printing = true;
+    opened = byId("sheet").open;
+    byId("sheet").open = true;
+    redraw();
+  });
+  addEventListener("afterprint", () => {
+    state.printing = false;
+    byId("sheet").open = opened;
+    redraw();
+  });
 })();

@@ -5,8 +5,9 @@
   const { data, dark, narrow, coarse, state, byId, last, colour, percent, number, layout,
     options } = tools;
   const { dates, series: all, reference, effective } = data.weights;
-  const ROW = 23, BELOW = 130, TOP = 26, BOTTOM = 40;
-  let chosen = all.findIndex((series) => series !== null);
+  const tall = () => (state.printing ? [13, 72] : [23, 130]); // of a row, and of the panel below
+  const TOP = 26, BOTTOM = 40;
+  let chosen = Number(byId("weights-strategy").value);
 
   /** The rows from top to bottom: the largest first, cash at the end. */
   const rows = (series) => [...series.names.keys()].slice(1).concat(0);
@@ -20,12 +21,12 @@
 
   function draw() {
     const series = all[chosen], order = rows(series), alone = reference === null || chosen === reference;
-    const inner = ROW * order.length + 40 + BELOW;
+    const [row, panel] = tall(), inner = row * order.length + 40 + panel;
     const edge = reach(series);
-    const share = (ROW * order.length) / inner;
+    const share = (row * order.length) / inner;
     const map = {
       type: "heatmap", x: dates, y: order.map((_, place) => place),
-      z: order.map((row) => series.active[row]), zmin: alone ? 0 : -edge, zmax: edge,
+      z: order.map((place) => series.active[place]), zmin: alone ? 0 : -edge, zmax: edge,
       colorscale: alone ? [[0, colour("paper")], [1, colour("accent")]]
         : [[0, colour("second")], [0.5, colour("paper")], [1, colour("accent")]],
       showscale: false, hoverinfo: "none", ygap: 2,
@@ -34,7 +35,7 @@
       x: dates, y, yaxis: "y2", type: "scatter", mode: "lines", hoverinfo: "none",
       line: { color: colour(ink), width },
     });
-    const below = (BELOW / inner);
+    const below = panel / inner;
     const traces = [map, ...(alone ? [] : [line(effective, "ink", 1)]),
       line(series.effective, "accent", 1.8)];
     say(alone, edge);
@@ -63,7 +64,7 @@
     const place = byId("weights-list"), chart = byId("weights");
     const { _offset: top, _length: height } = chart._fullLayout.yaxis;
     const { l, r } = margin();
-    const width = chart.clientWidth;
+    const width = chart._fullLayout.width;
     const add = (text, kind, at, left, wide) => {
       const span = document.createElement("span");
       span.className = kind;

@@ -10,11 +10,12 @@ const tools = (() => {
   const state = { printing: false };
 
   const MARGIN = 44; // left of an axis, for its numbers
+  const PRINTED = 380; // the most height of a chart on paper
   const SPACE = "\u202f", MINUS = "\u2212";
   const SANS = getComputedStyle(document.documentElement).getPropertyValue("--sans").trim();
   const byId = (id) => document.getElementById(id);
   const last = (values) => values[values.length - 1];
-  const colour = (name) => data.themes[dark.matches && !state.printing ? "dark" : "light"][name] || name;
+  const colour = (name) => (state.printing && name === "paper") ? "#ffffff" : data.themes[dark.matches && !state.printing ? "dark" : "light"][name] || name;
   const translucent = (hex, alpha) => hex + Math.round(255 * alpha).toString(16).padStart(2, "0");
   const dashes = (pattern) => pattern && pattern.split(" ").map((part) => part + "px").join(",");
 
@@ -33,7 +34,7 @@ const tools = (() => {
   function layout(height, more) {
     const text = colour("muted");
     return {
-      height, width: state.printing ? 660 : undefined,
+      height: state.printing ? Math.min(height, PRINTED) : height, width: state.printing ? 660 : undefined,
       paper_bgcolor: colour("paper"), plot_bgcolor: colour("paper"),
       font: { family: SANS, size: 12, color: text },
       margin: { l: MARGIN, r: 10, t: 26, b: 40, ...more.margin },

@@ -1,0 +1,121 @@
+"""The command that writes a folder's report again, also as PDF."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from qfolio.commands.arguments import Modules
+from qfolio.core import registry
+from qfolio.core.errors import QfolioError
+
+FILES = ("comparison.json", "continual.json", "study.json", "config.json")
+"""The files that say of which kind a folder is."""
+
+PAGE, PDF = "report.html", "report.pdf"
+
+
+def report(folder: Positional[Path], *, pdf: bool = False, trust: Modules = ()) -> None:
+    """Write the report of a finished run again, and print it as PDF.
+
+    Args:
+        folder: Folder of qfolio train, backtest, study, compare, tune or continual.
+        pdf: Also write report.pdf, printed by Chromium or Chrome.
+        trust: Modules of your own code that the folder may name (default: none).
+    """
+    from qfolio.commands import console
+    from qfolio.report.printing import find_browser, print_pdf
+
+    kind = _kind(folder)
+    if pdf and find_browser() is None:
+        print_pdf(folder / PAGE, folder / PDF)  # raises before anything is written
+    from qfolio.core import devices
+
+    devices.configure()
+    registry.trust(trust)
+    with console.console.status("Writing the report"):
+        WRITERS[kind](folder)
+    console.say(f"Report: {folder / PAGE}")
+    if pdf:
+        with console.console.status("Printing"):
+            print_pdf(folder / PAGE, folder / PDF)
+        console.say(f"PDF: {folder / PDF}")
+
+
+def _kind(folder: Path) -> str:
+    from qfolio.core.files import read_json
+
+    path = next((folder / name for name in FILES if (folder / name).is_file()), None)
+    kind = None if path is None else read_json(path).get("kind")
+    if not isinstance(kind, str) or kind not in WRITERS:
+        raise QfolioError(
+            f"{folder} has no report; give the folder of a training, backtest, study, comparison, "
+            "search or continual experiment."
+        )
+    return kind
+
+
+def _backtest(folder: Path) -> None:
+    from qfolio.commands.backtesting import write_report
+    from qfolio.portfolio.backtest.attribution.explain import explain
+    from qfolio.portfolio.backtest.attribution.why import Why
+    from qfolio.portfolio.backtest.folder import BacktestFolder
+    from qfolio.portfolio.backtest.run import Backtest
+
+    run = Backtest.open(folder)
+    entries, notes = run.entries()
+    known = (folder / "why.json").is_file()
+    why = Why.read(BacktestFolder(folder).read_why()) if known else explain(run, entries)
+    write_report(run, entries, run.assess(entries), notes, why)
+
+
+def _study(folder: Path) -> None:
+    from qfolio.portfolio.study.run import Study
+    from qfolio.report.study import write_study_report
+
+    write_study_report(Study.open(folder))
+
+
+def _training(folder: Path) -> None:
+    from qfolio.commands.training import write_again
+
+    write_again(folder)
+
+
+def _comparison(folder: Path) -> None:
+    from qfolio.experiments.comparison.run import Comparison
+    from qfolio.report.comparison import write_comparison_report
+
+    write_comparison_report(folder, Comparison.open(folder).finish())
+
+
+def _search(folder: Path) -> None:
+    from qfolio.commands.tuning import write_again
+
+    write_again(folder)
+
+
+def _continual(folder: Path) -> None:
+    import msgspec
+
+    from qfolio.core.config import read_config
+    from qfolio.experiments.continual import FILE, WAYS, ContinualConfig
+    from qfolio.report.continual import write_continual_report
+
+    state = read_config(folder / FILE, ContinualConfig)
+    if set(WAYS) - set(state.courses):
+        raise QfolioError(
+            f"The experiment is not finished; continue with qfolio continual --resume {folder}."
+        )
+    write_continual_report(folder, msgspec.to_builtins(state))
+
+
+WRITERS: dict[str, Callable[[Path], None]] = {
+    "backtest": _backtest,
+    "study": _study,
+    "run": _training,
+    "comparison": _comparison,
+    "search": _search,
+    "continual": _continual,
+}
+"""How the report of each kind of folder is written."""

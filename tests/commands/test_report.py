@@ -1,0 +1,111 @@
+"""qfolio report: pages written again, and printed."""
+
+import shutil
+
+import pytest
+
+from qfolio.report import printing
+
+from shell import TINY as SMALL
+from shell import qfolio
+from tables import write_table
+
+TINY = [
+    "--agents", "pathwise", "--train", "80d", "--test", "40d", "--seeds", 1, "--episodes", 8,
+    "--baselines", "equal-weight",
+    "--set", "window=10", "horizon=20", "hidden=4", "num_envs=4", "rollout_length=10",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def backtest(tmp_path_factory):
+    place = tmp_path_factory.mktemp("backtest")
+    prices = write_table(place / "prices.csv", rows=160)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        code = qfolio(
+            monkeypatch, "backtest", prices, *TINY, "--title", "For the <committee>", "--out",
+            place / "run",
+        )  # fmt: skip
+    assert code == 0
+    return place / "run"
+
+
+def test_a_backtest_is_reported_again(backtest, monkeypatch, capsys):
+    page = backtest / "report.html"
+    before = page.read_bytes()
+    assert b"<h1>For the &lt;committee&gt;</h1>" in before
+    others = {path: path.read_bytes() for path in backtest.iterdir() if path.suffix == ".json"}
+    page.unlink()
+    assert qfolio(monkeypatch, "report", backtest) == 0
+    assert page.read_bytes() == before
+    assert all(path.read_bytes() == content for path, content in others.items())
+    assert str(page) in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_pdf_is_printed(backtest, monkeypatch):
+    if printing.find_browser() is None:
+        pytest.skip("no Chromium found")
+    assert qfolio(monkeypatch, "report", backtest, "--pdf") == 0
+    content = (backtest / "report.pdf").read_bytes()
+    assert content.startswith(b"%PDF")
+    pages = content.count(b"/Type /Page\n")
+    assert 3 <= pages <= 6
+
+
+def test_without_a_browser_nothing_is_written(backtest, monkeypatch, capsys):
+    monkeypatch.setenv("QFOLIO_CHROMIUM", "no-such-program")
+    (backtest / "report.html").unlink(missing_ok=True)
+    assert qfolio(monkeypatch, "report", backtest, "--pdf") == 2
+    assert "printed by Chromium or Chrome" in capsys.readouterr().err
+    assert not (backtest / "report.html").exists()
+
+
+def test_an_unfinished_backtest_is_refused(backtest, monkeypatch, capsys, tmp_path):
+    copy = shutil.copytree(backtest, tmp_path / "copy")
+    shutil.rmtree(copy / "policies")
+    assert qfolio(monkeypatch, "report", copy) == 2
+    assert f"qfolio backtest --resume {copy}" in capsys.readouterr().err.replace("\n", "")
+
+
+def test_a_training_is_reported_again(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "run"
+    assert qfolio(monkeypatch, "train", "pendulum", "--episodes", 4, "--seeds", 1, "--no-compare",
+                  "--out", folder, *SMALL) == 0  # fmt: skip
+    before = (folder / "report.html").read_bytes()
+    (folder / "report.html").unlink()
+    assert qfolio(monkeypatch, "report", folder) == 0
+    assert (folder / "report.html").read_bytes() == before
+    (folder / "summary.json").unlink()
+    assert qfolio(monkeypatch, "report", folder) == 2
+    assert "qfolio train --resume" in capsys.readouterr().err
+
+
+def test_a_comparison_is_reported_again(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    assert qfolio(monkeypatch, "compare", "finite/cliff", "--agents", "q-learning,sarsa",
+                  "--episodes", 20, "--seeds", 2, "--out", folder) == 0  # fmt: skip
+    before = (folder / "report.html").read_bytes()
+    (folder / "report.html").unlink()
+    assert qfolio(monkeypatch, "report", folder) == 0
+    assert (folder / "report.html").read_bytes() == before
+
+
+def test_a_study_is_reported_again(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    tables = [write_table(tmp_path / f"{name}.csv", rows=160, seed=seed)
+              for seed, name in enumerate(("one", "two"))]  # fmt: skip
+    assert qfolio(monkeypatch, "study", *tables, *TINY, "--out", folder) == 0
+    before = (folder / "report.html").read_bytes()
+    (folder / "report.html").unlink()
+    assert qfolio(monkeypatch, "report", folder) == 0
+    assert (folder / "report.html").read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [None, '{"kind": "policy"}', "[1]"])
+def test_other_folders_are_refused(tmp_path, monkeypatch, capsys, content):
+    if content is not None:
+        (tmp_path / "config.json").write_text(content)
+    assert qfolio(monkeypatch, "report", tmp_path) == 2
+    printed = capsys.readouterr().err
+    assert "Traceback" not in printed
+    assert str(tmp_path) in printed.replace("\n", "")
