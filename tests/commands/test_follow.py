@@ -64,6 +64,10 @@ def test_follow_shows_live_beside_the_backtest(folder, monkeypatch, capsys, tmp_
     assert "Live returns are consistent with the backtest (evidence against it" in printed
     assert "no retrain is due before it is 80d old." in printed
     assert "Holdings differed from those expected 2 times" in printed
+    page = (folder / "follow.html").read_text()
+    assert page.count("<svg") == 2
+    assert "Live returns are consistent with the backtest" in page
+    assert "pathwise, live and in the backtest" in page
 
 
 def test_a_loss_at_every_row_raises_the_alarm(folder, monkeypatch, capsys, tmp_path):

@@ -171,29 +171,44 @@ def follow(
         folder: Folder of a backtest with a ledger.
         prices: Prices with all rows since the first allocation, CSV or Parquet (default: the
             prices of the backtest).
-        out: CSV file with a row for each row of the prices (default: follow.csv in the folder).
+        out: CSV file with a row for each row of the prices (default: follow.csv in the folder); a
+            page is written beside it, with the suffix html.
         trust: Modules of your own code that the folder may name (default: none).
         missing: How to treat missing prices.
         features: Columns that hold features (default: those of the backtest).
         date: Column of dates (default: found by its name).
         as_json: Print JSON instead of a table.
     """
+    import numpy as np
+
     from qfolio.core import devices
 
     devices.configure()
     registry.trust(trust)
     from qfolio.commands import console
+    from qfolio.core.files import write_bytes
+    from qfolio.portfolio.backtest.consistency import ALARM
     from qfolio.portfolio.backtest.desk import Desk
     from qfolio.portfolio.backtest.follow import follow as marked
+    from qfolio.report.follow import LiveRows, render_following
 
     following = marked(Desk.open(folder, missing=missing, features=features, date=date), prices)
     path = folder / "follow.csv" if out is None else out
     following.write(path)
+    page, live = path.with_suffix(".html"), following.live
+    if len(live.returns):
+        equal = np.cumprod(1 + following.reference)
+        rows = LiveRows(
+            live.dates, following.growth, equal, following.band, following.evidence, ALARM
+        )
+        title = f"{following.agent}, live and in the backtest"
+        text = render_following(title, following.sentences(), rows, following.rows())
+        write_bytes(page, text.encode())
     if as_json:
         print(json.dumps(following.to_json(), indent=2))
         return
     console.print_following(following)
-    console.say(f"Rows: {path}")
+    console.say(f"Rows: {path}" + (f", page: {page}" if len(live.returns) else ""))
 
 
 def _reproduce(

@@ -110,7 +110,7 @@ class Allocation:
     @property
     def cost(self) -> float:
         """The expected cost of all kinds, in money."""
-        return sum(self.costs.values())
+        return float(sum(self.costs.values()))
 
     @property
     def wealth(self) -> float:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from qfolio.portfolio.allocation import Allocation
-from qfolio.portfolio.backtest.attribution.drivers import reasons, sentence
+from qfolio.portfolio.backtest.attribution.drivers import Driver, Reason, reasons, sentence
 from qfolio.portfolio.policy import Policy
 
 from planted import ASSETS, Known, four_folds, planted
@@ -34,5 +34,12 @@ def test_the_largest_trades_are_explained_exactly(plan):
         assert [each.weight for each in others] == [0, 0, 0]
     best = found[0]
     assert best.drivers[0].weight == pytest.approx(0.5 / ASSETS, abs=1e-6)
-    assert sentence(best).startswith(f"{best.asset} +25.00%: momentum:20 +8.33%, ")
-    assert sentence(best).endswith("on a typical day it would be +16.67%.")
+    assert sentence(best) == (
+        f"{best.asset} +25.00%: momentum:20 +8.33%; on a typical day it would be +16.67%."
+    )
+    many = Reason("A", 0.1, [Driver(name, 0.02) for name in "abcde"], 0.0)
+    assert "a +2.00%, b +2.00%, c +2.00%, other signals +4.00%;" in sentence(many)
+    none = Reason("A", 0.1, [Driver("a", 1e-6)], 0.1)
+    assert (
+        sentence(none) == "A +10.00%: no signal moves it, so that it is the same on a typical day."
+    )

@@ -24,6 +24,10 @@ SHOWN = 3
 """Largest contributions to each."""
 
 
+VISIBLE = 5e-5
+"""Smaller changes of a weight are not named."""
+
+
 class Driver(msgspec.Struct, frozen=True):
     """What a channel does to an asset's target weight."""
 
@@ -67,10 +71,13 @@ def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reas
 
 def sentence(reason: Reason) -> str:
     """A reason in words, with its largest drivers."""
-    shown = [f"{each.name} {each.weight:+.2%}" for each in reason.drivers[:SHOWN]]
-    others = sum(each.weight for each in reason.drivers[SHOWN:])
-    if len(reason.drivers) > SHOWN:
-        shown.append(f"other signals {others:+.2%}")
+    moving = [each for each in reason.drivers if abs(each.weight) >= VISIBLE]
+    if not moving:
+        change = f"{reason.asset} {reason.change:+.2%}"
+        return f"{change}: no signal moves it, so that it is the same on a typical day."
+    shown = [f"{each.name} {each.weight:+.2%}" for each in moving[:SHOWN]]
+    if len(moving) > SHOWN:
+        shown.append(f"other signals {sum(each.weight for each in moving[SHOWN:]):+.2%}")
     return (
         f"{reason.asset} {reason.change:+.2%}: {', '.join(shown)}; on a typical day it would be "
         f"{reason.rest:+.2%}."

@@ -1,0 +1,91 @@
+"""The page of a ledger that is followed: live wealth beside the backtest's band, and evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from qfolio.report import palette
+from qfolio.report.figures.style import legend_above, new_figure, svgs
+from qfolio.report.rendering import number, percent, render
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WIDTH = 8.6
+
+
+@dataclass(frozen=True)
+class LiveRows:
+    """What the page draws; an entry for each row, growth over the start.
+
+    band: 2.5 %, 50 % and 97.5 %, of shape (3, rows). alarm: the evidence that raises it.
+    """
+
+    dates: np.ndarray
+    growth: np.ndarray
+    equal_weights: np.ndarray
+    band: np.ndarray
+    evidence: np.ndarray
+    alarm: float
+
+
+def render_following(
+    title: str,
+    sentences: Sequence[str],
+    rows: LiveRows,
+    measures: Mapping[str, Mapping[str, float]],
+) -> str:
+    """Return the text of the page.
+
+    Args:
+        title: Its heading.
+        sentences: What is to be said; the first stand at the top.
+        rows: What to draw; at least one.
+        measures: Growth, growth a year, volatility, Sharpe ratio and drawdown, by name; may be
+            empty for a name with too few rows.
+    """
+    table = [
+        (
+            name,
+            [number(x, 2) if key == "sharpe" else percent(x) for key, x in found.items()]
+            or ["–"] * 5,
+        )
+        for name, found in measures.items()
+    ]
+    chart = svgs(draw_following, rows, WIDTH)
+    return render("follow.html", title=title, sentences=sentences, table=table, chart=chart)
+
+
+def draw_following(rows: LiveRows, width: float) -> Figure:
+    """Wealth with the band above, evidence with the alarm below, on a logarithmic axis."""
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+    few = width < 5
+    figure = new_figure(width, 4.6 if few else 5.0)
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.3))
+    low, middle, high = 100 * (rows.band - 1)
+    days = rows.dates.astype("datetime64[s]").astype(object)
+    shade = above.fill_between(days, low, high, color=palette.HAIRLINE, linewidth=0)
+    (median,) = above.plot(days, middle, color=palette.MUTED, linewidth=0.8, linestyle="--")
+    (equal,) = above.plot(days, 100 * (rows.equal_weights - 1), color=palette.SECOND, linewidth=1.1)
+    (live,) = above.plot(days, 100 * (rows.growth - 1), color=palette.ACCENT, linewidth=1.6)
+    above.set_title("Growth since the first trade, after costs, %")
+    above.grid(axis="y")
+    below.plot(days, rows.evidence, color=palette.INK, linewidth=1.1)
+    below.axhline(rows.alarm, color=palette.SECOND, linewidth=0.9)
+    below.set_yscale("log")
+    highest = max(2 * rows.alarm, 1.2 * float(rows.evidence.max()))
+    below.set_ylim(min(0.5, float(rows.evidence.min())), highest)
+    below.set_yticks([1, rows.alarm], ["1", f"{rows.alarm:g}"])
+    below.minorticks_off()
+    below.set_title(f"Evidence against the backtest; alarm at {rows.alarm:g}")
+    ticks = AutoDateLocator(minticks=2, maxticks=4 if few else 8)
+    below.xaxis.set_major_locator(ticks)
+    below.xaxis.set_major_formatter(ConciseDateFormatter(ticks, show_offset=False))
+    marks = {"live": live, "equal weights": equal, "backtest, median": median, "95 %": shade}
+    legend_above(figure, marks, few=few)
+    return figure
