@@ -40,6 +40,8 @@ def make_data(
         assessment=assess(
             {
                 name: Strategy(series.kind, series.returns, series.turnover, series.cost)
+                if series.weighted
+                else Strategy(series.kind, series.returns, None, None)
                 for name, series in strategies.items()
             },
             dates,
@@ -99,6 +101,19 @@ def usual(days: int = 300, seeds: int = 3, **more: Any) -> BacktestData:
         "pathwise": make_series(rng, "agent", seeds, days, 4, 0.02),
     }
     return make_data(series, weekdays("2001-01-02", days), ("A", "B", "C", "D"), **more)
+
+
+def of_returns_alone() -> BacktestData:
+    """A reference and a strategy of the user's own of which only returns are known."""
+    data = usual()
+    strategies = dict(data.strategies)
+    for name, kind in (("equal weight", "baseline"), ("third", "strategy")):
+        series = strategies[name]
+        unknown = np.full_like(series.turnover, np.nan)
+        weights = np.full_like(series.weights, np.nan)
+        strategies[name] = StrategySeries(kind, series.returns, unknown, unknown, weights)
+    del strategies["slow"], strategies["never"]
+    return make_data(strategies, data.dates, data.assets)
 
 
 def hostile() -> BacktestData:

@@ -12,11 +12,11 @@ from PIL import Image
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.differences import Contrast
 from qfolio.portfolio.backtest.verdict import verdicts
-from qfolio.report.backtest.data import BacktestData, StrategySeries
+from qfolio.report.backtest.data import BacktestData, StrategySeries, shown_order
 from qfolio.report.backtest.page import render_backtest
-from qfolio.report.rendering import percent
+from qfolio.report.rendering import number, percent
 
-from backtests import Page, make_data, usual
+from backtests import Page, make_data, of_returns_alone, usual
 
 
 def plain(text: str) -> str:
@@ -163,3 +163,35 @@ def test_picture(folder: Path) -> None:
 
 def test_page_is_repeatable(data: BacktestData) -> None:
     assert render_backtest(data) == render_backtest(data)
+
+
+def test_strategies_of_returns_alone() -> None:
+    """What is not known is a dash; their holdings cannot be chosen, and nothing is compared."""
+    known = of_returns_alone()
+    page = render_backtest(known)
+    shown = Page(page)
+    weights = shown.data["weights"]
+    assert weights["reference"] is None
+    assert [each is None for each in weights["series"]] == [
+        name in ("equal weight", "third") for name in shown_order(known)
+    ]
+    chooser = page.split('id="weights-strategy"')[1].split("</select>")[0]
+    assert "DQN" in chooser
+    assert "third" not in chooser
+    assert "nan" not in page.split("<script")[0].lower().split()
+    statistics = page.split('aria-label="Table of statistics"')[1]
+    row = statistics.split(">third</th>")[1].split("</tr>")[0]
+    assert re.findall(r"<td>([^<]*)", row)[-2:] == ["–", "–"]
+
+
+def test_figures_beside_the_reference(data: BacktestData) -> None:
+    html = render_backtest(data)
+    table = html.split('aria-label="Table of figures beside the reference"')[1].split("</table>")[0]
+    for name in ("DQN", "best of all", "equal weight"):
+        cells = re.findall(r"<td>([^<]*)", table.split(f">{name}</th>")[1].split("</tr>")[0])
+        measured = data.assessment.strategies[name].relative
+        if name == data.assessment.reference:
+            assert cells == ["–"] * 7
+        else:
+            assert cells[0] == percent(measured["active_return"].mean)
+            assert cells[3] == number(measured["beta"].mean, 2)

@@ -127,7 +127,7 @@ def tiles(data: BacktestData) -> list[dict[str, str]]:
     own, other = (test.strategies[name].measures for name in (shown, test.reference))
 
     def written(key: str, value: float) -> str:
-        if key == "turnover":
+        if key == "turnover" and not math.isnan(value):
             return f"{number(value)} ×"
         if key == "cost_drag":
             return percent(value, 2)
