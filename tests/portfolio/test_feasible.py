@@ -1,8 +1,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from qfolio.portfolio.feasible import CappedSimplex
+from qfolio.portfolio.mandate import feasible, settled
 
 LIMITS = [0.4, 0.0, 0.7]
 
@@ -35,3 +37,53 @@ def test_violations_are_named_and_measured():
                                atol=1e-7)  # fmt: skip
     np.testing.assert_allclose(found["a weight is below 0 by"], [0, 0.2, 0, np.nan], atol=1e-7)
     np.testing.assert_allclose(found["the sum is off 1 by"], [0, 0, 0.1, np.nan], atol=1e-7)
+
+
+MANDATE = {
+    "assets": {"cap": 0.3, "floor": {"A0": 0.05}},
+    "groups": {"sector": {"x": {"assets": ["A1", "A2", "A3"], "cap": 0.35, "floor": 0.1}}},
+    "cash": {"max": 0.1},
+}
+
+
+def mandated(**trading):
+    assets = [f"A{i}" for i in range(8)]
+    made = feasible(settled({**MANDATE, "trading": trading}, assets), np.ones(8, bool))
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), made)
+
+
+@pytest.mark.parametrize(
+    "trading",
+    [{"turnover": 0.2}, {"turnover": 0.3, "holdings": 5, "smallest_trade": 0.02}],
+)
+def test_what_a_mandate_projects_or_draws_is_allowed(trading):
+    made = mandated(**trading)
+    drawn = jax.vmap(made.draw)(jax.random.split(jax.random.key(0), 200))
+    assert largest(made.violations(drawn)) <= 2e-6
+    wanted = jnp.asarray(np.random.default_rng(0).dirichlet(np.full(9, 0.7), 200), jnp.float32)
+    project = jax.jit(jax.vmap(made.project))
+    found = project(wanted, drawn)
+    assert largest(made.violations(found, drawn)) <= 2e-6
+    again = project(found, drawn)
+    np.testing.assert_allclose(again, found, atol=2e-6)
+
+
+def test_small_trades_are_left_out_and_others_made():
+    made = mandated(smallest_trade=0.03)
+    held = jnp.array([0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.2])
+    near = held + jnp.array([0, 0.01, -0.01, 0, 0, 0.02, -0.02, 0, 0])
+    np.testing.assert_array_equal(made.project(near, held)[1:], held[1:])
+    far = held + jnp.array([0, 0.01, -0.01, 0, 0, 0.05, -0.05, 0, 0])
+    moved = made.project(far, held) - held
+    np.testing.assert_allclose(moved, [0, 0, 0, 0, 0, 0.05, -0.05, 0, 0], atol=1e-6)
+    below = held.at[1].set(0.045).at[7].set(0.155)  # under its floor: a limit needs the trade
+    np.testing.assert_allclose(made.project(below, below), below.at[:2].set([0.095, 0.05]),
+                               atol=1e-6)  # fmt: skip
+
+
+def test_the_largest_weights_are_kept():
+    made = mandated(holdings=4)
+    wanted = jnp.array([0.02, 0.01, 0.02, 0.12, 0.01, 0.27, 0.05, 0.26, 0.24])
+    found = np.asarray(made.project(wanted, wanted))
+    assert np.flatnonzero(found[1:] > 0).tolist() == [0, 2, 4, 6]  # with those that floors need
+    assert largest(made.violations(found)) <= 1e-6

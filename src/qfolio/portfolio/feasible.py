@@ -6,7 +6,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from qfolio.portfolio.projection import Limits, excess, nearest
+
+BARELY = 5e-6
+"""Excesses of a limit up to this are rounding errors in float32."""
 
 
 class Feasible(eqx.Module):
@@ -70,3 +75,127 @@ class CappedSimplex(Feasible):
             "a weight is below 0 by": -weights.min(-1),
             "a weight is above its limit by": (weights[..., 1:] - xp.asarray(self.limits)).max(-1),
         }
+
+
+class Mandated(Feasible):
+    """Weights that obey a mandate, made by ``mandate.feasible``.
+
+    An order is the point of the set that is nearest to the weights wanted, in the weights of the
+    assets; cash is the rest. With a number of holdings, the largest weights of that point are kept,
+    and the others are 0. Changes below the smallest trade are not made, unless a limit needs them.
+    If turnover clashes with other limits, as after a fall in prices, it gives way to them.
+    """
+
+    limits: Limits
+    names: tuple[str, ...] = eqx.field(static=True)  # of the rows of the limits
+    holdings: int = eqx.field(static=True, default=0)  # at most so many; 0: any number
+    smallest_trade: float = eqx.field(static=True, default=0.0)
+
+    def project(
+        self, wanted: Float[Array, " entry"], held: Float[Array, " entry"]
+    ) -> Float[Array, " entry"]:
+        aim, now, limits = wanted[1:], held[1:], self.limits
+        weights = nearest(aim, now, limits)
+        if self.holdings and self.holdings < len(aim):
+            weights, limits = self._fewer(aim, now, weights)
+        if self.smallest_trade:
+            weights = self._without_small(aim, now, weights, limits)
+        return jnp.concatenate([1 - weights.sum(keepdims=True), weights])
+
+    def _fewer(
+        self,
+        wanted: Float[Array, " asset"],
+        held: Float[Array, " asset"],
+        weights: Float[Array, " asset"],
+    ) -> tuple[Float[Array, " asset"], Limits]:
+        """The nearest weights with the largest alone, and the limits that keep it so.
+
+        If they need more turnover than there may be, those with what is held alone.
+        """
+
+        def only(size: Array) -> tuple[Array, Limits]:
+            _, kept = jax.lax.top_k(abs(size) + self._needed(size), self.holdings)
+            others = jnp.ones(len(wanted), bool).at[kept].set(False)
+            limits = _fixed(self.limits, others, jnp.zeros_like(wanted))
+            return nearest(wanted, held, limits), limits
+
+        largest, as_held = only(weights), only(held)
+        over, over_as_held = (
+            excess(found, held, limits).max() for found, limits in (largest, as_held)
+        )
+        better = (over <= BARELY) | (over <= over_as_held)
+        return jax.tree.map(lambda one, other: jnp.where(better, one, other), largest, as_held)
+
+    def _without_small(
+        self,
+        wanted: Float[Array, " asset"],
+        held: Float[Array, " asset"],
+        weights: Float[Array, " asset"],
+        limits: Limits,
+    ) -> Float[Array, " asset"]:
+        """The weights, with what changes little left as it is held.
+
+        The others take what that leaves over; if it makes their changes too small as well, nothing
+        is traded.
+        """
+        can_stay = (held >= limits.low) & (held <= limits.high)
+
+        def small(weights: Array) -> Array:
+            return can_stay & (abs(weights - held) < self.smallest_trade - BARELY)
+
+        left = small(weights)
+        once = nearest(wanted, held, _fixed(limits, left, held))
+        left |= small(once)
+        fewer = nearest(wanted, held, _fixed(limits, left, held))
+
+        def allowed(weights: Array) -> Array:
+            return excess(weights, held, limits).max() <= BARELY
+
+        fits = allowed(fewer) & ~(small(fewer) & ~left).any()
+        now = jnp.append(1 - held.sum(), held)
+        may_stay = jnp.stack(list(self.violations(now).values())).max() <= BARELY
+        return jnp.where(fits, fewer, jnp.where(may_stay, held, weights))
+
+    def _needed(self, weights: Float[Array, " asset"]) -> Float[Array, " asset"]:
+        """Which assets are kept first: those with a floor, then the largest weights of each group
+        with a floor, as many as its caps require."""
+        low, high, rows, most, *_ = self.limits
+        members = (rows < 0) & ~(rows < 0).all(1)[:, None]  # of a floor, but not that of all assets
+        larger = weights[None] > weights[:, None]
+        room = jnp.where(members, high, 0.0) @ larger.T  # of larger weights, (row, asset)
+        of_groups = (members & (room < -most[:, None] - BARELY)).any(0)
+        return 20.0 * ((low > 0) | (high < 0)) + 10.0 * of_groups
+
+    def draw(self, key: PRNGKeyArray) -> Float[Array, " entry"]:
+        drawn = CappedSimplex(jnp.ones_like(self.limits.high)).draw(key)
+        from_anywhere = self.limits._replace(turnover=jnp.array(jnp.inf))
+        return Mandated(from_anywhere, self.names, self.holdings).project(drawn, drawn)
+
+    def violations(self, weights: Any, held: Any = None) -> dict[str, Any]:
+        """As in the base; with the weights held, also of turnover and of the smallest trade."""
+        xp = weights.__array_namespace__()
+        low, high, rows, most, gross, turnover = (xp.asarray(x) for x in self.limits)
+        assets = weights[..., 1:]
+        found = {
+            "the sum is off 1 by": abs(weights.sum(-1) - 1),
+            "a weight is below its floor by": (low - assets).max(-1),
+            "a weight is above its cap by": (assets - high).max(-1),
+            "gross exposure is too high by": abs(assets).sum(-1) - gross,
+        }
+        over = assets @ rows.T - most
+        found |= {name: over[..., i] for i, name in enumerate(self.names)}
+        if self.holdings:
+            count = (abs(assets) > BARELY).sum(-1)
+            found["the number of holdings is too high by"] = count - 1.0 * self.holdings
+        if held is not None:
+            change = abs(assets - held[..., 1:])
+            found["turnover is too high by"] = change.sum(-1) - turnover
+            made = xp.where(change > BARELY, self.smallest_trade - change, -1.0)
+            found["a trade is too small by"] = made.max(-1)
+        return found
+
+
+def _fixed(limits: Limits, which: Bool[Array, " asset"], to: Float[Array, " asset"]) -> Limits:
+    """The limits, with some weights at given values."""
+    low, high = (jnp.where(which, to, bound) for bound in (limits.low, limits.high))
+    return limits._replace(low=low, high=high)

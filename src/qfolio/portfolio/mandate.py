@@ -1,0 +1,294 @@
+"""A mandate: the limits that every order obeys, as a file says them.
+
+    [assets]                  # cap and floor: a number for all, or a table with some assets
+    cap = 0.2
+    floor = { SPY = 0.05 }
+    forbidden = ["USO"]
+
+    [groups]                  # a table with the columns asset, sector, …
+    file = "groups.csv"
+    [groups.sector.Energy]
+    cap = 0.2
+
+    [cash]
+    max = 0.05
+
+    [trading]                 # of one decision
+    turnover = 0.3
+    smallest_trade = 0.005
+    holdings = 10
+
+docs/mandate.md describes every key. ``mandate_checks.py`` says whether the limits can be met.
+"""
+
+import csv
+import difflib
+import re
+import tomllib
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.text import quote
+from qfolio.portfolio.feasible import Mandated
+from qfolio.portfolio.projection import Limits
+
+Weight = Annotated[float, msgspec.Meta(ge=-3, le=3)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A part of a mandate."""
+
+
+class Assets(Section, frozen=True):
+    """Limits of single assets; a floor below 0 allows to sell short."""
+
+    cap: Weight | dict[str, Weight] = 1.0
+    floor: Weight | dict[str, Weight] = 0.0
+    forbidden: tuple[str, ...] = ()
+
+
+class Group(Section, frozen=True):
+    """Limits of the sum of some assets' weights."""
+
+    cap: Weight | None = None
+    floor: Weight | None = None
+    assets: tuple[str, ...] = ()
+
+
+class Cash(Section, frozen=True):
+    """The range of cash, which is 1 less the net exposure."""
+
+    min: Weight = 0.0
+    max: Weight = 1.0
+
+
+class Trading(Section, frozen=True):
+    """Limits of a decision. turnover: the sum of all changes of weights, bought and sold."""
+
+    turnover: Annotated[float, msgspec.Meta(gt=0, le=20)] | None = None
+    smallest_trade: Share = 0.0
+    holdings: Annotated[int, msgspec.Meta(ge=1, le=100_000)] | None = None
+
+
+class Exposure(Section, frozen=True):
+    """gross: the largest sum of absolute weights."""
+
+    gross: Annotated[float, msgspec.Meta(gt=0, le=20)] | None = None
+
+
+class Mandate(Section, frozen=True):
+    """Limits on weights; each section is optional. groups: by column and value."""
+
+    assets: Assets = Assets()
+    groups: dict[str, dict[str, Group]] = {}
+    cash: Cash = Cash()
+    trading: Trading = Trading()
+    exposure: Exposure = Exposure()
+
+    @staticmethod
+    def read(path: Path | str) -> "Mandate":
+        """The mandate in a file. Raises QfolioError if there is none, or one that is wrong."""
+        path = Path(path)
+        try:
+            content = tomllib.loads(path.read_text("utf-8"))
+        except OSError as error:
+            raise QfolioError(f"The mandate {path} cannot be read: {error.strerror}.") from None
+        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise QfolioError(f"{path} is no TOML: {error}; see docs/mandate.md.") from None
+        groups = content.get("groups")
+        file = groups.pop("file", None) if isinstance(groups, dict) else None
+        mandate = _converted(content, str(path))
+        if file is None:
+            return mandate
+        if not isinstance(file, str):
+            raise QfolioError(f"{path}: groups.file must be the name of a CSV file.")
+        return _with_members(mandate, path.parent / file, str(path))
+
+    @staticmethod
+    def of(given: "Mandate | Path | str | dict[str, Any]") -> "Mandate":
+        """A mandate, from one, from the path of a file, or from a dictionary of its sections."""
+        if isinstance(given, Mandate):
+            return given
+        return _converted(given, "mandate") if isinstance(given, dict) else Mandate.read(given)
+
+    def text(self, assets: Sequence[str]) -> str:
+        """The mandate for a table's assets, in order, as JSON; ``feasible`` takes it.
+
+        Raises QfolioError if it names an asset that the table does not have.
+        """
+        named = {
+            "assets.cap": _named(self.assets.cap),
+            "assets.floor": _named(self.assets.floor),
+            "assets.forbidden": self.assets.forbidden,
+        }
+        for place, names in named.items():
+            for name in names:
+                if name not in assets:
+                    raise QfolioError(
+                        f"{place} of the mandate names {quote(name)}, which is no asset of the "
+                        f"table; {_near(name, assets)}"
+                    )
+        for column, value, group in self.every_group:
+            if not set(group.assets) & set(assets):
+                raise QfolioError(
+                    f"The mandate's group {column} {value} has none of the table's assets; name "
+                    "them in groups.file, or in the group's assets."
+                )
+        return msgspec.json.encode((list(assets), self)).decode()
+
+    @property
+    def every_group(self) -> list[tuple[str, str, Group]]:
+        """Column, value and limits of each group."""
+        return [(c, v, group) for c, values in self.groups.items() for v, group in values.items()]
+
+
+def settled(given: Any, assets: Sequence[str]) -> str:
+    """The text of a mandate; given: what ``Mandate.of`` takes, such a text, or nothing."""
+    if not given:
+        return ""
+    if isinstance(given, str) and given.startswith("["):
+        _, mandate = parse(given)
+        return mandate.text(assets)
+    return Mandate.of(given).text(assets)
+
+
+@lru_cache(64)
+def parse(text: str) -> tuple[list[str], Mandate]:
+    """The assets and the mandate of a text. Raises QfolioError if it is none."""
+    try:
+        return msgspec.json.decode(text, type=tuple[list[str], Mandate])
+    except msgspec.MsgspecError as error:
+        raise QfolioError(f"mandate is no mandate: {error}.") from None
+
+
+def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> Mandated:
+    """The set of weights that a mandate allows, in float64.
+
+    usable: assets that can be traded; the others have weight 0, and no floor. most: the largest
+    weight of each asset, beside its cap.
+    """
+    assets, mandate = parse(text)
+    can = usable & ~np.isin(assets, mandate.assets.forbidden)
+    cap, floor = (_by_asset(x, assets, default) for x, default in _bounds(mandate.assets))
+    high, low = np.where(can, np.minimum(cap, most), 0.0), np.where(can, floor, 0.0)
+    rows, limits, names = [], [], []
+
+    def limit(row: np.ndarray, at_most: float, name: str) -> None:
+        rows.append(row)
+        limits.append(at_most)
+        names.append(name)
+
+    ones = np.ones(len(assets))
+    limit(ones, 1 - mandate.cash.min, "cash is below its minimum by")
+    if mandate.cash.max < 1 or low.min() < 0:
+        limit(-ones, mandate.cash.max - 1, "cash is above its maximum by")
+    for column, value, group in mandate.every_group:
+        members = 1.0 * np.isin(assets, group.assets)
+        if group.cap is not None:
+            limit(members, group.cap, f"{column} {value} is above its cap by")
+        if group.floor is not None:
+            limit(-members, -group.floor, f"{column} {value} is below its floor by")
+    trading = mandate.trading
+    return Mandated(
+        Limits(
+            low,
+            high,
+            np.array(rows),
+            np.array(limits),
+            np.array(mandate.exposure.gross or np.inf),
+            np.array(trading.turnover or np.inf),
+        ),
+        tuple(names),
+        trading.holdings or 0,
+        trading.smallest_trade,
+    )
+
+
+def _bounds(assets: Assets) -> tuple[tuple[float | dict[str, float], float], ...]:
+    return (assets.cap, 1.0), (assets.floor, 0.0)
+
+
+def _by_asset(given: float | dict[str, float], assets: Sequence[str], default: float) -> np.ndarray:
+    if isinstance(given, dict):
+        return np.array([given.get(name, default) for name in assets])
+    return np.full(len(assets), given)
+
+
+def _named(given: float | dict[str, float]) -> Sequence[str]:
+    return list(given) if isinstance(given, dict) else []
+
+
+def _near(name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1)
+    some = ", ".join(known[:8]) + (", …" if len(known) > 8 else "")
+    return f"did you mean {close[0]}?" if close else f"there are {some}."
+
+
+def _converted(content: Any, source: str) -> Mandate:
+    """The mandate in a dictionary; source: where it comes from, for the message."""
+    try:
+        return msgspec.convert(content, Mandate)
+    except msgspec.ValidationError as error:
+        text, _, place = str(error).replace("`", "").partition(" - at $")
+        where = place.lstrip(".")
+        if unknown := re.fullmatch(r"Object contains unknown field (.+)", text):
+            known = _fields(where)
+            inside = f"[{where}]" if where else "the mandate"
+            raise QfolioError(
+                f"{source}: {inside} has no key {quote(unknown[1])}; {_near(unknown[1], known)}"
+            ) from None
+        raise QfolioError(
+            f"{source}: {where or 'the mandate'}: {text[:1].lower()}{text[1:]}; see "
+            "docs/mandate.md."
+        ) from None
+
+
+def _fields(place: str) -> list[str]:
+    """The keys of a section."""
+    section = place.partition(".")[0].partition("[")[0]
+    kinds: dict[str, Any] = {"": Mandate, "assets": Assets, "groups": Group, "cash": Cash}
+    kinds |= {"trading": Trading, "exposure": Exposure}
+    return list(kinds[section].__struct_fields__)
+
+
+def _with_members(mandate: Mandate, file: Path, source: str) -> Mandate:
+    """The mandate, with the assets of each group as a CSV says."""
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as lines:
+            table = list(csv.DictReader(lines))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise QfolioError(f"{source}: groups.file {file} cannot be read: {error}.") from None
+    columns = list(table[0]) if table else []
+    if "asset" not in columns or len(columns) < 2:
+        raise QfolioError(
+            f"{source}: groups.file {file} must have a column asset and one for each kind of "
+            "group, such as sector."
+        )
+    groups: dict[str, dict[str, Group]] = {}
+    for column, value, group in mandate.every_group:
+        if column not in columns:
+            raise QfolioError(
+                f"{source}: [groups.{column}] is no column of {file}; {_near(column, columns[1:])}"
+            )
+        members = tuple(row["asset"].strip() for row in table if _cell(row, column) == value)
+        if not members:
+            values = sorted({_cell(row, column) for row in table})
+            raise QfolioError(
+                f"{source}: no asset of {file} has the {column} {quote(value)}; "
+                f"{_near(value, values)}"
+            )
+        given = msgspec.structs.replace(group, assets=members)
+        groups.setdefault(column, {})[value] = given
+    return msgspec.structs.replace(mandate, groups=groups)
+
+
+def _cell(row: dict[str, Any], column: str) -> str:
+    return str(row.get(column) or "").strip()

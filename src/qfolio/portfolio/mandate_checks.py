@@ -1,0 +1,187 @@
+"""Whether a mandate can be met: which limits clash, and what is unusual about the others."""
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.feasible import Mandated
+from qfolio.portfolio.mandate import feasible, parse
+from qfolio.portfolio.projection import Limits
+
+TINY = 1e-7
+
+
+def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> list[str]:
+    """What is unusual about a mandate, a sentence each; arguments as for ``mandate.feasible``.
+
+    Raises QfolioError with limits that clash, if no weights obey it: without any one of those that
+    it names, the others could be met.
+    """
+    made = feasible(text, usable, most)
+    _require_each(text, made.limits)
+    said = _said(text, made, most)
+    clash = list(range(len(said)))
+    if _found(made.limits, clash) is None:
+        for i in range(len(said)):
+            rest = [other for other in clash if other != i]
+            if _found(made.limits, rest) is None:
+                clash = rest
+        both = " and ".join(said[i] for i in clash)
+        raise QfolioError(f"The mandate cannot be met: {both} clash; change one of them.")
+    cash = parse(text)[1].cash
+    left = 1 - _most_held(made)
+    if left > cash.max + TINY:
+        raise QfolioError(
+            f"The mandate cannot be met: {made.holdings} holdings at their caps leave "
+            f"{_percent(left)} in cash, and cash is at most {_percent(cash.max)}; change one of "
+            "them."
+        )
+    if made.holdings and (floors := int((made.limits.low > 0).sum())) > made.holdings:
+        raise QfolioError(
+            f"The mandate cannot be met: {floors} assets have a floor, and trading.holdings is "
+            f"{made.holdings}; change one of them."
+        )
+    return _unusual(made, left, cash.min)
+
+
+def relaxed(made: Mandated) -> tuple[Mandated, list[str]]:
+    """The same set with lower floors where they cannot be met, and what was lowered, in words.
+
+    For folds in which some assets cannot be traded. What is taken off the floors (and added to the
+    maximum of cash) is the least in sum.
+    """
+    limits, count = made.limits, made.limits.low.size
+    if _found(limits) is not None:
+        return made, []
+    found = _found(limits, slack=limits.rows.min(1) < 0)
+    if found is None:
+        raise QfolioError(
+            "The mandate cannot be met with the assets that can be traded; relax its caps, or drop "
+            "the assets that start late."
+        )
+    extra = np.where(found[2 * count :] > TINY, found[2 * count :] + TINY, 0.0)
+    names = [name for name, more in zip(made.names, extra, strict=True) if more > 0]
+    eased = limits._replace(most=limits.most + extra)
+    lowered = [f"{name.partition(' is ')[0]} by {_percent(more)}"
+               for name, more in zip(names, extra[extra > 0], strict=True)]  # fmt: skip
+    return Mandated(eased, made.names, made.holdings, made.smallest_trade), lowered
+
+
+def _found(
+    limits: Limits,
+    kept: Collection[int] | None = None,
+    *,
+    value: Any = 0.0,
+    slack: Any = False,
+) -> Float[np.ndarray, " number"] | None:
+    """Long positions, short ones, and what rows are exceeded by; None if the limits cannot be met.
+
+    kept: the limits to obey, numbered as in ``_said`` (default: all). value: what a weight is worth
+    in the sum to maximise, which what rows are exceeded by counts against. slack: the rows that may
+    be exceeded.
+    """
+    from scipy.optimize import linprog
+
+    count, rows = limits.low.size, limits.most.size
+    keep = range(rows + 3) if kept is None else kept
+    high = limits.high if 0 in keep else np.where(limits.high > 0, 10.0, limits.high)
+    low = limits.low if 1 in keep else np.minimum(limits.low, 0.0)
+    table = np.vstack([limits.rows, np.ones((1, count))])
+    other = np.vstack([-limits.rows, np.ones((1, count))])
+    both = np.hstack([table, other, -np.eye(rows + 1, rows)])
+    most = np.append(limits.most, limits.gross)
+    chosen = [i for i in range(rows + 1) if i + 2 in keep and np.isfinite(most[i])]
+    worth = np.broadcast_to(value, count)
+    bounds = [
+        *zip(np.maximum(low, 0.0), np.maximum(high, 0.0), strict=True),
+        *zip(np.maximum(-high, 0.0), np.maximum(-low, 0.0), strict=True),
+        *((0.0, None if yes else 0.0) for yes in np.broadcast_to(slack, rows)),
+    ]
+    solved = linprog(
+        np.concatenate([-worth, worth, np.ones(rows)]),
+        both[chosen] if chosen else None,
+        most[chosen] + 1e-9 if chosen else None,
+        bounds=bounds,
+    )
+    return np.asarray(solved.x) if solved.success else None
+
+
+def _most_held(made: Mandated) -> float:
+    """The largest sum of weights that the limits allow."""
+    limits = made.limits
+    found = _found(limits, value=1.0)
+    assert found is not None  # they can be met
+    held = found[: limits.low.size].sum() - found[limits.low.size : 2 * limits.low.size].sum()
+    if made.holdings:
+        held = min(held, np.sort(limits.high)[::-1][: made.holdings].sum())
+    return float(held)
+
+
+def _require_each(text: str, limits: Limits) -> None:
+    assets, mandate = parse(text)
+    for name, low, high in zip(assets, limits.low, limits.high, strict=True):
+        if low > high:
+            raise QfolioError(
+                f"The mandate cannot be met: the floor of {name}, {_percent(low)}, is above its "
+                f"cap, {_percent(high)}; change one of them."
+            )
+    pairs: list[tuple[str, float | None, float | None]] = [
+        ("cash", mandate.cash.min, mandate.cash.max)
+    ]
+    pairs += [(f"{c} {v}", group.floor, group.cap) for c, v, group in mandate.every_group]
+    for name, floor, cap in pairs:
+        if floor is not None and cap is not None and floor > cap:
+            raise QfolioError(
+                f"The mandate cannot be met: the minimum of {name}, {_percent(floor)}, is above "
+                f"its maximum, {_percent(cap)}; change one of them."
+            )
+
+
+def _said(text: str, made: Mandated, most: float) -> list[str]:
+    """The limits in words: caps and floors of assets, then the rows, then gross exposure."""
+    _, mandate = parse(text)
+    said = [f"the caps of assets{_spelled(mandate.assets.cap, most)}"]
+    said.append(f"the floors of assets{_spelled(mandate.assets.floor)}")
+    for name, row, bound in zip(made.names, made.limits.rows, made.limits.most, strict=True):
+        what, falls = name.partition(" is ")[0], row.min() < 0
+        if what == "cash":
+            said.append(
+                f"cash of at {'most' if falls else 'least'} {_percent(_cash(bound, falls))}"
+            )
+        else:
+            said.append(f"{what} of at {'least' if falls else 'most'} {_percent(abs(bound))}")
+    return [*said, f"gross exposure of at most {_percent(float(made.limits.gross))}"]
+
+
+def _cash(bound: float, falls: bool) -> float:
+    return 1 + bound if falls else 1 - bound
+
+
+def _spelled(given: float | dict[str, float], most: float = np.inf) -> str:
+    return "" if isinstance(given, dict) else f" ({_percent(min(given, most))})"
+
+
+def _unusual(made: Mandated, left: float, least: float) -> list[str]:
+    limits = made.limits
+    notes = []
+    if left > max(least, 0.0) + TINY:
+        notes.append(f"The mandate forces at least {_percent(left)} cash: caps allow no more.")
+    for name, row, bound in zip(made.names, limits.rows, limits.most, strict=True):
+        what = name.partition(" is ")[0]
+        if row.min() < 0 and what != "cash":
+            found = _found(limits, value=-row)
+            assert found is not None
+            count = limits.low.size
+            if -row @ (found[:count] - found[count : 2 * count]) <= -bound + TINY:
+                notes.append(
+                    f"The mandate leaves no choice for {what}: its floor, {_percent(-bound)}, is "
+                    "also the most that the other limits allow."
+                )
+    return notes
+
+
+def _percent(share: float) -> str:
+    return f"{100 * round(share, 9):.6g} %"

@@ -1,0 +1,141 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio import mandate_checks
+from qfolio.portfolio.mandate import Mandate, feasible, parse, settled
+
+ASSETS = ["SPY", "TLT", "XLE", "XOM"]
+ALL = np.ones(4, bool)
+
+FILE = """
+[assets]
+cap = 0.5
+floor = { SPY = 0.1 }
+forbidden = ["TLT"]
+[groups]
+file = "groups.csv"
+[groups.sector.Energy]
+cap = 0.3
+floor = 0.05
+[cash]
+min = 0.02
+max = 0.4
+[trading]
+turnover = 0.3
+smallest_trade = 0.01
+holdings = 3
+"""
+
+GROUPS = "asset,sector\nSPY,Index\nTLT,Bonds\nXLE,Energy\nXOM,Energy\nother,Energy\n"
+
+
+def written(folder: Path, text: str = FILE, groups: str = GROUPS) -> Path:
+    (folder / "groups.csv").write_text(groups)
+    (folder / "mandate.toml").write_text(text)
+    return folder / "mandate.toml"
+
+
+def test_a_file_says_the_limits(tmp_path):
+    made = feasible(settled(written(tmp_path), ASSETS), ALL)
+    limits = made.limits
+    np.testing.assert_allclose(limits.high, [0.5, 0, 0.5, 0.5])
+    np.testing.assert_allclose(limits.low, [0.1, 0, 0, 0])
+    allowed = np.array([0.4, 0.4, 0, 0.1, 0.1])
+    assert max(np.max(x) for x in made.violations(allowed).values()) <= 1e-9
+    held = np.array([0.6, 0.2, 0, 0.105, 0.095])
+    wrong = {k: float(x) for k, x in made.violations(allowed, held).items() if x > 1e-9}
+    assert wrong == pytest.approx({"a trade is too small by": 0.005})
+    outside = np.array([0.01, 0.05, 0.1, 0.42, 0.42])
+    assert {k: round(float(x), 9) for k, x in made.violations(outside, held).items() if x > 0} == {
+        "a weight is below its floor by": 0.05,
+        "a weight is above its cap by": 0.1,
+        "cash is below its minimum by": 0.01,
+        "sector Energy is above its cap by": 0.54,
+        "the number of holdings is too high by": 1.0,
+        "turnover is too high by": 0.59,
+    }
+
+
+def test_its_text_is_whole_and_is_for_any_order_of_assets(tmp_path):
+    mandate = Mandate.read(written(tmp_path))
+    text = settled(mandate, ASSETS)
+    assert parse(text) == (ASSETS, mandate)
+    assert mandate.groups["sector"]["Energy"].assets == ("XLE", "XOM", "other")
+    turned = feasible(settled(text, ASSETS[::-1]), ALL)
+    np.testing.assert_allclose(turned.limits.low, [0, 0, 0, 0.1])
+    assert settled(None, ASSETS) == settled("", ASSETS) == ""
+    inline = {"assets": {"cap": 0.5}, "groups": {"kind": {"x": {"assets": ["XLE"], "cap": 0.1}}}}
+    np.testing.assert_allclose(feasible(settled(inline, ASSETS), ALL, 0.4).limits.high, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[asset]\ncap = 0.1", "no key 'asset'; did you mean assets?"),
+        ("[assets]\ncaps = 0.1", r"\[assets\] has no key 'caps'; did you mean cap?"),
+        ("[assets]\ncap = 'much'", "assets.cap"),
+        ("[assets]\ncap = 20", "assets.cap: expected .* <= 3"),
+        ("[trading]\nholdings = 2.5", "trading.holdings: expected .*int"),
+        ("[cash", "is no TOML"),
+        ("[assets]\nforbidden = ['SPX']", "'SPX', which is no asset of.* mean SPY"),
+        ("[assets.cap]\nQQQ = 0.1", "assets.cap of the mandate names 'QQQ'.*there are SPY"),
+        ("[groups.sector.Energy]\ncap = 0.1", "sector Energy has none of the table's assets"),
+        ("[groups]\nfile = 'none.csv'\n[groups.a.b]\ncap = 1", "cannot be read"),
+        ("[groups]\nfile = 'groups.csv'\n[groups.sectors.Energy]\ncap = 1", "did you mean sector?"),
+        ("[groups]\nfile = 'groups.csv'\n[groups.sector.energy]\ncap = 1", "did you mean Energy?"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_a_file_is_said(tmp_path, text, message):
+    with pytest.raises(QfolioError, match=message):
+        settled(written(tmp_path, text), ASSETS)
+
+
+GROUP = {"assets": ["XLE", "XOM"]}
+
+
+@pytest.mark.parametrize(
+    ("mandate", "message"),
+    [
+        ({"assets": {"cap": 0.1}, "cash": {"max": 0.05}},
+         r"the caps of assets \(10 %\) and cash of at most 5 % clash"),
+        ({"groups": {"sector": {"E": {**GROUP, "cap": 0.1}}}, "assets": {"floor": 0.06}},
+         r"the floors of assets \(6 %\) and sector E of at most 10 % clash"),
+        ({"groups": {"a": {"E": {**GROUP, "cap": 0.1}}, "b": {"F": {**GROUP, "floor": 0.2}}}},
+         "a E of at most 10 % and b F of at least 20 % clash"),
+        ({"assets": {"floor": 0.3}, "cash": {"min": 0.1}},
+         r"the floors of assets \(30 %\) and cash of at least 10 % clash"),
+        ({"assets": {"floor": {"SPY": 0.3}, "cap": 0.2}}, "floor of SPY, 30 %, is above its cap"),
+        ({"cash": {"min": 0.3, "max": 0.2}}, "minimum of cash, 30 %, is above its maximum, 20 %"),
+        ({"assets": {"cap": 0.3}, "trading": {"holdings": 2}, "cash": {"max": 0.1}},
+         "2 holdings at their caps leave 40 % in cash"),
+        ({"assets": {"floor": 0.1}, "trading": {"holdings": 3}}, "4 assets have a floor"),
+        ({"cash": {"max": 0.1}, "exposure": {"gross": 0.5}},
+         "cash of at most 10 % and gross exposure of at most 50 % clash"),
+    ],
+)  # fmt: skip
+def test_limits_that_clash_are_refused_with_their_names(mandate, message):
+    with pytest.raises(QfolioError, match=message):
+        mandate_checks.require(settled(mandate, ASSETS), ALL)
+
+
+def test_what_is_unusual_is_said():
+    many = [f"A{i}" for i in range(15)]
+    [note] = mandate_checks.require(settled({"assets": {"cap": 0.05}}, many), np.ones(15, bool))
+    assert note == "The mandate forces at least 25 % cash: caps allow no more."
+    bound = {"assets": {"cap": 0.1}, "groups": {"s": {"E": {**GROUP, "floor": 0.2}}}}
+    notes = mandate_checks.require(settled(bound, ASSETS), ALL)
+    assert "no choice for s E: its floor, 20 %" in notes[1]
+    assert mandate_checks.require(settled({"cash": {"max": 0.1}}, ASSETS), ALL) == []
+
+
+def test_floors_yield_where_assets_cannot_be_traded():
+    mandate = {"assets": {"cap": 0.3, "floor": {"XOM": 0.1}}, "cash": {"max": 0.2},
+               "groups": {"sector": {"E": {**GROUP, "floor": 0.25}}}}  # fmt: skip
+    text = settled(mandate, ASSETS)
+    assert mandate_checks.relaxed(feasible(text, ALL))[1] == []
+    made, lowered = mandate_checks.relaxed(feasible(text, np.array([True, True, False, False])))
+    assert sorted(x.partition(" by ")[0] for x in lowered) == ["cash", "sector E"]
+    assert max(np.max(x) for x in made.violations(np.array([0.4, 0.3, 0.3, 0, 0])).values()) <= 1e-9
