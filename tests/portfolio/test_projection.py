@@ -58,7 +58,7 @@ def test_it_is_the_point_that_a_convex_solver_finds(short, turnover):
     expected = np.array([solved(*one) for one in made])
     with jax.enable_x64(True):
         exact = jax.jit(jax.vmap(nearest))(*stacked)
-        over = jax.vmap(excess)(exact, *map(jnp.asarray, stacked[1:2]), stacked[2])
+        over = jax.vmap(excess)(exact, jnp.asarray(stacked[1]), stacked[2])
         np.testing.assert_allclose(over.max(1), np.minimum(over.max(1), 0), atol=1e-12)
         again = jax.jit(jax.vmap(nearest))(exact, *stacked[1:])
         np.testing.assert_allclose(again, exact, atol=1e-12)

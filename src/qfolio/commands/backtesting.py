@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Trackers
+from qfolio.commands.arguments import Assignments, Count, File, Folder, Modules, Name, Trackers
 from qfolio.commands.tables import Reading
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
@@ -38,6 +38,7 @@ class Options(Reading):
         test: Length of a fold, after which agents are retrained.
         rolling: Train on a window of fixed length instead of all rows so far.
         cap: Largest weight of one asset, from 0 to 1.
+        mandate: File with the limits of all orders (TOML; see docs/mandate.md).
         cost_model: Cost of trading and holding: proportional, itemized or your own as module:Name;
             settings follow in brackets, as in "itemized(fixed=5, cash_rate=0.03)".
         calendar: When all strategies may trade: weekly, monthly, quarterly, yearly, or a number of
@@ -70,6 +71,7 @@ class Options(Reading):
     test: str = "1y"
     rolling: bool = False
     cap: float = 1.0
+    mandate: File = None
     cost_model: str = "proportional"
     calendar: str = ""
     signals: Name = None
@@ -112,6 +114,7 @@ class Options(Reading):
             "test": self.test,
             "expanding": not self.rolling,
             "cap": self.cap,
+            "mandate": self.mandate,
             "cost_model": _known("cost", settings.called(self.cost_model)[0]) and self.cost_model,
             "calendar": self.calendar,
             "baselines": list(registry.BASELINES)
@@ -193,7 +196,7 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
 
     used = set()
     changed = {}
-    own_options = {"lag", "cost", "cost_model", "max_weight", "calendar"}
+    own_options = {"lag", "cost", "cost_model", "max_weight", "mandate", "calendar"}
     for name, preset in presets.items():
         kind = registry.find("agent", preset.agent)
         own, task = {}, {}
@@ -217,6 +220,6 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
     for key in chosen.keys() - used:
         raise QfolioError(
             f"--set {key}: none of {', '.join(presets)} has this setting, nor the portfolio task "
-            "(its lag, costs and cap have options of their own)."
+            "(its lag, costs, cap and mandate have options of their own)."
         )
     return changed

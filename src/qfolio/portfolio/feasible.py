@@ -6,7 +6,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from numpy.typing import NDArray
 
 from qfolio.portfolio.projection import Limits, excess, nearest
 
@@ -90,6 +92,16 @@ class Mandated(Feasible):
     names: tuple[str, ...] = eqx.field(static=True)  # of the rows of the limits
     holdings: int = eqx.field(static=True, default=0)  # at most so many; 0: any number
     smallest_trade: float = eqx.field(static=True, default=0.0)
+    exposure: float = eqx.field(static=True, default=1.0)  # largest sum of absolute weights
+    long: bool = eqx.field(static=True, default=True)
+
+    @property
+    def long_only(self) -> bool:
+        return self.long
+
+    @property
+    def gross(self) -> float:
+        return self.exposure
 
     def project(
         self, wanted: Float[Array, " entry"], held: Float[Array, " entry"]
@@ -193,6 +205,22 @@ class Mandated(Feasible):
             made = xp.where(change > BARELY, self.smallest_trade - change, -1.0)
             found["a trade is too small by"] = made.max(-1)
         return found
+
+
+def exactly(
+    feasible: Feasible, wanted: NDArray[np.float64], held: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The projection in float64; all weights have shape (entry,)."""
+    with jax.enable_x64(True):
+        found = np.array(_projected(jax.tree.map(jnp.asarray, feasible), wanted, held))
+    if feasible.long_only:
+        found[0] = max(found[0], 0.0)  # rounding may leave it below 0
+    return found
+
+
+@eqx.filter_jit
+def _projected(feasible: Feasible, wanted: Any, held: Any) -> Array:
+    return feasible.project(jnp.asarray(wanted), jnp.asarray(held))
 
 
 def _fixed(limits: Limits, which: Bool[Array, " asset"], to: Float[Array, " asset"]) -> Limits:

@@ -196,20 +196,30 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
             limit(members, group.cap, f"{column} {value} is above its cap by")
         if group.floor is not None:
             limit(-members, -group.floor, f"{column} {value} is below its floor by")
-    trading = mandate.trading
+    trading, exposure = mandate.trading, mandate.exposure.gross
+    long = mandate.cash.min >= 0 and bool(floor.min() >= 0)
+    most_gross = float(np.maximum(abs(cap), abs(floor)).sum())
     return Mandated(
         Limits(
             low,
             high,
             np.array(rows),
             np.array(limits),
-            np.array(mandate.exposure.gross or np.inf),
+            np.array(exposure or np.inf),
             np.array(trading.turnover or np.inf),
         ),
         tuple(names),
         trading.holdings or 0,
         trading.smallest_trade,
+        1.0 if long else min(exposure or most_gross, most_gross),
+        long,
     )
+
+
+def largest_weight(text: str) -> float:
+    """The highest cap of an asset, at most 1."""
+    assets, mandate = parse(text)
+    return min(1.0, float(_by_asset(mandate.assets.cap, assets, 1.0).max()))
 
 
 def _bounds(assets: Assets) -> tuple[tuple[float | dict[str, float], float], ...]:

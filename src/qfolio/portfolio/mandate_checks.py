@@ -1,5 +1,6 @@
 """Whether a mandate can be met: which limits clash, and what is unusual about the others."""
 
+import dataclasses
 from collections.abc import Collection
 from typing import Any
 
@@ -67,7 +68,7 @@ def relaxed(made: Mandated) -> tuple[Mandated, list[str]]:
     eased = limits._replace(most=limits.most + extra)
     lowered = [f"{name.partition(' is ')[0]} by {_percent(more)}"
                for name, more in zip(names, extra[extra > 0], strict=True)]  # fmt: skip
-    return Mandated(eased, made.names, made.holdings, made.smallest_trade), lowered
+    return dataclasses.replace(made, limits=eased), lowered
 
 
 def _found(

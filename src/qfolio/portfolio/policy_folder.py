@@ -99,6 +99,7 @@ def _kept(task: Portfolio, members: PyTree) -> dict[str, PyTree]:
         "center": task.center,
         "scale": task.scale,
         "limits": task.limits,
+        "allowed": task.allowed,
     }
 
 

@@ -18,10 +18,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Position, Simplex
-from qfolio.portfolio import anchors, signals
+from qfolio.portfolio import anchors, mandate_checks, signals
 from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import grown
+from qfolio.portfolio.feasible import Feasible, Mandated
+from qfolio.portfolio.mandate import feasible, largest_weight, settled
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
 
@@ -53,6 +55,7 @@ class Portfolio(Market):
     cost_model: str = static("proportional")
     calendar: str = static("")  # of decisions, see portfolio.calendars; between them nothing trades
     max_weight: float = constant(1.0)  # of one asset
+    mandate: str = static("")  # text of a mandate, see portfolio.mandate
     menu: str = static("")
     signals: str = static("")  # names of signals that are observed, see portfolio.signals
     signal_scale: str = static("rank")  # of signals: rank, z-score, centered or raw
@@ -63,10 +66,13 @@ class Portfolio(Market):
     risk_aversion: float = number(3.0)
     sharpe_rate: float = number(0.01)
     horizon: int = static(50)
+    allowed: Mandated | None = None  # the weights that the mandate allows, if there is one
 
     @staticmethod
     def of(prices: Prices, **settings: Any) -> "Portfolio":
-        """A task on all rows of a table."""
+        """A task on all rows of a table; mandate: anything that ``mandate.settled`` takes."""
+        if "mandate" in settings:
+            settings["mandate"] = settled(settings["mandate"], prices.assets)
         task = Portfolio.blank(len(prices.assets), len(prices.feature_names), **settings)
         first = ~np.isnan(prices.values[0])
         return task.on(prices).part(0, len(prices) - 1, first)
@@ -86,6 +92,7 @@ class Portfolio(Market):
             decides=jnp.zeros(0, bool),
             first_decision=jnp.array(0, jnp.int32),
             last_decision=jnp.array(0, jnp.int32),
+            allowed=_allowed(settings.get("mandate", ""), np.ones(assets, bool), 1.0),
             **settings,
         )
 
@@ -156,17 +163,22 @@ class Portfolio(Market):
         )[:, usable]
         center, scale = channels.mean((0, 1)), channels.std((0, 1))
         center[0] = 0.0  # the sign of a return means something
-        return eqx.tree_at(
+        limits = np.where(usable, self.max_weight, 0.0)
+        allowed = _allowed(self.mandate, usable, self.max_weight)
+        if allowed is not None:
+            limits = np.maximum(allowed.limits.high, 0.0)
+        part = eqx.tree_at(
             lambda t: (t.limits, t.center, t.scale, t.first_decision, t.last_decision),
             self,
             (
-                jnp.asarray(np.where(usable, self.max_weight, 0.0), jnp.float32),
+                jnp.asarray(limits, jnp.float32),
                 jnp.asarray(center, jnp.float32),
                 jnp.asarray(np.where(scale > 0, scale, 1.0), jnp.float32),
                 jnp.array(first + self.window, jnp.int32),
                 jnp.array(last - self.lag - 1, jnp.int32),
             ),
         )
+        return part if allowed is None else eqx.tree_at(lambda t: t.allowed, part, allowed)
 
     @property
     def parts(self) -> list[object]:
@@ -179,7 +191,17 @@ class Portfolio(Market):
         self, market: Row, held: Float[Array, " entry"], action: Array
     ) -> Float[Array, " entry"]:
         """As in any market; what is held where the calendar has no decision."""
-        wanted = super().target(market, held, action)
+        return self._when_deciding(market, held, super().target(market, held, action))
+
+    def obeying(
+        self, market: Row, held: Float[Array, " entry"], wanted: Float[Array, " entry"]
+    ) -> Float[Array, " entry"]:
+        """The order for a mean of orders, which may break rules on holdings and small trades."""
+        return self._when_deciding(market, held, self.feasible.project(wanted, held))
+
+    def _when_deciding(
+        self, market: Row, held: Float[Array, " entry"], wanted: Float[Array, " entry"]
+    ) -> Float[Array, " entry"]:
         if not self.calendar:
             return wanted
         decides = lax.dynamic_index_in_dim(self.decides, market, keepdims=False)
@@ -187,7 +209,14 @@ class Portfolio(Market):
 
     @property
     def actions(self) -> Actions:
-        return super().actions if self.menu else Simplex(self.limits.shape[0], self.max_weight)
+        if self.menu:
+            return super().actions
+        most = largest_weight(self.mandate) if self.mandate else 1.0
+        return Simplex(self.limits.shape[0], min(self.max_weight, most))
+
+    @property
+    def feasible(self) -> Feasible:
+        return super().feasible if self.allowed is None else self.allowed
 
     def reset_market(self, key: PRNGKeyArray) -> Row:
         starts = self.last_decision - self.first_decision + 1 - self.horizon + 1
@@ -291,3 +320,11 @@ class Portfolio(Market):
         rows = self.log_relatives.shape[0]
         following = lax.dynamic_index_in_dim(self.log_relatives, row + 1, keepdims=False)
         return jnp.where(row + 1 < rows, jnp.exp(following), 1.0)
+
+
+def _allowed(mandate: str, usable: np.ndarray, most: float) -> Mandated | None:
+    """What a mandate allows over some rows, in float32; without one, nothing is to be said."""
+    if not mandate:
+        return None
+    made, _ = mandate_checks.relaxed(feasible(mandate, usable, most))
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), made)

@@ -52,15 +52,16 @@ class Desk:
         if name in self.run.agents:
             return self.run.policy(name, stored)
         if name in self.run.baselines:
-            config, costs = self.run.config, next(iter(self.run.tasks.values())).costs
+            config, task = self.run.config, next(iter(self.run.tasks.values()))
             return Rule(
                 name,
                 self.run.baselines[name],
                 self.run.prices.assets,
-                costs,
+                task.costs,
                 train=config.train,
                 expanding=config.expanding,
                 cap=config.cap,
+                mandate=task.mandate,
             )
         raise QfolioError(
             f"The backtest has no agent {quote(name)}; choose from {', '.join(self.run.agents)}, "

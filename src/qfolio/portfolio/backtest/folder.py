@@ -35,6 +35,7 @@ from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Row
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.own import KINDS, Own
+from qfolio.portfolio.mandate import Mandate
 from qfolio.portfolio.prices.table import Prices
 
 EQUAL_WEIGHT = "equal-weight"
@@ -132,6 +133,7 @@ class BacktestConfig(Config, frozen=True):
     title: str = ""
     strategies: tuple[str, ...] = ()
     benchmark: str = EQUAL_WEIGHT
+    mandate: Mandate | None = None
 
     def __post_init__(self) -> None:
         seed_range(self.seeds, self.seed)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, Bools, Floats, History
+from qfolio.portfolio.feasible import Feasible, exactly
 
 TOLERANCE = 1e-6
 """How far weights may be off the simplex or above the cap."""
@@ -46,6 +47,7 @@ def orders(
     *,
     tradable: ArrayLike | None = None,
     cap: float = 1.0,
+    feasible: Sequence[Feasible] | None = None,
     month: int = 21,
     decides: Bools | None = None,
 ) -> Orders:
@@ -61,6 +63,8 @@ def orders(
         tradable: Which assets a fold may hold, of shape (folds, N) (default: those with prices in
             all of its training rows).
         cap: Largest weight of one asset when it is ordered.
+        feasible: The weights that a mandate allows in each fold. Targets are projected onto them at
+            every row at which there is one; a target of the calendar "fold" is one of every row.
         month: Rows in a month.
         decides: Which rows are for decisions, of shape (rows,), instead of the baseline's calendar.
 
@@ -81,19 +85,23 @@ def orders(
         chosen = None if tradable is None else np.asarray(tradable, dtype=bool)[number]
         allowed = _tradable(fold, prices, chosen)
         rows = range(len(prices))[fold.decisions]
+        asked = set(_asked(baseline, rows, folds[0].decisions.start, month, decides))
+        trading = np.ones(len(rows), bool) if decides is None else decides[fold.decisions]
+        mandated = None if feasible is None else feasible[number]
+        again = mandated is not None and baseline.calendar == "fold"
         part = np.full((len(rows), len(ordered)), np.nan)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            for row in _asked(baseline, rows, folds[0].decisions.start, month, decides):
-                known = slice(0, row + 1)
-                history = History(dates[known], prices[known], fold.train, allowed, cap, month)
+            for row in rows if again else sorted(asked):
                 held = drifted(ordered, prices[row_ordered], prices[row])
-                wanted = baseline.decide(history, held)
-                if wanted is not None:
-                    ordered, row_ordered = checked(name, wanted, history), row
-                    part[row - rows[0]] = ordered
-        if baseline.calendar == "fold" and not np.isnan(part[0]).any():
-            trading = np.ones(len(rows), bool) if decides is None else decides[fold.decisions]
+                if row in asked:
+                    known = slice(0, row + 1)
+                    history = History(dates[known], prices[known], fold.train, allowed, cap, month)
+                    wanted = baseline.decide(history, held)
+                if wanted is not None and (trading[row - rows[0]] or not again):
+                    ordered = obeying(name, wanted, held, history, mandated)
+                    part[row - rows[0]], row_ordered = ordered, row
+        if baseline.calendar == "fold" and not again and not np.isnan(part[0]).any():
             part[:] = np.where(trading[:, None], part[0], np.nan)
             row_ordered = rows[np.flatnonzero(trading)[-1]] if trading.any() else row_ordered
         said = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
@@ -130,6 +138,18 @@ def drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
     bought = weights[1:] != 0  # others may have no price yet
     worth[1:][bought] *= now[bought] / then[bought]
     return np.asarray(worth / worth.sum())
+
+
+def obeying(
+    name: str, wanted: ArrayLike, held: Floats, history: History, mandated: Feasible | None
+) -> Floats:
+    """A baseline's target weights, projected onto what a mandate allows, if there is one.
+
+    Raises QfolioError if they are invalid.
+    """
+    if mandated is None:
+        return checked(name, wanted, history)
+    return exactly(mandated, checked(name, wanted, history._replace(cap=np.inf)), held)
 
 
 def checked(name: str, wanted: ArrayLike, history: History) -> Floats:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from qfolio.core.mdp import Agent
+from qfolio.portfolio import mandate_checks
 from qfolio.portfolio.backtest.assessment import Strategy
 from qfolio.portfolio.backtest.baselines import Baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
@@ -18,7 +19,9 @@ from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.own import Placed
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.feasible import Mandated
 from qfolio.portfolio.following import follow
+from qfolio.portfolio.mandate import feasible, largest_weight
 from qfolio.portfolio.prices.findings import listing
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -106,6 +109,25 @@ class Replay(NamedTuple):
             if (late := [self.prices.assets[j] for j in np.flatnonzero(~tradable)])
         ]
 
+    def mandated(self) -> list[str]:
+        """Notes on what is unusual about the mandate, and on what a fold cannot meet."""
+        if not self.task.mandate:
+            return []
+        every = np.ones(len(self.prices.assets), bool)
+        return mandate_checks.require(self.task.mandate, every, self.cap) + [
+            f"In fold {fold.name} the mandate yields to the assets that can be traded: {said}."
+            for fold, (_, lowered) in zip(self.folds, self._relaxed(), strict=True)
+            for said in lowered
+        ]
+
+    def _relaxed(self) -> list[tuple[Mandated, list[str]]]:
+        mandate, values = self.task.mandate, self.prices.values
+        return [
+            mandate_checks.relaxed(feasible(mandate, fold.tradable(values), self.cap))
+            for fold in self.folds
+            if mandate
+        ]
+
     def wiped_out(self, entries: Mapping[str, Entry]) -> list[str]:
         """A note on each strategy that lost everything."""
         counts = {name: int(entry.simulation.ruined.sum()) for name, entry in entries.items()}
@@ -129,14 +151,15 @@ class Replay(NamedTuple):
 
     def baseline(self, kind: str, name: str, baseline: Baseline) -> tuple[Entry, tuple[str, ...]]:
         """A baseline, and notes on its decisions."""
-        table = self.prices
+        table, text = self.prices, self.task.mandate
         given = orders(
             name,
             baseline,
             self.folds,
             table.dates,
             table.values,
-            cap=self.cap,
+            cap=min(self.cap, largest_weight(text)) if text else self.cap,
+            feasible=[made for made, _ in self._relaxed()] if text else None,
             month=table.month,
             decides=np.asarray(self.task.decides) if self.task.calendar else None,
         )

@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio import mandate_checks
 from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.folds import latest
-from qfolio.portfolio.backtest.orders import checked
+from qfolio.portfolio.backtest.orders import obeying
 from qfolio.portfolio.costs import CostModel
+from qfolio.portfolio.mandate import feasible, largest_weight
 from qfolio.portfolio.prices.table import Prices, load
 
 
@@ -28,9 +30,11 @@ class Rule:
         train: str,
         expanding: bool,
         cap: float,
+        mandate: str = "",
     ) -> None:
         self.name, self.baseline, self.assets, self.costs = name, baseline, assets, costs
-        self.train, self.expanding, self.cap = train, expanding, cap
+        self.train, self.expanding = train, expanding
+        self.cap, self.mandate = cap, mandate
 
     def table(self, prices: Any, **options: Any) -> Prices:
         """The prices with the assets of the backtest, in its order."""
@@ -53,7 +57,13 @@ class Rule:
             raise QfolioError(
                 f"No asset has prices in all of the last {self.train}; give earlier prices."
             )
-        history = History(table.dates, table.values, fold.train, tradable, self.cap, table.month)
+        mandated, cap = None, self.cap
+        if self.mandate:
+            mandated, _ = mandate_checks.relaxed(feasible(self.mandate, tradable, cap))
+            cap = min(cap, largest_weight(self.mandate))
+        history = History(table.dates, table.values, fold.train, tradable, cap, table.month)
         wanted = self.baseline.decide(history, held)
-        target = held if wanted is None else checked(self.name, wanted, history)
+        target = held
+        if wanted is not None:
+            target = obeying(self.name, wanted, held, history, mandated)
         return dict(zip(("cash", *self.assets), target.tolist(), strict=True))

@@ -25,6 +25,7 @@ from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, at_onc
 from qfolio.experiments.fit import Row
 from qfolio.experiments.log import Log
 from qfolio.experiments.presets import Preset
+from qfolio.portfolio import mandate_checks
 from qfolio.portfolio.backtest import assessment, memory
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.benchmark import field_of
@@ -35,6 +36,7 @@ from qfolio.portfolio.backtest.kept import LATEST, Kept, learning
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
+from qfolio.portfolio.mandate import Mandate, settled
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
@@ -100,6 +102,7 @@ class Backtest:
         lag: int = 1,
         cost: float = 0.001,
         cap: float = 1.0,
+        mandate: Mandate | Path | str | dict[str, Any] | None = None,
         cost_model: str = "proportional",
         calendar: str = "",
         baselines: Sequence[str] = tuple(BASELINES),
@@ -125,6 +128,8 @@ class Backtest:
             lag: Rows from a decision to its execution.
             cost: One-way trading cost, as a fraction of the value traded.
             cap: Largest weight of one asset.
+            mandate: Limits that all orders obey, of agents and of baselines: a ``Mandate``, the
+                path of a file, or a dictionary of its sections.
             cost_model: Cost of trading and holding, in training and replay: a name of the registry,
                 or your own as ``module:Name``, with its settings as in "itemized(fixed=5)".
             calendar: When all strategies may trade: weekly, monthly, quarterly or yearly, on the
@@ -156,6 +161,7 @@ class Backtest:
             lag=int(lag),
             cost=float(cost),
             cap=float(cap),
+            mandate=None if mandate is None else Mandate.of(mandate),
             cost_model=cost_model,
             calendar=calendar,
             baselines=field.baselines,
@@ -173,6 +179,9 @@ class Backtest:
             **devices.circumstances("python", "jax", "equinox", "numpy", "skfolio"),
         )
         memory.require(prices, config)
+        if config.mandate is not None:
+            every = np.ones(len(prices.assets), bool)
+            mandate_checks.require(settled(config.mandate, prices.assets), every, config.cap)
         given = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
         backtest = cls(prices, config, None, given, field.own)
         if out is not None:
@@ -328,7 +337,7 @@ class Backtest:
             entries |= replay.agent(name, agent, self.stretches(name), self.config.seeds)
         others, notes = replay.others(self.baselines, self._own, self.config.benchmark)
         entries |= others
-        return entries, [*replay.left_out(), *notes, *replay.wiped_out(entries)]
+        return entries, [*replay.left_out(), *replay.mandated(), *notes, *replay.wiped_out(entries)]
 
     @property
     def dates(self) -> np.ndarray:
@@ -371,6 +380,7 @@ class Backtest:
             "cost_model": config.cost_model,
             "max_weight": config.cap,
             "calendar": config.calendar,
+            "mandate": settled(config.mandate, config.assets),
         }
         entry = config.agents[name].task
         task = Portfolio.of(self.prices, **settings.convert(Portfolio, {**entry, **own}))

@@ -69,6 +69,19 @@ def account(data: BacktestData) -> dict[str, Any]:
     return {
         "cost": _basis_points(settings["cost"]) if "cost" in settings else None,
         **{key: settings.get(key) for key in ("lag", "train", "test", "expanding", "cap")},
+        "mandate": "; ".join(_limits(settings.get("mandate") or {})),
         "trials": _counts(test),
         "earlier": test.earlier_trials,
     }
+
+
+def _limits(mandate: dict[str, Any], place: str = "") -> list[str]:
+    """A mandate's limits as its file has them, without the assets of groups."""
+    said = []
+    for key, value in mandate.items():
+        if isinstance(value, dict):
+            said += _limits(value, f"{place}{key}.")
+        elif not (place.startswith("groups.") and key == "assets"):
+            shown = ", ".join(value) if isinstance(value, list | tuple) else f"{value:g}"
+            said.append(f"{place}{key} = {shown}")
+    return said

@@ -1,0 +1,117 @@
+"""A mandate over a whole backtest: of agents, ensembles, baselines and tomorrow's orders."""
+
+import json
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.desk import Desk
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.mandate import feasible
+from qfolio.portfolio.prices.table import Prices
+
+ASSETS = ("A", "B", "C", "D", "E")
+
+MANDATE = {
+    "assets": {"cap": {"A": 0.35, "B": 0.5}, "floor": {"C": 0.04}, "forbidden": ["E"]},
+    "groups": {"kind": {"x": {"assets": ["B", "D"], "cap": 0.55, "floor": 0.2}}},
+    "cash": {"min": 0.02, "max": 0.15},
+    "trading": {"smallest_trade": 0.004, "turnover": 0.6},
+}
+
+AGENTS = {
+    "pathwise": Preset(
+        "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (8, 8)},
+        episodes=8, seeds=2, task={"window": 10, "horizon": 20},
+    ),
+    "dqn": Preset(
+        "dqn",
+        {"network": "mlp", "hidden": (8, 8), "all_actions": True, "num_envs": 4,
+         "batch_size": 8, "learning_starts": 40, "replay_capacity": 400, "episode_steps": 0},
+        episodes=8, seeds=2, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
+    ),
+}  # fmt: skip
+
+
+def table(late: int = 0) -> Prices:
+    rng = np.random.default_rng(0)
+    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.02, (200, 5)), axis=0))
+    values[:late, 3] = np.nan
+    dates = np.datetime64("2020-01-01") + np.arange(200)
+    return Prices(dates, ASSETS, values, note="made up")
+
+
+def create(mandate, folder=None, prices=None, agents=AGENTS, **more) -> Backtest:
+    options = {"train": "100d", "test": "50d", "seeds": 2, "expanding": False,
+               "baselines": ["equal-weight-monthly", "minimum-variance"], **more}  # fmt: skip
+    prices = table() if prices is None else prices
+    return Backtest.create(prices, agents, mandate=mandate, out=folder, **options)
+
+
+@pytest.mark.slow
+def test_every_order_obeys_the_mandate(tmp_path):
+    backtest = create(MANDATE, tmp_path / "run")
+    backtest.run()
+    backtest = Backtest.open(tmp_path / "run")
+    assert "mandate" in json.loads((tmp_path / "run" / "config.json").read_text())
+    text = backtest.tasks["dqn"].mandate
+    made = feasible(text, np.ones(5, bool))
+    entries, notes = backtest.entries()
+    assert {"dqn", "dqn-together", "pathwise", "equal-weight", "minimum-variance"} < set(entries)
+    prices, first = backtest.prices.values, backtest.folds[0].decisions.start
+    for name, entry in entries.items():
+        checked = 0
+        for decisions in entry.decisions:
+            held = np.eye(6)[0]
+            for day, decided in enumerate(decisions):
+                if not np.isnan(decided).any():
+                    # What brings a holding back within its limits may be small, and the first
+                    # purchases, for the range of cash, need more turnover than there may be.
+                    outside = max(made.violations(held).values()) > 0
+                    for said, amount in made.violations(decided, held).items():
+                        if not (outside and said.startswith(("turnover", "a trade"))):
+                            assert amount <= 2e-5, (name, day, said)
+                            checked += 1
+                    held = decided
+                drifted = held[1:] * prices[first + day + 1] / prices[first + day]
+                held = np.append(held[0], drifted) / (held[0] + drifted.sum())
+        assert checked, name
+    assert not any("yields" in note for note in notes)
+    for name in ("pathwise", "minimum-variance", "equal-weight"):
+        followed = Desk.open(tmp_path / "run").followed(name)
+        weights = followed.weights(backtest.prices, {"cash": 0.1, "A": 0.3, "B": 0.4, "C": 0.2})
+        amounts = made.violations(np.array(list(weights.values()))).values()
+        assert max(float(amount) for amount in amounts) <= 2e-5, name
+
+
+@pytest.mark.slow
+def test_floors_yield_to_assets_that_start_late():
+    mandate = {"assets": {"cap": 0.3}, "cash": {"max": 0.2},
+               "groups": {"kind": {"x": {"assets": ["D"], "floor": 0.1}}}}  # fmt: skip
+    backtest = create(mandate, prices=table(late=40), agents={"pathwise": AGENTS["pathwise"]})
+    backtest.run()
+    entries, notes = backtest.entries()
+    first = backtest.folds[0].name
+    assert f"In fold {first} the mandate yields to the assets that can be traded: kind x" in str(
+        notes
+    )
+    held = entries["pathwise"].decisions[:, :, 4]
+    assert (held[:, :50] == 0).all()
+    assert (held[:, 50:] >= 0.1 - 1e-5).all()
+
+
+def test_a_mandate_that_cannot_be_met_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(QfolioError, match=r"caps of assets \(10 %\) and cash of at most 5 % clash"):
+        create({"assets": {"cap": 0.1}, "cash": {"max": 0.05}}, tmp_path / "run")
+    with pytest.raises(QfolioError, match="names 'Z'"):
+        create({"assets": {"forbidden": ["Z"]}}, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_a_mandate_the_program_is_as_before():
+    backtest = create(None, agents={"pathwise": AGENTS["pathwise"]})
+    task = backtest.tasks["pathwise"]
+    assert task.allowed is None
+    assert type(task.feasible).__name__ == "CappedSimplex"
