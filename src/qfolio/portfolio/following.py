@@ -89,7 +89,7 @@ def paths(
 
 def _require_feasible(task: Portfolio, agent: Agent, targets: np.ndarray, first: int) -> None:
     """Raises QfolioError for infeasible targets; a replay would read NaN as no order."""
-    ordered = True
+    ordered = np.ones(targets.shape[1], bool)
     if task.calendar:  # elsewhere, what is held may have drifted outside
         rows = first + np.arange(targets.shape[1])
         ordered = np.take(np.asarray(task.decides), rows, mode="clip")

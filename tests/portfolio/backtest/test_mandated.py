@@ -87,6 +87,19 @@ def test_every_order_obeys_the_mandate(tmp_path):
 
 
 @pytest.mark.slow
+def test_orders_of_a_calendar_obey_although_holdings_drift_between_them():
+    mandate = {"assets": {"cap": 0.25}, "trading": {"holdings": 4}}
+    backtest = create(mandate, agents={"pathwise": AGENTS["pathwise"]}, calendar="weekly")
+    backtest.run()
+    made = feasible(backtest.tasks["pathwise"].mandate, np.ones(5, bool))
+    decides = np.asarray(backtest.tasks["pathwise"].decides)[backtest.folds[0].decisions]
+    for name, entry in backtest.entries()[0].items():
+        ordered = entry.decisions[:, : len(decides)][:, decides]
+        ordered = ordered[~np.isnan(ordered).any(-1)]
+        assert max(np.max(x) for x in made.violations(ordered).values()) <= 1e-5, name
+
+
+@pytest.mark.slow
 def test_floors_yield_to_assets_that_start_late():
     mandate = {"assets": {"cap": 0.3}, "cash": {"max": 0.2},
                "groups": {"kind": {"x": {"assets": ["D"], "floor": 0.1}}}}  # fmt: skip
