@@ -42,8 +42,8 @@ class Leverage(SyntheticMarket):
     Returns over a quarter are drawn from a fixed set of log-normal scenarios; the third asset is
     best sold short. An action is the weights of the assets, of any size and sign; cash is the rest.
     The best weights maximise the expected utility of the next step, with constant relative risk
-    aversion (1: log growth). Bold investors borrow, careful ones lend, and those between them hold
-    no cash: at the default rates up to about 1.2, from about 2.7, and between.
+    aversion (1: log growth). At the default rates those with an aversion below 1.6 borrow, those
+    above 3.2 lend, and those between hold no cash.
     """
 
     cash_rate: float = constant(0.02)  # a year, as the spread
