@@ -249,7 +249,10 @@ def test_a_sale_pays_its_expected_shortfall_and_its_risk():
     assert float(total) == pytest.approx(-exact.cost - 0.7 * exact.variance, rel=1e-5)
 
 
-@pytest.mark.parametrize(("risk_aversion", "cash"), [(1.0, -0.5688), (2.0, 0.0), (4.0, 0.1858)])
+@pytest.mark.parametrize(
+    ("risk_aversion", "cash"),
+    [(1.0, -0.5688), (1.5, -0.0629), (1.6, 0.0), (3.2, 0.0), (3.3, 0.0146), (4.0, 0.1858)],
+)
 def test_leverage_has_three_regimes(risk_aversion, cash):
     task = Leverage(risk_aversion=risk_aversion)
     rule = task.rule(task.best())
