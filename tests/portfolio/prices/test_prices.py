@@ -635,6 +635,9 @@ def survive(seed: int, tables: int, folder: Path) -> int:
             "missing": str(rng.choice(["error", "drop-asset", "forward-fill"])),
             "late": str(rng.choice(["error", "drop-asset", "trim", "join"])),
         }
+        if changed := rng.random() < 0.2:
+            options["returns"] = str(rng.choice(["percent", "fraction"]))
+            options["columns"] = str(rng.choice(["A", "B", "asset"]))
         if rng.random() < 0.5:
             path.write_bytes(hostile_text(rng))
             read += outcome(path, **options) is not None
@@ -645,7 +648,11 @@ def survive(seed: int, tables: int, folder: Path) -> int:
             continue
         read += 1
         names = [str(name).strip() for name in table.columns]
-        if options["missing"] != "forward-fill" and set(prices.assets) <= set(names):
+        if (
+            not changed
+            and options["missing"] != "forward-fill"
+            and set(prices.assets) <= set(names)
+        ):
             for j, name in enumerate(prices.assets):
                 given = [float(c) for c in table.iloc[:, names.index(name)] if usable(c)]
                 kept = prices.values[:, j]
@@ -660,7 +667,7 @@ def usable(cell: Any) -> bool:
 
 
 def test_hostile_tables(tmp_path: Path):
-    assert survive(seed=0, tables=700, folder=tmp_path) > 100  # so both ends are reached
+    assert survive(seed=0, tables=700, folder=tmp_path) > 80  # so both ends are reached
 
 
 @pytest.mark.slow

@@ -90,7 +90,7 @@ def _jumps(values: np.ndarray, moves: np.ndarray, sizes: np.ndarray) -> list[Jum
         usual = float(np.median(sizes[:, j][sizes[:, j] > 0])) / 0.6745
         steps = np.abs(np.diff(values[:, j]))
         tick = steps[steps > 0].min()
-        jumps[:, j] &= (sizes[:, j] > UNUSUAL * usual) & (steps > (TICKS - 0.5) * tick)
+        jumps[:, j] &= (sizes[:, j] > UNUSUAL * usual) & (steps / (TICKS - 0.5) > tick)
         for i in np.flatnonzero(jumps[:, j]).tolist():
             around = sizes[max(i - AROUND, 0) : i + AROUND + 1, j]
             jumps[i, j] = sizes[i, j] > UNUSUAL * float(np.nanmedian(around)) / 0.6745

@@ -20,6 +20,8 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
     An asset's price is 100 in the row before its first return. If that row is not in the table,
     it is 100 in the row of its first return, which is then not used.
     """
+    if not grid.prices.values.size:
+        return grid
     block = replace(grid.prices, name="return")
     with np.errstate(over="ignore", under="ignore"):
         rates = block.values * UNITS[unit]
@@ -36,7 +38,7 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
         first = present.argmax(axis=0)
         values = np.where(np.isnan(rates), np.nan, START * growth)
         unused = present.any(axis=0) & (first == 0)
-        values[:, unused] /= growth[0, unused] if len(growth) else 1.0
+        values[:, unused] /= growth[0, unused]
     for j in np.flatnonzero(first > 0).tolist():
         values[first[j] - 1, j] = START
     if unused.any():
