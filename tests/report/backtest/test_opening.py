@@ -1,6 +1,7 @@
 """The first screen of the page: conclusion, tiles, verdicts in a line, the best strategy."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -31,7 +32,7 @@ def found(data: BacktestData, **findings: tuple[Finding, Finding]) -> BacktestDa
         growth, sharpe = findings.get(name.removesuffix("-together"), ("none", "none"))
         assert entry.to_reference is not None
         assert entry.to_rebalanced is not None
-        changed = {
+        changed: dict[str, Any] = {
             field: replace(
                 difference,
                 growth=replace(difference.growth, finding=growth),

@@ -19,12 +19,12 @@ def test_figures_are_means_over_seeds() -> None:
     sheet = tear_sheet(["DQN", "equal weight"], data)
     rows = {name: cells for _, group in sheet["groups"] for name, cells in group}
     returns = data.strategies["DQN"].returns
-    assert rows["Best day"][0] == percent(returns.max(axis=1).mean(), sign=True)
+    assert rows["Best day"][0] == percent(float(returns.max(axis=1).mean()), sign=True)
     assert rows["Growth a year (CAGR)"][0] == percent(
         data.assessment.strategies["DQN"].measures["growth"].mean
     )
     assert rows["Value at risk, 95\u202f%, daily"][1] == percent(
-        -np.quantile(data.strategies["equal weight"].returns, 0.05), 2
+        -float(np.quantile(data.strategies["equal weight"].returns, 0.05)), 2
     )
     assert len(rows) == 27
 
