@@ -19,6 +19,7 @@ from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.simulation import Simulation
 from qfolio.portfolio.market import Market
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.base import OneAsset, Synthetic
@@ -106,6 +107,7 @@ def backtest_data(
                 entry.simulation.turnover,
                 entry.simulation.cost,
                 entry.mean_weights,
+                _costs(entry.simulation, backtest.prices.periods_per_year),
             )
             for name, entry in entries.items()
         },
@@ -130,6 +132,14 @@ def backtest_data(
         why=why,
         moves=_moves(backtest),
     )
+
+
+def _costs(simulation: Simulation, year: float) -> dict[str, float]:
+    """Costs a year by kind; what interest, fees and carry earned is a negative one."""
+    costs = {kind: year * float(paid.mean()) for kind, paid in simulation.costs.items()}
+    if simulation.financing is not None:
+        costs["interest and carry"] = -year * float(simulation.financing.mean())
+    return costs
 
 
 def _moves(backtest: Backtest) -> Floats:

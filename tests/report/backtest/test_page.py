@@ -119,6 +119,26 @@ def test_only_the_corrected_verdict_is_marked() -> None:
     assert first_cell(none).startswith(' class="">+1.0')
 
 
+def test_costs_by_kind_have_a_table() -> None:
+    data = usual(60)
+    assert "Table of costs by kind" not in render_backtest(data)
+    paid = {"commission": 0.002, "impact": 0.0015, "interest and carry": -0.01}
+    dqn = replace(data.strategies["DQN"], costs=paid)
+    data = replace(data, strategies={**data.strategies, "DQN": dqn})
+    data = replace(data, config={**data.config, "cost_model": "itemized(impact=1)"})
+    page = render_backtest(data)
+    table = page.split("Table of costs by kind")[1].split("</table>")[0]
+    rows = dict(re.findall(r"<th scope=\"row\">(.*?)</th>(.*?)</tr>", table))
+    cells = {name: re.findall(r"<td>(.*?)</td>", row) for name, row in rows.items()}
+    shown = [percent(value, 2) for value in (*paid.values(), -0.0065)]
+    assert cells["DQN"] == shown
+    assert cells["equal weight"] == ["–"] * 4
+    assert re.findall(r"<th scope=\"col\">(.*?)</th>", table)[1:] == [*paid, "Sum"]
+    text = Page(page).text
+    assert "that the cost model itemized(impact=1) leaves out" in text
+    assert "cash earns nothing" not in text
+
+
 def test_months_are_compounded() -> None:
     days = np.array(["2020-11-30", "2020-12-01", "2020-12-02", "2021-01-04"], "datetime64[s]")
     returns = np.array([[0.1, 0.1, 0.1, -0.5]])

@@ -27,6 +27,7 @@ class StrategySeries:
         cost: Cost of each day's trade as a share of the wealth, shape (S, D).
         weights: Weights after the trade, cash first, the mean over the seeds, shape (D, N + 1);
             NaN, like turnover and cost, where only returns are known.
+        costs: Costs a year by kind, shares of the wealth, means over the seeds; negative ones earn.
     """
 
     kind: str
@@ -34,6 +35,7 @@ class StrategySeries:
     turnover: Floats
     cost: Floats
     weights: Floats
+    costs: dict[str, float] = field(default_factory=dict)
 
     @property
     def weighted(self) -> bool:

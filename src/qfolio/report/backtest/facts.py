@@ -70,6 +70,7 @@ def account(data: BacktestData) -> dict[str, Any]:
         "cost": _basis_points(settings["cost"]) if "cost" in settings else None,
         **{key: settings.get(key) for key in ("lag", "train", "test", "expanding", "cap")},
         "mandate": "; ".join(_limits(settings.get("mandate") or {})),
+        "itemized": settings.get("cost_model", "proportional") != "proportional",
         "trials": _counts(test),
         "earlier": test.earlier_trials,
     }

@@ -16,7 +16,7 @@ Standing = Literal["better", "mixed", "none", "worse"]
 
 WORDS: dict[Standing, str] = {
     "better": "better",
-    "mixed": "better at its own pace only",
+    "mixed": "better, not at every speed",
     "none": "no evidence",
     "worse": "worse",
 }
@@ -154,6 +154,7 @@ def verdict_lines(data: BacktestData) -> dict[str, Any]:
     names = [name for name in shown_order(data) if test.strategies[name].kind in JUDGED]
     columns = [_column(key, names, data) for key in ("growth", "sharpe")]
     return {
+        "mixed": any(cell["side"] == "mixed" for column in columns for cell in column["cells"]),
         "zeros": [column["zero"] for column in columns],
         "agents": [
             (name, [column["cells"][place] for column in columns])

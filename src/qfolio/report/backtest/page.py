@@ -40,6 +40,8 @@ from qfolio.report.backtest.opening import (
 from qfolio.report.backtest.tables import (
     HEADINGS,
     RELATIVE_HEADINGS,
+    cost_kinds,
+    cost_rows,
     difference_headings,
     difference_rows,
     fold_rows,
@@ -128,6 +130,8 @@ def render_backtest(data: BacktestData) -> str:
         difference_headings=difference_headings(data),
         differences=[(name, difference_rows(name, data)) for name in names],
         rebalancings=rebalancing_rows(data),
+        cost_kinds=cost_kinds(data),
+        costs=cost_rows(lead, data),
         luck=luck_rows(lead, data),
         months=month_tables(names, data),
         folds=fold_rows(data.folds),

@@ -185,6 +185,23 @@ def rebalancing_rows(data: BacktestData) -> list[dict[str, Any]]:
     ]
 
 
+def cost_kinds(data: BacktestData) -> list[str]:
+    """The kinds of costs, if there are several."""
+    kinds = list(dict.fromkeys(kind for s in data.strategies.values() for kind in s.costs))
+    return kinds if len(kinds) > 1 else []
+
+
+def cost_rows(names: list[str], data: BacktestData) -> list[tuple[str, list[str]]]:
+    """Costs a year of each strategy by kind, and their sum; those that earn are negative."""
+    rows, kinds = [], cost_kinds(data)
+    for name in names:
+        costs = data.strategies[name].costs
+        values = [costs.get(kind, math.nan) for kind in kinds] + [sum(costs.values())]
+        shown = values if costs else [math.nan] * len(values)
+        rows.append((name, ["–" if math.isnan(x) else percent(x, 2) for x in shown]))
+    return rows
+
+
 def _telling(value: float, digits: int) -> int:
     """The decimals, at least ``digits``, with which a small number does not round to 0."""
     if value == 0 or not math.isfinite(value):

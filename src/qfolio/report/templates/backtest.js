@@ -106,8 +106,8 @@
         titles: [["Share of the wealth lost to costs so far", 1],
           [months ? "Monthly turnover, over wealth" : "Turnover, over wealth", 0.42]],
         xaxis: { anchor: "y2" },
-        yaxis: { domain: [0.56, 1], rangemode: "tozero", tickformat: ".0%", nticks: 5 },
-        yaxis2: { domain: [0, 0.42], rangemode: "tozero", tickformat: ".0%", nticks: 5 },
+        yaxis: { domain: [0.56, 1], rangemode: "tozero", tickformat: "~%", nticks: 5 },
+        yaxis2: { domain: [0, 0.42], rangemode: "tozero", tickformat: "~%", nticks: 5 },
       }), options("costs"));
   }
 
