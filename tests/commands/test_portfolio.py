@@ -88,6 +88,33 @@ def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
         assert message in capsys.readouterr().err
 
 
+def test_backtest_obeys_a_mandate(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    write_table(tmp_path / "prices.csv")
+    (tmp_path / "groups.csv").write_text("asset,sector\nA,Metals\nB,Metals\nC,Energy\n")
+    mandate = tmp_path / "mandate.toml"
+    options = ["prices.csv", "--agents", "pathwise", "--train", "100d", "--test", "80d", "--seeds",
+               1, "--episodes", 4, "--baselines", "momentum", "--mandate", "mandate.toml", "--set",
+               "window=10", "horizon=20", "hidden=4", "num_envs=2",
+               "rollout_length=10"]  # fmt: skip
+    mandate.write_text("[assets]\ncap = 0.1\n[cash]\nmax = 0.5\n")
+    assert qfolio(monkeypatch, "backtest", *options, "--out", "run") == 2
+    assert "caps of assets (10 %) and cash of at most 50 % clash" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    mandate.write_text(
+        '[assets]\ncap = 0.6\n[groups]\nfile = "groups.csv"\n[groups.sector.Metals]\ncap = 0.3\n'
+    )
+    assert qfolio(monkeypatch, "backtest", *options, "--out", "run") == 0
+    assert "groups.sector.Metals.cap = 0.3" in (tmp_path / "run" / "report.html").read_text()
+    capsys.readouterr()
+    for file in (mandate, tmp_path / "groups.csv"):
+        file.unlink()
+    asked = ["run", "--capital", 1000, "--as-of", "2020-09-16", "--anyway", "--json"]
+    assert qfolio(monkeypatch, "allocate", *asked) == 0
+    weights = {row["asset"]: row["weight"] for row in json.loads(capsys.readouterr().out)["assets"]}
+    assert weights["A"] + weights["B"] <= 0.3 + 1e-5
+
+
 def test_backtest_explains_its_agents(folder):
     why = Why.read(BacktestFolder(folder).read_why())
     assert list(why.agents) == ["pathwise-together"]
