@@ -22,6 +22,7 @@ from qfolio.portfolio.backtest.folds import walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.costs import with_cash
 from qfolio.portfolio.prices.table import Prices, load
 
 ROWS = 5000
@@ -60,7 +61,8 @@ def measure(prices: Prices) -> None:
     equal = np.full((1, ROWS - 1300, values.shape[1] + 1), 1 / (values.shape[1] + 1))
     timed("replay", lambda: simulate(values, equal, first=1290, cost=0.001))
     timed("factors", lambda: factor_returns(values, folds, 1, 252))
-    timed("bound", lambda: constant_bound(values, 1290, 252))
+    growth = with_cash(values[1290:] / values[1289:-1])
+    timed("bound", lambda: constant_bound(growth, 252))
 
 
 def main() -> None:

@@ -1,11 +1,14 @@
 """Calendars, and that nothing trades between their rows."""
 
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import preset
+from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.prices.table import Prices
@@ -79,6 +82,7 @@ def test_every_strategy_of_a_backtest_keeps_to_the_calendar() -> None:
         seeds=2,
         episodes=2,
         calendar="quarterly",
+        cost_model="itemized(cash_rate=0.05)",
         baselines=("minimum-variance", "momentum", "buy-and-hold"),
     )
     backtest.run()
@@ -92,3 +96,13 @@ def test_every_strategy_of_a_backtest_keeps_to_the_calendar() -> None:
         assert not trades[:, ~allowed[: trades.shape[1]]].any()
         some += int(trades[:, 1:].any())
     assert some > 5  # most trade more than once
+
+    # What follows from the orders leaves out the rows without one, and Sharpe ratios the interest.
+    json.dumps(explain(backtest, entries).to_json(), allow_nan=False)
+    interest = backtest.growth[:, 0] - 1
+    days = np.diff(prices.dates[-len(interest) - 1 :]) / np.timedelta64(1, "D")
+    np.testing.assert_allclose(interest, np.expm1(0.05 * days / 365), rtol=1e-9)
+    assessed = backtest.assess(entries)
+    over_cash = entries["buy-and-hold"].simulation.returns - interest
+    sharpe = over_cash.mean() / over_cash.std(ddof=1) * np.sqrt(assessed.periods_per_year)
+    assert assessed.strategies["buy-and-hold"].measures["sharpe"].mean == pytest.approx(sharpe)

@@ -22,6 +22,7 @@ from qfolio.portfolio.backtest.differences import Difference, Rival, compare
 from qfolio.portfolio.backtest.measures import (
     Floats,
     checked_dates,
+    checked_risk_free,
     checked_track,
     measures,
 )
@@ -124,6 +125,7 @@ def assess(
     earlier_trials: int = 0,
     resamples: int = 2000,
     seed: int = 0,
+    risk_free: ArrayLike | None = None,
 ) -> Assessment:
     """Compute every statistic of a backtest.
 
@@ -146,6 +148,8 @@ def assess(
             agent, every ensemble and every strategy of the user's own.
         resamples: Number of histories that the bootstrap draws.
         seed: Seed of the drawing.
+        risk_free: Returns of cash, shape (periods,), which Sharpe and Sortino ratios leave out
+            (default: 0).
 
     Raises:
         QfolioError: Shapes do not fit, numbers are missing or out of range, there are fewer than
@@ -167,19 +171,20 @@ def assess(
             f"positive number of periods per year; they are {periods}, {resamples} and "
             f"{periods_per_year}."
         )
+    free = checked_risk_free(risk_free, periods)
     # All seeds of all strategies together, so that they share the resampled days.
     rng = np.random.default_rng(seed)
     table = np.concatenate([_canonical(track) for track in tracks.values()], axis=1)
     block = _common_block([_canonical(track)[0].mean(axis=0) for track in tracks.values()])
     drawn = bootstrap_measures(
-        table[0], table[1], table[2], periods_per_year, block, resamples, rng
+        table[0], table[1], table[2], periods_per_year, block, resamples, rng, free
     )
     sampled, end = {}, 0
     for name, track in tracks.items():
         seeds = track.shape[1]
         start, end = end, end + seeds
         sampled[name] = Sampled(
-            measures(track[0], track[1], track[2], periods_per_year),
+            measures(track[0], track[1], track[2], periods_per_year, free),
             {key: values[:, start:end] for key, values in drawn.items()},
         )
 
@@ -200,7 +205,7 @@ def assess(
         rivals["best"] = Rival(best, tuple(classical), tested=("growth",))
     returns = {name: _canonical(track)[0] for name, track in tracks.items()}
     compared = _relative(known, tracks, reference, periods_per_year, block, resamples, seed)
-    differences = compare(returns, rivals, judged, periods_per_year, seed)
+    differences = compare(returns, rivals, judged, periods_per_year, seed, free)
 
     return Assessment(
         first_date=str(days[0].astype("datetime64[D]")),
@@ -230,7 +235,7 @@ def assess(
                 to_rebalanced=differences.get("rebalanced", {}).get(name),
                 to_best_baseline=differences.get("best", {}).get(name),
                 sharpe_test=_sharpe_test(
-                    returns[name],
+                    returns[name] if free is None else returns[name] - free,
                     mean_over_seeds(sampled[name].observed["sharpe"]),
                     trials if name in judged else 1,  # baselines were not selected among trials
                     variance,

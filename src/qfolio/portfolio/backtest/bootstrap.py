@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from qfolio.portfolio.backtest.measures import (
     MEASURES,
     Floats,
+    checked_risk_free,
     checked_track,
     deepest_drawdown,
     deviations,
@@ -114,6 +115,7 @@ def bootstrap_measures(
     block: float,
     resamples: int,
     rng: np.random.Generator,
+    risk_free: ArrayLike | None = None,
 ) -> dict[str, Floats]:
     """Compute ``measures`` on histories resampled by the stationary bootstrap.
 
@@ -121,7 +123,7 @@ def bootstrap_measures(
 
     Args:
         returns, turnover, cost: As in ``measures``, shape (series, periods), at least two periods.
-        periods_per_year: As in ``measures``.
+        periods_per_year, risk_free: As in ``measures``.
         block, resamples, rng: As in ``stationary_bootstrap_indices``.
 
     Returns:
@@ -130,7 +132,8 @@ def bootstrap_measures(
     track = checked_track(returns, turnover, cost)
     series, periods = track[0].shape
     centre = track[0].mean(axis=-1)
-    features = per_period(track, centre).reshape(-1, periods).T
+    free = checked_risk_free(risk_free, periods)
+    features = per_period(track, centre, free).reshape(-1, periods).T
     steps = np.ascontiguousarray(log_growth(track[0]).T)
     parts = []
     for days, counts in histories(periods, block, resamples, rng):
@@ -140,6 +143,7 @@ def bootstrap_measures(
                 moments.swapaxes(0, 1),
                 deepest_drawdown(steps, days),
                 centre,
+                free,
                 periods,
                 periods_per_year,
             )

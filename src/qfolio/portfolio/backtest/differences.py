@@ -88,6 +88,7 @@ def compare(
     judged: Sequence[str],
     periods_per_year: float,
     seed: int = 0,
+    risk_free: Floats | None = None,
 ) -> dict[str, dict[str, Difference]]:
     """Every strategy minus each of the rivals.
 
@@ -97,6 +98,7 @@ def compare(
         judged: Which strategies are tested.
         periods_per_year: For example 252 for days of trading.
         seed: Seed of the draws.
+        risk_free: Returns of cash, shape (periods,), which Sharpe ratios leave out (default: 0).
 
     Returns:
         Differences by role and strategy, but none of a rival to itself.
@@ -105,7 +107,7 @@ def compare(
     differences: dict[str, dict[str, Difference]] = {role: {} for role in rivals}
     for name, ours in returns.items():
         others = {
-            other: estimate(ours, returns[other], periods_per_year)
+            other: estimates(ours, returns[other], periods_per_year, risk_free)
             for rival in rivals.values()
             for other in (rival.without(name) if name in judged else (rival.name,))
         }
@@ -135,6 +137,18 @@ def compare(
         known: dict[str, Any] = {key: tested}
         differences[role][name] = dataclasses.replace(differences[role][name], **known)
     return differences
+
+
+def estimates(
+    ours: Floats, theirs: Floats, periods_per_year: float, risk_free: Floats | None
+) -> dict[Measured, Estimate]:
+    """The differences of a pair, with Sharpe ratios of the returns over cash."""
+    found = estimate(ours, theirs, periods_per_year)
+    if risk_free is None:
+        return found
+    mine, other = (np.maximum(each - risk_free, -1) for each in (ours, theirs))
+    excess = estimate(mine, other, periods_per_year)
+    return {**found, "sharpe": excess["sharpe"]}
 
 
 def tails_to(

@@ -20,7 +20,11 @@ MEASURES = (
 
 
 def measures(
-    returns: ArrayLike, turnover: ArrayLike, cost: ArrayLike, periods_per_year: float
+    returns: ArrayLike,
+    turnover: ArrayLike,
+    cost: ArrayLike,
+    periods_per_year: float,
+    risk_free: ArrayLike | None = None,
 ) -> dict[str, Floats]:
     """Compute the usual measures of track records, annualised.
 
@@ -29,14 +33,16 @@ def measures(
         turnover: Value bought plus value sold, over wealth, same shape.
         cost: Share of wealth that a period's trade cost, at least 0 and below 1, same shape.
         periods_per_year: For example 252 for days of trading.
+        risk_free: Returns of cash, shape (periods,) (default: 0).
 
     Returns:
         One array of shape (...) for each name in ``MEASURES``:
 
         - growth: geometric mean, as a simple annual rate; a total loss gives −1;
         - volatility: standard deviation (n − 1) of the returns;
-        - sharpe: mean over standard deviation, with a risk-free rate of 0;
-        - sortino: mean over the downside deviation, the root mean square of min(return, 0);
+        - sharpe: mean over standard deviation, of returns over cash;
+        - sortino: mean over the downside deviation, the root mean square of min(return, 0), of
+          returns over cash;
         - drawdown: the maximum drawdown below an earlier peak (or the start), between 0 and 1;
         - calmar: growth over drawdown;
         - turnover: mean times periods per year;
@@ -47,10 +53,11 @@ def measures(
         QfolioError: The shapes differ, or a number is missing, infinite or out of range.
     """
     track = checked_track(returns, turnover, cost)
+    free = checked_risk_free(risk_free, track[0].shape[-1])
     deepest = drawdown(track[0]).max(axis=-1)
     centre = track[0].mean(axis=-1)
-    moments = per_period(track, centre).mean(axis=-1)
-    return from_moments(moments, deepest, centre, track[0].shape[-1], periods_per_year)
+    moments = per_period(track, centre, free).mean(axis=-1)
+    return from_moments(moments, deepest, centre, free, track[0].shape[-1], periods_per_year)
 
 
 def drawdown(returns: ArrayLike) -> Floats:
@@ -95,26 +102,41 @@ def monthly(returns: ArrayLike, dates: ArrayLike) -> tuple[list[int], Floats]:
     return list(years), table.reshape(*values.shape[:-1], len(years), 12)
 
 
-def per_period(track: Floats, centre: Floats) -> Floats:
-    """Quantities whose means over time give all measures but the drawdown: (7, ..., periods)."""
+def per_period(track: Floats, centre: Floats, free: Floats | None) -> Floats:
+    """Quantities whose means over time give all measures but the drawdown: (7, ..., periods).
+
+    With returns of cash there are 9; the downside is that of returns over them.
+    """
     returns, turnover, cost = track
     deviation = returns - centre[..., None]  # centred, or the variance would lose precision
     ruined = returns == -1
     log_net = np.log1p(np.where(ruined, 0, returns))
     log_free = log_net - np.log1p(-cost)
-    downside = np.minimum(returns, 0) ** 2
-    return np.stack([deviation, deviation**2, downside, log_net, log_free, ruined, turnover])
+    downside = np.minimum(returns if free is None else returns - free, 0) ** 2
+    found = [deviation, deviation**2, downside, log_net, log_free, ruined, turnover]
+    if free is not None:
+        over = deviation - (free - free.mean())
+        found += [over, over**2]
+    return np.stack(found)
 
 
 def from_moments(
-    moments: Floats, deepest: Floats, centre: Floats, periods: int, periods_per_year: float
+    moments: Floats,
+    deepest: Floats,
+    centre: Floats,
+    free: Floats | None,
+    periods: int,
+    periods_per_year: float,
 ) -> dict[str, Floats]:
-    deviation, square, downside, log_net, log_free, ruined, turnover = moments
-    mean = centre + deviation
-    variance = square - deviation**2
-    rounding = 1e-14 * square + 1e-24 * mean**2  # what remains of equal returns
-    variance = np.where(variance > rounding, variance, 0)
+    deviation, square, downside, log_net, log_free, ruined, turnover, *of_excess = moments
     bessel = periods / (periods - 1) if periods > 1 else math.nan
+    spread = np.sqrt(bessel * _variance(square, deviation, centre))
+    excess, excess_spread = centre + deviation, spread
+    if free is not None:
+        over, over_square = of_excess
+        excess = centre - free.mean() + over
+        excess = np.where(np.abs(excess) > 1e-12 * np.abs(centre), excess, 0)  # cash itself
+        excess_spread = np.sqrt(bessel * _variance(over_square, over, centre))
     with np.errstate(over="ignore", invalid="ignore"):
         growth, free = (
             np.where(ruined > 0, -1, np.expm1(periods_per_year * log))
@@ -122,17 +144,23 @@ def from_moments(
         )
         drag = free - growth
     annual = math.sqrt(periods_per_year)
-    spread = np.sqrt(bessel * variance)
     return {
         "growth": growth,
         "volatility": annual * spread,
-        "sharpe": annual * ratio_or_zero(mean, spread),
-        "sortino": annual * ratio_or_zero(mean, np.sqrt(downside)),
+        "sharpe": annual * ratio_or_zero(excess, excess_spread),
+        "sortino": annual * ratio_or_zero(excess, np.sqrt(downside)),
         "drawdown": deepest,
         "calmar": ratio_or_zero(growth, deepest),
         "turnover": periods_per_year * turnover,
         "cost_drag": drag,
     }
+
+
+def _variance(square: Floats, deviation: Floats, centre: Floats) -> Floats:
+    """The mean of squared deviations, exactly 0 where only rounding is left of equal returns."""
+    variance = square - deviation**2
+    rounding = 1e-14 * square + 1e-24 * (centre + deviation) ** 2
+    return np.where(variance > rounding, variance, 0)
 
 
 def ratio_or_zero(above: ArrayLike, below: ArrayLike) -> Floats:
@@ -195,6 +223,19 @@ def checked_track(
             f"theirs are {', '.join(str(array.shape) for array in arrays)}."
         )
     return np.stack(arrays)
+
+
+def checked_risk_free(risk_free: ArrayLike | None, periods: int) -> Floats | None:
+    """The returns of cash, of shape (periods,); None if there are none."""
+    if risk_free is None:
+        return None
+    free = _checked_series("returns", risk_free, "cash")
+    if free.shape != (periods,):
+        raise QfolioError(
+            f"There are {periods} returns and risk-free returns of shape {free.shape}; each return "
+            "needs one."
+        )
+    return free if free.any() else None
 
 
 # The least and the greatest value; rounding may leave a turnover or a cost slightly below zero.

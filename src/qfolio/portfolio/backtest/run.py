@@ -36,6 +36,7 @@ from qfolio.portfolio.backtest.kept import LATEST, Kept, learning
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
+from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.mandate import Mandate, settled
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
@@ -331,7 +332,7 @@ class Backtest:
 
     def entries(self) -> tuple[dict[str, Entry], list[str]]:
         """Every strategy replayed over all folds, and notes on problems."""
-        replay = Replay(self.prices, self.folds, next(iter(self.tasks.values())), self.config.cap)
+        replay = Replay(self.prices, self.folds, self._task_of_all, self.config.cap)
         entries: dict[str, Entry] = {}
         for name, agent in self.agents.items():
             entries |= replay.agent(name, agent, self.stretches(name), self.config.seeds)
@@ -346,6 +347,21 @@ class Backtest:
         first, last = self.folds[0].decisions.start, self.folds[-1].decisions.stop
         return self.prices.dates[first + shift : last + shift]
 
+    @property
+    def growth(self) -> np.ndarray:
+        """Growth factors of cash and each asset over the test's returns, shape (day, entry)."""
+        task, values = self._task_of_all, self.prices.values
+        first = self.folds[0].decisions.start + self.config.lag
+        rows = first + np.arange(len(self.dates))
+        relatives = np.nan_to_num(values[rows + 1] / values[rows], nan=1.0)
+        period = Conditions.of(self.prices, task.costs.columns).holding(rows, rows + 1)
+        return np.asarray(task.costs.carry(relatives, period))
+
+    @property
+    def _task_of_all(self) -> Portfolio:
+        """Any agent's task; costs, lag and limits are the same for all."""
+        return next(iter(self.tasks.values()))
+
     def assess(self, entries: dict[str, Entry], since: str | None = None) -> assessment.Assessment:
         """The statistics of all strategies, over the whole test or from a date on."""
         first = 0 if since is None else int(np.searchsorted(self.dates, np.datetime64(since)))
@@ -356,9 +372,11 @@ class Backtest:
             periods_per_year=table.periods_per_year,
             reference=self.config.benchmark,
             earlier_trials=self.config.trials + trials_on(table.source),
+            risk_free=self.growth[days, 0] - 1,
         )
-        begin = self.folds[0].decisions.start + self.config.lag + 1 + first
-        bound = constant_bound(table.values, begin, table.periods_per_year)
+        if not self._task_of_all.feasible.long_only:
+            return assessed  # debts may exceed any bound on weights without them
+        bound = constant_bound(self.growth[days], table.periods_per_year)
         return dataclasses.replace(assessed, bound=bound)
 
     def _name(self, agent: str | None) -> str:

@@ -63,6 +63,10 @@ def few_seeds(test: Assessment) -> bool:
     return 1 < max(seeds, default=1) < FEWEST_SEEDS
 
 
+PLAIN = (None, "proportional")
+"""Cost models that the proportional cost describes."""
+
+
 def account(data: BacktestData) -> dict[str, Any]:
     """Return the settings for the description of the test; None for those that are unknown."""
     test, settings = data.assessment, data.config
@@ -70,7 +74,8 @@ def account(data: BacktestData) -> dict[str, Any]:
         "cost": _basis_points(settings["cost"]) if "cost" in settings else None,
         **{key: settings.get(key) for key in ("lag", "train", "test", "expanding", "cap")},
         "mandate": "; ".join(_limits(settings.get("mandate") or {})),
-        "itemized": settings.get("cost_model", "proportional") != "proportional",
+        "model": None if settings.get("cost_model") in PLAIN else settings["cost_model"],
+        "calendar": settings.get("calendar") or None,
         "trials": _counts(test),
         "earlier": test.earlier_trials,
     }

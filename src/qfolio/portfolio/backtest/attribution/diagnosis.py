@@ -54,9 +54,15 @@ def _dead(entry: Entry, seed: int, folds: Sequence[slice], assets: Sequence[str]
     alone = (weights > ALONE).mean(0)
     if alone.max() >= ALONE:
         return f"always held {('cash', *assets)[alone.argmax()]} alone"
-    if all(np.ptp(targets[days], axis=0).max() < SAME for days in folds):
-        whole = np.ptp(targets, axis=0).max() < SAME
+    if all(_same(targets[days]) for days in folds):
+        whole = _same(targets)
         return "ordered the same weights at every row" + (
             "" if whole else " of a fold, in each of the folds"
         )
     return ""
+
+
+def _same(targets: np.ndarray) -> bool:
+    """Whether all orders are the same; NaN gives none."""
+    given = targets[~np.isnan(targets[:, 0])]
+    return not len(given) or bool(np.ptp(given, axis=0).max() < SAME)

@@ -14,7 +14,6 @@ from qfolio.portfolio.backtest.attribution.diagnosis import diagnose
 from qfolio.portfolio.backtest.attribution.distillation import Rule, distil
 from qfolio.portfolio.backtest.attribution.factors import exposures, factor_returns
 from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
-from qfolio.portfolio.backtest.attribution.hac import Floats
 from qfolio.portfolio.backtest.attribution.importance import importance, of_seeds
 from qfolio.portfolio.backtest.attribution.replays import channel_names, channels
 from qfolio.portfolio.backtest.attribution.slices import slices
@@ -48,7 +47,7 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
             decomposition=decompose(
                 net,
                 entry.simulation.weights[0],
-                held_returns(backtest, stretches[0], len(net)),
+                backtest.growth - 1,
                 folds,
                 prices.assets,
                 year,
@@ -69,15 +68,6 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
     return Why(config.benchmark, agents, diagnosis)
 
 
-def held_returns(backtest: Backtest, stretch: Stretch, days: int) -> Floats:
-    """Returns of cash and assets from each day's trade to the next, shape (days, N + 1)."""
-    task, begin = stretch.task, stretch.fold.decisions.start + backtest.config.lag
-    rows = begin + np.arange(days)
-    values = backtest.prices.values
-    relatives = np.nan_to_num(values[rows + 1] / values[rows], nan=1.0)
-    return np.asarray(task.costs.carry(relatives, task.conditions.holding(rows, rows + 1))) - 1
-
-
 def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> Rule:
     """The linear rule of an agent's decisions, fitted on every other fold."""
     begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
@@ -91,4 +81,6 @@ def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> 
         fitted[days // 2 :] = False
     anchor = np.asarray(task.anchors)[begin:end] if task.anchor else np.zeros_like(tradable)
     seen = np.asarray(channels(task))[begin:end]
-    return distil(decisions[:, 1:], anchor, seen, names, tradable, fitted)
+    given = ~np.isnan(decisions[:, 0])  # there are no orders between a calendar's decisions
+    ordered, anchor, seen = decisions[given, 1:], anchor[given], seen[given]
+    return distil(ordered, anchor, seen, names, tradable[given], fitted[given])
