@@ -154,9 +154,11 @@ class _Rates:
             column = _column(quantity)
             return float(quantity) if column is None else context.columns[column]
 
-        half = known(model.spread) / 2
-        sides = [{"commission": model.cost, "tax": known(tax), "spread": half}
-                 for tax in (model.buy, model.sell)]  # fmt: skip
+        spread = {} if model.spread == "0" else {"spread": known(model.spread) / 2}
+        sides = [
+            {"commission": model.cost, **({} if tax == "0" else {"tax": known(tax)}), **spread}
+            for tax in (model.buy, model.sell)
+        ]
         buying, self.selling = sides
         # Spending m buys (1 − c)m, so that buying v costs v·c/(1 − c).
         kept = 1 - sum(buying.values())
@@ -174,7 +176,8 @@ class _Rates:
         """Shares of wealth by kind of cost, and their derivative by the change of a weight."""
         xp, model, size = self.xp, self.model, abs(change)
         bought, sold = (change > 0) * size, (change < 0) * size
-        rates = {kind: (self.buying[kind], self.selling[kind]) for kind in self.buying}
+        kinds = dict.fromkeys([*self.buying, *self.selling])
+        rates = {kind: (self.buying.get(kind, 0), self.selling.get(kind, 0)) for kind in kinds}
         paid = {kind: bought * buy + sold * sell for kind, (buy, sell) in rates.items()}
         slope = (change > 0) * sum(self.buying.values()) - (change < 0) * sum(self.selling.values())
         if model.minimum > 0:
