@@ -155,7 +155,8 @@ class MeanVariance(Onlooker):
             )
         if not isinstance(task.actions, Simplex):
             raise QfolioError(
-                "A learned minimum variance, or mean and variance, gives weights; leave menu empty."
+                "A learned minimum variance, or mean and variance, gives weights that are not "
+                "negative; leave menu empty, and take a mandate without debts or other agents."
             )
         self._require_whole(task)
         each = Member(Means(), Trading.start(0.1))

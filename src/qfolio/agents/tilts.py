@@ -22,7 +22,7 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, static
 from qfolio.core.market import View
-from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
+from qfolio.core.mdp import Box, Discrete, ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.evidence import Evidence, blocks_of, left_out, require_members
 from qfolio.learning.scores import NETWORKS, Attention, Hidden
@@ -65,7 +65,7 @@ class TiltPolicy(eqx.Module):
 
     members: Tilt  # with a leading member axis
     share: Float[Array, ""]  # of the scores that the evidence leaves
-    actions: Simplex
+    actions: Simplex | Box
 
     def __call__(self, view: View) -> Float[Array, "*batch entry"]:
         assert view.anchor is not None
@@ -83,16 +83,23 @@ class TiltPolicy(eqx.Module):
 
 
 def tilted(
-    anchor: Float[Array, "*batch asset"], scores: Float[Array, "*batch asset"], actions: Simplex
+    anchor: Float[Array, "*batch asset"],
+    scores: Float[Array, "*batch asset"],
+    actions: Simplex | Box,
 ) -> Float[Array, "*batch entry"]:
     """The weights nearest to the anchor plus scores over the number of assets, cash first.
 
-    None is negative, and their sum is the anchor's. Weights that are exactly 0 in the anchor cannot
-    be traded.
+    Their sum is the anchor's. None is negative, unless actions are a box: the task then projects
+    them onto what its mandate allows. Weights that are exactly 0 in the anchor cannot be traded.
     """
     total = anchor.sum(-1, keepdims=True)
-    share = ratio(total, (anchor > 0).sum(-1, keepdims=True))
-    wanted = _nearest(anchor + share * scores, anchor > 0, total)
+    open_to, count = anchor > 0, (anchor > 0).sum(-1, keepdims=True)
+    share = ratio(total, count)
+    if isinstance(actions, Box):
+        mean = ratio(jnp.where(open_to, scores, 0.0).sum(-1, keepdims=True), count)
+        wanted = jnp.where(open_to, anchor + share * (scores - mean), 0.0)
+        return jnp.concatenate([1 - total, wanted], -1)
+    wanted = _nearest(anchor + share * scores, open_to, total)
     target = jnp.concatenate([1 - total, wanted], -1)
     return target if actions.cap == 1 else simplex.project(target, jnp.asarray(actions.caps))
 
@@ -171,10 +178,11 @@ class Tilts(Onlooker):
                 f"tilts departs from an anchor, and {task.name} has none; train it on a portfolio, "
                 "with a task setting such as anchor=equal-weight."
             )
-        if not isinstance(task.actions, Simplex):
+        actions = task.actions
+        if isinstance(actions, Discrete):
             raise QfolioError("tilts gives weights; leave menu empty.")
         self._require_whole(task)
-        channels, actions = view.features.shape[-1] - 1, task.actions
+        channels = view.features.shape[-1] - 1
 
         def member(key: PRNGKeyArray) -> Tilt:
             kind = NETWORKS.get(self.network)
@@ -230,7 +238,7 @@ class Tilts(Onlooker):
         Both begin at their own targets. The anchor is followed at the member's rate and band.
         """
         actions = task.actions
-        assert isinstance(actions, Simplex)
+        assert not isinstance(actions, Discrete)
 
         def targets(view: View, _: None) -> tuple[Array, Array]:
             assert view.anchor is not None

@@ -314,9 +314,9 @@ def _linear(task: Task, observation: PyTree, outputs: Outputs) -> Values | Tilti
     weights = isinstance(task.actions, Simplex)
     if not fits or (observation.anchor if weights else observation.choices) is None:
         raise QfolioError(
-            "network=positions is for portfolios with signals, and either an anchor (such as "
-            "anchor=equal-weight) or a menu of signals (such as menu=signals:1), which "
-            f"{task.name} has not."
+            "network=positions is for portfolios with signals and a mandate without debts, and "
+            "either an anchor (such as anchor=equal-weight) or a menu of signals (such as "
+            f"menu=signals:1), which {task.name} has not; set network=mlp."
         )
     if weights and outputs.each:
         return Tilting(observation, spread=outputs.each > 1)

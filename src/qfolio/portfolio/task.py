@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
-from qfolio.core.mdp import Actions, Position, Simplex
+from qfolio.core.mdp import Actions, Box, Position, Simplex
 from qfolio.portfolio import anchors, mandate_checks, signals
 from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.conditions import Conditions
@@ -190,7 +190,12 @@ class Portfolio(Market):
     def target(
         self, market: Row, held: Float[Array, " entry"], action: Array
     ) -> Float[Array, " entry"]:
-        """As in any market; what is held where the calendar has no decision."""
+        """As in any market; what is held where the calendar has no decision.
+
+        Where debts are allowed, an action may also be the weights of the assets; cash is the rest.
+        """
+        if action.shape == self.limits.shape:
+            action = jnp.concatenate([1 - action.sum(keepdims=True), action])
         return self._when_deciding(market, held, super().target(market, held, action))
 
     def obeying(
@@ -212,6 +217,8 @@ class Portfolio(Market):
         if self.menu:
             return super().actions
         most = largest_weight(self.mandate) if self.mandate else 1.0
+        if not self.feasible.long_only:  # the weights of the assets; cash is the rest
+            return Box(self.limits.shape[0], most)
         return Simplex(self.limits.shape[0], min(self.max_weight, most))
 
     @property

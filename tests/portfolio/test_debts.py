@@ -1,0 +1,81 @@
+"""Mandates that allow short sales and loans: actions, tilts, and what agents learn."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.agents.tilts import tilted
+from qfolio.core.errors import QfolioError
+from qfolio.core.mdp import Box, Simplex
+from qfolio.experiments.presets import preset
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.task import Portfolio
+
+from planted import planted
+
+MANDATE = {
+    "assets": {"cap": 0.5, "floor": -0.3},
+    "cash": {"min": 0.0, "max": 0.3},
+    "exposure": {"gross": 1.6},
+}
+
+
+def test_an_action_is_the_weights_of_the_assets() -> None:
+    task = Portfolio.of(planted(200), window=5, horizon=10, mandate=MANDATE)
+    assert task.actions == Box(6, 0.5)
+    row, held = jnp.array(50), jnp.eye(7)[0]
+    assets = jnp.array([0.5, 0.4, 0.3, -0.1, -0.1, -0.1])
+    weights = jnp.append(1 - assets.sum(), assets)
+    for action in (assets, weights):
+        np.testing.assert_allclose(task.target(row, held, action), weights, atol=1e-6)
+    # Half as much again is more than the mandate allows.
+    order = task.target(row, held, 1.5 * assets)
+    assert abs(order[1:]).sum() <= 1.6 + 1e-5
+    assert order[0] >= -1e-6
+    assert order[1:].max() <= 0.5 + 1e-6
+
+
+def test_without_debts_actions_are_weights() -> None:
+    mandate = {"assets": {"cap": 0.5}}
+    task = Portfolio.of(planted(200), window=5, horizon=10, mandate=mandate)
+    assert task.actions == Simplex(6, 0.5)
+
+
+def test_tilts_may_go_below_zero() -> None:
+    anchor, scores = jnp.array([0.4, 0.4, 0.0]), jnp.array([3.0, -1.0, 9.0])
+    # Of each score its mean over the two open assets is taken, times an equal share of 0.4.
+    long_short = tilted(anchor, scores, Box(3, 1.0))
+    np.testing.assert_allclose(long_short, [0.2, 1.2, -0.4, 0.0], atol=1e-6)
+    np.testing.assert_allclose(tilted(anchor, scores, Simplex(3)), [0.2, 0.8, 0, 0], atol=1e-6)
+
+
+def test_a_policy_of_weights_says_what_it_is_for() -> None:
+    task = Portfolio.of(planted(200), window=5, horizon=10, mandate=MANDATE)
+    ppo = preset("fast", "portfolio", "ppo").build()
+    with pytest.raises(QfolioError, match="which Portfolio has not; set network=mlp"):
+        ppo.init(task, jnp.zeros(2, jnp.uint32))
+
+
+@pytest.mark.slow
+def test_what_is_learned_sells_short_within_the_mandate() -> None:
+    few = preset("fast", "portfolio", "pathwise")._replace(episodes=192)
+    backtest = Backtest.create(
+        planted(900),
+        {"pathwise": few},
+        train="2y",
+        test="3m",
+        seeds=2,
+        mandate=MANDATE,
+        baselines=("minimum-variance",),
+        cost_model="itemized(borrow_fee=0.01)",
+    )
+    backtest.run()
+    entries, notes = backtest.entries()
+    assert notes == []
+    orders = entries["pathwise"].decisions
+    assert orders[..., 1:].min() < -0.02
+    assert abs(orders[..., 1:]).sum(-1).max() <= 1.6 + 1e-4
+    assert orders[..., 0].min() >= -1e-4
+    growth = {name: entry.simulation.growth.mean() for name, entry in entries.items()}
+    assert growth["pathwise"] > growth["equal-weight"]
+    assert backtest.assess(entries).bound is None  # constant weights with debts have none
