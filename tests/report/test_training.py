@@ -23,7 +23,7 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.market import View
 from qfolio.core.mdp import Box, Position
-from qfolio.experiments.run import Run
+from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen, Signals
 from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.portfolio.synthetic.regime import Regime
@@ -31,7 +31,13 @@ from qfolio.report import Curve, Episode, Maps, ReportData, write_report
 from qfolio.report.animation import FADE_FRAMES, SIZE, pendulum_frames, pendulum_gif
 from qfolio.report.collect import constant_weights, report_data, responses
 from qfolio.report.data import MarketData, Responses, Weights, decimals
-from qfolio.report.figures.curves import draw_learning_curve, overestimation
+from qfolio.report.figures.curves import (
+    DECADES,
+    LEAST_REGRET,
+    draw_learning_curve,
+    draw_overestimation,
+    overestimation,
+)
 from qfolio.report.figures.pendulum import value
 from qfolio.report.figures.policies import draw_policy, policy
 from qfolio.report.training import (
@@ -43,6 +49,7 @@ from qfolio.report.training import (
     setting_groups,
     verdict,
 )
+from qfolio.tasks.catch import Catch
 
 Floats = NDArray[np.float64]
 
@@ -134,7 +141,7 @@ def make_data(seeds: int = 8, points: int = 20, steps: int = 200) -> ReportData:
         "preset": "default",
         "seeds": seeds,
         "episodes": 400,
-        "env_steps": 80_000 * seeds,
+        "env_steps": 80_000,
         "seconds_compile": 6.4,
         "seconds_train": 41.7,
         "steps_per_second": 80_000 * seeds / 41.7,
@@ -170,7 +177,7 @@ def make_data(seeds: int = 8, points: int = 20, steps: int = 200) -> ReportData:
         config=config,
         curve=curve,
         comparison=make_curve("without double DQN", seeds, points, 6.5),
-        training_episodes=episodes,
+        training_done=episodes,
         training_returns=training,
         optimum=-137.4,
         maps=make_maps(),
@@ -411,7 +418,7 @@ def make_market(seeds: int = 3) -> ReportData:
         config={"seed": 0},
         curve=Curve("greedy return", 64 * np.arange(10), returns, nothing),
         comparison=None,
-        training_episodes=np.array([]),
+        training_done=np.array([]),
         training_returns=np.array([]),
         optimum=0.1903,
         maps=None,
@@ -539,7 +546,49 @@ def test_a_beginner_far_off_does_not_hide_the_curve() -> None:
     returns[0] = -1e17
     far = draw_learning_curve(replace(data, curve=replace(data.curve, returns=returns)), 10.5)
     assert far.axes[0].get_ylim()[0] > -1
-    assert any("off the scale" in text.get_text() for text in far.axes[0].texts)
+    low, high = far.axes[1].get_ylim()
+    assert high <= 2 * 10**DECADES * low
+    for panel in far.axes:
+        assert any("off the scale" in text.get_text() for text in panel.texts)
+
+
+def test_regret_is_drawn_on_a_logarithmic_scale() -> None:
+    """By hand; a seed that does better than the optimum is drawn at the least regret."""
+    data = make_data(seeds=1, points=3, steps=1)
+    returns = np.array([[-300.0], [-110.0], [-99.0]])
+    data = replace(data, curve=replace(data.curve, returns=returns), optimum=-100.0)
+    whole, regret = draw_learning_curve(data, 10.5).axes
+    (line,) = regret.lines
+    np.testing.assert_allclose(np.asarray(line.get_ydata()), [2.0, 0.1, LEAST_REGRET])
+    assert regret.get_yscale() == "log"
+    assert [text.get_text().split()[-1] for text in regret.texts] == ["less"]
+    legend = whole.get_legend()
+    assert legend is not None
+    assert "exact optimum \N{MINUS SIGN}100.0" in [text.get_text() for text in legend.texts]
+
+
+@pytest.mark.parametrize("optimum", [math.nan, 0.0])
+def test_no_regret_without_an_optimum_to_divide_by(optimum: float) -> None:
+    assert len(draw_learning_curve(replace(make_data(steps=1), optimum=optimum), 10.5).axes) == 1
+
+
+@pytest.mark.parametrize(
+    ("unit", "label"), [("episodes", "training episodes"), ("steps", "environment steps")]
+)
+def test_curves_are_drawn_over_the_budget(unit: str, label: str) -> None:
+    data = replace(make_data(seeds=2, points=3, steps=1), unit=unit)
+    for draw in (draw_learning_curve, draw_overestimation):
+        for axes in draw(data, 7.2).axes:
+            assert axes.get_xlabel() == label
+
+
+def test_key_figures_count_all_seeds() -> None:
+    data = make_data(seeds=8, points=3, steps=1)
+    for unit, each in (("episodes", "400 episodes each"), ("steps", "80 000 steps each")):
+        text = text_of(render_page(replace(data, unit=unit, maps=None, episode=None)))
+        assert f"Environment steps 640 000 all seeds, {each}" in text
+    one = replace(make_data(seeds=1, points=3, steps=1), maps=None, episode=None)
+    assert "Environment steps 80 000 400 episodes Learning" in text_of(render_page(one))
 
 
 def test_decimals() -> None:
@@ -549,6 +598,15 @@ def test_decimals() -> None:
 
 PATHWISE = Pathwise(num_envs=2, rollout_length=5, hidden=(4, 4))
 CHOOSER = DQN(num_envs=2, hidden=(4,), all_actions=True)
+
+
+def test_curves_in_the_unit_of_the_budget() -> None:
+    for unit, last in (("episodes", 4), ("steps", 16)):
+        run = train(Catch(rows=5), DQN(num_envs=2, hidden=(4,)), **{unit: last})  # type: ignore[arg-type]
+        data = report_data(run, run.summary(), None, "")
+        assert data.unit == unit
+        assert data.curve.done[[0, -1]].tolist() == [0, last]
+        np.testing.assert_allclose(data.training_done, np.linspace(0, last, 5)[1:])
 
 
 def test_a_market_is_collected() -> None:

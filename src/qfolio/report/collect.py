@@ -63,20 +63,21 @@ def report_data(
     rows = run.metrics if whole else []
     variant = contrast_of(run.agent)
     names = ("greedy return", "") if variant is None else (variant.name, variant.variant_name)
-    agent, task = summary["agent"], summary["task"]
+    agent, task, unit = summary["agent"], summary["task"], run.budget.unit
     return ReportData(
         title=f"{agent_name(agent)} {words_of(task).where}",
         command=command,
         summary=summary,
         config=msgspec.to_builtins(run.config),
-        curve=_curve(run, names[0]),
-        comparison=_curve(contrast, names[1]) if contrast and contrast.evaluations else None,
-        training_episodes=np.array([row["episode"] for row in rows]),
+        curve=_curve(run, names[0], unit),
+        comparison=_curve(contrast, names[1], unit) if contrast and contrast.evaluations else None,
+        training_done=_done(run, unit, np.array([row["episode"] for row in rows], float)),
         training_returns=np.array([row["return"] for row in rows]),
         optimum=optimum,
         maps=_maps(run, pendulum) if pendulum else None,
         episode=greedy_episode(run, pendulum) if pendulum else None,
         market=_market(run, summary, known) if known else None,
+        unit=unit,
     )
 
 
@@ -168,13 +169,22 @@ def greedy_episode(run: Run, task: Pendulum, start: int = EPISODE_START) -> Epis
     )
 
 
-def _curve(run: Run, label: str) -> Curve:
-    seeds = run.config.seeds
-    table = {
-        name: np.array([row[name] for row in run.evaluations]).reshape(-1, seeds)
-        for name in ("episode", "return", "overestimation")
-    }
-    return Curve(label, table["episode"].mean(1), table["return"], table["overestimation"])
+def _curve(run: Run, label: str, unit: str) -> Curve:
+    done = _evaluated(run, "episode" if unit == "episodes" else "env_steps").mean(1)
+    return Curve(label, done, _evaluated(run, "return"), _evaluated(run, "overestimation"))
+
+
+def _done(run: Run, unit: str, episodes: Floats) -> Floats:
+    """Episodes of a seed in the unit of the budget: its steps, from the learning curve's."""
+    if unit == "episodes":
+        return episodes
+    known = (_evaluated(run, name).mean(1) for name in ("episode", "env_steps"))
+    return np.interp(episodes, *known)
+
+
+def _evaluated(run: Run, name: str) -> Floats:
+    """A column of the learning curve, of shape (point, seed)."""
+    return np.array([row[name] for row in run.evaluations], float).reshape(-1, run.config.seeds)
 
 
 def _market(run: Run, summary: dict[str, Any], solution: FollowedOptimum) -> MarketData:

@@ -24,14 +24,14 @@ class Curve:
 
     Attributes:
         label: Name of the variant, for example 'double DQN'.
-        episodes: Training episodes finished at each evaluation, shape (P,).
+        done: Training of a seed before each evaluation, in the budget's unit, shape (P,).
         returns: Mean greedy return on fixed starts, shape (P, S).
         overestimation: Mean of the largest action value at the visited states minus the
             discounted return that followed, shape (P, S); NaN if no values are estimated.
     """
 
     label: str
-    episodes: Numbers
+    done: Numbers
     returns: Floats
     overestimation: Floats
 
@@ -145,14 +145,16 @@ class ReportData:
         title: Heading of the page.
         command: Command line that repeats or continues the training; may have several lines.
         summary: The results: task, agent, preset, seeds, episodes, env_steps, seconds_compile,
-            seconds_train, steps_per_second, return_mean, return_ci95 (low, high;
-            None for few seeds), return_per_seed, optimum, regret_per_seed (shares of the optimum),
-            overestimation_per_seed (None if no action values are estimated) and, in markets,
-            rule: a few numbers that describe a policy, "exact" and "per_seed".
+            seconds_train, steps_per_second (of all seeds; episodes and env_steps are those of
+            one), return_mean, return_ci95 (low, high; None for few seeds), return_per_seed,
+            optimum, regret_per_seed (shares of the optimum), overestimation_per_seed (None if no
+            action values are estimated) and, in markets, rule: a few numbers that describe a
+            policy, "exact" and "per_seed".
         config: All settings, a nested dictionary.
         curve: The reported run.
         comparison: The same run with one thing changed, or None.
-        training_episodes: Number of each finished training episode of every seed, shape (R,).
+        training_done: Training of its seed up to each finished episode of every seed, in the
+            budget's unit, shape (R,).
         training_returns: Return of those episodes, shape (R,); none if they do not compare with
             the curve.
         optimum: Mean return of the exact optimum on the evaluation starts of the curve; NaN if
@@ -160,6 +162,7 @@ class ReportData:
         maps: Solutions over the state space, or None for tasks without a 2-D state.
         episode: A greedy episode to show, or None.
         market: The description of a market, or None for other tasks.
+        unit: The unit of the training budget, "episodes" or "steps".
     """
 
     title: str
@@ -168,9 +171,10 @@ class ReportData:
     config: dict[str, Any]
     curve: Curve
     comparison: Curve | None
-    training_episodes: Numbers
+    training_done: Numbers
     training_returns: Floats
     optimum: float
     maps: Maps | None
     episode: Episode | None
     market: MarketData | None = None
+    unit: str = "episodes"

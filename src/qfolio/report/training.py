@@ -73,7 +73,7 @@ def render_page(data: ReportData, gif: bytes | None = None) -> str:
         measure=data.market.measure if data.market else "return",
         seeds=len(data.summary["return_per_seed"]),
         verdict=verdict(data.summary, data.market),
-        facts=_facts(data.summary, data.market),
+        facts=_facts(data.summary, data.market, data.unit),
         biases=[(label, number(bias, _bias_digits(data), sign=True)) for label, bias in biases],
         doubled=any("double DQN" in label for label, _ in biases),
         agents=_agents(data),
@@ -125,11 +125,17 @@ def _digits(summary: dict[str, Any]) -> int:
     return decimals(summary["return_mean" if summary["optimum"] is None else "optimum"])
 
 
-def _facts(summary: dict[str, Any], market: MarketData | None) -> list[tuple[str, str, str]]:
+def _facts(
+    summary: dict[str, Any], market: MarketData | None, unit: str
+) -> list[tuple[str, str, str]]:
     """Return the key figures: name, value and a remark."""
-    several = len(summary["return_per_seed"]) > 1
+    seeds = len(summary["return_per_seed"])
     digits = _digits(summary)
-    together = "all seeds together" if several else "while training"
+    together = "all seeds together" if seeds > 1 else "while training"
+    done = f"{amount(summary['episodes'])} episodes"
+    if seeds > 1:
+        each = amount(summary["env_steps"]) + " steps" if unit == "steps" else done
+        done = f"all seeds, {each} each"
     speed = ("Steps per second", amount(summary["steps_per_second"]), together)
     facts = [("Return", number(summary["return_mean"], digits), _over_seeds(summary))]
     if summary["optimum"] is not None:
@@ -147,8 +153,8 @@ def _facts(summary: dict[str, Any], market: MarketData | None) -> list[tuple[str
         speed,
         (
             "Environment steps",
-            amount(summary["env_steps"]),
-            f"{amount(summary['episodes'])} episodes per seed",
+            amount(seeds * summary["env_steps"]),
+            done,
         ),
     ]
     if market:

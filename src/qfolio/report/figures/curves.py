@@ -1,4 +1,4 @@
-"""Learning curves: greedy returns and overestimation over training."""
+"""Learning curves: greedy returns, their regret and the overestimation over training."""
 
 from __future__ import annotations
 
@@ -21,11 +21,27 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from qfolio.report.figures.style import LEAD, NARROW, WIDE, Target, new_figure, save_png
+from qfolio.report.figures.style import (
+    LEAD,
+    NARROW,
+    WIDE,
+    Target,
+    new_figure,
+    percent_axis,
+    percent_tick,
+    save_png,
+    short_tick,
+)
+
+LEAST_REGRET = 1e-4
+"""Regret that counts as none: logarithmic scales end there."""
+
+DECADES = 5
+"""Most powers of ten on a scale of regrets; what is worse is off the scale."""
 
 
 def learning_curve(target: Target, data: ReportData) -> None:
-    """Save the greedy return over training, with a close view near the optimum, as PNG."""
+    """Save the greedy return over training, and its regret if the optimum is known, as PNG."""
     save_png(target, draw_learning_curve, data, LEAD)
 
 
@@ -35,12 +51,11 @@ def overestimation(target: Target, data: ReportData) -> None:
 
 
 def draw_learning_curve(data: ReportData, width: float) -> Figure:
-    """Draw the greedy return over training, and a close-up near the optimum if useful.
+    """Draw the greedy return over training, and its regret if the optimum is known.
 
     In a market, the comparison is drawn instead of training returns.
     """
-    window = _near_optimum(data)
-    panels = 1 if window is None else 2
+    panels = 2 if np.isfinite(data.optimum) and data.optimum else 1
     figure = new_figure(width, 3.7 if width > NARROW or panels == 1 else 6.4)
     if width > NARROW:
         axes = figure.subplots(1, panels, squeeze=False, width_ratios=[1.25, 1][:panels])
@@ -52,24 +67,17 @@ def draw_learning_curve(data: ReportData, width: float) -> Figure:
         curves.append((data.comparison, palette.SECOND))
     kind = None if data.market else "greedy"
     whole = axes.flat[0]
-    _line_axes(whole, f"{name.capitalize()} over the whole run", "training episodes")
+    _line_axes(whole, name.capitalize(), data)
     for curve, colour in curves:
-        _draw_runs(whole, curve.episodes, curve.returns, colour, kind, curve.label)
+        _draw_runs(whole, curve.done, curve.returns, colour, kind, curve.label)
     _draw_training(whole, data)
     whole.set_xlim(left=0)
-    _draw_optimum(whole, data, label=panels == 1)
+    _draw_optimum(whole, data)
     if data.market:
         _cut_beginning(whole, data.optimum)
     whole.legend(loc="best", labelcolor=palette.MUTED)
-    if window is not None:
-        close = axes.flat[1]
-        _line_axes(close, "The same near the optimum", "training episodes")
-        for curve, colour in curves:
-            _draw_runs(close, curve.episodes, curve.returns, colour)
-        left, low, high = window
-        close.set_xlim(left, data.curve.episodes[-1])
-        close.set_ylim(low, high)
-        _draw_optimum(close, data, label=True)
+    if panels == 2:
+        _draw_regret(axes.flat[1], data, curves)
     return figure
 
 
@@ -77,10 +85,10 @@ def draw_overestimation(data: ReportData, width: float) -> Figure:
     """Draw how far the action values lie above the realised returns."""
     figure = new_figure(width, 3.5 if width > NARROW else 3.2)
     axes = figure.subplots()
-    _line_axes(axes, "", "training episodes")
+    _line_axes(axes, "", data)
     curves = [data.curve] if data.comparison is None else [data.curve, data.comparison]
     for curve, colour in zip(curves, (palette.ACCENT, palette.SECOND), strict=False):
-        _draw_runs(axes, curve.episodes, curve.overestimation, colour, None, curve.label)
+        _draw_runs(axes, curve.done, curve.overestimation, colour, None, curve.label)
     axes.axhline(0, color=palette.INK, linewidth=0.9, dashes=(4, 3))
     _line_label(axes, 0, "unbiased", below=True)
     low, high, clipped = _settled_range(curves)
@@ -103,23 +111,29 @@ def draw_overestimation(data: ReportData, width: float) -> Figure:
     return figure
 
 
-def _line_axes(axes: Axes, title: str, label: str) -> None:
+def _line_axes(axes: Axes, title: str, data: ReportData) -> None:
     axes.grid(axis="y")
     axes.set_title(title)
-    axes.set_xlabel(label)
+    axes.set_xlabel("training episodes" if data.unit == "episodes" else "environment steps")
     axes.locator_params(nbins=6)
+    if data.curve.done[-1] >= 10_000:
+        axes.xaxis.set_major_formatter(lambda tick, _: short_tick(tick))
     axes.margins(x=0)
 
 
 def _draw_runs(
     axes: Axes,
-    episodes: Numbers,
+    done: Numbers,
     runs: Floats,
     colour: str,
     kind: str | None = None,
     label: str | None = None,
+    least: float = -np.inf,
 ) -> None:
-    """Draw runs of shape (P, S): a thin line per seed, the interquartile mean, its band."""
+    """Draw runs of shape (P, S): a thin line per seed, the interquartile mean, its band.
+
+    What is below ``least`` is drawn there.
+    """
     points, seeds = runs.shape
     marker = "o" if points == 1 else None
     if kind is not None:
@@ -128,24 +142,25 @@ def _draw_runs(
         )
     if seeds > 1:
         alpha = max(0.1, min(0.35, 4 / seeds))
-        axes.plot(episodes, runs, color=colour, linewidth=0.7, alpha=alpha, marker=marker)
-        low, high = band(runs)
-        axes.fill_between(episodes, low, high, color=colour, alpha=0.2, linewidth=0)
-    middle = interquartile_mean(runs)
+        thin = np.maximum(runs, least)
+        axes.plot(done, thin, color=colour, linewidth=0.7, alpha=alpha, marker=marker)
+        low, high = (np.maximum(end, least) for end in band(runs))
+        axes.fill_between(done, low, high, color=colour, alpha=0.2, linewidth=0)
+    middle = np.maximum(interquartile_mean(runs), least)
     # A single point must not vanish behind the edge or the legend.
     order, clip = (2, True) if points > 1 else (6, False)
-    (line,) = axes.plot(episodes, middle, color=colour, linewidth=2, marker=marker, label=label)
+    (line,) = axes.plot(done, middle, color=colour, linewidth=2, marker=marker, label=label)
     line.set(zorder=order, clip_on=clip)
 
 
 def _draw_training(axes: Axes, data: ReportData) -> None:
     """Draw the median return of the exploring agents in about 60 bins of episodes."""
-    if data.training_episodes.size == 0:
+    if data.training_done.size == 0:
         return
-    edges = np.linspace(data.training_episodes.min(), data.training_episodes.max() + 1, 61)
-    bins = np.digitize(data.training_episodes, edges)
+    edges = np.linspace(data.training_done.min(), data.training_done.max() + 1, 61)
+    bins = np.digitize(data.training_done, edges)
     used = np.unique(bins)
-    centres = [data.training_episodes[bins == number].mean() for number in used]
+    centres = [data.training_done[bins == number].mean() for number in used]
     medians = [np.median(data.training_returns[bins == number]) for number in used]
     axes.plot(
         centres,
@@ -158,13 +173,11 @@ def _draw_training(axes: Axes, data: ReportData) -> None:
     )
 
 
-def _draw_optimum(axes: Axes, data: ReportData, *, label: bool) -> None:
+def _draw_optimum(axes: Axes, data: ReportData) -> None:
     if np.isnan(data.optimum):  # not known
         return
-    axes.axhline(data.optimum, color=palette.INK, linewidth=0.9, dashes=(4, 3))
-    if label:
-        text = f"exact optimum {number(data.optimum, decimals(data.optimum))}"
-        _line_label(axes, data.optimum, text)
+    name = f"exact optimum {number(data.optimum, decimals(data.optimum))}"
+    axes.axhline(data.optimum, color=palette.INK, linewidth=0.9, dashes=(4, 3), label=name)
 
 
 def _line_label(
@@ -191,22 +204,24 @@ def _cut_beginning(axes: Axes, optimum: float) -> None:
         _line_label(axes, floor, "beginning off the scale", color=palette.MUTED)
 
 
-def _near_optimum(data: ReportData) -> tuple[float, float, float] | None:
-    """Return the left, lower and upper ends of the close view, or None if none is needed."""
-    if np.isnan(data.optimum):
-        return None
-    returns, episodes = data.curve.returns, data.curve.episodes
-    late = returns[len(returns) // 2 :]
-    # One failed seed must not decide the scale.
-    low = min(float(np.quantile(late, 0.1)), data.optimum)
-    high = max(float(late.max()), data.optimum)
-    margin = max(0.15 * (high - low), 0.01 * abs(data.optimum), 1e-6)
-    low, high = low - margin, high + 1.5 * margin
-    whole = max(returns.max(), data.optimum) - returns.min()
-    inside = np.flatnonzero(interquartile_mean(returns) >= low)
-    if high - low > whole / 3 or inside.size == 0 or inside[0] + 1 >= len(episodes):
-        return None
-    return float(episodes[inside[0]]), low, high
+def _draw_regret(axes: Axes, data: ReportData, curves: list[tuple[Curve, str]]) -> None:
+    """Draw the share of the optimum that is missed, on a logarithmic scale."""
+    _line_axes(axes, "Regret, on a logarithmic scale", data)
+    regrets = [(data.optimum - curve.returns) / abs(data.optimum) for curve, _ in curves]
+    for (curve, colour), regret in zip(curves, regrets, strict=True):
+        _draw_runs(axes, curve.done, regret, colour, least=LEAST_REGRET)
+    least = max(min(interquartile_mean(regret).min() for regret in regrets), LEAST_REGRET)
+    worst = max(regret.max() for regret in regrets)
+    top = min(max(worst, 10 * least), 10**DECADES * least)
+    axes.set_yscale("log")
+    axes.set_ylim(least / 1.3, top * 1.3)
+    percent_axis(axes.yaxis)
+    axes.set_xlim(left=0)
+    if least == LEAST_REGRET:
+        text = f"{percent_tick(LEAST_REGRET)} or less"
+        _line_label(axes, least, text, color=palette.MUTED)
+    if worst > top:
+        _line_label(axes, top, "beginning off the scale", below=True, color=palette.MUTED)
 
 
 def _settled_range(curves: list[Curve]) -> tuple[float, float, bool]:
