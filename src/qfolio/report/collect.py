@@ -17,6 +17,7 @@ from qfolio.experiments.comparison.conclusion import listed
 from qfolio.experiments.run import Run
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
+from qfolio.portfolio.backtest.capacity import capacity
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import Simulation
@@ -132,6 +133,7 @@ def backtest_data(
         training={name: folds for name in backtest.agents if (folds := _training(backtest, name))},
         why=why,
         moves=_moves(backtest),
+        capacity=capacity(backtest.replay, entries, assessment.reference),
     )
 
 

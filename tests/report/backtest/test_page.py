@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.differences import Contrast
 from qfolio.portfolio.backtest.verdict import verdicts
 from qfolio.report.backtest.data import BacktestData, StrategySeries, shown_order
@@ -137,6 +138,19 @@ def test_costs_by_kind_have_a_table() -> None:
     text = Page(page).text
     assert "that the cost model itemized(impact=1) leaves out" in text
     assert "cash earns nothing" not in text
+
+
+def test_growth_by_capital_has_a_table() -> None:
+    data = usual(60)
+    assert "Table of growth by capital" not in render_backtest(data)
+    found = Capacity((1e4, 1e6), {"DQN": (0.1, -0.02), "equal weight": (0.05, 0.04)})
+    page = render_backtest(replace(data, capacity=found))
+    table = page.split("Table of growth by capital")[1].split("</table>")[0]
+    assert re.findall(r"<th scope=\"col\">(.*?)</th>", table)[1:] == [
+        number(1e4, 0),
+        number(1e6, 0),
+    ]
+    assert re.findall(r"<td>(.*?)</td>", table)[:2] == [percent(0.1), percent(-0.02)]
 
 
 def test_months_are_compounded() -> None:

@@ -19,6 +19,7 @@ from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.own import Placed
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.feasible import Mandated
 from qfolio.portfolio.following import follow
 from qfolio.portfolio.mandate import feasible, largest_weight
@@ -190,13 +191,13 @@ class Replay(NamedTuple):
                 notes += said
         return entries, notes
 
-    def entry(self, kind: str, decisions: np.ndarray) -> Entry:
-        """Decisions of shape (seed, day, entry), carried out."""
+    def entry(self, kind: str, decisions: np.ndarray, costs: CostModel | None = None) -> Entry:
+        """Decisions of shape (seed, day, entry), carried out; costs: instead of the task's."""
         simulation = simulate(
             self.prices.values,
             decisions,
             first=self.folds[0].decisions.start,
-            cost=self.task.costs,
+            cost=self.task.costs if costs is None else costs,
             lag=self.task.lag,
             conditions=Conditions.of(self.prices, self.task.costs.columns),
             long_only=self.task.feasible.long_only,

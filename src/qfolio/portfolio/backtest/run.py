@@ -332,13 +332,18 @@ class Backtest:
 
     def entries(self) -> tuple[dict[str, Entry], list[str]]:
         """Every strategy replayed over all folds, and notes on problems."""
-        replay = Replay(self.prices, self.folds, self._task_of_all, self.config.cap)
+        replay = self.replay
         entries: dict[str, Entry] = {}
         for name, agent in self.agents.items():
             entries |= replay.agent(name, agent, self.stretches(name), self.config.seeds)
         others, notes = replay.others(self.baselines, self._own, self.config.benchmark)
         entries |= others
         return entries, [*replay.left_out(), *replay.mandated(), *notes, *replay.wiped_out(entries)]
+
+    @property
+    def replay(self) -> Replay:
+        """The rules that hold for all strategies."""
+        return Replay(self.prices, self.folds, self._task_of_all, self.config.cap)
 
     @property
     def dates(self) -> np.ndarray:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
+from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.folder import followed
 from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.data import Floats
@@ -65,6 +66,7 @@ class BacktestData:
         why: What explains the agents' returns; without it, the page has no such section.
         moves: Simple returns of the assets on these days, shape (D, N), 0 before an asset's start;
             without them, the page does not say what each asset contributed.
+        capacity: Growth by capital, if costs depend on it.
     """
 
     title: str
@@ -80,6 +82,7 @@ class BacktestData:
     training: dict[str, list[FoldTraining]] = field(default_factory=dict)
     why: Why | None = None
     moves: Floats | None = None
+    capacity: Capacity | None = None
 
 
 def require_fit(data: BacktestData) -> None:

@@ -40,6 +40,7 @@ from qfolio.report.backtest.opening import (
 from qfolio.report.backtest.tables import (
     HEADINGS,
     RELATIVE_HEADINGS,
+    capacity_table,
     cost_kinds,
     cost_rows,
     difference_headings,
@@ -132,6 +133,7 @@ def render_backtest(data: BacktestData) -> str:
         rebalancings=rebalancing_rows(data),
         cost_kinds=cost_kinds(data),
         costs=cost_rows(lead, data),
+        capacity=capacity_table(data),
         luck=luck_rows(lead, data),
         months=month_tables(names, data),
         folds=fold_rows(data.folds),

@@ -202,6 +202,15 @@ def cost_rows(names: list[str], data: BacktestData) -> list[tuple[str, list[str]
     return rows
 
 
+def capacity_table(data: BacktestData) -> tuple[list[str], list[tuple[str, list[str]]]] | None:
+    """Capitals as headings, and growth at each by strategy; None if no cost depends on them."""
+    if data.capacity is None:
+        return None
+    headings = [number(capital, 0) for capital in data.capacity.capitals]
+    rows = data.capacity.growth.items()
+    return headings, [(name, [percent(x) for x in growth]) for name, growth in rows]
+
+
 def _telling(value: float, digits: int) -> int:
     """The decimals, at least ``digits``, with which a small number does not round to 0."""
     if value == 0 or not math.isfinite(value):
