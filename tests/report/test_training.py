@@ -23,6 +23,7 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
 from qfolio.core.market import View
 from qfolio.core.mdp import Box, Position
+from qfolio.experiments.presets import preset
 from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen, Signals
 from qfolio.portfolio.synthetic.no_trade import NoTrade
@@ -380,6 +381,24 @@ def test_setting_groups() -> None:
     ]
 
 
+def test_settings_that_differ_from_the_preset_come_first() -> None:
+    data = replace(make_data(seeds=1, points=3, steps=1), maps=None, episode=None)
+    assert "All settings of this training. general" in text_of(render_page(data))
+    same = text_of(render_page(replace(data, preset="fast")))
+    assert "They are those of the preset fast. general" in same
+    changes = {
+        "budget": ("9 steps", "8 episodes"),
+        "hidden": ([4, 4], [8]),
+        "double": (True, False),
+    }
+    text = text_of(render_page(replace(data, preset="<fast>", changes=changes)))
+    assert (
+        "Those that differ from the preset &lt;fast&gt; come first. "
+        "changed budget 9 steps instead of 8 episodes hidden [4, 4] instead of [8] "
+        "double true instead of false general"
+    ) in text
+
+
 LOW, HIGH = 0.41, 0.59
 HELD = np.linspace(0, 1, 101)
 
@@ -604,6 +623,13 @@ def test_curves_in_the_unit_of_the_budget() -> None:
     for unit, last in (("episodes", 4), ("steps", 16)):
         run = train(Catch(rows=5), DQN(num_envs=2, hidden=(4,)), **{unit: last})  # type: ignore[arg-type]
         data = report_data(run, run.summary(), None, "")
+        own = preset("fast", "catch")
+        assert data.preset == "fast"
+        assert list(data.changes)[:2] == ["budget", "seeds"]
+        assert data.changes["budget"] == (f"{last} {unit}", f"{own.episodes} episodes")
+        assert data.changes["hidden"] == ([4], list(own.settings["hidden"]))
+        assert data.changes["rows"] == (5, Catch(**own.task).rows)
+        assert all(value != before for value, before in data.changes.values())
         assert data.unit == unit
         assert data.curve.done[[0, -1]].tolist() == [0, last]
         np.testing.assert_allclose(data.training_done, np.linspace(0, last, 5)[1:])

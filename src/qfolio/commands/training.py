@@ -325,24 +325,20 @@ def _resume(run: "Run", folder: Path | None, on: str = "here") -> str:
 
 def _command(run: "Run") -> str:
     """The command line that repeats a run, and the one that resumes it."""
-    from qfolio.experiments.presets import preset, presets_of
+    from qfolio.experiments.presets import changes
 
     config = run.config
     resume = _resume(run, run.folder)
-    known = presets_of(config.task, config.agent)
-    if not known:
+    found = changes(config, type(run.task))
+    if found is None:
         return resume
-    name = config.preset if config.preset in known else next(iter(known))
-    default = settings.describe(preset(name, config.task, config.agent).build())
-    default |= settings.describe(type(run.task)(**known[name].task))
-    chosen = config.agent_settings | config.task_settings
+    preset, differing = found
     changed = [
         f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}"
-        for name, value in chosen.items()
-        if value != default[name]
+        for name, (value, _) in differing.items()
     ]
     words = ["qfolio train", config.task, "--agent", config.agent, "--preset"]
-    words += [name, f"--{run.budget.unit}", str(run.budget.amount)]
+    words += [preset, f"--{run.budget.unit}", str(run.budget.amount)]
     words += ["--seeds", str(config.seeds), "--seed", str(config.seed)]
     words += ["--set", *map(shlex.quote, changed)] if changed else []
     return f"{' '.join(words)}\n{resume}"

@@ -14,6 +14,7 @@ from qfolio.core.evaluation import greedy, play, start_keys
 from qfolio.core.mdp import Agent, Box, Policy, Position
 from qfolio.core.training import episode_steps
 from qfolio.experiments.comparison.conclusion import listed
+from qfolio.experiments.presets import changes, preset
 from qfolio.experiments.run import Run
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
@@ -65,6 +66,7 @@ def report_data(
     variant = contrast_of(run.agent)
     names = ("greedy return", "") if variant is None else (variant.name, variant.variant_name)
     agent, task, unit = summary["agent"], summary["task"], run.budget.unit
+    name, changed = _changes(run)
     return ReportData(
         title=f"{agent_name(agent)} {words_of(task).where}",
         command=command,
@@ -79,6 +81,8 @@ def report_data(
         episode=greedy_episode(run, pendulum) if pendulum else None,
         market=_market(run, summary, known) if known else None,
         unit=unit,
+        preset=name,
+        changes=changed,
     )
 
 
@@ -182,6 +186,22 @@ def _done(run: Run, unit: str, episodes: Floats) -> Floats:
         return episodes
     known = (_evaluated(run, name).mean(1) for name in ("episode", "env_steps"))
     return np.interp(episodes, *known)
+
+
+def _changes(run: Run) -> tuple[str | None, dict[str, tuple[Any, Any]]]:
+    """The preset of a run, and its budget, seeds and settings that differ from it."""
+    config = run.config
+    found = changes(config, type(run.task))
+    if found is None:
+        return None, {}
+    name, settings = found
+    own = preset(name, config.task, config.agent)
+    now, before = (f"{budget.amount} {budget.unit}" for budget in (run.budget, own.budget))
+    plan: dict[str, tuple[Any, Any]] = {
+        "budget": (now, before),
+        "seeds": (config.seeds, own.seeds),
+    }
+    return name, {key: pair for key, pair in plan.items() if pair[0] != pair[1]} | settings
 
 
 def _evaluated(run: Run, name: str) -> Floats:

@@ -1,7 +1,7 @@
 """The data of a report: plain arrays and dictionaries, independent of their origin."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -163,6 +163,8 @@ class ReportData:
         episode: A greedy episode to show, or None.
         market: The description of a market, or None for other tasks.
         unit: The unit of the training budget, "episodes" or "steps".
+        preset: The preset that the run is compared with, or None if there is none.
+        changes: What differs from the preset: the run's value and the preset's, by name.
     """
 
     title: str
@@ -178,3 +180,5 @@ class ReportData:
     episode: Episode | None
     market: MarketData | None = None
     unit: str = "episodes"
+    preset: str | None = None
+    changes: dict[str, tuple[Any, Any]] = field(default_factory=dict)

@@ -109,6 +109,15 @@ def setting_groups(config: dict[str, Any]) -> list[tuple[str, list[tuple[str, st
     return [(str(name), _flat(group)) for name, group in groups.items()]
 
 
+def changed_settings(changes: dict[str, tuple[Any, Any]]) -> list[tuple[str, str]]:
+    """Return settings that differ from others: their name, and their value instead of which."""
+    now, other = (_flat({name: pair[i] for name, pair in changes.items()}) for i in (0, 1))
+    return [
+        (name, f"{text} instead of {before}")
+        for (name, text), (_, before) in zip(now, other, strict=True)
+    ]
+
+
 def _flat(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = []
     for key, value in settings.items():

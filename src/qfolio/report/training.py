@@ -16,6 +16,7 @@ from qfolio.report.figures import curves, pendulum, policies
 from qfolio.report.figures.style import LEAD, WIDE, svgs
 from qfolio.report.rendering import (
     amount,
+    changed_settings,
     counted,
     duration,
     number,
@@ -78,7 +79,8 @@ def render_page(data: ReportData, gif: bytes | None = None) -> str:
         doubled=any("double DQN" in label for label, _ in biases),
         agents=_agents(data),
         rule=_rule(data.summary.get("rule")),
-        settings=setting_groups(data.config),
+        settings=_settings(data),
+        order=_order(data),
         gif=None if gif is None else _data_uri("image/gif", gif),
         still=None if gif is None else _data_uri("image/png", _first_frame(gif)),
         learning=svgs(curves.draw_learning_curve, data, LEAD),
@@ -167,6 +169,21 @@ def _facts(
         facts.remove(speed)
         facts.insert(3, (f"Growth a {market.period}", percent(learned, fine), exact))
     return facts
+
+
+def _settings(data: ReportData) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return all settings by group, before them those that differ from the preset."""
+    changed = [("changed", changed_settings(data.changes))] if data.changes else []
+    return changed + setting_groups(data.config)
+
+
+def _order(data: ReportData) -> str:
+    """Return what settings are compared with, in a sentence."""
+    if data.preset is None:
+        return ""
+    if not data.changes:
+        return f"They are those of the preset {data.preset}."
+    return f"Those that differ from the preset {data.preset} come first."
 
 
 def _agents(data: ReportData) -> list[tuple[str, list[str]]]:

@@ -1,11 +1,20 @@
 """Presets: hyperparameters tuned for each task and agent."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import AGENTS, GYM, TASKS
 from qfolio.experiments.presets import finite, gymnasium, markets, pendulum, portfolio
 from qfolio.experiments.presets.preset import Preset, Presets
 
-__all__ = ["PRESETS", "Preset", "default_agent", "preset", "presets_of"]
+if TYPE_CHECKING:
+    from qfolio.core.mdp import Task
+    from qfolio.experiments.run_folder import RunConfig
+
+__all__ = ["PRESETS", "Preset", "changes", "default_agent", "preset", "presets_of"]
 
 PRESETS: Presets = {
     **pendulum.PRESETS,
@@ -42,3 +51,19 @@ def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
         there = f"choose from {', '.join(presets)}" if presets else "there are none"
         raise QfolioError(f"there is no preset {name!r} for {agent} on {task}; {there}.")
     return presets[name]
+
+
+def changes(config: RunConfig, task: type[Task]) -> tuple[str, dict[str, tuple[Any, Any]]] | None:
+    """The preset of a run, and the settings that differ from it: their values, and the preset's.
+
+    A run without a preset is compared with the first one; None if there is none.
+    task: The class of the run's task.
+    """
+    known = presets_of(config.task, config.agent)
+    if not known:
+        return None
+    name = config.preset if config.preset in known else next(iter(known))
+    own = settings.describe(preset(name, config.task, config.agent).build())
+    own |= settings.describe(task(**known[name].task))
+    chosen = config.agent_settings | config.task_settings
+    return name, {key: (value, own[key]) for key, value in chosen.items() if value != own[key]}
