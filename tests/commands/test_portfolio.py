@@ -103,9 +103,17 @@ def test_backtest_obeys_a_mandate(monkeypatch, capsys, tmp_path):
     assert not (tmp_path / "run").exists()
     mandate.write_text(
         '[assets]\ncap = 0.6\n[groups]\nfile = "groups.csv"\n[groups.sector.Metals]\ncap = 0.3\n'
+        '[trading]\ncalendar = "weekly"\n[costs]\nminimum = 1.0\ncash_rate = 0.02\n'
     )
     assert qfolio(monkeypatch, "backtest", *options, "--out", "run") == 0
-    assert "groups.sector.Metals.cap = 0.3" in (tmp_path / "run" / "report.html").read_text()
+    page = (tmp_path / "run" / "report.html").read_text()
+    for said in (
+        "groups.sector.Metals.cap = 0.3",
+        "itemized(minimum=1.0, cash_rate=0.02)",
+        "weekly, on the first day of each period",
+        "Table of growth by capital",
+    ):
+        assert said in page
     capsys.readouterr()
     for file in (mandate, tmp_path / "groups.csv"):
         file.unlink()

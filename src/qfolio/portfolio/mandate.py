@@ -1,4 +1,6 @@
-"""A mandate: the limits that every order obeys, as a file says them.
+"""A mandate: the limits that every order obeys, its calendar and its costs, as a file says them.
+
+    benchmark = "SPY"
 
     [assets]                  # cap and floor: a number for all, or a table with some assets
     cap = 0.2
@@ -17,6 +19,11 @@
     turnover = 0.3
     smallest_trade = 0.005
     holdings = 10
+    calendar = "monthly"
+
+    [costs]                   # of the cost model "itemized"
+    minimum = 1.0
+    cash_rate = 0.03
 
 docs/mandate.md describes every key. ``mandate_checks.py`` says whether the limits can be met.
 """
@@ -71,8 +78,12 @@ class Cash(Section, frozen=True):
 
 
 class Trading(Section, frozen=True):
-    """Limits of a decision. turnover: the sum of all changes of weights, bought and sold."""
+    """Limits of a decision. turnover: the sum of all changes of weights, bought and sold.
 
+    calendar: as ``calendars.decision_rows`` takes it.
+    """
+
+    calendar: str = ""
     turnover: Annotated[float, msgspec.Meta(gt=0, le=20)] | None = None
     smallest_trade: Share = 0.0
     holdings: Annotated[int, msgspec.Meta(ge=1, le=100_000)] | None = None
@@ -85,8 +96,14 @@ class Exposure(Section, frozen=True):
 
 
 class Mandate(Section, frozen=True):
-    """Limits on weights; each section is optional. groups: by column and value."""
+    """Limits on weights, and terms of trade; each section is optional.
 
+    groups: by column and value. costs: settings of the cost model "itemized", or of another one
+    that the key "model" names. benchmark: what all strategies are compared with.
+    """
+
+    benchmark: str | None = None
+    costs: dict[str, str | float] = {}
     assets: Assets = Assets()
     groups: dict[str, dict[str, Group]] = {}
     cash: Cash = Cash()
@@ -119,8 +136,16 @@ class Mandate(Section, frozen=True):
             return given
         return _converted(given, "mandate") if isinstance(given, dict) else Mandate.read(given)
 
+    @property
+    def cost_model(self) -> str:
+        """The cost model with its settings, as a market takes it; empty if there is none."""
+        if not self.costs:
+            return ""
+        chosen = ", ".join(f"{k}={v}" for k, v in self.costs.items() if k != "model")
+        return f"{self.costs.get('model', 'itemized')}({chosen})"
+
     def text(self, assets: Sequence[str]) -> str:
-        """The mandate for a table's assets, in order, as JSON; ``feasible`` takes it.
+        """The limits for a table's assets, in order, as JSON; ``feasible`` takes it.
 
         Raises QfolioError if it names an asset that the table does not have.
         """
@@ -142,7 +167,9 @@ class Mandate(Section, frozen=True):
                     f"The mandate's group {column} {value} has none of the table's assets; name "
                     "them in groups.file, or in the group's assets."
                 )
-        return msgspec.json.encode((list(assets), self)).decode()
+        trading = msgspec.structs.replace(self.trading, calendar="")
+        limits = msgspec.structs.replace(self, benchmark=None, costs={}, trading=trading)
+        return msgspec.json.encode((list(assets), limits)).decode()
 
     @property
     def every_group(self) -> list[tuple[str, str, Group]]:

@@ -9,6 +9,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.desk import Desk
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate import feasible
 from qfolio.portfolio.prices.table import Prices
 
@@ -48,6 +49,27 @@ def create(mandate, folder=None, prices=None, agents=AGENTS, **more) -> Backtest
                "baselines": ["equal-weight-monthly", "minimum-variance"], **more}  # fmt: skip
     prices = table() if prices is None else prices
     return Backtest.create(prices, agents, mandate=mandate, out=folder, **options)
+
+
+def test_a_mandate_names_costs_calendar_and_benchmark(tmp_path):
+    path = tmp_path / "mandate.toml"
+    path.write_text(
+        'benchmark = "A"\n[assets]\ncap = 0.5\n[trading]\ncalendar = "weekly"\n'
+        "[costs]\ncost = 0.002\nminimum = 1.5\ncash_rate = 0.03\n"
+    )
+    backtest = create(path)
+    config, task = backtest.config, backtest.tasks["pathwise"]
+    assert (config.benchmark, config.calendar, config.cost) == ("A", "weekly", 0.002)
+    assert isinstance(task.costs, Itemized)
+    assert (task.costs.cost, task.costs.minimum, task.costs.cash_rate) == (0.002, 1.5, "0.03")
+    assert task.calendar == "weekly"
+    assert "costs" not in task.mandate  # which holds the limits alone
+    other = create(path, calendar="monthly", cost_model="itemized(fixed=2)", benchmark="B").config
+    assert (other.benchmark, other.calendar) == ("B", "monthly")
+    assert other.cost_model == "itemized(fixed=2)"
+    path.write_text("[costs]\nfee = 1.0\n")
+    with pytest.raises(QfolioError, match="Itemized has no setting 'fee'"):
+        create(path)
 
 
 @pytest.mark.slow

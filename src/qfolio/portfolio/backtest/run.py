@@ -44,6 +44,9 @@ from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
 
+PROPORTIONAL = "proportional"
+"""The cost model, unless one is chosen."""
+
 FOLDS_AT_ONCE = 8
 """Folds that train at once if members advance in lockstep; results are kept after each group."""
 
@@ -104,7 +107,7 @@ class Backtest:
         cost: float = 0.001,
         cap: float = 1.0,
         mandate: Mandate | Path | str | dict[str, Any] | None = None,
-        cost_model: str = "proportional",
+        cost_model: str = PROPORTIONAL,
         calendar: str = "",
         baselines: Sequence[str] = tuple(BASELINES),
         strategies: Mapping[str, Any] | None = None,
@@ -130,7 +133,8 @@ class Backtest:
             cost: One-way trading cost, as a fraction of the value traded.
             cap: Largest weight of one asset.
             mandate: Limits that all orders obey, of agents and of baselines: a ``Mandate``, the
-                path of a file, or a dictionary of its sections.
+                path of a file, or a dictionary of its sections. Its costs, calendar and benchmark
+                hold where the arguments of these names have their defaults.
             cost_model: Cost of trading and holding, in training and replay: a name of the registry,
                 or your own as ``module:Name``, with its settings as in "itemized(fixed=5)".
             calendar: When all strategies may trade: weekly, monthly, quarterly or yearly, on the
@@ -151,6 +155,12 @@ class Backtest:
         """
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")
+        terms = None if mandate is None else Mandate.of(mandate)
+        if terms is not None:
+            benchmark = terms.benchmark if benchmark is None else benchmark
+            calendar = calendar or terms.trading.calendar
+            cost = float(terms.costs.get("cost", cost))
+            cost_model = (cost_model == PROPORTIONAL and terms.cost_model) or cost_model
         field = field_of(prices, agents, baselines, strategies or {}, benchmark)
         config = BacktestConfig(
             prices=describe(prices),
@@ -162,7 +172,7 @@ class Backtest:
             lag=int(lag),
             cost=float(cost),
             cap=float(cap),
-            mandate=None if mandate is None else Mandate.of(mandate),
+            mandate=terms,
             cost_model=cost_model,
             calendar=calendar,
             baselines=field.baselines,

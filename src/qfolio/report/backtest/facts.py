@@ -82,12 +82,13 @@ def account(data: BacktestData) -> dict[str, Any]:
 
 
 def _limits(mandate: dict[str, Any], place: str = "") -> list[str]:
-    """A mandate's limits as its file has them, without the assets of groups."""
+    """A mandate's keys as its file has them, without the assets of groups."""
     said = []
     for key, value in mandate.items():
         if isinstance(value, dict):
             said += _limits(value, f"{place}{key}.")
         elif not (place.startswith("groups.") and key == "assets"):
-            shown = ", ".join(value) if isinstance(value, list | tuple) else f"{value:g}"
-            said.append(f"{place}{key} = {shown}")
+            values = value if isinstance(value, list | tuple) else [value]
+            shown = (each if isinstance(each, str) else f"{each:g}" for each in values)
+            said.append(f"{place}{key} = {', '.join(shown)}")
     return said
