@@ -27,6 +27,7 @@ from qfolio.experiments.tuning.run import Progress, Tuning, tuning_keys
 from qfolio.experiments.tuning.search import dimension
 from qfolio.experiments.tuning.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
 from qfolio.experiments.tuning.trials import trials_jobs
+from qfolio.report.figures.tuning import draw_progress
 from qfolio.report.tuning import Sweep, render_page, write_tuning_report
 
 from jobs import Elsewhere
@@ -531,13 +532,13 @@ def test_the_page(optimum, tmp_path):
     data = page(optimum)
     write_tuning_report(tmp_path, data)
     assert {path.name for path in tmp_path.iterdir()} == {
-        "report.html", "sensitivity.png", "pair.png"
+        "report.html", "progress.png", "sensitivity.png", "pair.png"
     }  # fmt: skip
     text = (tmp_path / "report.html").read_text()
     assert "&lt;dqn&gt;" in text
     assert "<dqn>" not in text
     assert "://" not in text.replace("http://www.w3.org", "")
-    assert text.count("<svg") == 4
+    assert text.count("<svg") == 6
     assert "color-mix(in srgb, var(--accent)" in text
     assert ("regret (higher is better)" in text) == (optimum is not None)
     assert "1 diverged" in text
@@ -548,6 +549,35 @@ def test_the_page_of_few_trials(tmp_path):
     data = page()
     few = Sweep(**{**vars(data), "trials": data.trials[:4], "found": None})
     assert "are needed to say what matters" in render_page(few)
+
+
+@pytest.mark.parametrize("optimum", [-100.0, None])
+def test_the_best_so_far(optimum):
+    """By hand; a trial that diverged never is the best, nor one that comes before any result."""
+    returns = [(None,), (-150.0,), (-180.0,), (None,), (-110.0,), (-120.0,)]
+    data = page(optimum)
+    trials = [trial._replace(returns=x) for trial, x in zip(data.trials, returns, strict=False)]
+    few = Sweep(**{**vars(data), "trials": trials, "found": None})
+    (axes,) = draw_progress(few, 7.2).axes
+    (line,) = (x for x in axes.lines if x.get_drawstyle() == "steps-post")
+    best = np.array([math.nan, -150.0, -150.0, -150.0, -110.0, -110.0])
+    expected = best if optimum is None else -np.log10((-100 - best) / 100)
+    np.testing.assert_allclose(np.asarray(line.get_ydata(), float), expected)
+    np.testing.assert_array_equal(np.asarray(line.get_xdata(), float), np.arange(1, 7))
+
+
+@pytest.mark.parametrize("optimum", [-100.0, None])
+def test_the_progress_of_a_single_trial(optimum, tmp_path):
+    data = page(optimum)
+    one = Sweep(**{**vars(data), "trials": data.trials[:1], "found": None})
+    (axes,) = draw_progress(one, 7.2).axes
+    low, high = axes.get_xlim()
+    assert [tick for tick in axes.get_xticks() if low <= tick <= high] == [1]
+    low, high = axes.get_ylim()
+    assert sum(low <= tick <= high for tick in axes.get_yticks()) >= 2
+    (tmp_path / "pair.png").touch()
+    write_tuning_report(tmp_path, one)
+    assert {path.name for path in tmp_path.iterdir()} == {"report.html", "progress.png"}
 
 
 @pytest.mark.parametrize(
