@@ -601,6 +601,13 @@ def test_curves_are_drawn_over_the_budget(unit: str, label: str) -> None:
             assert axes.get_xlabel() == label
 
 
+def test_two_numbers_for_the_optimum_are_explained() -> None:
+    data = replace(make_data(seeds=1, points=3, steps=1), maps=None, episode=None)
+    assert "so its optimum is a slightly different number" in render_page(data)
+    same = replace(data, optimum=data.summary["optimum"])
+    assert "slightly different" not in render_page(same)
+
+
 def test_key_figures_count_all_seeds() -> None:
     data = make_data(seeds=8, points=3, steps=1)
     for unit, each in (("episodes", "400 episodes each"), ("steps", "80 000 steps each")):
