@@ -99,7 +99,7 @@ def test_every_strategy_of_a_backtest_keeps_to_the_calendar() -> None:
 
     # What follows from the orders leaves out the rows without one, and Sharpe ratios the interest.
     json.dumps(explain(backtest, entries).to_json(), allow_nan=False)
-    interest = backtest.growth[:, 0] - 1
+    interest = backtest.replay.growth[:, 0] - 1
     days = np.diff(prices.dates[-len(interest) - 1 :]) / np.timedelta64(1, "D")
     np.testing.assert_allclose(interest, np.expm1(0.05 * days / 365), rtol=1e-9)
     assessed = backtest.assess(entries)

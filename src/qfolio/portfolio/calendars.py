@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
 
-PERIODS = {"weekly": "W", "monthly": "M", "quarterly": "Q", "yearly": "Y"}
-"""Calendars by name, and the periods that they are named after."""
+PERIODS = ("weekly", "monthly", "quarterly", "yearly")
+"""Calendars that are named after their periods."""
 
 
 def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bool_]:
@@ -27,7 +27,8 @@ def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bo
         days = dates.astype("datetime64[D]").astype(int)
         months = dates.astype("datetime64[M]").astype(int)
         weeks = (days + 3) // 7  # 1970-01-01 was a Thursday; weeks begin on Monday
-        period = {"W": weeks, "M": months, "Q": months // 3, "Y": months // 12}[PERIODS[calendar]]
+        numbers = dict(zip(PERIODS, (weeks, months, months // 3, months // 12), strict=True))
+        period = numbers[calendar]
         return np.diff(period, prepend=period[:1] - 1) > 0
     if calendar.isdecimal() and int(calendar) > 0:
         return rows % int(calendar) == 0

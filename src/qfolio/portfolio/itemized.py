@@ -40,7 +40,7 @@ class Itemized(CostModel):
     impact · σ · p^impact_power (a square root by default; 1 is linear), where σ is the volatility
     of a row's returns. volume: quantity, in shares. capital: wealth at the start. cash_rate:
     quantity, the rate that cash earns. borrow_spread: what a loan costs above it. borrow_fee:
-    quantity, the rate that assets sold short cost. carry: quantity, the rate that holding an asset
+    quantity, the rate that assets sold short cost. carry_rate: quantity, the rate that holding one
     earns besides its price (a dividend paid out), or costs if negative (a management fee); a short
     position pays it.
 
@@ -159,10 +159,15 @@ class _Rates:
             {"commission": model.cost, **({} if tax == "0" else {"tax": known(tax)}), **spread}
             for tax in (model.buy, model.sell)
         ]
-        buying, self.selling = sides
+        buying, selling = sides
         # Spending m buys (1 − c)m, so that buying v costs v·c/(1 − c).
         kept = 1 - sum(buying.values())
-        self.buying = {kind: rate / kept for kind, rate in buying.items()}
+        buying = {kind: rate / kept for kind, rate in buying.items()}
+        self.rates = {
+            kind: (buying.get(kind, 0), selling.get(kind, 0))
+            for kind in dict.fromkeys([*buying, *selling])
+        }
+        self.totals = sum(buying.values()), sum(selling.values())
         # An account that fees have wiped out still gives orders.
         self.money = xp.maximum(model.capital * xp.asarray(context.wealth, dtype=dtype), TINY)
         self.money = self.money[..., None]
@@ -176,13 +181,11 @@ class _Rates:
         """Shares of wealth by kind of cost, and their derivative by the change of a weight."""
         xp, model, size = self.xp, self.model, abs(change)
         bought, sold = (change > 0) * size, (change < 0) * size
-        kinds = dict.fromkeys([*self.buying, *self.selling])
-        rates = {kind: (self.buying.get(kind, 0), self.selling.get(kind, 0)) for kind in kinds}
-        paid = {kind: bought * buy + sold * sell for kind, (buy, sell) in rates.items()}
-        slope = (change > 0) * sum(self.buying.values()) - (change < 0) * sum(self.selling.values())
+        paid = {kind: bought * buy + sold * sell for kind, (buy, sell) in self.rates.items()}
+        slope = (change > 0) * self.totals[0] - (change < 0) * self.totals[1]
         if model.minimum > 0:
             least = self.ordered * model.minimum / self.money
-            buy, sell = rates["commission"]
+            buy, sell = self.rates["commission"]
             under = paid["commission"] < least
             paid["commission"] = xp.where(under, least, paid["commission"])
             slope = slope - under * ((change > 0) * buy - (change < 0) * sell)

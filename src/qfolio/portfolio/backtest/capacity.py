@@ -47,8 +47,8 @@ def capacity(replay: Replay, entries: Mapping[str, Entry], reference: str) -> Ca
     year = replay.prices.periods_per_year
 
     def growth(entry: Entry, model: Itemized) -> float:
-        logs = replay.entry(entry.kind, entry.decisions, model).simulation.growth.mean(-1)
-        return float(np.expm1(year * logs).mean())
+        paid = entry if model == costs else replay.entry(entry.kind, entry.decisions, model)
+        return float(np.expm1(year * paid.simulation.growth.mean(-1)).mean())
 
     return Capacity(
         tuple(model.capital for model in models),

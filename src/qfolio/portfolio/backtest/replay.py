@@ -90,7 +90,8 @@ def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: 
     return np.concatenate(parts, axis=1)
 
 
-class Replay(NamedTuple):
+@dataclass(frozen=True)
+class Replay:
     """The rules that hold for all strategies of a backtest.
 
     task: of any agent; all have the same costs and lag. cap: largest weight that baselines order.
@@ -117,10 +118,25 @@ class Replay(NamedTuple):
         every = np.ones(len(self.prices.assets), bool)
         return mandate_checks.require(self.task.mandate, every, self.cap) + [
             f"In fold {fold.name} the mandate yields to the assets that can be traded: {said}."
-            for fold, (_, lowered) in zip(self.folds, self._relaxed(), strict=True)
+            for fold, (_, lowered) in zip(self.folds, self._relaxed, strict=True)
             for said in lowered
         ]
 
+    @cached_property
+    def _conditions(self) -> Conditions:
+        return Conditions.of(self.prices, self.task.costs.columns)
+
+    @cached_property
+    def growth(self) -> np.ndarray:
+        """Growth factors of cash and each asset over the test's returns, shape (day, entry)."""
+        begin, end = self.folds[0].decisions.start, self.folds[-1].decisions.stop
+        rows, values = np.arange(begin, end) + self.task.lag, self.prices.values
+        relatives = np.nan_to_num(values[rows + 1] / values[rows], nan=1.0)
+        return np.asarray(
+            self.task.costs.carry(relatives, self._conditions.holding(rows, rows + 1))
+        )
+
+    @cached_property
     def _relaxed(self) -> list[tuple[Mandated, list[str]]]:
         mandate, values = self.task.mandate, self.prices.values
         return [
@@ -160,7 +176,7 @@ class Replay(NamedTuple):
             table.dates,
             table.values,
             cap=min(self.cap, largest_weight(text)) if text else self.cap,
-            feasible=[made for made, _ in self._relaxed()] if text else None,
+            feasible=[made for made, _ in self._relaxed] if text else None,
             month=table.month,
             decides=np.asarray(self.task.decides) if self.task.calendar else None,
         )
@@ -199,7 +215,7 @@ class Replay(NamedTuple):
             first=self.folds[0].decisions.start,
             cost=self.task.costs if costs is None else costs,
             lag=self.task.lag,
-            conditions=Conditions.of(self.prices, self.task.costs.columns),
+            conditions=self._conditions,
             long_only=self.task.feasible.long_only,
         )
         return Entry(kind, decisions, simulation)

@@ -8,6 +8,7 @@ float64, beside classical allocators under the same rules.
 import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,6 @@ from qfolio.portfolio.backtest.kept import LATEST, Kept, learning
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
-from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.mandate import Mandate, settled
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
@@ -350,7 +350,7 @@ class Backtest:
         entries |= others
         return entries, [*replay.left_out(), *replay.mandated(), *notes, *replay.wiped_out(entries)]
 
-    @property
+    @cached_property
     def replay(self) -> Replay:
         """The rules that hold for all strategies."""
         return Replay(self.prices, self.folds, self._task_of_all, self.config.cap)
@@ -361,16 +361,6 @@ class Backtest:
         shift = self.config.lag + 1
         first, last = self.folds[0].decisions.start, self.folds[-1].decisions.stop
         return self.prices.dates[first + shift : last + shift]
-
-    @property
-    def growth(self) -> np.ndarray:
-        """Growth factors of cash and each asset over the test's returns, shape (day, entry)."""
-        task, values = self._task_of_all, self.prices.values
-        first = self.folds[0].decisions.start + self.config.lag
-        rows = first + np.arange(len(self.dates))
-        relatives = np.nan_to_num(values[rows + 1] / values[rows], nan=1.0)
-        period = Conditions.of(self.prices, task.costs.columns).holding(rows, rows + 1)
-        return np.asarray(task.costs.carry(relatives, period))
 
     @property
     def _task_of_all(self) -> Portfolio:
@@ -387,11 +377,11 @@ class Backtest:
             periods_per_year=table.periods_per_year,
             reference=self.config.benchmark,
             earlier_trials=self.config.trials + trials_on(table.source),
-            risk_free=self.growth[days, 0] - 1,
+            risk_free=self.replay.growth[days, 0] - 1,
         )
         if not self._task_of_all.feasible.long_only:
             return assessed  # debts may exceed any bound on weights without them
-        bound = constant_bound(self.growth[days], table.periods_per_year)
+        bound = constant_bound(self.replay.growth[days], table.periods_per_year)
         return dataclasses.replace(assessed, bound=bound)
 
     def _name(self, agent: str | None) -> str:

@@ -47,7 +47,7 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
             decomposition=decompose(
                 net,
                 entry.simulation.weights[0],
-                backtest.growth - 1,
+                backtest.replay.growth - 1,
                 folds,
                 prices.assets,
                 year,
