@@ -6,15 +6,8 @@ import pytest
 
 from qfolio.report import printing
 
-from shell import TINY as SMALL
-from shell import qfolio
+from shell import TINY, TINY_BACKTEST, qfolio
 from tables import write_table
-
-TINY = [
-    "--agents", "pathwise", "--train", "80d", "--test", "40d", "--seeds", 1, "--episodes", 8,
-    "--baselines", "equal-weight",
-    "--set", "window=10", "horizon=20", "hidden=4", "num_envs=4", "rollout_length=10",
-]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -23,8 +16,8 @@ def backtest(tmp_path_factory):
     prices = write_table(place / "prices.csv", rows=160)
     with pytest.MonkeyPatch.context() as monkeypatch:
         code = qfolio(
-            monkeypatch, "backtest", prices, *TINY, "--title", "For the <committee>", "--out",
-            place / "run",
+            monkeypatch, "backtest", prices, *TINY_BACKTEST,
+            "--title", "For the <committee>", "--out", place / "run",
         )  # fmt: skip
     assert code == 0
     return place / "run"
@@ -70,7 +63,7 @@ def test_an_unfinished_backtest_is_refused(backtest, monkeypatch, capsys, tmp_pa
 def test_a_training_is_reported_again(tmp_path, monkeypatch, capsys):
     folder = tmp_path / "run"
     assert qfolio(monkeypatch, "train", "pendulum", "--episodes", 4, "--seeds", 1, "--no-compare",
-                  "--out", folder, *SMALL) == 0  # fmt: skip
+                  "--out", folder, *TINY) == 0  # fmt: skip
     before = (folder / "report.html").read_bytes()
     (folder / "report.html").unlink()
     assert qfolio(monkeypatch, "report", folder) == 0
@@ -94,7 +87,7 @@ def test_a_study_is_reported_again(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     tables = [write_table(tmp_path / f"{name}.csv", rows=160, seed=seed)
               for seed, name in enumerate(("one", "two"))]  # fmt: skip
-    assert qfolio(monkeypatch, "study", *tables, *TINY, "--out", folder) == 0
+    assert qfolio(monkeypatch, "study", *tables, *TINY_BACKTEST, "--out", folder) == 0
     before = (folder / "report.html").read_bytes()
     (folder / "report.html").unlink()
     assert qfolio(monkeypatch, "report", folder) == 0

@@ -5,14 +5,8 @@ import pytest
 from qfolio.commands.study import _numbers
 from qfolio.portfolio.study.run import Study
 
-from shell import qfolio
+from shell import TINY_BACKTEST, qfolio
 from tables import write_table
-
-TINY = [
-    "--agents", "pathwise", "--train", "80d", "--test", "40d", "--seeds", 1, "--episodes", 8,
-    "--baselines", "equal-weight",
-    "--set", "window=10", "horizon=20", "hidden=4", "num_envs=4", "rollout_length=10",
-]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +18,8 @@ def place(tmp_path_factory):
     short = write_table(place / "short.csv", rows=100, seed=2)
     with pytest.MonkeyPatch.context() as monkeypatch:
         code = qfolio(
-            monkeypatch, "study", one, f"other={two}", short, *TINY, "--out", place / "run",
+            monkeypatch, "study", one, f"other={two}", short, *TINY_BACKTEST,
+            "--out", place / "run",
         )  # fmt: skip
     assert code == 0
     return place
@@ -95,6 +90,6 @@ def test_lags_and_costs_are_lists_beside_the_main_value():
 
 
 def test_a_folder_has_one_configuration(place, monkeypatch, capsys):
-    again = ["study", place / "two.csv", *TINY, "--out", place / "run"]
+    again = ["study", place / "two.csv", *TINY_BACKTEST, "--out", place / "run"]
     assert qfolio(monkeypatch, *again) == 2
     assert "is not empty" in capsys.readouterr().err

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
 from qfolio.core.mdp import Agent, ExogenousTask, Metrics, Position, Task, Transition
@@ -133,8 +134,7 @@ class Onlooker(OnPaths):
         self, state: State, observation: View, key: PRNGKeyArray
     ) -> Float[Array, "batch entry"]:
         """The order that changes nothing."""
-        held = observation.holding
-        return jnp.concatenate([1 - held.sum(-1, keepdims=True), held], -1)
+        return simplex.with_rest(observation.holding)
 
     def measure(self, task: Task, step: Transition) -> Metrics:
         return {}

@@ -69,7 +69,7 @@ class Band(eqx.Module):
         assets = lax.clamp(low, holding, high)
         if isinstance(self.actions, Box):
             return assets
-        return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
+        return simplex.with_rest(assets)
 
     def edges(
         self, reading: Reading, holding: Float[Array, "*batch asset"]

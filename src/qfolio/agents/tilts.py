@@ -242,8 +242,8 @@ class Tilts(Onlooker):
 
         def targets(view: View, _: None) -> tuple[Array, Array]:
             assert view.anchor is not None
-            anchor = jnp.concatenate([1 - view.anchor.sum(-1, keepdims=True), view.anchor], -1)
-            return tilted(view.anchor, member.scores(view.features), actions), anchor
+            target = tilted(view.anchor, member.scores(view.features), actions)
+            return target, simplex.with_rest(view.anchor)
 
         trades = member.trading, lax.stop_gradient(member.trading)
         (rewards, anchored), _ = self._followed(task, rollout, trades, targets)

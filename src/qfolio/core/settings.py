@@ -70,11 +70,11 @@ def called(text: str) -> tuple[str, dict[str, str]]:
     name, bracket, rest = text.strip().partition("(")
     if not bracket:
         return name, {}
-    chosen, equals = {}, [part.partition("=") for part in rest.removesuffix(")").split(",")]
-    for setting, given, value in equals if rest.strip(" )") else []:
-        if not (rest.endswith(")") and name and setting.strip() and given and value.strip()):
-            raise QfolioError(f"{text!r} must be written like itemized(fixed=5, spread=0.0004).")
-        chosen[setting.strip()] = value.strip()
+    inside = rest.removesuffix(")").strip()
+    pairs = [part.partition("=") for part in inside.split(",")] if inside else []
+    chosen = {setting.strip(): value.strip() for setting, _, value in pairs}
+    if not (name and rest.endswith(")") and all(chosen) and all(chosen.values())):
+        raise QfolioError(f"{text!r} must be written like itemized(fixed=5, spread=0.0004).")
     return name.strip(), chosen
 
 

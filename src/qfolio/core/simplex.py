@@ -38,6 +38,11 @@ def project(
     return jnp.where(full, cap, jnp.where(between, jnp.clip(scores - shift, 0, cap), 0))
 
 
+def with_rest(assets: Float[Array, "*batch asset"]) -> Float[Array, "*batch entry"]:
+    """Weights of assets, with cash before them, which is the rest of 1."""
+    return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
+
+
 def grid(entries: int, parts: int) -> np.ndarray:
     """All weights that are multiples of 1/parts, shape (points, entries), the last varying fastest.
 

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from qfolio.core import simplex
+
 
 class Trading(eqx.Module):
     """A share of the way to the target, outside a band; both are learned."""
@@ -45,7 +47,7 @@ class Trading(eqx.Module):
         source = jnp.where(idle > 0, target[..., 1:], held)
         invested = idle * source * ratio(1.0, source.sum(-1, keepdims=True))
         assets = held + jax.nn.sigmoid(self.rate) * trade + invested
-        return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
+        return simplex.with_rest(assets)
 
 
 def equal(anchor: Float[Array, "*batch asset"]) -> Float[Array, "*batch asset"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from numpy.typing import NDArray
 
+from qfolio.core import simplex
 from qfolio.portfolio.projection import Limits, excess, nearest
 
 BARELY = 5e-6
@@ -112,7 +113,7 @@ class Mandated(Feasible):
             weights, limits = self._fewer(aim, now, weights)
         if self.smallest_trade:
             weights = self._without_small(aim, now, weights, limits)
-        return jnp.concatenate([1 - weights.sum(keepdims=True), weights])
+        return simplex.with_rest(weights)
 
     def _fewer(
         self,

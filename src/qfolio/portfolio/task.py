@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Box, Position, Simplex
@@ -195,7 +196,7 @@ class Portfolio(Market):
         Where debts are allowed, an action may also be the weights of the assets; cash is the rest.
         """
         if action.shape == self.limits.shape:
-            action = jnp.concatenate([1 - action.sum(keepdims=True), action])
+            action = simplex.with_rest(action)
         return self._when_deciding(market, held, super().target(market, held, action))
 
     def obeying(

@@ -35,6 +35,16 @@ def _all_actions(episodes: int, menu: str, **changes: Any) -> dict[str, Preset]:
     return {"fast": Preset("dqn", changes, episodes, seeds=5, task={"menu": menu})}
 
 
+_ON_FACTORS = _pathwise(
+    25_600,
+    num_envs=64,
+    rollout_length=50,
+    tail=20,
+    learning_rate_steps=400.0,
+    reward_scale=10.0,
+    max_grad_norm=0.3,
+)
+
 PRESETS: Presets = {
     ("market/kelly", "pathwise"): _pathwise(
         307_200, num_envs=1024, rollout_length=5, learning_rate_steps=300.0, reward_scale=10.0
@@ -89,24 +99,8 @@ PRESETS: Presets = {
         reward_scale=100.0,
         max_grad_norm=1e-4,
     ),
-    ("market/garleanu-pedersen", "pathwise"): _pathwise(
-        25_600,
-        num_envs=64,
-        rollout_length=50,
-        tail=20,
-        learning_rate_steps=400.0,
-        reward_scale=10.0,
-        max_grad_norm=0.3,
-    ),
-    ("market/signals", "pathwise"): _pathwise(
-        25_600,
-        num_envs=64,
-        rollout_length=50,
-        tail=20,
-        learning_rate_steps=400.0,
-        reward_scale=10.0,
-        max_grad_norm=0.3,
-    ),
+    ("market/garleanu-pedersen", "pathwise"): _ON_FACTORS,
+    ("market/signals", "pathwise"): _ON_FACTORS,
     ("market/leverage", "pathwise"): _pathwise(
         153_600, num_envs=512, rollout_length=5, learning_rate_steps=300.0, reward_scale=10.0
     ),

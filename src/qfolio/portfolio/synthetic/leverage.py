@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from qfolio.core import simplex
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Box, Policy, Position
 from qfolio.portfolio.costs import Context
@@ -30,7 +31,7 @@ class Anything(Feasible):
         return wanted
 
     def draw(self, key: PRNGKeyArray) -> Float[Array, " entry"]:
-        return with_cash(jax.random.normal(key, (self.assets,)) / self.assets)
+        return simplex.with_rest(jax.random.normal(key, (self.assets,)) / self.assets)
 
     def violations(self, weights: Any) -> dict[str, Any]:
         return {"the sum is off 1 by": abs(weights.sum(-1) - 1)}
@@ -84,7 +85,7 @@ class Leverage(SyntheticMarket):
     def target(
         self, market: Array, held: Float[Array, " entry"], action: Array
     ) -> Float[Array, " entry"]:
-        return with_cash(action)
+        return simplex.with_rest(action)
 
     def intent(self, state: Position, action: Array) -> Array:
         return action
@@ -126,14 +127,9 @@ class Leverage(SyntheticMarket):
         return lambda state: weights
 
     def rule(self, policy: Policy) -> dict[str, float]:
-        weights = policy(Position(jnp.array(0), self.hold(with_cash(jnp.zeros(3)))))
+        weights = policy(Position(jnp.array(0), self.hold(simplex.with_rest(jnp.zeros(3)))))
         named = {f"weight of asset {i + 1}": float(weight) for i, weight in enumerate(weights)}
         return named | {"weight of cash": 1 - sum(named.values())}
 
     def scenes(self) -> list[tuple[str, Any]]:
         return []
-
-
-def with_cash(weights: Float[Array, " asset"]) -> Float[Array, " entry"]:
-    """Weights of assets, with what they leave before them."""
-    return jnp.concatenate([1 - weights.sum(keepdims=True), weights])
