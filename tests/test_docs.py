@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from qfolio.portfolio.holdings import read_holdings
+from qfolio.portfolio.desk.holdings import read_holdings
 from qfolio.portfolio.prices.table import load
 
 from shell import qfolio

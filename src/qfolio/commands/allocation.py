@@ -12,7 +12,7 @@ from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
-    from qfolio.portfolio.backtest.desk import Desk
+    from qfolio.portfolio.desk.desk import Desk
 
 Date = Annotated[str | None, arg(metavar="DATE", help_behavior_hint="")]
 
@@ -84,12 +84,12 @@ def allocate(
     devices.configure()
     registry.trust(trust)
     from qfolio.commands import console
-    from qfolio.portfolio.allocation import Allocation, require_fresh
     from qfolio.portfolio.backtest.attribution.drivers import reasons, sentence
-    from qfolio.portfolio.backtest.desk import Desk
-    from qfolio.portfolio.backtest.standing import Standing
-    from qfolio.portfolio.holdings import read_holdings
-    from qfolio.portfolio.orders_csv import order_rows
+    from qfolio.portfolio.desk.allocation import Allocation, require_fresh
+    from qfolio.portfolio.desk.desk import Desk
+    from qfolio.portfolio.desk.holdings import read_holdings
+    from qfolio.portfolio.desk.orders_csv import order_rows
+    from qfolio.portfolio.desk.standing import Standing
     from qfolio.portfolio.policy import Policy
     from qfolio.portfolio.prices.findings import amount, day
 
@@ -187,9 +187,9 @@ def follow(
     registry.trust(trust)
     from qfolio.commands import console
     from qfolio.core.files import write_bytes
-    from qfolio.portfolio.backtest.consistency import ALARM
-    from qfolio.portfolio.backtest.desk import Desk
-    from qfolio.portfolio.backtest.follow import follow as marked
+    from qfolio.portfolio.desk.consistency import ALARM
+    from qfolio.portfolio.desk.desk import Desk
+    from qfolio.portfolio.desk.follow import follow as marked
     from qfolio.report.follow import LiveRows, render_following
 
     following = marked(Desk.open(folder, missing=missing, features=features, date=date), prices)
@@ -221,7 +221,7 @@ def _reproduce(
 ) -> None:
     """Computes an allocation of the ledger again and says how near it comes."""
     from qfolio.commands import console
-    from qfolio.portfolio.holdings import read_holdings
+    from qfolio.portfolio.desk.holdings import read_holdings
 
     held = None
     if holdings is not None or capital is not None:

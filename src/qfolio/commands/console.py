@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
     from qfolio.experiments.run import Run
     from qfolio.experiments.tuning.run import Tuning
-    from qfolio.portfolio.allocation import Allocation
     from qfolio.portfolio.backtest.assessment import Assessment
-    from qfolio.portfolio.backtest.follow import Following
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.portfolio.backtest.sampled import Measure
-    from qfolio.portfolio.backtest.standing import Standing
+    from qfolio.portfolio.desk.allocation import Allocation
+    from qfolio.portfolio.desk.follow import Following
+    from qfolio.portfolio.desk.standing import Standing
     from qfolio.portfolio.prices.findings import Finding
     from qfolio.portfolio.study.folder import Result, Variant
     from qfolio.portfolio.study.pooling import Active, Pooled

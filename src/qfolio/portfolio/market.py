@@ -30,7 +30,7 @@ from qfolio.core.mdp import (
 )
 from qfolio.core.registry import Kind, build
 from qfolio.portfolio.costs import Context, CostModel, grown, traded
-from qfolio.portfolio.feasible import CappedSimplex, Feasible
+from qfolio.portfolio.mandate.feasible import CappedSimplex, Feasible
 from qfolio.portfolio.rewards import Outcome, Reward
 
 MENU_LIMIT = 2000

@@ -19,12 +19,13 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Box, Position, Simplex
-from qfolio.portfolio import anchors, mandate_checks, signals
+from qfolio.portfolio import anchors, signals
 from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import grown
-from qfolio.portfolio.feasible import Feasible, Mandated
-from qfolio.portfolio.mandate import feasible, largest_weight, settled
+from qfolio.portfolio.mandate import checks
+from qfolio.portfolio.mandate.feasible import Feasible, Mandated
+from qfolio.portfolio.mandate.mandate import feasible, largest_weight, settled
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
 
@@ -334,5 +335,5 @@ def _allowed(mandate: str, usable: np.ndarray, most: float) -> Mandated | None:
     """What a mandate allows over some rows, in float32; without one, nothing is to be said."""
     if not mandate:
         return None
-    made, _ = mandate_checks.relaxed(feasible(mandate, usable, most))
+    made, _ = checks.relaxed(feasible(mandate, usable, most))
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), made)

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import itertools
 import multiprocessing
 from typing import Any
 
@@ -119,7 +120,7 @@ def test_stopped_and_resumed_elsewhere(here, tmp_path):
 
 @pytest.mark.slow
 def test_a_worker_that_is_killed(here, tmp_path):
-    """Its job is trained again, by another worker."""
+    """Its job is trained again, by another worker: the second one, or one that has begun since."""
     backtest, told = create(tmp_path / "run"), []
 
     class Kill(Listener):
@@ -133,7 +134,7 @@ def test_a_worker_that_is_killed(here, tmp_path):
 
     backtest.run(listen, Processes(1, cores=1))
     assert len(told) == 5
-    assert told[1] == told[2]
+    assert [a for a, b in itertools.pairwise(told) if a == b] != []
     assert files(tmp_path / "run") == here
 
 

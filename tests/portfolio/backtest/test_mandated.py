@@ -7,10 +7,10 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio.backtest.desk import Desk
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.itemized import Itemized
-from qfolio.portfolio.mandate import feasible
+from qfolio.portfolio.mandate.mandate import feasible
 from qfolio.portfolio.prices.table import Prices
 
 ASSETS = ("A", "B", "C", "D", "E")

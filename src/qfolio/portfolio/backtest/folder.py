@@ -35,7 +35,7 @@ from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Row
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.own import KINDS, Own
-from qfolio.portfolio.mandate import Mandate
+from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.prices.table import Prices
 
 EQUAL_WEIGHT = "equal-weight"

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, Bools, Floats, History
-from qfolio.portfolio.feasible import Feasible, exactly
+from qfolio.portfolio.mandate.feasible import Feasible, exactly
 
 TOLERANCE = 1e-6
 """How far weights may be off the simplex or above the cap."""

@@ -12,7 +12,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
 from qfolio.portfolio.backtest.measures import Floats
 from qfolio.portfolio.backtest.own import Own
-from qfolio.portfolio.holdings import ASSET_NAMES, CASH, SHARES_NAMES
+from qfolio.portfolio.desk.holdings import ASSET_NAMES, CASH, SHARES_NAMES
 from qfolio.portfolio.prices.cells import is_missing, label, not_a_number, numbers
 from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.dates import read_dates

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import PyTree
 
 from qfolio.core.mdp import Agent
-from qfolio.portfolio import mandate_checks
 from qfolio.portfolio.backtest.assessment import Strategy
 from qfolio.portfolio.backtest.baselines import Baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
@@ -20,9 +19,10 @@ from qfolio.portfolio.backtest.own import Placed
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel
-from qfolio.portfolio.feasible import Mandated
 from qfolio.portfolio.following import follow
-from qfolio.portfolio.mandate import feasible, largest_weight
+from qfolio.portfolio.mandate import checks
+from qfolio.portfolio.mandate.feasible import Mandated
+from qfolio.portfolio.mandate.mandate import feasible, largest_weight
 from qfolio.portfolio.prices.findings import listing
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -116,7 +116,7 @@ class Replay:
         if not self.task.mandate:
             return []
         every = np.ones(len(self.prices.assets), bool)
-        return mandate_checks.require(self.task.mandate, every, self.cap) + [
+        return checks.require(self.task.mandate, every, self.cap) + [
             f"In fold {fold.name} the mandate yields to the assets that can be traded: {said}."
             for fold, (_, lowered) in zip(self.folds, self._relaxed, strict=True)
             for said in lowered
@@ -140,7 +140,7 @@ class Replay:
     def _relaxed(self) -> list[tuple[Mandated, list[str]]]:
         mandate, values = self.task.mandate, self.prices.values
         return [
-            mandate_checks.relaxed(feasible(mandate, fold.tradable(values), self.cap))
+            checks.relaxed(feasible(mandate, fold.tradable(values), self.cap))
             for fold in self.folds
             if mandate
         ]

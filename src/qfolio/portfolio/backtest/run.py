@@ -26,7 +26,6 @@ from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, at_onc
 from qfolio.experiments.fit import Row
 from qfolio.experiments.log import Log
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio import mandate_checks
 from qfolio.portfolio.backtest import assessment, memory
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.benchmark import field_of
@@ -37,7 +36,8 @@ from qfolio.portfolio.backtest.kept import LATEST, Kept, learning
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
-from qfolio.portfolio.mandate import Mandate, settled
+from qfolio.portfolio.mandate import checks
+from qfolio.portfolio.mandate.mandate import Mandate, settled
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
@@ -192,7 +192,7 @@ class Backtest:
         memory.require(prices, config)
         if config.mandate is not None:
             every = np.ones(len(prices.assets), bool)
-            mandate_checks.require(settled(config.mandate, prices.assets), every, config.cap)
+            checks.require(settled(config.mandate, prices.assets), every, config.cap)
         given = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
         backtest = cls(prices, config, None, given, field.own)
         if out is not None:

@@ -11,7 +11,7 @@ from qfolio.core import simplex
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Box, Policy, Position
 from qfolio.portfolio.costs import Context
-from qfolio.portfolio.feasible import Feasible
+from qfolio.portfolio.mandate.feasible import Feasible
 from qfolio.portfolio.market import Contexts, Relatives
 from qfolio.portfolio.synthetic.base import SyntheticMarket
 from qfolio.portfolio.synthetic.merton import lognormal_table

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.portfolio.allocation import Allocation
 from qfolio.portfolio.backtest.attribution.drivers import Driver, Reason, reasons, sentence
+from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.policy import Policy
 
 from planted import ASSETS, Known, four_folds, planted

@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 
 from qfolio.core.mdp import Discrete
-from qfolio.portfolio.allocation import NOISE, Allocation
 from qfolio.portfolio.backtest.attribution.gradients import integrated
 from qfolio.portfolio.backtest.attribution.replays import channel_names
+from qfolio.portfolio.desk.allocation import NOISE, Allocation
 from qfolio.portfolio.following import on_table
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices

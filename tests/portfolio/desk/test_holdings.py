@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.holdings import read_holdings
+from qfolio.portfolio.desk.holdings import read_holdings
 
 ASSETS = ("AAA", "BBB", "NA")
 

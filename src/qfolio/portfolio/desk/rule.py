@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio import mandate_checks
 from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.folds import latest
 from qfolio.portfolio.backtest.orders import obeying
 from qfolio.portfolio.costs import CostModel
-from qfolio.portfolio.mandate import feasible, largest_weight
+from qfolio.portfolio.mandate import checks
+from qfolio.portfolio.mandate.mandate import feasible, largest_weight
 from qfolio.portfolio.prices.table import Prices, load
 
 
@@ -59,7 +59,7 @@ class Rule:
             )
         mandated, cap = None, self.cap
         if self.mandate:
-            mandated, _ = mandate_checks.relaxed(feasible(self.mandate, tradable, cap))
+            mandated, _ = checks.relaxed(feasible(self.mandate, tradable, cap))
             cap = min(cap, largest_weight(self.mandate))
         history = History(table.dates, table.values, fold.train, tradable, cap, table.month)
         wanted = self.baseline.decide(history, held)

@@ -17,7 +17,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, read_arrays, read_json, write_arrays, write_json
 from qfolio.core.text import quote
-from qfolio.portfolio.allocation import Allocation
+from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.prices.table import Prices
 
 FORMAT = 1

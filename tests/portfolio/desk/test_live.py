@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.allocation import Allocation
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import Proportional
+from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.ledger import Record
+from qfolio.portfolio.desk.live import mark
 from qfolio.portfolio.itemized import Itemized
-from qfolio.portfolio.ledger import Record
-from qfolio.portfolio.live import mark
 from qfolio.portfolio.prices.table import Prices
 
 NAMES = ("A", "B", "C")

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.allocation import context_of, settled
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel
-from qfolio.portfolio.ledger import Record
+from qfolio.portfolio.desk.allocation import context_of, settled
+from qfolio.portfolio.desk.ledger import Record
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 

@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.portfolio.feasible import CappedSimplex
-from qfolio.portfolio.mandate import feasible, settled
+from qfolio.portfolio.mandate.feasible import CappedSimplex
+from qfolio.portfolio.mandate.mandate import feasible, settled
 
 LIMITS = [0.4, 0.0, 0.7]
 

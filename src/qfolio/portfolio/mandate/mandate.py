@@ -25,7 +25,7 @@
     minimum = 1.0
     cash_rate = 0.03
 
-docs/mandate.md describes every key. ``mandate_checks.py`` says whether the limits can be met.
+docs/mandate.md describes every key. ``checks.py`` says whether the limits can be met.
 """
 
 import csv
@@ -43,8 +43,8 @@ from jaxtyping import Bool
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
-from qfolio.portfolio.feasible import Mandated
-from qfolio.portfolio.projection import Limits
+from qfolio.portfolio.mandate.feasible import Mandated
+from qfolio.portfolio.mandate.projection import Limits
 
 Weight = Annotated[float, msgspec.Meta(ge=-3, le=3)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]

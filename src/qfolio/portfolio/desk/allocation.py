@@ -12,10 +12,10 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import Context, CostModel
+from qfolio.portfolio.desk.whole_shares import whole_shares as rounded
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
-from qfolio.portfolio.whole_shares import whole_shares as rounded
 
 MAX_AGE = datetime.timedelta(days=7)
 """Older prices are stale."""

@@ -9,16 +9,16 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import write_csv
-from qfolio.portfolio.backtest import consistency
-from qfolio.portfolio.backtest.desk import Desk
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
 from qfolio.portfolio.backtest.measures import drawdown
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.ledger import Record
-from qfolio.portfolio.live import Live, mark
+from qfolio.portfolio.desk import consistency
+from qfolio.portfolio.desk.desk import Desk
+from qfolio.portfolio.desk.ledger import Record
+from qfolio.portfolio.desk.live import Live, mark
 from qfolio.portfolio.prices.findings import amount, day
 from qfolio.portfolio.prices.table import Prices
 

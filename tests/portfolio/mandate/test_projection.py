@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.portfolio.projection import Limits, excess, nearest
+from qfolio.portfolio.mandate.projection import Limits, excess, nearest
 
 ASSETS, CASES = 10, 60
 

@@ -5,8 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from qfolio.portfolio.allocation import Allocation
 from qfolio.portfolio.costs import Proportional
+from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.prices.table import Prices
 
 

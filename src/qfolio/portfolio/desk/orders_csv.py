@@ -8,7 +8,7 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
-from qfolio.portfolio.allocation import Allocation
+from qfolio.portfolio.desk.allocation import Allocation
 
 DIGITS = 6
 """Decimal places of fractional shares; what is beyond is not ordered."""

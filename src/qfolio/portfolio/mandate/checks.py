@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.feasible import Mandated
-from qfolio.portfolio.mandate import feasible, parse
-from qfolio.portfolio.projection import Limits
+from qfolio.portfolio.mandate.feasible import Mandated
+from qfolio.portfolio.mandate.mandate import feasible, parse
+from qfolio.portfolio.mandate.projection import Limits
 
 TINY = 1e-7
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from numpy.typing import NDArray
 
 from qfolio.core import simplex
-from qfolio.portfolio.projection import Limits, excess, nearest
+from qfolio.portfolio.mandate.projection import Limits, excess, nearest
 
 BARELY = 5e-6
 """Excesses of a limit up to this are rounding errors in float32."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.consistency import ALARM, ALPHA, Promise, band, evidence, together
+from qfolio.portfolio.desk.consistency import ALARM, ALPHA, Promise, band, evidence, together
 
 SHARPE = 1.0 / np.sqrt(252)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.allocation import Allocation, require_fresh
+from qfolio.portfolio.desk.allocation import Allocation, require_fresh
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio import mandate_checks
-from qfolio.portfolio.mandate import Mandate, feasible, parse, settled
+from qfolio.portfolio.mandate import checks
+from qfolio.portfolio.mandate.mandate import Mandate, feasible, parse, settled
 
 ASSETS = ["SPY", "TLT", "XLE", "XOM"]
 ALL = np.ones(4, bool)
@@ -118,24 +118,24 @@ GROUP = {"assets": ["XLE", "XOM"]}
 )  # fmt: skip
 def test_limits_that_clash_are_refused_with_their_names(mandate, message):
     with pytest.raises(QfolioError, match=message):
-        mandate_checks.require(settled(mandate, ASSETS), ALL)
+        checks.require(settled(mandate, ASSETS), ALL)
 
 
 def test_what_is_unusual_is_said():
     many = [f"A{i}" for i in range(15)]
-    [note] = mandate_checks.require(settled({"assets": {"cap": 0.05}}, many), np.ones(15, bool))
+    [note] = checks.require(settled({"assets": {"cap": 0.05}}, many), np.ones(15, bool))
     assert note == "The mandate forces at least 25 % cash: caps allow no more."
     bound = {"assets": {"cap": 0.1}, "groups": {"s": {"E": {**GROUP, "floor": 0.2}}}}
-    notes = mandate_checks.require(settled(bound, ASSETS), ALL)
+    notes = checks.require(settled(bound, ASSETS), ALL)
     assert "no choice for s E: its floor, 20 %" in notes[1]
-    assert mandate_checks.require(settled({"cash": {"max": 0.1}}, ASSETS), ALL) == []
+    assert checks.require(settled({"cash": {"max": 0.1}}, ASSETS), ALL) == []
 
 
 def test_floors_yield_where_assets_cannot_be_traded():
     mandate = {"assets": {"cap": 0.3, "floor": {"XOM": 0.1}}, "cash": {"max": 0.2},
                "groups": {"sector": {"E": {**GROUP, "floor": 0.25}}}}  # fmt: skip
     text = settled(mandate, ASSETS)
-    assert mandate_checks.relaxed(feasible(text, ALL))[1] == []
-    made, lowered = mandate_checks.relaxed(feasible(text, np.array([True, True, False, False])))
+    assert checks.relaxed(feasible(text, ALL))[1] == []
+    made, lowered = checks.relaxed(feasible(text, np.array([True, True, False, False])))
     assert sorted(x.partition(" by ")[0] for x in lowered) == ["cash", "sector E"]
     assert max(np.max(x) for x in made.violations(np.array([0.4, 0.3, 0.3, 0, 0])).values()) <= 1e-9

@@ -11,11 +11,11 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
 from qfolio.core.version import __version__
-from qfolio.portfolio.allocation import Allocation
 from qfolio.portfolio.backtest.folder import BacktestFolder
-from qfolio.portfolio.backtest.rule import Rule
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.ledger import Ledger, Record, file_digest, holdings_digest
+from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
+from qfolio.portfolio.desk.rule import Rule
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices, load
 
