@@ -113,7 +113,7 @@ class TestRay:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
         done = subprocess.run(
             [sys.executable, "-c", code],
-            capture_output=True, text=True, timeout=120, env=environment, check=False,
+            capture_output=True, text=True, timeout=300, env=environment, check=False,
         )  # fmt: skip
         assert done.stdout == "3 45.0\n", done.stderr
 

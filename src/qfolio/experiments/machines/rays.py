@@ -169,16 +169,26 @@ def _connected(address: str | None) -> Any:
         ) from None
     if not ray.is_initialized():
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # what matters becomes an exception
-                ray.init(address, logging_level=logging.ERROR, log_to_driver=False)
+            try:
+                _connect(ray, address)
+            except ConnectionAbortedError:
+                # The head starts a process for each client, and gives up after 30 seconds, which
+                # a busy machine may need. By then most of it has been loaded.
+                _connect(ray, address)
         except (ConnectionError, ValueError, RuntimeError) as error:
-            (first, *_) = str(error).strip().splitlines() or [type(error).__name__]
+            lines = str(error).strip().splitlines() or [type(error).__name__]
+            why = lines[-1] if isinstance(error, ConnectionAbortedError) else lines[0]
             raise QfolioError(
                 f"The Ray cluster {address or 'of this machine'} cannot be reached "
-                f"({first.rstrip('.')}); check its address, and that it is running."
+                f"({why.rstrip('.')}); check its address, and that it is running."
             ) from None
     return ray
+
+
+def _connect(ray: Any, address: str | None) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what matters becomes an exception
+        ray.init(address, logging_level=logging.ERROR, log_to_driver=False)
 
 
 def _cores(count: int) -> str:
