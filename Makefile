@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 NOW := $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: demo test test-all check format bench bench-gpu clean
+.PHONY: demo test test-all check format bench bench-gpu docs linkcheck clean
 
 demo: .venv/installed
 	$(BIN)/qfolio train pendulum --no-compare --out runs/demo-$(NOW)/pendulum
@@ -30,6 +30,14 @@ format: .venv/installed-dev
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
+# The site, in docs/_build/html. Any warning fails: a broken link, a page that the navigation does not reach.
+docs: .venv/installed-docs
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/_build/html
+
+# The links to other sites, which may fail for a day.
+linkcheck: .venv/installed-docs
+	$(BIN)/sphinx-build --builder linkcheck --quiet docs docs/_build/linkcheck
+
 bench: .venv/installed-dev
 	$(BIN)/python bench/run.py
 
@@ -47,4 +55,8 @@ clean:
 
 .venv/installed-dev: .venv/installed
 	$(BIN)/python -m pip install --quiet --group dev
+	touch $@
+
+.venv/installed-docs: .venv/installed-dev
+	$(BIN)/python -m pip install --quiet --group docs
 	touch $@

@@ -1,7 +1,7 @@
 """The report's run for 1,024 agents in one program on a GPU: `make bench-gpu`.
 
 Prints how long it took beside the limits from arithmetic and from memory, which default to those of
-an H200 (float32 without tensor cores). docs/benchmarks.md says how they are counted.
+an H200 (float32 without tensor cores). docs/results/benchmarks.md says how they are counted.
 """
 
 from time import perf_counter

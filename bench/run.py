@@ -1,7 +1,7 @@
 """Measures qfolio against its peers and its own limits: `make bench`.
 
-Prints tables and writes results.json and results.md; docs/benchmarks.md, which takes the tables
-over, says what each figure means. Nothing fails because of a figure.
+Prints tables and writes results.json and results.md; docs/results/benchmarks.md, which takes the
+tables over, says what each figure means. Nothing fails because of a figure.
 """
 
 import json
@@ -48,7 +48,7 @@ from workload import EPISODES, families, hosted, layers, products, report  # noq
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 PEERS = ROOT / ".venv-bench"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "results" / "benchmarks.md"
 QFOLIO = Path(sys.executable).with_name("qfolio")
 THREADS = (1, 2)
 

@@ -54,7 +54,9 @@ def test_the_addresses_agree(services):
     head = dict(option.partition("=")[::2] for option in services["head"]["command"])
     worker = dict(option.partition("=")[::2] for option in services["worker"]["command"])
     assert worker["--address"] == f"head:{head['--port']}"
-    shown = (ROOT / "compose.yaml").read_text() + (ROOT / "docs" / "machines.md").read_text()
+    shown = (ROOT / "compose.yaml").read_text() + (
+        ROOT / "docs" / "guides" / "machines.md"
+    ).read_text()
     client = head["--ray-client-server-port"]
     assert set(re.findall(r"ray://head:(\d+)", shown)) == {client}
     assert services["head"]["ports"] == [f"127.0.0.1:{client}:{client}"]  # of this machine only

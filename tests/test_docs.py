@@ -1,4 +1,4 @@
-"""What README and docs/own_parts.md show is executed, with less to compute."""
+"""What README and docs/guides/own_parts.md show is executed, with less to compute."""
 
 import csv
 import json
@@ -53,7 +53,7 @@ def own(tmp_path, monkeypatch, prices):
     """The files that the page has its reader write; returns what forgets their modules."""
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     names = []
-    for before, code in blocks("docs/own_parts.md", "python"):
+    for before, code in blocks("docs/guides/own_parts.md", "python"):
         (name,) = re.findall(r"`(\w+)\.py`", before)
         (tmp_path / f"{name}.py").write_text(code)
         names.append(name)
@@ -65,7 +65,7 @@ def own(tmp_path, monkeypatch, prices):
 
 @pytest.mark.slow
 def test_the_page_about_own_parts(own, monkeypatch, capsys):
-    shown = "".join(code for _, code in blocks("docs/own_parts.md", "sh")).splitlines()
+    shown = "".join(code for _, code in blocks("docs/guides/own_parts.md", "sh")).splitlines()
     corridor, table, merton, rate, backtest, own_backtest, evaluate, resume = shown
 
     def run(command):
@@ -172,7 +172,7 @@ def test_the_examples_of_the_readme(prices, tmp_path):
 def test_the_tables_that_are_shown_are_read(tmp_path):
     """Those of the README and of the page, and their numbers are those of skfolio's table."""
     whole = load().to_frame()
-    for page in ("README.md", "docs/tables.md"):
+    for page in ("README.md", "docs/guides/tables.md"):
         *tables, held = [code for _, code in blocks(page, "csv")]
         for table in tables:
             path = tmp_path / "prices.csv"

@@ -659,7 +659,7 @@ def test_refuses_what_makes_no_sense(kind, settings):
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
 def test_fast_presets_swing_the_pendulum_up(agent):
-    """What docs/actor_critic.md says of every seed; an idle agent loses 900 %."""
+    """What docs/algorithms/actor_critic.md says of every seed; an idle agent loses 900 %."""
     fast = preset("fast", "pendulum", agent)
     task = Pendulum(**fast.task)
     run = train(task, fast.build(), episodes=fast.episodes, seeds=2, seed=100)

@@ -8,7 +8,7 @@ import pytest
 from qfolio.core import settings
 from qfolio.core.registry import AGENTS, find
 
-PAGE = (Path(__file__).parents[2] / "docs" / "papers.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "appendix" / "papers.md").read_text()
 PAPERS = dict(re.findall(r"^## ([\w-]+): [^\n]*\n\n(.*?)\n\n", PAGE, re.DOTALL | re.MULTILINE))
 TABULAR = {"q-learning", "sarsa", "expected-sarsa", "double-q", "dyna-q"}
 

@@ -21,6 +21,6 @@ def test_presets_come_near_the_optimum(name, seeds, worst):
 
 @pytest.mark.slow
 def test_report_preset_learns_in_90_episodes():
-    """Where the plain algorithm is at its best; docs/dqn.md says what happens until 600."""
+    """Where the plain algorithm is at its best (docs/algorithms/dqn.md: until 600)."""
     run = train(Pendulum(), preset("report").build(), episodes=90, seeds=4, seed=100)
     assert np.mean(run.grade()["regret_per_seed"]) < 0.15

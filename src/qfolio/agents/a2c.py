@@ -2,7 +2,7 @@
 
 After a few steps of all environments, the policy takes one step along the gradient of its actions'
 log probabilities times their advantages, and the critic one towards the returns.
-docs/policy_gradients.md has the formulas and the deviations from the paper.
+docs/algorithms/policy_gradients.md has the formulas and the deviations from the paper.
 """
 
 from jaxtyping import PRNGKeyArray

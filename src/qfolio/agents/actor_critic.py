@@ -3,7 +3,7 @@
 The critics regress Q(s, a) towards a Bellman target at the action that the policy takes next; the
 actor ascends the critics' gradient in the action. Each algorithm's file defines these two steps;
 this file holds the networks, the buffer and the settings that all three share.
-docs/actor_critic.md lists every formula and its place.
+docs/algorithms/actor_critic.md lists every formula and its place.
 """
 
 import abc

@@ -2,8 +2,8 @@
 
 The critic regresses Q(s, a) towards r + γ Q'(s', π'(s')), where Q' and π' are slowly updated
 targets. The actor π ascends Q(s, π(s)) by the critic's gradient in the action (Silver et al. 2014,
-eq. 9). Exploration adds noise to the actor's action. docs/actor_critic.md lists formulas and
-deviations.
+eq. 9). Exploration adds noise to the actor's action. docs/algorithms/actor_critic.md lists formulas
+and deviations.
 """
 
 import math

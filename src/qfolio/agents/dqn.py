@@ -4,12 +4,12 @@ A Q-network estimates the discounted return of each action. Collecting: actions 
 and transitions go into a replay buffer. Training: it regresses, on batches from the buffer, towards
 r + γ max_a Q'(s', a), where Q' is a slowly updated target network.
 
-Options, which together are Rainbow (Hessel et al. 2018): double Q-learning (van Hasselt et
-al. 2016), dueling networks (Wang et al. 2016), returns over n steps, prioritized replay (Schaul et
-al. 2016), noisy networks (Fortunato et al. 2018), and distributions of returns in place of their
-means (Bellemare et al. 2017; Dabney et al. 2018). In addition, a network may learn roots of values
-(after Pohlen et al. 2018), and in an exogenous task ``all_actions`` learns every action's outcome
-from one move of the market. docs/dqn.md lists every formula, its place in this file, and each
+Options, which together are Rainbow (Hessel et al. 2018): double Q-learning (van Hasselt et al.
+2016), dueling networks (Wang et al. 2016), returns over n steps, prioritized replay (Schaul et al.
+2016), noisy networks (Fortunato et al. 2018), and distributions of returns in place of their means
+(Bellemare et al. 2017; Dabney et al. 2018). In addition, a network may learn roots of values (after
+Pohlen et al. 2018), and in an exogenous task ``all_actions`` learns every action's outcome from one
+move of the market. docs/algorithms/dqn.md lists every formula, its place in this file, and each
 deviation from the papers.
 """
 

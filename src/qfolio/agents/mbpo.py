@@ -5,7 +5,7 @@ reward, and whether the episode ends. From real observations the model then imag
 the policy, each predicted by a random member, and soft actor-critic learns from these steps, and
 from a share of real ones if one is set. Members differ in their initial weights and data: each
 counts a real transition 0, 1, 2, … times (on-line bootstrap, Oza & Russell 2001).
-docs/model_based.md lists formulas and deviations.
+docs/algorithms/model_based.md lists formulas and deviations.
 """
 
 import dataclasses

@@ -8,7 +8,7 @@ paths, as in ``pathwise.py``.
 With returns, several members learn which ones to expect, each without some blocks of the data. As
 in ``tilts.py``, what a member earns over the least variance in blocks that it has not seen is the
 evidence; without it, the policy is that of least variance.
-docs/mean_variance.md lists formulas and their sources.
+docs/algorithms/mean_variance.md lists formulas and their sources.
 """
 
 import equinox as eqx

@@ -3,7 +3,7 @@
 They act by drawing from the policy, and learn from rollouts of the current policy: each action's
 return is compared with the estimate (the advantage), the policy moves towards actions that did
 better, and the estimate towards the returns. ``reinforce.py``, ``a2c.py`` and ``ppo.py`` differ in
-how. docs/policy_gradients.md has the formulas.
+how. docs/algorithms/policy_gradients.md has the formulas.
 """
 
 import abc

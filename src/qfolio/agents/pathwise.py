@@ -4,7 +4,7 @@ If prices do not depend on our trades, the reward of a whole episode is a differ
 the policy: each action earns the market's next return, pays the cost of trading from the last
 holding, and leaves the next one. The gradient of the sum is exact for the paths seen; no action is
 perturbed to estimate it (Moody & Saffell 1998; Jiang et al. 2017, eq. 21–22, whose memory of
-previous weights is the holding here). docs/pathwise.md lists formulas and deviations.
+previous weights is the holding here). docs/algorithms/pathwise.md lists formulas and deviations.
 """
 
 import math

@@ -3,7 +3,7 @@
 A rollout is used for several epochs of gradient steps on minibatches. The clipped objective keeps
 the policy near the one that made the rollout: it does not reward a probability ratio beyond
 1 ± ``clip_range``. Advantages are generalised (Schulman et al. 2016).
-docs/policy_gradients.md has the formulas and the deviations from the paper.
+docs/algorithms/policy_gradients.md has the formulas and the deviations from the paper.
 """
 
 import jax

@@ -4,8 +4,8 @@ Whole episodes are played; then the policy takes one step along the gradient of 
 probabilities, each times the return that followed minus the baseline. No reward is replaced by an
 estimate: steps of an episode that is unfinished at the end of a rollout are left out. There is one
 exception: the baseline replaces the rewards that a time limit cuts off, unless
-``time_limit_terminal``. docs/policy_gradients.md has the formulas and the deviations from the
-paper.
+``time_limit_terminal``. docs/algorithms/policy_gradients.md has the formulas and the deviations
+from the paper.
 """
 
 from jax import lax

@@ -4,7 +4,7 @@ The agent maximises reward plus α times the policy's entropy. Two critics regre
 r + γ V'(s') with the soft value V(s) = E[min Q(s, a) − α log π(a|s)]; the actor ascends V; the
 temperature α is tuned so that the entropy meets a target. Actions are squashed normal numbers,
 weights on a simplex, or numbered (then expectations are sums, Christodoulou 2019).
-docs/actor_critic.md lists formulas and deviations.
+docs/algorithms/actor_critic.md lists formulas and deviations.
 """
 
 import math

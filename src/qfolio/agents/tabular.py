@@ -10,7 +10,7 @@ in v(s'), the estimate of the next state's value:
 - Double Q-learning (van Hasselt 2010): two tables; one selects the best action, the other values
   it, and a fair coin decides which of them learns.
 
-docs/tabular.md lists every formula and each deviation from the papers.
+docs/algorithms/tabular.md lists every formula and each deviation from the papers.
 """
 
 from typing import NamedTuple, TypeVar

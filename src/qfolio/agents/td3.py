@@ -2,8 +2,8 @@
 
 DDPG with three changes against overestimation: the Bellman target takes the smaller of two critics'
 estimates; noise on its action smooths the value over similar actions; and the actor and all targets
-are updated only once for several steps of the critics. docs/actor_critic.md lists formulas and
-deviations.
+are updated only once for several steps of the critics. docs/algorithms/actor_critic.md lists
+formulas and deviations.
 """
 
 from typing import ClassVar

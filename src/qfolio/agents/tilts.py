@@ -8,7 +8,7 @@ net utility through whole paths, as in ``pathwise.py``.
 Several members learn side by side, each without some blocks of the data. What a member earns over
 the anchor in the blocks that it has not seen is the evidence: the policy, the mean of the members,
 is shrunk to the anchor by it, after James & Stein (1961), and stays there without it.
-docs/tilts.md lists formulas and their sources.
+docs/algorithms/tilts.md lists formulas and their sources.
 """
 
 import equinox as eqx

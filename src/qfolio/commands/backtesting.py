@@ -38,7 +38,7 @@ class Options(Reading):
         test: Length of a fold, after which agents are retrained.
         rolling: Train on a window of fixed length instead of all rows so far.
         cap: Largest weight of one asset, from 0 to 1.
-        mandate: File with the limits of all orders (TOML; see docs/mandate.md).
+        mandate: File with the limits of all orders (TOML; see docs/guides/mandate.md).
         cost_model: Cost of trading and holding: proportional, itemized or your own as module:Name;
             settings follow in brackets, as in "itemized(fixed=5, cash_rate=0.03)".
         calendar: When all strategies may trade: weekly, monthly, quarterly, yearly, or a number of

@@ -68,7 +68,7 @@ def train(
         seed: First seed; the others follow it (default: 0).
         out: New folder for the run (default: one in runs/).
         assignments: Settings of agent and task, for example --set discount=0.98 hidden=256,256; a
-            report and docs/dqn.md list them.
+            report and docs/algorithms/dqn.md list them.
         resume: Folder of a run to resume, up to --episodes or --steps if given.
         on: Where seeds train: here, processes:4 (or another number), ray or ray://HOST:10001.
         track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as

@@ -73,7 +73,7 @@ class CNN(eqx.Module):
     Filters cover three rows of a window (time, channel), or 3 × 3 pixels of an image (height,
     width, channel); there are ``width`` / 8 (16 for 128, as in MinAtar, Young & Tian 2019). On a
     CPU, small convolutions are faster as one matrix product over copied neighbourhoods than XLA's
-    own (docs/networks.md).
+    own (docs/concepts/networks.md).
     """
 
     first: MLP

@@ -4,8 +4,8 @@
 looks back on and the latest rows that it skips; a user's own are ``module:Name``, with rows or
 without, and ``feature:NAME`` is a column of the table. Agents observe them after the log return and
 the table's own features. By default each is ranked across assets, from −1 to 1, and nothing has to
-be fitted; a number that all assets share stays as it is. docs/signals.md lists formulas and
-sources.
+be fitted; a number that all assets share stays as it is. docs/concepts/signals.md lists formulas
+and sources.
 """
 
 import abc

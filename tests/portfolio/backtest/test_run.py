@@ -271,13 +271,13 @@ def test_large_tables_of_weights_have_the_last_row_of_each_day_or_month():
 
 
 def test_looks_at_the_default_table_count_as_trials(finished):
-    """They count on top of --trials, and docs/results.md admits as many."""
+    """They count on top of --trials, and docs/results/real_prices.md admits as many."""
     entries, _ = finished.entries()
     prices = dataclasses.replace(table(), source=DEFAULT_SOURCE)
     known = create(prices=prices, trials=3)
     assert known.assess(entries).earlier_trials == 3 + DEFAULT_TRIALS
     assert finished.assess(entries).earlier_trials == 0
-    results = Path(__file__).parents[3] / "docs" / "results.md"
+    results = Path(__file__).parents[3] / "docs" / "results" / "real_prices.md"
     (said,) = re.findall(r"\*\*(\d+) earlier trials\*\*", results.read_text(encoding="utf-8"))
     assert int(said) == DEFAULT_TRIALS
 

@@ -25,7 +25,7 @@
     minimum = 1.0
     cash_rate = 0.03
 
-docs/mandate.md describes every key. ``checks.py`` says whether the limits can be met.
+docs/guides/mandate.md describes every key. ``checks.py`` says whether the limits can be met.
 """
 
 import csv
@@ -119,7 +119,7 @@ class Mandate(Section, frozen=True):
         except OSError as error:
             raise QfolioError(f"The mandate {path} cannot be read: {error.strerror}.") from None
         except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise QfolioError(f"{path} is no TOML: {error}; see docs/mandate.md.") from None
+            raise QfolioError(f"{path} is no TOML: {error}; see docs/guides/mandate.md.") from None
         groups = content.get("groups")
         file = groups.pop("file", None) if isinstance(groups, dict) else None
         mandate = _converted(content, str(path))
@@ -284,7 +284,7 @@ def _converted(content: Any, source: str) -> Mandate:
             ) from None
         raise QfolioError(
             f"{source}: {where or 'the mandate'}: {text[:1].lower()}{text[1:]}; see "
-            "docs/mandate.md."
+            "docs/guides/mandate.md."
         ) from None
 
 

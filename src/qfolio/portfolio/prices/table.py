@@ -27,7 +27,7 @@ DEFAULT_NOTE = (
     "that hold them look better than they could have been at the time."
 )
 DEFAULT_TRIALS = 177
-"""Earlier trials on the default table, as docs/results.md lists them."""
+"""Earlier trials on the default table, as docs/results/real_prices.md lists them."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Why an agent earned what it earned: all attributions of a backtest.
 
 Each agent is explained by the policy that ``allocate`` follows, the mean of all its seeds.
-docs/why.md lists formulas and sources.
+docs/guides/why.md lists formulas and sources.
 """
 
 from collections.abc import Mapping

@@ -1,0 +1,30 @@
+"""Settings of the documentation; `make docs` builds it, and any warning fails the build."""
+
+from pygments.lexers.special import TextLexer
+from sphinx.highlighting import lexers
+
+from qfolio.core.version import __version__
+
+project = "qfolio"
+copyright = "The qfolio developers"
+release = version = __version__
+
+extensions = ["myst_nb", "sphinx_copybutton"]
+exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
+nitpicky = True
+
+myst_enable_extensions = ["colon_fence", "dollarmath", "html_image"]
+myst_heading_anchors = 4
+# Notebooks run when they change; an error or a cell of more than two minutes fails the build.
+nb_execution_mode = "cache"
+nb_execution_timeout = 120
+nb_execution_raise_on_error = True
+
+html_theme = "furo"
+html_title = "qfolio"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sphinx = False
+lexers["csv"] = TextLexer()  # Pygments has none
+copybutton_prompt_text = "$ "
