@@ -1,17 +1,31 @@
 """Settings of the documentation; `make docs` builds it, and any warning fails the build."""
 
+import sys
+from pathlib import Path
+
+import jax
 from pygments.lexers.special import TextLexer
 from sphinx.highlighting import lexers
 
 from qfolio.core.version import __version__
 
+jax.Array.__module__ = "jax"  # where its users find it
+sys.path.append(str(Path(__file__).parent / "_extensions"))
+
 project = "qfolio"
 copyright = "The qfolio developers"
 release = version = __version__
 
-extensions = ["myst_nb", "sphinx_copybutton"]
+extensions = [
+    "myst_nb",
+    "reference",
+    "signatures",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
-nitpicky = True
 
 myst_enable_extensions = ["colon_fence", "dollarmath", "html_image"]
 myst_heading_anchors = 4
@@ -19,6 +33,11 @@ myst_heading_anchors = 4
 nb_execution_mode = "cache"
 nb_execution_timeout = 120
 nb_execution_raise_on_error = True
+
+autodoc_member_order = "bysource"
+napoleon_use_ivar = True
+maximum_signature_line_length = 80
+python_use_unqualified_type_names = True
 
 html_theme = "furo"
 html_title = "qfolio"

@@ -17,10 +17,8 @@ def main() -> NoReturn:
     run()
 
 
-def run() -> NoReturn:
-    """Runs the command line; a QfolioError becomes one sentence and exit code 2."""
-    import tyro
-
+def commands() -> dict[str, Callable[..., Any]]:
+    """All commands by name."""
     from qfolio.commands.allocation import allocate, follow
     from qfolio.commands.board import board
     from qfolio.commands.comparison import compare
@@ -30,17 +28,24 @@ def run() -> NoReturn:
     from qfolio.commands.study import study
     from qfolio.commands.training import evaluate, train, watch
     from qfolio.commands.tuning import tune
-    from qfolio.core.errors import QfolioError
 
-    commands: dict[str, Callable[..., Any]] = {
+    return {
         "backtest": backtest, "allocate": allocate, "follow": follow, "prices": prices,
         "study": study, "train": train, "compare": compare, "evaluate": evaluate, "watch": watch,
         "tune": tune, "continual": continual, "board": board, "report": report,
     }  # fmt: skip
+
+
+def run() -> NoReturn:
+    """Runs the command line; a QfolioError becomes one sentence and exit code 2."""
+    import tyro
+
+    from qfolio.core.errors import QfolioError
+
     try:
         try:
             tyro.extras.subcommand_cli_from_dict(
-                commands,
+                commands(),
                 prog="qfolio",
                 description="Reinforcement learning for portfolio optimization, "
                 "graded against exact optima.",

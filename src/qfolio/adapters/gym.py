@@ -328,6 +328,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         return self._as_numpy(observation), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One step of the task; raises QfolioError after the end of an episode."""
         if self._steps >= self.task.horizon:
             raise QfolioError("The episode is over; call reset() first.")
         numbered = isinstance(self.action_space, spaces.Discrete)

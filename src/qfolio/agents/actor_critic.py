@@ -141,14 +141,14 @@ class ActorCritic(Agent, Generic[L]):
     hidden: tuple[int, ...] = sizes(256, 256)  # of actor and critics
     num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    batch_size: int = static(256)
+    batch_size: int = static(256)  # transitions of a gradient step
     gradient_steps: int = static(1)  # gradient steps per step of all environments
     n_steps: int = static(1)  # of a target's return
     replay_capacity: int = static(100_000)  # transitions
     learning_starts: int = static(1000)  # transitions by random actions before learning
     tau: float = number(0.005)  # step of the targets towards the online networks
-    discount: float = number(0.99)
-    learning_rate: float = number(1e-3)
+    discount: float = number(0.99)  # γ
+    learning_rate: float = number(1e-3)  # of actor and critics
     learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
     actor_learning_rate_ratio: float = number(0.3)  # the actor's, as a share of the critics'

@@ -70,15 +70,15 @@ class DQN(Agent):
     """A deep Q-network; the defaults are those of the report that qfolio grew out of."""
 
     network: str = static("flat")  # over everything observed; or one of networks.KINDS
-    hidden: tuple[int, ...] = sizes(256, 256)
+    hidden: tuple[int, ...] = sizes(256, 256)  # units of each hidden layer
     num_envs: int = static(1)  # stepped side by side
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    batch_size: int = static(64)
+    batch_size: int = static(64)  # transitions of a gradient step
     train_freq: int = static(1)  # steps of all environments between updates
     gradient_steps: int = static(1)  # gradient steps of an update
     replay_capacity: int = static(50_000)  # transitions
     learning_starts: int = static(64)  # transitions stored before learning
-    double: bool = static(False)
+    double: bool = static(False)  # the online network chooses the action of a target
     dueling: bool = static(False)  # a stream for the state's value and one for advantages
     n_steps: int = static(1)  # of a target's return
     prioritized: bool = static(False)  # transitions are drawn in proportion to their errors
@@ -87,8 +87,8 @@ class DQN(Agent):
     importance_steps: float = number(1e5)  # gradient steps until β is 1
     values: str = static("expected")  # of returns: expected, categorical or quantile
     atoms: int = static(51)  # numbers for each action, if values are a distribution
-    v_min: float = number(-10.0)  # ends of categorical's support, in units of scaled reward
-    v_max: float = number(10.0)
+    v_min: float = number(-10.0)  # lower end of categorical's support, in units of scaled reward
+    v_max: float = number(10.0)  # upper end of it
     noisy: bool = static(False)  # explore by learned noise on weights, in addition to ε
     noise_scale: float = number(0.5)  # σ₀
     all_actions: bool = static(False)  # learn all actions at once, from random holdings
@@ -99,15 +99,15 @@ class DQN(Agent):
     time_limit_terminal: bool = static(False)  # wrong, but often done
     target_update_interval: int = static(200)  # steps between target updates
     tau: float = number(1.0)  # step towards the online network; 1 copies it
-    discount: float = number(0.99)
-    learning_rate: float = number(1e-3)
+    discount: float = number(0.99)  # γ
+    learning_rate: float = number(1e-3)  # at the start
     learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
     optimizer: str = static("adam")  # or rmsprop, rmsprop-centered, sgd
     rmsprop_decay: float = constant(0.95)  # of the running mean of squared gradients
     optimizer_epsilon: float = constant(1e-8)  # added to the divisor of a gradient
-    epsilon_start: float = number(1.0)
-    epsilon_end: float = number(0.01)
+    epsilon_start: float = number(1.0)  # share of random actions at the start
+    epsilon_end: float = number(0.01)  # least share of random actions
     epsilon_decay: float = number(0.995)  # factor per finished episode
     epsilon_steps: float = constant(0.0)  # of a linear decay in steps; 0: use epsilon_decay
     persistence: float = constant(0.0)  # share of exploring steps that repeat the last action

@@ -164,7 +164,7 @@ class MBPO(SAC):
     ensemble_size: int = static(5)  # networks in the ensemble
     elites: int = static(0)  # members that imagine, those with the least error; 0: all
     gaussian_model: bool = static(False)  # members predict normal distributions; false: means
-    model_hidden: tuple[int, ...] = sizes(128, 128)
+    model_hidden: tuple[int, ...] = sizes(128, 128)  # units of each hidden layer of the model
     model_updates: int = static(4)  # gradient steps of the model per step of all environments
     model_learning_rate_ratio: float = number(1.0)  # its learning rate, as a share of the critics'
     model_rollout_batch: int = static(64)  # real observations that rollouts of the model start from

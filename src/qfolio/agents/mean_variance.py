@@ -122,7 +122,7 @@ class MeanVariance(Onlooker):
     head: int = static(21)  # of these, first steps that only lead to a holding
     every: int = static(7)  # steps from a covariance to the next one, in training
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    learning_rate: float = number(0.05)
+    learning_rate: float = number(0.05)  # of Adam
     learning_rate_final: float = number(0.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(80.0)  # gradient steps of the cosine
     risk_aversion: float = number(10.0)  # half of it times variance is worth a return, or a cost

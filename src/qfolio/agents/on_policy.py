@@ -78,8 +78,8 @@ class OnPolicy(Agent):
     num_envs: int = static(8)  # stepped side by side
     rollout_length: int = static(128)  # steps of each environment that are learned from at once
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    discount: float = number(0.99)
-    learning_rate: float = number(3e-4)
+    discount: float = number(0.99)  # γ
+    learning_rate: float = number(3e-4)  # at the start
     learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
     optimizer: str = static("adam")  # or rmsprop, rmsprop-centered, sgd

@@ -121,7 +121,7 @@ class SAC(ActorCritic[Learned]):
     """A stochastic actor, two critics with targets, and a temperature."""
 
     spread: float = number(0.184)  # target entropy, as a share of the actions; Haarnoja: e⁻¹/2
-    initial_temperature: float = number(1.0)
+    initial_temperature: float = number(1.0)  # weight of the entropy at the start
 
     def __check_init__(self) -> None:
         scales = "spread initial_temperature"

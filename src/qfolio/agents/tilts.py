@@ -149,7 +149,7 @@ class Tilts(Onlooker):
     rollout_length: int = static(84)  # steps of a path
     head: int = static(21)  # of these, first steps that only lead to a holding
     episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    learning_rate: float = number(0.1)
+    learning_rate: float = number(0.1)  # of Adam
     learning_rate_final: float = number(0.0)  # share of it that remains at the end of the cosine
     learning_rate_steps: float = number(80.0)  # gradient steps of the cosine
     tracking_aversion: float = number(10.0)  # of the variance of rewards over the anchor's

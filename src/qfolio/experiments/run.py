@@ -73,7 +73,7 @@ class Run:
 
         Args:
             task, agent: The task, and the agent that learns it.
-            budget: The budget of each seed; or as a number:
+            budget: The budget of each seed, unless one of the next two is given.
             episodes, steps: One of the two. Steps are those of all environments of a seed.
             seeds, seed: How many agents, and the first one's seed; the others have the next ones.
             preset: The name of the settings, for readers.

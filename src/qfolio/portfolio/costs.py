@@ -102,7 +102,7 @@ class CostModel(abc.ABC):
 class Proportional(CostModel):
     """A share of the value traded, one way; holding costs nothing and cash earns nothing."""
 
-    cost: float = 0.001
+    cost: float = 0.001  # one way, as a share of the value traded
     gross: float = 1.0  # the largest sum of absolute weights of the assets
 
     def trade(self, before: Any, after: Any, context: Context) -> tuple[Any, dict[str, Any]]:

@@ -193,6 +193,7 @@ class Market(ExogenousTask):
 
     @property
     def actions(self) -> Actions:
+        """The allocations of the menu; without one, all weights of the assets and cash."""
         return self._menu.actions if self.menu else Simplex(self.limits.shape[0])
 
     @property

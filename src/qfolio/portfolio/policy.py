@@ -196,6 +196,7 @@ class Policy:
 
     @property
     def seeds(self) -> int:
+        """How many members the policy has, one for each seed."""
         return int(jax.tree.leaves(self.members)[0].shape[0])
 
     @property

@@ -216,6 +216,7 @@ class Portfolio(Market):
 
     @property
     def actions(self) -> Actions:
+        """The allocations of the menu; without one, all weights up to the largest."""
         if self.menu:
             return super().actions
         most = largest_weight(self.mandate) if self.mandate else 1.0

@@ -33,9 +33,9 @@ class Catch(Task):
     (rows, columns, 1), pixels 0 or 1. Start: the paddle in the middle, all columns random.
     """
 
-    rows: int = static(10)
-    columns: int = static(5)
-    decoys: int = static(0)
+    rows: int = static(10)  # of the image, in pixels
+    columns: int = static(5)  # of the image, in pixels
+    decoys: int = static(0)  # things that fall beside the ball
 
     def __check_init__(self) -> None:
         require(self, "rows columns", lambda x: 3 <= x <= 256, "from 3 to 256")

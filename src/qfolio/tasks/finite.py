@@ -46,7 +46,7 @@ class FiniteMDP(Task):
     start: Float[np.ndarray, " state"]
     terminal: Bool[np.ndarray, " state"]
     successors: Int[np.ndarray, "state action outcome"]
-    horizon: int = static(100)
+    horizon: int = static(100)  # steps of an episode
 
     def __init__(
         self,
@@ -115,6 +115,7 @@ class FiniteMDP(Task):
 
     @property
     def actions(self) -> Discrete:
+        """The actions, as many in every state."""
         return Discrete(self.transitions.shape[1])
 
     def reset(self, key: PRNGKeyArray) -> Int[Array, ""]:
@@ -142,8 +143,8 @@ class Cliff(FiniteMDP):
     ``slippery``, the step goes that way or to either side, with probability 1/3 each.
     """
 
-    slippery: bool = static(False)
-    horizon: int = static(200)
+    slippery: bool = static(False)  # steps may go to a side
+    horizon: int = static(200)  # steps of an episode
 
     def __init__(self, slippery: bool = False, horizon: int = 200) -> None:
         self.slippery = slippery
@@ -180,9 +181,9 @@ class FrozenLake(FiniteMDP):
     either side, with probability 1/3 each. horizon: 0 for Gymnasium's, 100 and 200 steps.
     """
 
-    size: int = static(4)
-    slippery: bool = static(True)
-    horizon: int = static(0)
+    size: int = static(4)  # cells of a side: 4 or 8
+    slippery: bool = static(True)  # steps may go to a side
+    horizon: int = static(0)  # 0: Gymnasium's, 100 or 200
 
     def __init__(self, size: int = 4, slippery: bool = True, horizon: int = 0) -> None:
         self.size, self.slippery = size, slippery
@@ -211,11 +212,11 @@ class Garnet(FiniteMDP):
     interval at random points, and has a standard normal reward. It never ends.
     """
 
-    n_states: int = static(50)
-    n_actions: int = static(4)
-    branching: int = static(3)
-    seed: int = static(0)
-    horizon: int = static(100)
+    n_states: int = static(50)  # states
+    n_actions: int = static(4)  # actions in each state
+    branching: int = static(3)  # states that an action may lead to
+    seed: int = static(0)  # of the process itself
+    horizon: int = static(100)  # steps of an episode
 
     def __init__(
         self,

@@ -26,9 +26,9 @@ class GridPendulum(Pendulum):
     cell. Speeds at the limit have half a cell.
     """
 
-    torques: int = static(3)
-    angles: int = static(101)
-    speeds: int = static(61)
+    torques: int = static(3)  # choices of torque
+    angles: int = static(101)  # cells of the angle
+    speeds: int = static(61)  # cells of the speed
 
     def __check_init__(self) -> None:
         require(self, "torques", lambda x: 2 <= x <= 1001, "from 2 to 1001, for a table")

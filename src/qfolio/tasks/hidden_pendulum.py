@@ -26,9 +26,9 @@ class HiddenPendulum(Task):
     this is an upper bound that cannot quite be reached.
     """
 
-    window: int = static(4)
+    window: int = static(4)  # rows that are observed
     torques: int = static(11)  # 0: any torque
-    horizon: int = static(200)
+    horizon: int = static(200)  # steps of an episode
 
     def __check_init__(self) -> None:
         require(self, "window", lambda x: 1 <= x <= 256, "from 1 to 256")

@@ -34,7 +34,7 @@ class Pendulum(Task):
     """
 
     torques: int = static(11)  # 0: any torque
-    horizon: int = static(200)
+    horizon: int = static(200)  # steps of an episode
     gravity: float = number(10.0)  # m/s²
     mass: float = number(1.0)  # kg
     length: float = number(1.0)  # m

@@ -24,14 +24,14 @@ class Ar1Market(NamedTuple):
 class Ar1(OneAsset):
     """One asset whose mean return follows a signal: x' = ρx + noise ε, r = drift + slope·x + ση."""
 
-    rho: float = number(0.95)
-    noise: float = number(0.3122)
-    drift: float = number(0.0002)
-    slope: float = number(0.004)
-    volatility: float = number(0.01)
-    cost: float = constant(0.002)
-    menu: str = static("")
-    horizon: int = static(252)
+    rho: float = number(0.95)  # persistence of the signal
+    noise: float = number(0.3122)  # of the signal, a step
+    drift: float = number(0.0002)  # mean return without a signal, a step
+    slope: float = number(0.004)  # mean return for a signal of 1
+    volatility: float = number(0.01)  # of the return, a step
+    cost: float = constant(0.002)  # one way, as a share of the value traded
+    menu: str = static("")  # such as grid:10; empty: any weights
+    horizon: int = static(252)  # steps of an episode
 
     levels = 11
     optimum_discount = 0.97

@@ -43,9 +43,9 @@ class QuadraticCosts(Synthetic):
     paper's objective.
     """
 
-    risk_aversion: float = number(1.0)
-    rho: float = number(0.01)
-    horizon: int = static(300)
+    risk_aversion: float = number(1.0)  # γ
+    rho: float = number(0.01)  # discount rate, a step
+    horizon: int = static(300)  # steps of an episode
 
     def __check_init__(self) -> None:
         require(self, "rho", lambda x: 0 < x < 1, "above 0 and below 1")
@@ -115,11 +115,11 @@ class QuadraticCosts(Synthetic):
 class GarleanuPedersen(QuadraticCosts):
     """One asset and one signal; costs are ``cost_scale`` times the variance."""
 
-    loading: float = number(1.0)
-    phi: float = number(0.25)
-    noise: float = number(0.066)
-    cost_scale: float = number(5.0)
-    variance: float = number(0.04)
+    loading: float = number(1.0)  # mean return for a factor of 1
+    phi: float = number(0.25)  # share by which the factor fades in a step
+    noise: float = number(0.066)  # of the factor, a step
+    cost_scale: float = number(5.0)  # cost of a trade over the variance
+    variance: float = number(0.04)  # of the return, a step
 
     def __check_init__(self) -> None:
         require(self, "phi", lambda x: 0 < x <= 1, "above 0 and at most 1")
@@ -144,7 +144,7 @@ class Signals(QuadraticCosts):
     traded equally fast, and a position in one asset depends on those in the others.
     """
 
-    cost_scale: float = number(1.0)
+    cost_scale: float = number(1.0)  # factor on all costs
 
     def __check_init__(self) -> None:
         require(self, "cost_scale", lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")

@@ -16,11 +16,11 @@ from qfolio.solvers.kelly import kelly
 class Kelly(OneAsset):
     """A repeated bet: the stake is multiplied by ``up`` with ``probability``, else by ``down``."""
 
-    up: float = number(1.1)
-    down: float = number(0.9)
-    probability: float = number(0.53)
-    menu: str = static("")
-    horizon: int = static(100)
+    up: float = number(1.1)  # relative of the asset after a win
+    down: float = number(0.9)  # relative after a loss
+    probability: float = number(0.53)  # of a win
+    menu: str = static("")  # such as grid:10; empty: any weights
+    horizon: int = static(100)  # steps of an episode
 
     cost = 0.0
 

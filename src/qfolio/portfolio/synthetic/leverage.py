@@ -48,10 +48,10 @@ class Leverage(SyntheticMarket):
     """
 
     cash_rate: float = constant(0.02)  # a year, as the spread
-    borrow_spread: float = constant(0.03)
-    risk_aversion: float = number(2.0)
-    menu: str = static("")
-    horizon: int = static(100)
+    borrow_spread: float = constant(0.03)  # what a loan costs above cash_rate
+    risk_aversion: float = number(2.0)  # 1: log growth
+    menu: str = static("")  # such as grid:10; empty: any weights
+    horizon: int = static(100)  # quarters of an episode
 
     cost = 0.0
     reward = "crra"

@@ -27,8 +27,8 @@ class Liquidation(Synthetic):
     temporary: float = number(2.5)  # dollars a share for a million shares a day
     permanent: float = number(0.25)  # dollars a share for a million shares
     risk_aversion: float = number(1.0)  # per million dollars
-    days: float = number(5.0)
-    horizon: int = static(5)
+    days: float = number(5.0)  # of an episode
+    horizon: int = static(5)  # steps of an episode
 
     START = (0.5, 1.5)
     """The least and the most shares to sell, in millions."""

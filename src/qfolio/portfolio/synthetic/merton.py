@@ -37,8 +37,8 @@ class Merton(SyntheticMarket):
     conditions of Cover 1984); one asset is not worth holding.
     """
 
-    menu: str = static("")
-    horizon: int = static(100)
+    menu: str = static("")  # such as grid:10; empty: any weights
+    horizon: int = static(100)  # steps of an episode
 
     cost = 0.0
     means = (0.010, 0.006, 0.001)

@@ -30,13 +30,13 @@ class NoTrade(OneAsset):
     which is ``cash_rate``.
     """
 
-    rate: float = number(0.02)
-    cash_rate: float = constant(0.0)
-    volatility: float = number(0.2)
-    cost: float = constant(0.01)
-    dt: float = number(1 / 12)
-    menu: str = static("")
-    horizon: int = static(480)
+    rate: float = number(0.02)  # drift above that of cash, a year
+    cash_rate: float = constant(0.0)  # growth of cash, a year
+    volatility: float = number(0.2)  # of the asset, a year
+    cost: float = constant(0.01)  # one way, as a share of the value traded
+    dt: float = number(1 / 12)  # years of a step
+    menu: str = static("")  # such as grid:10; empty: any weights
+    horizon: int = static(480)  # steps of an episode
 
     NODES = 5
 

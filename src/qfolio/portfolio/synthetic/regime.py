@@ -22,11 +22,11 @@ class Regime(OneAsset):
     Two numbers are those of bad and of good times: stay=0.9,0.98 mean=-0.004,0.001.
     """
 
-    stay: tuple[float, ...] = numbers(0.95)
+    stay: tuple[float, ...] = numbers(0.95)  # probability that a regime lasts another step
     mean: tuple[float, ...] = numbers(0.002)  # log growth a step
-    cost: float = constant(0.005)
-    menu: str = static("")
-    horizon: int = static(250)
+    cost: float = constant(0.005)  # one way, as a share of the value traded
+    menu: str = static("")  # such as grid:10; empty: any weights
+    horizon: int = static(250)  # steps of an episode
 
     def __check_init__(self) -> None:
         one_or_two = "one number, or one for bad and one for good times"

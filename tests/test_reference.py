@@ -1,0 +1,77 @@
+"""What docs/reference/ must have: every public name, and what each setting means."""
+
+import importlib.util
+import inspect
+import re
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import qfolio
+from qfolio.cli import commands
+from qfolio.core import settings
+from qfolio.core.registry import ENTRIES, find
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = "\n".join(page.read_text() for page in sorted((DOCS / "reference").glob("*.md")))
+
+spec = importlib.util.spec_from_file_location("source", DOCS / "_extensions" / "source.py")
+assert spec is not None
+assert spec.loader is not None
+source = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(source)
+
+PARTS = {
+    (kind, name): find(kind, name) for kind, entries in ENTRIES.items() for name in entries.table
+}
+
+
+def resolve(path: str) -> Any:
+    """What a dotted path names."""
+    module, _, name = path.rpartition(".")
+    return getattr(import_module(module), name) if module else import_module(name)
+
+
+WRITTEN = {
+    path: resolve(path) for path in re.findall(r"auto(?:class|function|exception):: (\S+)", PAGES)
+}
+
+
+def test_every_public_name_has_its_reference():
+    assert {kind for kind in ENTRIES if f"{{parts}} {kind}\n" in PAGES} == set(ENTRIES)
+    there = {*WRITTEN.values(), *PARTS.values()}
+    public = {name: getattr(qfolio, name) for name in qfolio.__all__ if name != "__version__"}
+    public |= {
+        entries.base: resolve(entries.base.replace(":", ".")) for entries in ENTRIES.values()
+    }
+    assert {name for name, found in public.items() if found not in there} == set()
+
+
+def test_every_public_name_has_a_docstring():
+    documented = {**WRITTEN, **{f"{kind} {name}": found for (kind, name), found in PARTS.items()}}
+    silent = {name for name, found in documented.items() if not inspect.getdoc(found)}
+    for name, found in WRITTEN.items():
+        for member, value in vars(found).items() if isinstance(found, type) else ():
+            shown = isinstance(value, property) or inspect.isroutine(value)
+            if shown and not member.startswith("_") and not inspect.getdoc(getattr(found, member)):
+                silent.add(f"{name}.{member}")
+    assert silent == set()
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [key for key in PARTS if key[0] in ("agent", "task", "cost")]
+)
+def test_every_setting_has_a_meaning(kind, name):
+    """A comment beside it, or a sentence in its class's docstring that begins with its name."""
+    found = PARTS[kind, name]
+    parents = [parent for parent in found.__mro__ if parent.__module__.startswith("qfolio.")]
+    meant = {field for parent in parents for field in source.comments(parent)}
+    meant |= set(re.findall(r"\b(\w+)(?=(?:, \w+)*:)", inspect.getdoc(found) or ""))
+    assert settings.names(found) - meant == set()
+
+
+def test_every_command_says_what_it_does():
+    assert {name for name, command in commands().items() if not inspect.getdoc(command)} == set()
+    assert "{commands}" in PAGES
