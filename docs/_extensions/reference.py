@@ -61,9 +61,11 @@ def part(kind: Any, name: str) -> str:
     exported = getattr(qfolio, found.__name__, None) is found
     module = "qfolio" if exported else found.__module__
     text = [f"## {name}"]
-    text.append(f":::{{py:class}} {found.__name__}\n:module: {module}\n\n{described(found)}\n:::")
+    text.append(
+        f":::{{py:class}} {found.__name__}\n:module: {module}\n\n{linked(described(found))}\n:::"
+    )
     if dataclasses.is_dataclass(found):
-        rows = [[f"`{field}`", code(value), note] for field, value, note in fields(found)]
+        rows = [[f"`{field}`", code(value), linked(note)] for field, value, note in fields(found)]
         text.append(table(["Setting", "Default", "Meaning"], rows))
     rows = [
         [task, preset, code(chosen.settings), budget(chosen.budget), str(chosen.seeds)]

@@ -17,7 +17,7 @@ class A2C(OnPolicy):
 
     rollout_length: int = static(5)
     gae_lambda: float = number(1.0)  # λ of the advantages: 0 trusts the critic, 1 the rewards
-    learning_rate: float = number(7e-4)  # at the start
+    learning_rate: float = number(7e-4)  # step size at the start
     normalize_advantages: bool = static(False)
 
     def __check_init__(self) -> None:

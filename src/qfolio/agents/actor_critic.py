@@ -138,28 +138,28 @@ class ActorCritic(Agent, Generic[L]):
     """Settings, buffer and gradient steps; an algorithm adds what it learns and how it explores."""
 
     network: str = static("flat")  # the actor's; positions: also the critics', linear in them
-    hidden: tuple[int, ...] = sizes(256, 256)  # of actor and critics
-    num_envs: int = static(1)  # stepped side by side
-    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    batch_size: int = static(256)  # transitions of a gradient step
+    hidden: tuple[int, ...] = sizes(256, 256)  # units of each hidden layer of actor and critics
+    num_envs: int = static(1)  # environments stepped side by side
+    episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
+    batch_size: int = static(256)  # transitions per gradient step
     gradient_steps: int = static(1)  # gradient steps per step of all environments
-    n_steps: int = static(1)  # of a target's return
-    replay_capacity: int = static(100_000)  # transitions
+    n_steps: int = static(1)  # steps of the return in a target
+    replay_capacity: int = static(100_000)  # transitions that the replay buffer holds
     learning_starts: int = static(1000)  # transitions by random actions before learning
-    tau: float = number(0.005)  # step of the targets towards the online networks
-    discount: float = number(0.99)  # γ
-    learning_rate: float = number(1e-3)  # of actor and critics
-    learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
-    learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
-    actor_learning_rate_ratio: float = number(0.3)  # the actor's, as a share of the critics'
+    tau: float = number(0.005)  # targets' step towards the online networks
+    discount: float = number(0.99)  # γ, the discount of a step
+    learning_rate: float = number(1e-3)  # Adam's step size for the critics, at the start
+    learning_rate_final: float = number(1.0)  # share of learning_rate at the end of its cosine
+    learning_rate_steps: float = number(1e5)  # gradient steps of that cosine
+    actor_learning_rate_ratio: float = number(0.3)  # the actor's step size over the critics'
     reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
-    input_gain: float = number(0.0)  # of the first layer, on inputs scaled to ±1; 0: unscaled
-    normalize_observations: bool = static(False)  # to mean 0 and deviation 1, as seen so far
+    input_gain: float = number(0.0)  # gain of the first layer on inputs scaled to ±1; 0: unscaled
+    normalize_observations: bool = static(False)  # by their mean and deviation so far
     normalize_rewards: bool = static(False)  # by the deviation of discounted returns so far
     noise_theta: float = constant(1.0)  # mean reversion of the noise; 1: independent at each step
     huber_delta: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
     value_rescaling: bool = static(False)  # critics learn roots of values: small ones weigh more
-    clip_bootstrap: bool = static(True)  # to the range of values possible with the rewards so far
+    clip_bootstrap: bool = static(True)  # clips targets to values possible with rewards so far
 
     def __check_init__(self) -> None:
         self._replay.check()

@@ -88,7 +88,7 @@ class DDPG(ActorCritic[Learned]):
     """A deterministic actor and a critic, both with targets that follow them."""
 
     exploration_noise: float = number(0.1)  # standard deviation of the noise, in units of the bound
-    saturation_penalty: float = number(0.1)  # on outputs where tanh is flat; 0: none
+    saturation_penalty: float = number(0.1)  # penalty on outputs where tanh is flat; 0: none
     late_action: bool = static(False)  # the action enters the critic at its second layer
     critic_weight_decay: float = constant(0.0)  # coefficient of the critic's L2 penalty
     last_layer_bound: float = constant(0.0)  # last layers start uniform in ± it; 0: in ±1/√inputs

@@ -166,9 +166,9 @@ class MBPO(SAC):
     gaussian_model: bool = static(False)  # members predict normal distributions; false: means
     model_hidden: tuple[int, ...] = sizes(128, 128)  # units of each hidden layer of the model
     model_updates: int = static(4)  # gradient steps of the model per step of all environments
-    model_learning_rate_ratio: float = number(1.0)  # its learning rate, as a share of the critics'
+    model_learning_rate_ratio: float = number(1.0)  # the model's step size over the critics'
     model_rollout_batch: int = static(64)  # real observations that rollouts of the model start from
-    model_rollout_length: int = static(5)  # steps of each
+    model_rollout_length: int = static(5)  # steps of each such rollout
     model_replay_capacity: int = static(100_000)  # steps of the model that are kept
     real_ratio: float = constant(0.0)  # share of real steps in a batch of soft actor-critic
 

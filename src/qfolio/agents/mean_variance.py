@@ -114,19 +114,19 @@ class MeanVariance(Onlooker):
     """Gradient ascent on mean return less realised variance and costs."""
 
     returns: bool = static(True)  # learn expected returns, too
-    members: int = static(4)  # that learn them, each without every so-many-th block of the data
-    units: int = static(8)  # of the network that cleans eigenvalues
-    blocks: int = static(32)  # of the data, of equal length
+    members: int = static(4)  # members; each leaves out some blocks of the data
+    units: int = static(8)  # units of the network that cleans eigenvalues
+    blocks: int = static(32)  # equal blocks that the data are cut into
     num_envs: int = static(8)  # paths in a batch
     rollout_length: int = static(63)  # steps of a path
-    head: int = static(21)  # of these, first steps that only lead to a holding
+    head: int = static(21)  # first steps of these, which only lead to a holding
     every: int = static(7)  # steps from a covariance to the next one, in training
-    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    learning_rate: float = number(0.05)  # of Adam
-    learning_rate_final: float = number(0.0)  # share of it that remains at the end of the cosine
-    learning_rate_steps: float = number(80.0)  # gradient steps of the cosine
+    episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
+    learning_rate: float = number(0.05)  # step size at the start
+    learning_rate_final: float = number(0.0)  # share of learning_rate at the end of its cosine
+    learning_rate_steps: float = number(80.0)  # gradient steps of that cosine
     risk_aversion: float = number(10.0)  # half of it times variance is worth a return, or a cost
-    ridge: float = number(3.0)  # on squared changes of what is learned, divided by the data's moves
+    ridge: float = number(3.0)  # penalty on squared changes of the learned, per move
     threshold: float = number(2.0)  # t-statistic up to which no returns are expected
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 

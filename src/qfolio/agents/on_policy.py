@@ -71,30 +71,30 @@ class Batch(NamedTuple):
 class OnPolicy(Agent):
     """Acting, the networks and the optimiser's step; subclasses define ``improve``."""
 
-    network: str = static("flat")  # over everything observed; or one of networks.KINDS
-    hidden: tuple[int, ...] = sizes(64, 64)  # of the actor, and of the critic
-    activation: str = static("relu")  # of the hidden units; or tanh, silu
-    initialization: str = static("uniform")  # in ±1/√inputs; or orthogonal
-    num_envs: int = static(8)  # stepped side by side
+    network: str = static("flat")  # flat, or a kind of docs/concepts/networks.md
+    hidden: tuple[int, ...] = sizes(64, 64)  # units of each hidden layer of actor and critic
+    activation: str = static("relu")  # relu, tanh or silu
+    initialization: str = static("uniform")  # uniform (in ±1/√inputs) or orthogonal
+    num_envs: int = static(8)  # environments stepped side by side
     rollout_length: int = static(128)  # steps of each environment that are learned from at once
-    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    discount: float = number(0.99)  # γ
-    learning_rate: float = number(3e-4)  # at the start
-    learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
-    learning_rate_steps: float = number(1e5)  # gradient steps of the cosine
-    optimizer: str = static("adam")  # or rmsprop, rmsprop-centered, sgd
-    rmsprop_decay: float = constant(0.99)  # of the running mean of squared gradients
+    episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
+    discount: float = number(0.99)  # γ, the discount of a step
+    learning_rate: float = number(3e-4)  # step size at the start
+    learning_rate_final: float = number(1.0)  # share of learning_rate at the end of its cosine
+    learning_rate_steps: float = number(1e5)  # gradient steps of that cosine
+    optimizer: str = static("adam")  # adam, rmsprop, rmsprop-centered or sgd
+    rmsprop_decay: float = constant(0.99)  # decay of RMSProp's mean of squared gradients
     optimizer_epsilon: float = constant(1e-8)  # added to the divisor of a gradient
     max_grad_norm: float = number(0.5)  # longer gradients are rescaled to it
-    value_coef: float = number(0.5)  # of the critic's mean squared error in the loss
-    entropy_coef: float = number(0.0)  # of the policy's entropy, which the loss rewards
-    initial_std: float = number(1.0)  # in units of the bound, or of the logits of weights
-    normalize_advantages: bool = static(True)  # to mean 0 and deviation 1 over a batch
-    time_limit_terminal: bool = static(False)  # treats truncations as terminal
-    saturation_penalty: float = number(0.1)  # on means far beyond the bounds; 0: none
+    value_coef: float = number(0.5)  # weight of the critic's squared error in the loss
+    entropy_coef: float = number(0.0)  # weight of the policy's entropy in the loss
+    initial_std: float = number(1.0)  # of actions, in units of the bound, or of logits
+    normalize_advantages: bool = static(True)  # gives advantages mean 0, deviation 1 in a batch
+    time_limit_terminal: bool = static(False)  # treats a time limit as an end, which is wrong
+    saturation_penalty: float = number(0.1)  # penalty on means far beyond the bounds; 0: none
     reward_scale: float = number(1.0)  # the critic learns values of scaled rewards
-    input_gain: float = number(0.0)  # of the first layer, on inputs scaled to ±1; 0: unscaled
-    normalize_observations: bool = static(False)  # to mean 0 and deviation 1, as seen so far
+    input_gain: float = number(0.0)  # gain of the first layer on inputs scaled to ±1; 0: unscaled
+    normalize_observations: bool = static(False)  # by their mean and deviation so far
     normalize_rewards: bool = static(False)  # by the deviation of discounted returns so far
 
     def __check_init__(self) -> None:

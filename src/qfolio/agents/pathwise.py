@@ -178,17 +178,17 @@ class Pathwise(OnPaths):
     hidden: tuple[int, ...] = sizes(32, 32)  # units of each hidden layer
     num_envs: int = static(64)  # paths in a batch, without mirror images
     rollout_length: int = static(50)  # steps of each path that a gradient goes through
-    tail: int = static(0)  # of these, last steps without a gradient of their own
+    tail: int = static(0)  # last steps of these, without a gradient of their own
     bootstrap: bool = static(False)  # learn what the last holdings are worth after the rollout
-    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
+    episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
     gradient_steps: int = static(1)  # gradient steps per rollout
-    learning_rate: float = number(1e-3)  # of Adam
-    learning_rate_final: float = number(1.0)  # share of it that remains at the end of the cosine
-    learning_rate_steps: float = number(1e4)  # gradient steps of the cosine
-    slope_learning_rate_ratio: float = number(20.0)  # of bootstrap, as a share of the band's
+    learning_rate: float = number(1e-3)  # step size at the start
+    learning_rate_final: float = number(1.0)  # share of learning_rate at the end of its cosine
+    learning_rate_steps: float = number(1e4)  # gradient steps of that cosine
+    slope_learning_rate_ratio: float = number(20.0)  # rate of bootstrap, as a share of the band's
     max_grad_norm: float = number(math.inf)  # longer gradients are rescaled to it
     reward_scale: float = number(1.0)  # rewards are multiplied by it
-    simplex_penalty: float = number(0.01)  # on weights off the simplex, where the gradient is zero
+    simplex_penalty: float = number(0.01)  # penalty on weights off the simplex
 
     def __check_init__(self) -> None:
         if self.network not in SHARED:

@@ -24,7 +24,7 @@ class PPO(OnPolicy):
     num_envs: int = static(1)
     rollout_length: int = static(2048)
     epochs: int = static(10)  # passes over each rollout
-    batch_size: int = static(64)  # steps of a gradient step
+    batch_size: int = static(64)  # steps per gradient step
     gae_lambda: float = number(0.95)  # λ of the advantages: 0 trusts the critic, 1 the rewards
     clip_range: float = number(0.2)  # ε: largest rewarded change of a probability ratio
 

@@ -20,7 +20,7 @@ from qfolio.core.mdp import Metrics, Task, Transition
 class REINFORCE(OnPolicy):
     """REINFORCE with a learned baseline."""
 
-    rollout_length: int = static(200)  # a multiple of the longest episode
+    rollout_length: int = static(200)  # steps learned from at once: whole episodes
 
     def init(self, task: Task, key: PRNGKeyArray) -> OnPolicyState:
         episode = min(self.episode_steps or task.horizon, task.horizon)

@@ -120,7 +120,7 @@ class Policy(NamedTuple):
 class SAC(ActorCritic[Learned]):
     """A stochastic actor, two critics with targets, and a temperature."""
 
-    spread: float = number(0.184)  # target entropy, as a share of the actions; Haarnoja: e⁻¹/2
+    spread: float = number(0.184)  # target entropy, as a share of the actions
     initial_temperature: float = number(1.0)  # weight of the entropy at the start
 
     def __check_init__(self) -> None:

@@ -70,15 +70,15 @@ State = TypeVar("State", bound=TableState)
 class Tabular(Agent):
     """A table of action values and ε-greedy actions; subclasses define ``learn``."""
 
-    num_envs: int = static(1)  # stepped side by side
-    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    discount: float = number(0.99)  # γ
-    learning_rate: float = number(0.1)  # α
+    num_envs: int = static(1)  # environments stepped side by side
+    episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
+    discount: float = number(0.99)  # γ, the discount of a step
+    learning_rate: float = number(0.1)  # α: how far an entry moves towards its target
     learning_rate_decay: float = number(0.0)  # d: after n updates of an entry, α/(1 + d n)
     initial_value: float = number(0.0)  # of every entry; above the largest return: optimism
     epsilon_start: float = number(1.0)  # share of random actions at the start
     epsilon_end: float = number(0.01)  # least share of random actions
-    epsilon_decay: float = number(0.995)  # factor per finished episode
+    epsilon_decay: float = number(0.995)  # factor on ε per finished episode
 
     count = 1  # of tables
 

@@ -23,10 +23,10 @@ from qfolio.learning.targets import smallest
 class TD3(DDPG):
     """DDPG with two critics, a smoothed target and a delayed actor."""
 
-    target_noise: float = number(0.2)  # of the target's action, in units of the bound
+    target_noise: float = number(0.2)  # noise on the target's action, in units of the bound
     target_noise_clip: float = number(0.5)  # the largest such noise
     policy_delay: int = static(2)  # critics' steps for one of the actor and the targets
-    pessimistic_actor: bool = static(True)  # ascends the smaller value; false: the first critic's
+    pessimistic_actor: bool = static(True)  # the actor ascends the smaller value
 
     critics: ClassVar[int] = 2
 

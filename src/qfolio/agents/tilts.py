@@ -141,19 +141,19 @@ class TiltsState(eqx.Module):
 class Tilts(Onlooker):
     """Gradient ascent on net utility, with a penalty on tracking error and on tilts."""
 
-    network: str = static("linear")  # or hidden or attention, which are added to linear scores
-    units: int = static(8)  # of such a network
-    members: int = static(4)  # each learns without every so-many-th block of the data
-    blocks: int = static(32)  # of the data, of equal length
+    network: str = static("linear")  # linear scores, or hidden or attention beside them
+    units: int = static(8)  # units of such a network
+    members: int = static(4)  # members; each leaves out some blocks of the data
+    blocks: int = static(32)  # equal blocks that the data are cut into
     num_envs: int = static(24)  # paths in a batch
     rollout_length: int = static(84)  # steps of a path
-    head: int = static(21)  # of these, first steps that only lead to a holding
-    episode_steps: int = static(0)  # training episodes are cut here; 0: the task's horizon
-    learning_rate: float = number(0.1)  # of Adam
-    learning_rate_final: float = number(0.0)  # share of it that remains at the end of the cosine
-    learning_rate_steps: float = number(80.0)  # gradient steps of the cosine
-    tracking_aversion: float = number(10.0)  # of the variance of rewards over the anchor's
-    ridge: float = number(0.3)  # on squared coefficients, divided by the moves of the data
+    head: int = static(21)  # first steps of these, which only lead to a holding
+    episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
+    learning_rate: float = number(0.1)  # step size at the start
+    learning_rate_final: float = number(0.0)  # share of learning_rate at the end of its cosine
+    learning_rate_steps: float = number(80.0)  # gradient steps of that cosine
+    tracking_aversion: float = number(10.0)  # aversion to the variance of rewards over the anchor's
+    ridge: float = number(0.3)  # penalty on squared coefficients, per move of the data
     threshold: float = number(2.0)  # t-statistic up to which the policy stays at the anchor
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 

@@ -33,8 +33,8 @@ class Catch(Task):
     (rows, columns, 1), pixels 0 or 1. Start: the paddle in the middle, all columns random.
     """
 
-    rows: int = static(10)  # of the image, in pixels
-    columns: int = static(5)  # of the image, in pixels
+    rows: int = static(10)  # rows of the image, in pixels
+    columns: int = static(5)  # columns of the image, in pixels
     decoys: int = static(0)  # things that fall beside the ball
 
     def __check_init__(self) -> None:

@@ -183,7 +183,7 @@ class FrozenLake(FiniteMDP):
 
     size: int = static(4)  # cells of a side: 4 or 8
     slippery: bool = static(True)  # steps may go to a side
-    horizon: int = static(0)  # 0: Gymnasium's, 100 or 200
+    horizon: int = static(0)  # steps of an episode; 0: Gymnasium's
 
     def __init__(self, size: int = 4, slippery: bool = True, horizon: int = 0) -> None:
         self.size, self.slippery = size, slippery
@@ -215,7 +215,7 @@ class Garnet(FiniteMDP):
     n_states: int = static(50)  # states
     n_actions: int = static(4)  # actions in each state
     branching: int = static(3)  # states that an action may lead to
-    seed: int = static(0)  # of the process itself
+    seed: int = static(0)  # seed of the process itself
     horizon: int = static(100)  # steps of an episode
 
     def __init__(

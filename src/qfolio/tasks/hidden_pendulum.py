@@ -27,7 +27,7 @@ class HiddenPendulum(Task):
     """
 
     window: int = static(4)  # rows that are observed
-    torques: int = static(11)  # 0: any torque
+    torques: int = static(11)  # choices of torque; 0: any torque
     horizon: int = static(200)  # steps of an episode
 
     def __check_init__(self) -> None:

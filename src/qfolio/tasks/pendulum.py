@@ -33,11 +33,11 @@ class Pendulum(Task):
     (Gymnasium: 200) an episode is truncated.
     """
 
-    torques: int = static(11)  # 0: any torque
+    torques: int = static(11)  # choices of torque; 0: any torque
     horizon: int = static(200)  # steps of an episode
-    gravity: float = number(10.0)  # m/s²
-    mass: float = number(1.0)  # kg
-    length: float = number(1.0)  # m
+    gravity: float = number(10.0)  # acceleration, m/s²
+    mass: float = number(1.0)  # of the rod, kg
+    length: float = number(1.0)  # of the rod, m
 
     max_torque = 2.0  # N m
     max_speed = 8.0  # rad/s

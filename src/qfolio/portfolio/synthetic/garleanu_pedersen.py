@@ -43,7 +43,7 @@ class QuadraticCosts(Synthetic):
     paper's objective.
     """
 
-    risk_aversion: float = number(1.0)  # γ
+    risk_aversion: float = number(1.0)  # γ: price of variance
     rho: float = number(0.01)  # discount rate, a step
     horizon: int = static(300)  # steps of an episode
 
@@ -117,9 +117,9 @@ class GarleanuPedersen(QuadraticCosts):
 
     loading: float = number(1.0)  # mean return for a factor of 1
     phi: float = number(0.25)  # share by which the factor fades in a step
-    noise: float = number(0.066)  # of the factor, a step
+    noise: float = number(0.066)  # deviation of the factor's shocks, a step
     cost_scale: float = number(5.0)  # cost of a trade over the variance
-    variance: float = number(0.04)  # of the return, a step
+    variance: float = number(0.04)  # variance of the return, a step
 
     def __check_init__(self) -> None:
         require(self, "phi", lambda x: 0 < x <= 1, "above 0 and at most 1")

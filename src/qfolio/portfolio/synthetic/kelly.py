@@ -18,8 +18,8 @@ class Kelly(OneAsset):
 
     up: float = number(1.1)  # relative of the asset after a win
     down: float = number(0.9)  # relative after a loss
-    probability: float = number(0.53)  # of a win
-    menu: str = static("")  # such as grid:10; empty: any weights
+    probability: float = number(0.53)  # probability of a win
+    menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(100)  # steps of an episode
 
     cost = 0.0

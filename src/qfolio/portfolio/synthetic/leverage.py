@@ -47,10 +47,10 @@ class Leverage(SyntheticMarket):
     above 3.2 lend, and those between hold no cash.
     """
 
-    cash_rate: float = constant(0.02)  # a year, as the spread
-    borrow_spread: float = constant(0.03)  # what a loan costs above cash_rate
-    risk_aversion: float = number(2.0)  # 1: log growth
-    menu: str = static("")  # such as grid:10; empty: any weights
+    cash_rate: float = constant(0.02)  # what lent cash earns, a year
+    borrow_spread: float = constant(0.03)  # what a loan costs above it, a year
+    risk_aversion: float = number(2.0)  # relative risk aversion; 1: log growth
+    menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(100)  # quarters of an episode
 
     cost = 0.0

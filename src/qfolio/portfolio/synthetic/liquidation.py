@@ -27,7 +27,7 @@ class Liquidation(Synthetic):
     temporary: float = number(2.5)  # dollars a share for a million shares a day
     permanent: float = number(0.25)  # dollars a share for a million shares
     risk_aversion: float = number(1.0)  # per million dollars
-    days: float = number(5.0)  # of an episode
+    days: float = number(5.0)  # days of an episode
     horizon: int = static(5)  # steps of an episode
 
     START = (0.5, 1.5)

@@ -37,7 +37,7 @@ class Merton(SyntheticMarket):
     conditions of Cover 1984); one asset is not worth holding.
     """
 
-    menu: str = static("")  # such as grid:10; empty: any weights
+    menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(100)  # steps of an episode
 
     cost = 0.0

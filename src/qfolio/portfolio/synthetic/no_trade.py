@@ -32,10 +32,10 @@ class NoTrade(OneAsset):
 
     rate: float = number(0.02)  # drift above that of cash, a year
     cash_rate: float = constant(0.0)  # growth of cash, a year
-    volatility: float = number(0.2)  # of the asset, a year
+    volatility: float = number(0.2)  # deviation of the asset's return, a year
     cost: float = constant(0.01)  # one way, as a share of the value traded
     dt: float = number(1 / 12)  # years of a step
-    menu: str = static("")  # such as grid:10; empty: any weights
+    menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(480)  # steps of an episode
 
     NODES = 5

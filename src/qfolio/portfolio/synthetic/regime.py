@@ -23,9 +23,9 @@ class Regime(OneAsset):
     """
 
     stay: tuple[float, ...] = numbers(0.95)  # probability that a regime lasts another step
-    mean: tuple[float, ...] = numbers(0.002)  # log growth a step
+    mean: tuple[float, ...] = numbers(0.002)  # log growth of a good step
     cost: float = constant(0.005)  # one way, as a share of the value traded
-    menu: str = static("")  # such as grid:10; empty: any weights
+    menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(250)  # steps of an episode
 
     def __check_init__(self) -> None:
