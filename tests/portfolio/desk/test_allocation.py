@@ -101,6 +101,13 @@ def test_one_order_leaves_the_noise_of_the_others_alone():
     assert allocation.trades[1] == 0
 
 
+def test_noise_of_float32_is_no_loan():
+    """Targets whose sum is 1 + 1e-7 leave no debt of a few cents."""
+    allocation = plan([-1e-7, 0.5, 0.5 + 1e-7], [0, 0], 1e6)
+    assert allocation.weights[0] == 0
+    assert allocation.cash_after == pytest.approx(0, abs=1e-6)
+
+
 def test_whole_shares_by_hand():
     """Of 19 shares of A (380), 9.5 should go for 4.75 of B: 10 are sold for 5 of B."""
     allocation = plan([0, 0.5, 0.5], [19, 0], 0, cost=0.0, whole_shares=True)

@@ -162,7 +162,7 @@ def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
         return held
     weights = np.where(orders, targets, held)
     weights[0] = 1 - weights[1:].sum()
-    if targets[0] >= 0:
+    if targets[0] >= -NOISE:
         weights[0] = max(0.0, weights[0])
     return np.asarray(weights / weights.sum())
 
