@@ -9,6 +9,9 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.attribution.explain import explain
+from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
+from qfolio.portfolio.backtest.folds import Fold
+from qfolio.portfolio.backtest.orders import orders, without_small_drift
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.prices.table import Prices
@@ -37,6 +40,7 @@ def table(rows: int = 700) -> Prices:
         ("quarterly", [0, 2, 7]),
         ("yearly", [0, 2]),
         ("4", [0, 4, 8]),
+        ("drift:0.05", range(10)),
     ],
 )
 def test_rows_of_decisions(calendar: str, rows: list[int]) -> None:
@@ -50,9 +54,13 @@ def test_later_rows_decide_nothing() -> None:
             assert (decision_rows(calendar, DAYS[:end]) == whole[:end]).all()
 
 
-@pytest.mark.parametrize("calendar", ["daily", "0", "-3", "2.5", "Monthly"])
+@pytest.mark.parametrize(
+    "calendar", ["daily", "0", "-3", "2.5", "Monthly", "drift:", "drift:0", "drift:1", "drift:nan"]
+)
 def test_unknown_calendars(calendar: str) -> None:
-    with pytest.raises(QfolioError, match="weekly, monthly, quarterly, yearly or a number of rows"):
+    with pytest.raises(
+        QfolioError, match="weekly, monthly, quarterly, yearly, a number of rows, or drift:"
+    ):
         Portfolio.of(table(), calendar=calendar)
 
 
@@ -66,6 +74,77 @@ def test_between_decisions_the_target_is_what_is_held() -> None:
         assert (target == (wanted if decides[row] else held)).all()
     last = jnp.array(len(prices) - 1)
     assert (task.target(last, held, wanted) == wanted).all()
+
+
+def test_orders_wait_for_drift_beyond_the_band() -> None:
+    task = Portfolio.of(table(), window=5, horizon=10, calendar="drift:0.05")
+    rng, row = np.random.default_rng(1), jnp.array(200)
+    traded = 0
+    for _ in range(100):
+        held, other = (jnp.asarray(rng.dirichlet(np.ones(5)), jnp.float32) for _ in range(2))
+        wanted = held + 0.2 * (other - held)
+        target = task.target(row, held, wanted)
+        beyond = bool(abs(wanted - held).max() > 0.05)
+        assert (target == (wanted if beyond else held)).all()
+        traded += beyond
+    assert 20 < traded < 80
+
+
+def test_equal_weights_wait_for_drift_as_in_a_ledger_of_shares() -> None:
+    prices, test = table(400), range(100, 399)
+    fold = Fold("only", slice(0, 100), slice(test.start, test.stop), slice(0, 100))
+    rule, equal = type("Once", (EqualWeight,), {"calendar": "fold"})(), np.full(4, 0.25)
+    for band in np.random.default_rng(2).uniform(0.005, 0.05, 20):
+        found = orders("x", rule, [fold], prices.dates, prices.values, band=band).decisions
+        wanted = np.tile(np.append(0.0, equal), (len(test), 1))
+        again = without_small_drift(wanted, prices.values[test.start : test.stop], band)
+        np.testing.assert_array_equal(found, again)
+        shares = np.zeros(4)
+        for row, order in zip(test, found, strict=True):
+            worth = shares * prices.values[row]
+            held = worth / max(worth.sum(), 1e-9)
+            assert np.isnan(order[0]) == (row > test.start and abs(held - equal).max() <= band)
+            shares = shares if np.isnan(order[0]) else order[1:] / prices.values[row]
+        assert 1 < (~np.isnan(found[:, 0])).sum() < len(test) / 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mandate", [None, {"assets": {"cap": 0.3}}])
+def test_drift_is_that_of_an_independent_ledger(mandate: dict | None) -> None:
+    prices, band = table(), 0.02
+    backtest = Backtest.create(
+        prices,
+        {"tilts": preset("fast", "portfolio", "tilts")},
+        train="1y",
+        test="6m",
+        seeds=2,
+        episodes=2,
+        mandate=mandate,
+        calendar=f"drift:{band}",
+        cost_model="itemized(fixed=1)",
+        baselines=("minimum-variance", "buy-and-hold"),
+    )
+    backtest.run()
+    entries, _ = backtest.entries()
+    first = backtest.folds[0].decisions.start
+    for name, entry in entries.items():
+        for decisions, turnover in zip(entry.decisions, entry.simulation.turnover, strict=True):
+            shares, cash, orders = np.zeros(4), 1.0, 0
+            for day, target in enumerate(decisions):
+                now = prices.values[first + day]
+                wealth = cash + shares @ now
+                held = np.append(cash, shares * now) / wealth
+                off = 1.0
+                if name == "equal-weight":
+                    off = abs(held - np.array([0, 0.25, 0.25, 0.25, 0.25])).max()
+                    assert np.isnan(target[0]) == (off <= band)
+                if np.isnan(target[0]):
+                    assert turnover[day] == 0  # not even rounding errors, which would cost fees
+                    continue
+                assert abs(target - held).max() > band - 1e-5, (name, day)
+                shares, cash = wealth * target[1:] / now, wealth * target[0]
+                orders += 1
+            assert 1 <= orders < len(decisions) / 2, name
 
 
 def test_every_strategy_of_a_backtest_keeps_to_the_calendar() -> None:

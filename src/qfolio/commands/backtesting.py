@@ -41,8 +41,9 @@ class Options(Reading):
         mandate: File with the limits of all orders (TOML; see docs/guides/mandate.md).
         cost_model: Cost of trading and holding: proportional, itemized or your own as module:Name;
             settings follow in brackets, as in "itemized(fixed=5, cash_rate=0.03)".
-        calendar: When all strategies may trade: weekly, monthly, quarterly, yearly, or a number of
-            rows (default: at every row, and baselines by their own calendars).
+        calendar: When all strategies may trade: weekly, monthly, quarterly, yearly, a number of
+            rows, or drift:0.05 where some weight is more than 0.05 from its target (default: at
+            every row, and baselines by their own calendars).
         signals: Signals that agents observe beside returns, separated by commas, each with the rows
             that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
             own as module:Name (default: the preset's).

@@ -1,4 +1,4 @@
-"""Calendars: at which rows of a table an account may trade."""
+"""Calendars: at which rows of a table an account may trade, and how far it may drift until then."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,20 +8,24 @@ from qfolio.core.errors import QfolioError
 PERIODS = ("weekly", "monthly", "quarterly", "yearly")
 """Calendars that are named after their periods."""
 
+DRIFT = "drift:"
+"""Begins a calendar that orders only what has drifted beyond a band, such as drift:0.05."""
+
 
 def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bool_]:
     """Which rows are for decisions, of shape (row,).
 
     Args:
         calendar: "weekly", "monthly", "quarterly" or "yearly" for the first row of each period,
-            which is known without later rows; a number k for every k-th row; "" for every row.
+            which is known without later rows; a number k for every k-th row; "" or "drift:" and a
+            ``band`` for every row.
         dates: Dates of the rows.
 
     Raises:
         QfolioError: There is no such calendar.
     """
     rows = np.arange(len(dates))
-    if not calendar:
+    if not calendar or band(calendar):
         return rows >= 0
     if calendar in PERIODS:
         days = dates.astype("datetime64[D]").astype(int)
@@ -33,5 +37,18 @@ def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bo
     if calendar.isdecimal() and int(calendar) > 0:
         return rows % int(calendar) == 0
     raise QfolioError(
-        f"calendar is {calendar!r}; it must be {', '.join(PERIODS)} or a number of rows."
+        f"calendar is {calendar!r}; it must be {', '.join(PERIODS)}, a number of rows, or "
+        f"{DRIFT} and a band between 0 and 1, such as {DRIFT}0.05."
     )
+
+
+def band(calendar: str) -> float:
+    """How far some weight, cash included, must be from its target before there is an order.
+
+    0 for calendars without a band, for which any difference is ordered.
+    """
+    try:
+        found = float(calendar.removeprefix(DRIFT)) if calendar.startswith(DRIFT) else 0.0
+    except ValueError:
+        return 0.0
+    return found if 0 < found < 1 else 0.0

@@ -56,8 +56,21 @@ def follow(
     start = jnp.array(first, jnp.int32), jnp.asarray(held, jnp.float32)
     results = paths(task, agent, portfolios, *start, count)
     targets, after = (np.asarray(result) for result in results)
-    _require_feasible(task, agent, targets, first)
+    _require_feasible(task, agent, targets, first, ordered(task, targets, held, after))
     return targets, after
+
+
+def ordered(
+    task: Portfolio, targets: np.ndarray, held: np.ndarray, after: np.ndarray
+) -> np.ndarray:
+    """Where targets are orders, of shape (seed, count); between, they are what is held.
+
+    held, after: as ``follow`` takes and returns them.
+    """
+    if not task.calendar:
+        return np.ones(targets.shape[:2], bool)
+    before = np.concatenate([held[:, None].astype(after.dtype), after[:, :-1]], axis=1)
+    return np.asarray((targets != before).any(-1))
 
 
 @eqx.filter_jit(donate="none")
@@ -73,11 +86,9 @@ def paths(
         view = jax.tree.map(lambda x: x[None], task.view(row, held))
 
         def one(weights: PyTree) -> Array:
-            return task.target(row, held, agent.policy(weights, view)[0])
+            return task.wanted(row, held, agent.policy(weights, view)[0])
 
-        target = jax.vmap(one)(members).mean(0)
-        if task.mandate:
-            target = task.obeying(row, held, target)
+        target = task.obeying(row, held, jax.vmap(one)(members).mean(0))
         after = task.drifted(row, target)
         return after, (target, after)
 
@@ -87,14 +98,15 @@ def paths(
     return jax.vmap(path)(members, held)
 
 
-def _require_feasible(task: Portfolio, agent: Agent, targets: np.ndarray, first: int) -> None:
-    """Raises QfolioError for infeasible targets; a replay would read NaN as no order."""
-    ordered = np.ones(targets.shape[1], bool)
-    if task.calendar:  # elsewhere, what is held may have drifted outside
-        rows = first + np.arange(targets.shape[1])
-        ordered = np.take(np.asarray(task.decides), rows, mode="clip")
+def _require_feasible(
+    task: Portfolio, agent: Agent, targets: np.ndarray, first: int, given: np.ndarray
+) -> None:
+    """Raises QfolioError for infeasible orders; a replay would read NaN as no order.
+
+    given: where targets are orders; elsewhere, what is held may have drifted outside.
+    """
     for said, amount in task.feasible.violations(targets).items():
-        wrong = ~(amount <= TOLERANCE) & (ordered | np.isnan(amount))
+        wrong = ~(amount <= TOLERANCE) & (given | np.isnan(amount))
         if wrong.any():
             seed, day = np.argwhere(wrong)[0]
             raise QfolioError(

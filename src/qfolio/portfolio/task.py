@@ -20,7 +20,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Box, Position, Simplex
 from qfolio.portfolio import anchors, signals
-from qfolio.portfolio.calendars import decision_rows
+from qfolio.portfolio.calendars import band, decision_rows
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import grown
 from qfolio.portfolio.mandate import checks
@@ -192,19 +192,30 @@ class Portfolio(Market):
     def target(
         self, market: Row, held: Float[Array, " entry"], action: Array
     ) -> Float[Array, " entry"]:
-        """As in any market; what is held where the calendar has no decision.
+        """As in any market; what is held where the calendar has no decision."""
+        return self._when_deciding(market, held, self.wanted(market, held, action))
+
+    def wanted(
+        self, market: Row, held: Float[Array, " entry"], action: Array
+    ) -> Float[Array, " entry"]:
+        """The target if every row were for decisions.
 
         Where debts are allowed, an action may also be the weights of the assets; cash is the rest.
         """
         if action.shape == self.limits.shape:
             action = simplex.with_rest(action)
-        return self._when_deciding(market, held, super().target(market, held, action))
+        return super().target(market, held, action)
 
     def obeying(
         self, market: Row, held: Float[Array, " entry"], wanted: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
-        """The order for a mean of orders, which may break rules on holdings and small trades."""
-        return self._when_deciding(market, held, self.feasible.project(wanted, held))
+        """The order for a mean of ``wanted``, which may break rules on holdings and small trades.
+
+        As held where the calendar has no decision.
+        """
+        if self.mandate:
+            wanted = self.feasible.project(wanted, held)
+        return self._when_deciding(market, held, wanted)
 
     def _when_deciding(
         self, market: Row, held: Float[Array, " entry"], wanted: Float[Array, " entry"]
@@ -212,6 +223,8 @@ class Portfolio(Market):
         if not self.calendar:
             return wanted
         decides = lax.dynamic_index_in_dim(self.decides, market, keepdims=False)
+        if most := band(self.calendar):
+            decides &= abs(wanted - held).max() > most
         return jnp.where(decides, wanted, held)
 
     @property

@@ -50,6 +50,7 @@ def orders(
     feasible: Sequence[Feasible] | None = None,
     month: int = 21,
     decides: Bools | None = None,
+    band: float = 0.0,
 ) -> Orders:
     """Ask a baseline for its decisions on every row of the folds.
 
@@ -67,6 +68,7 @@ def orders(
             every row at which there is one; a target of the calendar "fold" is one of every row.
         month: Rows in a month.
         decides: Which rows are for decisions, of shape (rows,), instead of the baseline's calendar.
+        band: As ``calendars.band``; a target of the calendar "fold" is one of every row.
 
     Returns:
         Decisions for all rows of the folds, and notes that name the fold.
@@ -88,7 +90,7 @@ def orders(
         asked = set(_asked(baseline, rows, folds[0].decisions.start, month, decides))
         trading = np.ones(len(rows), bool) if decides is None else decides[fold.decisions]
         mandated = None if feasible is None else feasible[number]
-        again = mandated is not None and baseline.calendar == "fold"
+        again = (mandated is not None or band > 0) and baseline.calendar == "fold"
         part = np.full((len(rows), len(ordered)), np.nan)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -99,8 +101,10 @@ def orders(
                     history = History(dates[known], prices[known], fold.train, allowed, cap, month)
                     wanted = baseline.decide(history, held)
                 if wanted is not None and (trading[row - rows[0]] or not again):
-                    ordered = obeying(name, wanted, held, history, mandated)
-                    part[row - rows[0]], row_ordered = ordered, row
+                    target = obeying(name, wanted, held, history, mandated)
+                    if beyond(band, target, held):
+                        ordered, row_ordered = target, row
+                        part[row - rows[0]] = ordered
         if baseline.calendar == "fold" and not again and not np.isnan(part[0]).any():
             part[:] = np.where(trading[:, None], part[0], np.nan)
             row_ordered = rows[np.flatnonzero(trading)[-1]] if trading.any() else row_ordered
@@ -138,6 +142,26 @@ def drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
     bought = weights[1:] != 0  # others may have no price yet
     worth[1:][bought] *= now[bought] / then[bought]
     return np.asarray(worth / worth.sum())
+
+
+def without_small_drift(targets: Floats, prices: Floats, band: float) -> Floats:
+    """Targets of successive rows, NaN where what is held has not drifted beyond the band.
+
+    targets: shape (rows, N + 1), cash first, NaN for no order; the first is ordered. prices: of
+    the same rows, shape (rows, N).
+    """
+    found, last = targets.copy(), 0
+    for row in range(1, len(targets)):
+        if beyond(band, targets[row], drifted(targets[last], prices[last], prices[row])):
+            last = row
+        else:
+            found[row] = np.nan
+    return found
+
+
+def beyond(band: float, target: Floats, held: Floats) -> bool:
+    """Whether a target is ordered; band: as ``calendars.band``."""
+    return not band or bool(abs(target - held).max() > band)
 
 
 def obeying(

@@ -17,9 +17,10 @@ from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.own import Placed
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
+from qfolio.portfolio.calendars import band
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel
-from qfolio.portfolio.following import follow
+from qfolio.portfolio.following import follow, ordered
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight
@@ -68,7 +69,7 @@ class Stretch(NamedTuple):
 def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: bool) -> np.ndarray:
     """Decisions over all folds, (seed, day, entry); each fold starts with the last one's holding.
 
-    NaN where the calendar has no decision.
+    NaN where the calendar has no decision, or nothing is to be traded.
 
     With ``together`` one portfolio follows the mean of all seeds, and ``seeds`` is 1. The agents
     see their portfolio in float32; the replay is in float64.
@@ -81,11 +82,8 @@ def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: 
         # One length for all folds, so that one program serves all; the surplus is cut off.
         start = fold.decisions.start
         targets, after = follow(task, agent, members, start, held, max(days), together=together)
-        given = targets[:, :count]
-        if task.calendar:
-            no_order = ~np.asarray(task.decides)[start : start + count]
-            given = np.where(no_order[:, None], np.nan, given)
-        parts.append(given)
+        given = ordered(task, targets, held, after)
+        parts.append(np.where(given[..., None], targets, np.nan)[:, :count])
         held = after[:, count - 1]
     return np.concatenate(parts, axis=1)
 
@@ -179,6 +177,7 @@ class Replay:
             feasible=[made for made, _ in self._relaxed] if text else None,
             month=table.month,
             decides=np.asarray(self.task.decides) if self.task.calendar else None,
+            band=band(self.task.calendar),
         )
         return self.entry(kind, given.decisions[None]), given.notes
 

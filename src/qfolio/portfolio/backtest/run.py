@@ -138,8 +138,9 @@ class Backtest:
             cost_model: Cost of trading and holding, in training and replay: a name of the registry,
                 or your own as ``module:Name``, with its settings as in "itemized(fixed=5)".
             calendar: When all strategies may trade: weekly, monthly, quarterly or yearly, on the
-                first row of each, or a number of rows (default: at every row, and baselines by
-                their own calendars). All may trade on the first row of the test.
+                first row of each, a number of rows, or "drift:0.05" where some weight is more than
+                0.05 from its target (default: at every row, and baselines by their own calendars).
+                All may trade on the first row of the test.
             baselines: Names of the baselines, likewise; equal weights are always included.
             strategies: Strategies of your own by name, as ``own_tables.read_own`` takes them.
             benchmark: What all are compared with, as ``benchmark.field_of`` takes it (default:

@@ -13,6 +13,7 @@ from qfolio.core.text import quote
 from qfolio.core.version import __version__
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.calendars import band
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
 from qfolio.portfolio.desk.rule import Rule
@@ -62,6 +63,7 @@ class Desk:
                 expanding=config.expanding,
                 cap=config.cap,
                 mandate=task.mandate,
+                band=band(task.calendar),
             )
         raise QfolioError(
             f"The backtest has no agent {quote(name)}; choose from {', '.join(self.run.agents)}, "

@@ -12,8 +12,9 @@ from qfolio.core.files import write_csv
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
 from qfolio.portfolio.backtest.measures import drawdown
+from qfolio.portfolio.backtest.orders import without_small_drift
 from qfolio.portfolio.backtest.simulation import simulate
-from qfolio.portfolio.calendars import decision_rows
+from qfolio.portfolio.calendars import band, decision_rows
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.desk import consistency
 from qfolio.portfolio.desk.desk import Desk
@@ -227,6 +228,8 @@ def _equal_weights(desk: Desk, table: Prices, live: Live, lag: int) -> np.ndarra
         decides = decision_rows(task.calendar, table.dates)[first : first + count]
         decides[0] = True
         decisions[~decides] = np.nan
+        rows = table.values[first : first + count]
+        decisions = without_small_drift(decisions, rows, band(task.calendar))
     return simulate(
         table.values,
         decisions,

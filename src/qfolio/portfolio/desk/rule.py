@@ -7,7 +7,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.folds import latest
-from qfolio.portfolio.backtest.orders import obeying
+from qfolio.portfolio.backtest.orders import beyond, obeying
 from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight
@@ -15,7 +15,7 @@ from qfolio.portfolio.prices.table import Prices, load
 
 
 class Rule:
-    """A baseline's orders after the last row of a table, whatever its calendar.
+    """A baseline's orders after the last row of a table, whatever its calendar but for a band.
 
     It learns from the training window that ends there: all rows, or the last ``train``.
     """
@@ -31,10 +31,11 @@ class Rule:
         expanding: bool,
         cap: float,
         mandate: str = "",
+        band: float = 0.0,
     ) -> None:
         self.name, self.baseline, self.assets, self.costs = name, baseline, assets, costs
         self.train, self.expanding = train, expanding
-        self.cap, self.mandate = cap, mandate
+        self.cap, self.mandate, self.band = cap, mandate, band
 
     def table(self, prices: Any, **options: Any) -> Prices:
         """The prices with the assets of the backtest, in its order."""
@@ -66,4 +67,5 @@ class Rule:
         target = held
         if wanted is not None:
             target = obeying(self.name, wanted, held, history, mandated)
+            target = target if beyond(self.band, target, held) else held
         return dict(zip(("cash", *self.assets), target.tolist(), strict=True))
