@@ -53,6 +53,8 @@ def test_follow_shows_live_beside_the_backtest(folder, monkeypatch, capsys, tmp_
     assert float(rows[-1]["growth"]) == pytest.approx(found["growth"])
     low, middle, high = found["band"]
     assert low < middle < high
+    assert found["benchmark"] == "equal-weight"
+    assert float(rows[-1]["benchmark"]) == pytest.approx(found["benchmark_growth"])
     assert found["alarm_since"] is None
     assert found["costs"] == pytest.approx(sum(float(row["cost"]) for row in rows))
     assert found["costs"] > 0.5

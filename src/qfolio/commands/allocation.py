@@ -155,6 +155,7 @@ def follow(
     folder: Positional[Path],
     *,
     prices: File = None,
+    benchmark: File = None,
     out: File = None,
     trust: Modules = (),
     missing: Missing = "error",
@@ -171,6 +172,8 @@ def follow(
         folder: Folder of a backtest with a ledger.
         prices: Prices with all rows since the first allocation, CSV or Parquet (default: the
             prices of the backtest).
+        benchmark: Latest table of the backtest's benchmark, if that is a strategy of your own
+            (default: as the backtest read it).
         out: CSV file with a row for each row of the prices (default: follow.csv in the folder); a
             page is written beside it, with the suffix html.
         trust: Modules of your own code that the folder may name (default: none).
@@ -192,14 +195,20 @@ def follow(
     from qfolio.portfolio.desk.follow import follow as marked
     from qfolio.report.follow import LiveRows, render_following
 
-    following = marked(Desk.open(folder, missing=missing, features=features, date=date), prices)
+    desk = Desk.open(folder, missing=missing, features=features, date=date)
+    following = marked(desk, prices, benchmark)
     path = folder / "follow.csv" if out is None else out
     following.write(path)
     page, live = path.with_suffix(".html"), following.live
     if len(live.returns):
-        equal = np.cumprod(1 + following.reference)
         rows = LiveRows(
-            live.dates, following.growth, equal, following.band, following.evidence, ALARM
+            live.dates,
+            following.growth,
+            np.cumprod(1 + following.reference),
+            following.benchmark,
+            following.band,
+            following.evidence,
+            ALARM,
         )
         title = f"{following.agent}, live and in the backtest"
         text = render_following(title, following.sentences(), rows, following.rows())

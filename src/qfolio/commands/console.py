@@ -336,7 +336,7 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
 
 
 def print_following(following: "Following") -> None:
-    """A row for live, equal weights and the backtest, and what is to be said of them."""
+    """A row for live, the benchmark and the backtest, and what is to be said of them."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     table.add_column("net")
     for name in ("growth", "a year", "volatility", "Sharpe", "drawdown"):

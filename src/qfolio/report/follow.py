@@ -27,7 +27,8 @@ class LiveRows:
 
     dates: np.ndarray
     growth: np.ndarray
-    equal_weights: np.ndarray
+    benchmark: np.ndarray
+    benchmark_name: str
     band: np.ndarray
     evidence: np.ndarray
     alarm: float
@@ -71,7 +72,7 @@ def draw_following(rows: LiveRows, width: float) -> Figure:
     days = rows.dates.astype("datetime64[s]").astype(object)
     shade = above.fill_between(days, low, high, color=palette.HAIRLINE, linewidth=0)
     (median,) = above.plot(days, middle, color=palette.MUTED, linewidth=0.8, linestyle="--")
-    (equal,) = above.plot(days, 100 * (rows.equal_weights - 1), color=palette.SECOND, linewidth=1.1)
+    (other,) = above.plot(days, 100 * (rows.benchmark - 1), color=palette.SECOND, linewidth=1.1)
     (live,) = above.plot(days, 100 * (rows.growth - 1), color=palette.ACCENT, linewidth=1.6)
     above.set_title("Growth since the first trade, after costs, %")
     above.grid(axis="y")
@@ -86,6 +87,6 @@ def draw_following(rows: LiveRows, width: float) -> Figure:
     ticks = AutoDateLocator(minticks=2, maxticks=4 if few else 8)
     below.xaxis.set_major_locator(ticks)
     below.xaxis.set_major_formatter(ConciseDateFormatter(ticks, show_offset=False))
-    marks = {"live": live, "equal weights": equal, "backtest, median": median, "95 %": shade}
+    marks = {"live": live, rows.benchmark_name: other, "backtest, median": median, "95 %": shade}
     legend_above(figure, marks, few=few)
     return figure

@@ -3,7 +3,6 @@
 ``own_tables.py`` reads them from files and data frames.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.folds import Fold, spell
+from qfolio.portfolio.backtest.folds import spell
 from qfolio.portfolio.backtest.measures import Floats
 from qfolio.portfolio.backtest.orders import TOLERANCE, drifted
 from qfolio.portfolio.prices.findings import amount, day
@@ -63,9 +62,7 @@ def buy_and_hold(asset: str, prices: Prices) -> Own:
     return Own("weights", prices.dates[[prices.first_rows[place]]], weights)
 
 
-def place(
-    name: str, own: Own, prices: Prices, folds: Sequence[Fold], task: Portfolio, cap: float
-) -> Placed:
+def place(name: str, own: Own, prices: Prices, days: slice, task: Portfolio, cap: float) -> Placed:
     """Put a strategy on the days of a test.
 
     A date that is no row of the prices counts at the next row, so that nothing is known too early.
@@ -76,7 +73,7 @@ def place(
         name: Of the strategy, for messages.
         own: The strategy.
         prices: The table of the backtest.
-        folds: Of the test.
+        days: Rows of the test's decisions.
         task: Of any agent; all have the same lag, and are long-only or not.
         cap: Largest weight of one asset that agents may order; a note says where it is exceeded.
 
@@ -85,7 +82,6 @@ def place(
             first price or sold short though agents are long-only, a day of the test has no return
             or no level, or a return is on another day.
     """
-    days = slice(folds[0].decisions.start, folds[-1].decisions.stop)
     none = np.full((days.stop - days.start, len(prices.assets) + 1), np.nan)
     if own.kind == "weights":
         if task.feasible.long_only:

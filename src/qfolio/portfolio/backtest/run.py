@@ -83,8 +83,9 @@ class Backtest:
                 f"{min(both)} is an agent and a baseline; give the agent another name."
             )
         task = next(iter(self.tasks.values()))
+        days = slice(self.folds[0].decisions.start, self.folds[-1].decisions.stop)
         self._own = {
-            name: place(name, each, prices, self.folds, task, config.cap)
+            name: place(name, each, prices, days, task, config.cap)
             for name, each in (own or {}).items()
         }
         self.interrupted = False

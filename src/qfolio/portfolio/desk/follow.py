@@ -9,19 +9,15 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import write_csv
-from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, BacktestFolder, followed
+from qfolio.portfolio.backtest.folder import BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
 from qfolio.portfolio.backtest.measures import drawdown
-from qfolio.portfolio.backtest.orders import without_small_drift
-from qfolio.portfolio.backtest.simulation import simulate
-from qfolio.portfolio.calendars import band, decision_rows
-from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.desk import consistency
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.ledger import Record
 from qfolio.portfolio.desk.live import Live, mark
+from qfolio.portfolio.desk.reference import reference
 from qfolio.portfolio.prices.findings import amount, day
-from qfolio.portfolio.prices.table import Prices
 
 SEED = 0
 """Of the bootstrap: the same ledger gives the same evidence whenever one looks."""
@@ -32,16 +28,19 @@ class Following:
     """A ledger marked to market; arrays have an entry for each live row.
 
     tested: what its agent (that of the last allocation) earned in the backtest, net, shape (T,).
-    reference: live net returns of equal weights. band: growth of wealth by the backtest, shape
-    (3, rows). evidence: against the backtest. learned: the last row that the policy knows, or None
-    for a baseline. overdue: whether that is a test length ago or more.
+    benchmark: name of the backtest's. reference: its live net returns. note: on these, or "". band:
+    growth of wealth by the backtest, shape (3, rows). evidence: against the backtest. learned: the
+    last row that the policy knows, or None for a baseline. overdue: whether that is a test length
+    ago or more.
     """
 
     agent: str
     records: list[Record]
     live: Live
     tested: np.ndarray
+    benchmark: str
     reference: np.ndarray
+    note: str
     band: np.ndarray
     evidence: np.ndarray
     periods_per_year: float
@@ -68,12 +67,12 @@ class Following:
         if not len(live.returns):
             return [f"{since}: no trade has earned a return yet.", self._retrain()]
         low, middle, high = (f"{x - 1:+.1%}" for x in self.band[:, -1])
-        earned, equal = self.growth[-1], np.prod(1 + self.reference)
+        earned, other = self.growth[-1], np.prod(1 + self.reference)
         place = " Live is below the band." if earned < self.band[0, -1] else ""
         place = " Live is above the band." if earned > self.band[2, -1] else place
         said = [
             f"{since}, {amount(len(live.returns), 'row')} up to {day(live.dates[-1])}: "
-            f"{earned - 1:+.1%} after costs, and equal weights {equal - 1:+.1%}.",
+            f"{earned - 1:+.1%} after costs, and {self.benchmark} {other - 1:+.1%}.",
             f"Of histories like the backtest's, 95 % end between {low} and {high}, half of them "
             f"above {middle}.{place}",
         ]
@@ -85,7 +84,7 @@ class Following:
                 f"ALARM since {day(self.alarm)}: live returns are worse than the backtest's "
                 f"({level})."
             )
-        said.append(self._retrain())
+        said += [self._retrain(), *([self.note] if self.note else [])]
         flows = live.flows[abs(live.flows) > 1e-6 * live.wealth]
         if flows.size:
             said.append(
@@ -115,7 +114,7 @@ class Following:
         """Growth since the start and a year, volatility, Sharpe ratio and drawdown, by name."""
         return {
             "live": _measures(self.live.returns, self.periods_per_year),
-            "equal-weight, live": _measures(self.reference, self.periods_per_year),
+            f"{self.benchmark}, live": _measures(self.reference, self.periods_per_year),
             f"{self.agent}, backtest": _measures(self.tested, self.periods_per_year),
         }
 
@@ -123,7 +122,7 @@ class Following:
         """A CSV file with a row for each live row."""
         live = self.live
         header = [
-            "date", "return", "wealth", "cash", "cost", "flow", "growth", "equal_weight",
+            "date", "return", "wealth", "cash", "cost", "flow", "growth", "benchmark",
             "band_low", "band_middle", "band_high", "evidence",
         ]  # fmt: skip
         columns = (
@@ -138,6 +137,8 @@ class Following:
             "agent": self.agent,
             "allocations": len(self.records),
             "rows": len(self.live.returns),
+            "benchmark": self.benchmark,
+            "benchmark_growth": float(np.prod(1 + self.reference)) if len(self.growth) else None,
             "growth": float(self.growth[-1]) if len(self.growth) else None,
             "band": self.band[:, -1].tolist() if len(self.growth) else None,
             "evidence": float(self.evidence[-1]) if len(self.growth) else None,
@@ -150,15 +151,18 @@ class Following:
         }
 
 
-def follow(desk: Desk, prices: Path | None = None) -> Following:
+def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None) -> Following:
     """Marks a run's ledger to market and compares it with the backtest.
 
     Args:
         desk: The run.
         prices: A table with the rows since the first allocation (default: the backtest's).
+        benchmark: Latest table of a benchmark that is a strategy of the user's own (default: as the
+            backtest kept it).
 
     Raises:
-        QfolioError: The ledger is empty, prices do not fit it, or the backtest is not finished.
+        QfolioError: The ledger is empty, prices or the benchmark do not fit it, or the backtest is
+            not finished.
     """
     records, run = desk.ledger.current(), desk.run
     if not records:
@@ -169,20 +173,20 @@ def follow(desk: Desk, prices: Path | None = None) -> Following:
     known = desk.followed(agent, records[-1].policy)
     table = run.prices if prices is None else known.table(desk.load(prices))
     live = mark(records, table, known.costs, lag)
-    tested, equal = _tested(desk, agent), _tested(desk, EQUAL_WEIGHT)
-    reference = _equal_weights(desk, table, live, lag)
+    other, count = run.config.benchmark, len(live.returns)
+    tested, before = _tested(desk, agent), _tested(desk, other)
+    theirs, note = reference(desk, table, live.first - lag, count, benchmark)
     rng = np.random.default_rng(SEED)
-    count = len(live.returns)
     band, evidence = np.ones((3, count)), np.ones(count)
     if count:
         band = consistency.band(tested, count, rng)
         pairs = [(tested, live.returns)]
-        if agent != EQUAL_WEIGHT:
-            pairs.append((tested - equal, live.returns - reference))
+        if agent != other:
+            pairs.append((tested - before, live.returns - theirs))
         evidence = consistency.together(
             [
-                consistency.evidence(consistency.Promise.of(before, rng), now)
-                for before, now in pairs
+                consistency.evidence(consistency.Promise.of(promised, rng), now)
+                for promised, now in pairs
             ]
         )
     learned = getattr(known, "learned", None)
@@ -191,7 +195,9 @@ def follow(desk: Desk, prices: Path | None = None) -> Following:
         records,
         live,
         tested,
-        reference,
+        other,
+        theirs,
+        note,
         band,
         evidence,
         table.periods_per_year,
@@ -213,31 +219,6 @@ def _tested(desk: Desk, name: str) -> np.ndarray:
             f"{desk.folder}."
         )
     return columns[column]
-
-
-def _equal_weights(desk: Desk, table: Prices, live: Live, lag: int) -> np.ndarray:
-    """Net returns of equal weights over the live rows, under the run's costs and calendar."""
-    count = len(live.returns)
-    if not count:
-        return np.zeros(0)
-    rule, task = desk.followed(EQUAL_WEIGHT), next(iter(desk.run.tasks.values()))
-    first = live.first - lag
-    wanted = list(rule.weights(table.between(None, first + 1)).values())
-    decisions = np.tile(wanted, (count, 1))
-    if task.calendar:
-        decides = decision_rows(task.calendar, table.dates)[first : first + count]
-        decides[0] = True
-        decisions[~decides] = np.nan
-        rows = table.values[first : first + count]
-        decisions = without_small_drift(decisions, rows, band(task.calendar))
-    return simulate(
-        table.values,
-        decisions,
-        first=first,
-        cost=rule.costs,
-        lag=lag,
-        conditions=Conditions.of(table, rule.costs.columns),
-    ).returns
 
 
 def _measures(returns: np.ndarray, year: float) -> dict[str, float]:

@@ -1,0 +1,80 @@
+"""The benchmark over live rows, without any training."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.desk.desk import Desk
+from qfolio.portfolio.desk.reference import reference
+from qfolio.portfolio.prices.table import Prices
+
+AGENTS = {
+    "pathwise": Preset(
+        "pathwise", {"rollout_length": 10, "num_envs": 2, "hidden": (4,)},
+        episodes=4, seeds=1, task={"window": 5, "horizon": 20},
+    )
+}  # fmt: skip
+
+
+def table(rows=160):
+    rng = np.random.default_rng(0)
+    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (200, 3)), axis=0))
+    dates = np.datetime64("2020-01-01", "s") + np.arange(200) * np.timedelta64(1, "D")
+    return Prices(dates, ("A", "B", "C"), values).between(None, rows)
+
+
+def days(rows):
+    return table(200).dates[rows].astype("datetime64[D]").astype(str)
+
+
+def desk(out, benchmark, **options):
+    """Of a backtest with one fold that is not trained."""
+    rest = {"train": "100d", "test": "60d", "seeds": 1, "cost": 0.002, "baselines": []}
+    Backtest.create(table(), AGENTS, out=out, benchmark=benchmark, **{**rest, **options})
+    return Desk.open(out)
+
+
+ORDERS = pd.DataFrame({"date": days([40, 110, 130]), "A": [0.6, 0.2, 0.5], "B": [0.4, 0.8, 0.1]})
+INDEX = pd.DataFrame({"date": days(slice(160)), "level": np.exp(np.arange(160) * 1e-3)})
+
+
+@pytest.mark.parametrize(
+    ("benchmark", "options"),
+    [
+        ("equal-weight", {}),
+        ("equal-weight", {"calendar": "drift:0.02"}),
+        ("minimum-variance", {}),
+        ("minimum-variance", {"mandate": {"assets": {"cap": 0.4}}}),
+        ("A", {}),
+        (ORDERS, {}),
+        (INDEX, {}),
+    ],
+)
+def test_the_benchmark_earns_what_the_backtest_says(tmp_path, benchmark, options):
+    made = desk(tmp_path / "run", benchmark, **options)
+    run, name = made.run, made.run.config.benchmark
+    entries, _ = run.replay.others(run.baselines, run._own, name)
+    decisions = run.folds[0].decisions
+    count = decisions.stop - decisions.start
+    found, note = reference(made, run.prices, decisions.start, count, None)
+    np.testing.assert_array_equal(found, entries[name].simulation.returns[0])
+    assert note == ""
+
+
+def test_a_table_of_ones_own_goes_on_with_its_latest_rows(tmp_path):
+    made, later = desk(tmp_path / "index", INDEX), table(190)
+    with pytest.raises(QfolioError, match=r"no level on 2020-06-.* given with --benchmark"):
+        reference(made, later, 159, 28, None)
+    longer = pd.DataFrame({"date": days(slice(190)), "level": np.exp(np.arange(190) * 1e-3)})
+    longer.to_csv(tmp_path / "index.csv", index=False)
+    found, _ = reference(made, later, 159, 28, tmp_path / "index.csv")
+    np.testing.assert_allclose(found, np.expm1(1e-3))
+    made = desk(tmp_path / "orders", ORDERS)
+    _, note = reference(made, later, 159, 28, None)
+    assert "The last order of benchmark is of 2020-05-10, and its holding drifts since" in note
+    made = desk(tmp_path / "equal", None)
+    with pytest.raises(QfolioError, match="equal-weight is a baseline, which needs no table"):
+        reference(made, later, 159, 28, tmp_path / "index.csv")
