@@ -21,6 +21,12 @@ FEWEST_SEEDS = 5
 factor is 12.7 for two seeds and 4.3 for three, and a bootstrap of so few is far too narrow."""
 
 
+def regret(returns: ArrayLike, optimum: float) -> Floats:
+    """The share of the optimum's return that is missed; not finite if the optimum is zero."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((optimum - np.asarray(returns, dtype=float)) / np.abs(optimum))
+
+
 def interquartile_mean(values: ArrayLike, axis: int = -1) -> Floats:
     """Return the mean of the middle half of the values along an axis.
 

@@ -29,9 +29,10 @@ from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, read_tree, write_tree
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.population import Population
+from qfolio.core.statistics import regret
 from qfolio.core.training import TrainingState
 from qfolio.experiments.budget import Budget, seed_range
-from qfolio.experiments.comparison.ranking import middle_steps, regret, steps_within
+from qfolio.experiments.comparison.ranking import middle_steps, steps_within
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.experiments.log import JobLog, Log, seed_names

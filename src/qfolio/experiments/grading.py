@@ -9,7 +9,7 @@ import numpy as np
 from qfolio.core.evaluation import greedy, start_keys
 from qfolio.core.mdp import Optimum
 from qfolio.core.population import Population
-from qfolio.core.statistics import mean_interval
+from qfolio.core.statistics import mean_interval, regret
 from qfolio.solvers.followed import FollowedOptimum
 
 
@@ -22,17 +22,17 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
     played = population.evaluate(keys)
     returns = played.returns.mean(1)
     solution = task.optimum()
-    optimum, regret = None, None
+    optimum, regrets = None, None
     if solution is not None:
         optimum = float(solution.returns(keys).mean())
-        regret = ((optimum - returns) / abs(optimum)).tolist()
+        regrets = regret(returns, optimum).tolist()
     interval = mean_interval(returns)
     return {
         "return_mean": float(returns.mean()),
         "return_ci95": None if interval is None else list(interval),
         "return_per_seed": returns.tolist(),
         "optimum": optimum,
-        "regret_per_seed": regret,
+        "regret_per_seed": regrets,
         "overestimation_per_seed": [
             float(error) if np.isfinite(error) else None for error in played.overestimation
         ],

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from qfolio.core.statistics import mean_interval
+from qfolio.core.statistics import mean_interval, regret
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Trial, best_of
 from qfolio.experiments.tuning.search import Dimension, Value
@@ -205,8 +205,8 @@ def _finals(data: Sweep) -> list[tuple[str, list[str]]]:
             continue
         digits = decimals(optimum or returns.mean())
         spread = over_seeds(returns, mean_interval(returns), partial(number, digits=digits))
-        regret = "–" if optimum is None else percent((optimum - returns.mean()) / abs(optimum), 1)
-        cells = [number(returns.mean(), digits), spread, number(returns.min(), digits), regret]
+        missed = "–" if optimum is None else percent(float(regret(returns.mean(), optimum)), 1)
+        cells = [number(returns.mean(), digits), spread, number(returns.min(), digits), missed]
         rows.append((name, cells))
     return rows
 

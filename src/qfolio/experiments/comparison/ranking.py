@@ -23,6 +23,7 @@ from qfolio.core.statistics import (
     interquartile_mean,
     probability_of_improvement,
     rank_test,
+    regret,
     stratified_interval,
 )
 
@@ -103,12 +104,6 @@ def rank(results: dict[str, Result]) -> dict[str, Any]:
         "agents": agents,
         "pairs": _pairs(scores, order, sign),
     }
-
-
-def regret(returns: Any, optimum: float) -> Floats:
-    """The share of the optimum's return that is missed; not finite if the optimum is zero."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray((optimum - np.asarray(returns, dtype=float)) / np.abs(optimum))
 
 
 def curve(result: Result, measure: str) -> Floats:

@@ -25,11 +25,12 @@ from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, read_json
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
+from qfolio.core.statistics import regret
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.conclusion import conclusion, listed
 from qfolio.experiments.comparison.measure import measure
-from qfolio.experiments.comparison.ranking import Result, rank, regret
+from qfolio.experiments.comparison.ranking import Result, rank
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener

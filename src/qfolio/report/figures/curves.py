@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qfolio.core.statistics import band, interquartile_mean
+from qfolio.core.statistics import band, interquartile_mean, regret
 from qfolio.report import palette
 from qfolio.report.data import (
     Curve,
@@ -207,11 +207,11 @@ def _cut_beginning(axes: Axes, optimum: float) -> None:
 def _draw_regret(axes: Axes, data: ReportData, curves: list[tuple[Curve, str]]) -> None:
     """Draw the share of the optimum that is missed, on a logarithmic scale."""
     _line_axes(axes, "Regret, on a logarithmic scale", data)
-    regrets = [(data.optimum - curve.returns) / abs(data.optimum) for curve, _ in curves]
-    for (curve, colour), regret in zip(curves, regrets, strict=True):
-        _draw_runs(axes, curve.done, regret, colour, least=LEAST_REGRET)
-    least = max(min(interquartile_mean(regret).min() for regret in regrets), LEAST_REGRET)
-    worst = max(regret.max() for regret in regrets)
+    regrets = [regret(curve.returns, data.optimum) for curve, _ in curves]
+    for (curve, colour), missed in zip(curves, regrets, strict=True):
+        _draw_runs(axes, curve.done, missed, colour, least=LEAST_REGRET)
+    least = max(min(interquartile_mean(missed).min() for missed in regrets), LEAST_REGRET)
+    worst = max(missed.max() for missed in regrets)
     top = min(max(worst, 10 * least), 10**DECADES * least)
     axes.set_yscale("log")
     axes.set_ylim(least / 1.3, top * 1.3)
