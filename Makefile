@@ -32,11 +32,11 @@ format: .venv/installed-dev
 
 # The site, in docs/_build/html. Any warning fails: a broken link, a page that the navigation does not reach.
 docs: .venv/installed-docs
-	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/_build/html
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet --doctree-dir docs/_build/doctrees docs docs/_build/html
 
 # The links to other sites, which may fail for a day.
 linkcheck: .venv/installed-docs
-	$(BIN)/sphinx-build --builder linkcheck --quiet docs docs/_build/linkcheck
+	$(BIN)/sphinx-build --builder linkcheck --doctree-dir docs/_build/doctrees --quiet docs docs/_build/linkcheck
 
 bench: .venv/installed-dev
 	$(BIN)/python bench/run.py

@@ -29,9 +29,10 @@ exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
 
 myst_enable_extensions = ["colon_fence", "dollarmath", "html_image"]
 myst_heading_anchors = 4
-# Notebooks run when they change; an error or a cell of more than two minutes fails the build.
+# Notebooks run when they change; an error or a cell of more than five minutes fails the build.
 nb_execution_mode = "cache"
-nb_execution_timeout = 120
+nb_execution_in_temp = True
+nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 
 autodoc_member_order = "bysource"
