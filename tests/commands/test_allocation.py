@@ -299,7 +299,7 @@ def test_orders_as_csv(folder, monkeypatch, capsys, tmp_path):
     )
     assert all(",STK,SMART,EUR,DAY,MKT,qfolio 2020-09-16" in line for line in lines)
     assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *of, "--layout", "x") == 2
-    assert "--layout is 'x'; choose from generic, ib" in capsys.readouterr().err
+    assert "--layout is 'x'; choose from generic, ib, alpaca, schwab" in capsys.readouterr().err
 
 
 def test_nothing_to_trade_is_an_empty_file_of_orders(folder, monkeypatch, capsys, tmp_path):

@@ -71,6 +71,12 @@ def test_resuming_a_finished_study_reports_again(place, monkeypatch, capsys):
         (["one.csv", "--lags", "1.5"], "--lags has 1.5; lags are whole numbers"),
         (["one.csv", "--costs-bps", "9999"], "--costs-bps is 9999"),
         (["one.csv", "--after", "nowhere"], "nowhere is no study"),
+        (
+            ["one.csv", "--train", "80d", "--test", "40d", "--benchmark", "Z"],
+            "one: The benchmark 'Z' is no strategy",
+        ),
+        (["one.csv", "--strategy", "mine"], "it must be NAME=FILE"),
+        (["one.csv", "--train", "80d", "--test", "40d", "--mandate", "none.toml"], "none.toml"),
         (["short.csv", "--train", "80d", "--test", "40d"], "short is too short: 100 rows"),
     ],
 )
@@ -82,6 +88,27 @@ def test_studies_that_are_refused(place, monkeypatch, capsys, tmp_path, options,
     assert "Traceback" not in printed
     assert len(printed.splitlines()) == 1
     assert not (tmp_path / "run").exists()
+
+
+def test_strategies_benchmark_and_mandate_hold_for_every_table(
+    place, monkeypatch, capsys, tmp_path
+):
+    (tmp_path / "mine.csv").write_text("date,A,B\n2020-01-05,0.4,0.4\n")
+    (tmp_path / "mandate.toml").write_text("[assets]\ncap = 0.5\n")
+    code = qfolio(
+        monkeypatch, "study", place / "one.csv", place / "two.csv", *TINY_BACKTEST,
+        "--strategy", f"mine={tmp_path / 'mine.csv'}", "--benchmark", "A",
+        "--mandate", tmp_path / "mandate.toml", "--out", tmp_path / "run",
+    )  # fmt: skip
+    assert code == 0
+    printed = capsys.readouterr().out
+    assert "pathwise beats A in growth after costs over 2 tables" in printed
+    assert "best rebalancing of A" not in printed
+    for table in ("one", "two"):
+        config = Study.open(tmp_path / "run").backtest(table).config
+        assert (config.strategies, config.benchmark) == (("mine", "A"), "A")
+        assert config.mandate is not None
+        assert config.mandate.assets.cap == 0.5
 
 
 def test_lags_and_costs_are_lists_beside_the_main_value():

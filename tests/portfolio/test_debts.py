@@ -9,6 +9,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Box, Simplex
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.task import Portfolio
 
 from planted import planted
@@ -47,6 +48,19 @@ def test_tilts_may_go_below_zero() -> None:
     long_short = tilted(anchor, scores, Box(3, 1.0))
     np.testing.assert_allclose(long_short, [0.2, 1.2, -0.4, 0.0], atol=1e-6)
     np.testing.assert_allclose(tilted(anchor, scores, Simplex(3)), [0.2, 0.8, 0, 0], atol=1e-6)
+
+
+def test_holdings_may_be_short_where_the_mandate_allows_it() -> None:
+    found, agent = {}, preset("fast", "portfolio", "tilts").build()
+    for mandate in (MANDATE, {"assets": {"cap": 0.5}}):
+        task = Portfolio.of(planted(200), window=5, horizon=10, mandate=mandate)
+        found[task.feasible.long_only] = Policy(task, agent, None, planted(200).assets)
+    names = planted(200).assets
+    held = {names[0]: 1.3, names[1]: -0.4, "cash": 0.1}
+    np.testing.assert_allclose(found[False].holdings(held)[:3], [0.1, 1.3, -0.4])
+    assert found[False].holdings({names[0]: 1.25})[0] == pytest.approx(-0.25)
+    with pytest.raises(QfolioError, match="it must be a number from 0 to 1"):
+        found[True].holdings(held)
 
 
 def test_a_policy_of_weights_says_what_it_is_for() -> None:

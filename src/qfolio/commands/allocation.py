@@ -51,7 +51,8 @@ def allocate(
         prices: Latest prices, CSV or Parquet, of the assets of the backtest (default: the prices
             of the backtest).
         holdings: Table with a column of assets (asset, symbol, ticker) and one of shares (shares,
-            quantity, qty); a row "cash" holds money (default: all is cash).
+            quantity, qty); a row "cash" holds money (default: all is cash). Shares sold short and
+            loans are negative, where the mandate allows them.
         capital: Cash, unless the holdings include it.
         agent: Agent to follow, or a baseline such as equal-weight (default: the first agent of the
             backtest).
@@ -62,7 +63,8 @@ def allocate(
         update: Update the policy on the new rows first, and store the updated policy beside those
             before it.
         orders: Write the trades to this CSV file.
-        layout: Columns of that file: generic, or ib for a basket of Interactive Brokers.
+        layout: Columns of that file: generic, ib for a basket of Interactive Brokers, or alpaca or
+            schwab for the fields of an order in their APIs.
         currency: Currency in that file, where the layout names one.
         dry_run: Write nothing: neither a record in the ledger nor an updated policy.
         reproduce: Compute the ledger's allocation of this date again, from the inputs that it kept
@@ -114,7 +116,7 @@ def allocate(
     followed = desk.followed(name)
     table = desk.table(followed, prices)
     require_fresh(table, as_of)
-    shares, cash = read_holdings(holdings, table.assets, capital)
+    shares, cash = read_holdings(holdings, table.assets, capital, debts=desk.debts)
     if update:
         if not isinstance(followed, Policy):
             raise QfolioError(f"{name} is a baseline, which learns nothing; leave out --update.")
@@ -234,7 +236,7 @@ def _reproduce(
 
     held = None
     if holdings is not None or capital is not None:
-        held = read_holdings(holdings, desk.run.prices.assets, capital)
+        held = read_holdings(holdings, desk.run.prices.assets, capital, debts=desk.debts)
     record, again = desk.reproduce(date, prices, held)
     if as_json:
         print(json.dumps({"record": record.number, **again.to_json()}, indent=2))

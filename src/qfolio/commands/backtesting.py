@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
-from qfolio.commands.arguments import Assignments, Count, File, Folder, Modules, Name, Trackers
+from qfolio.commands.arguments import (
+    Assignments,
+    Count,
+    File,
+    Folder,
+    Modules,
+    Name,
+    Sources,
+    Trackers,
+    sources,
+)
 from qfolio.commands.tables import Reading
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
@@ -47,6 +57,10 @@ class Options(Reading):
         signals: Signals that agents observe beside returns, separated by commas, each with the rows
             that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
             own as module:Name (default: the preset's).
+        strategy: Strategies of your own, each a CSV of target weights (date, and a column an
+            asset), of returns (date, return) or of an index (date, level).
+        benchmark: What all strategies are compared with: the name of a baseline, an asset (bought
+            and held) or a strategy of your own, or such a CSV (default: equal-weight).
         baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight
             is always among them (default: all of qfolio's).
         seeds: Agents of each kind (default: the preset's number).
@@ -76,6 +90,8 @@ class Options(Reading):
     cost_model: str = "proportional"
     calendar: str = ""
     signals: Name = None
+    strategy: Sources = ()
+    benchmark: Name = None
     baselines: Name = None
     seeds: Count = None
     seed: int = 0
@@ -118,6 +134,8 @@ class Options(Reading):
             "mandate": self.mandate,
             "cost_model": _known("cost", settings.called(self.cost_model)[0]) and self.cost_model,
             "calendar": self.calendar,
+            "strategies": sources(self.strategy),
+            "benchmark": self.benchmark,
             "baselines": list(registry.BASELINES)
             if self.baselines is None
             else [_known("baseline", name) for name in _split(self.baselines).values()],

@@ -279,8 +279,8 @@ def print_study(result: "Result") -> None:
             table.add_row(name, *cells, style=style)
         console.print(table)
     say(
-        "Growth is what exceeds equal weights, t against them (pooled: Stouffer's z), rebal. the t "
-        "(or z) against their best rebalancing, Sharpe the ratio less that of the best baseline."
+        "Growth is what exceeds the benchmark's, t against it (pooled: Stouffer's z), rebal. the t "
+        "(or z) against its best rebalancing, Sharpe the ratio less that of the best baseline."
     )
     for sentences in result.verdicts.values():
         for sentence in sentences:

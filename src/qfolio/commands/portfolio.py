@@ -4,7 +4,7 @@ import sys
 
 from tyro.conf import Positional
 
-from qfolio.commands.arguments import File, Name, Sources, again, sources
+from qfolio.commands.arguments import File, Name, again
 from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points, write_report
 from qfolio.commands.tables import READING, Read
 from qfolio.core import registry
@@ -32,8 +32,6 @@ def prices(file: Positional[File] = None, *, reading: Read = READING) -> None:
 def backtest(
     file: Positional[File] = None,
     *,
-    strategy: Sources = (),
-    benchmark: Name = None,
     options: Shared = DEFAULTS,
     title: Name = None,
 ) -> None:
@@ -42,10 +40,6 @@ def backtest(
     Args:
         file: CSV or Parquet with prices, which qfolio prices checks (default: 20 US stocks that
             come with skfolio).
-        strategy: Strategies of your own, each a CSV of target weights (date, and a column an
-            asset), of returns (date, return) or of an index (date, level).
-        benchmark: What all strategies are compared with: the name of a baseline, an asset (bought
-            and held) or a strategy of your own, or such a CSV (default: equal-weight).
         title: Title of the report (default: the agents, the table and its years).
     """
     from qfolio.core import devices
@@ -71,17 +65,9 @@ def backtest(
             cost=basis_points("--cost-bps", options.cost_bps),
             title=title or "",
             out=folder,
-            strategies=sources(strategy),
-            benchmark=benchmark,
             **options.settings(),
         )
-    elif (
-        file is None
-        and not strategy
-        and benchmark is None
-        and title is None
-        and options.only_resumes
-    ):
+    elif file is None and title is None and options.only_resumes:
         run, folder = Backtest.open(options.resume), options.resume
     else:
         raise QfolioError(

@@ -85,6 +85,10 @@ def train(
     )
 
 
+MOST = 100.0
+"""Largest weight that may be held, long or short, where debts are allowed."""
+
+
 class Policy:
     """Agents of one kind and several seeds, trained on the assets of one table.
 
@@ -253,20 +257,23 @@ class Policy:
 
     def holdings(self, holdings: Mapping[str, Any] | None) -> np.ndarray:
         """Weights with cash first, from weights by asset."""
-        held = np.zeros(1 + len(self.assets))
+        held, long_only = np.zeros(1 + len(self.assets)), self.task.feasible.long_only
         given = {} if holdings is None else dict(holdings)
         for name, weight in given.items():
             if name != "cash" and name not in self.assets:
                 raise QfolioError(f"The holdings name {name!r}, which the policy does not know.")
-            if not isinstance(weight, Real) or not 0 <= float(weight) <= 1 + 1e-9:
+            low, high = (0.0, 1 + 1e-9) if long_only else (-MOST, MOST)
+            if not isinstance(weight, Real) or not low <= float(weight) <= high:
                 raise QfolioError(
-                    f"The weight of {name!r} is {weight!r}; it must be a number from 0 to 1."
+                    f"The weight of {name!r} is {weight!r}; it must be a number"
+                    f"{' from 0 to 1' if long_only else ''}."
                 )
             held[0 if name == "cash" else 1 + self.assets.index(name)] = weight
         total = held[1:].sum()
-        if total > 1 + 1e-9 or ("cash" in given and abs(held.sum() - 1) > 1e-6):
+        excessive = long_only and total > 1 + 1e-9
+        if excessive or ("cash" in given and abs(held.sum() - 1) > 1e-6):
             raise QfolioError(f"The weights held sum to {held.sum():.6g}; they must sum to 1.")
-        held[0] = max(0.0, 1 - total)
+        held[0] = max(0.0, 1 - total) if long_only else 1 - total
         return held / held.sum()
 
     def decide(

@@ -7,6 +7,7 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.desk.allocation import Allocation, require_fresh
+from qfolio.portfolio.desk.orders_csv import order_rows
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -106,6 +107,24 @@ def test_noise_of_float32_is_no_loan():
     allocation = plan([-1e-7, 0.5, 0.5 + 1e-7], [0, 0], 1e6)
     assert allocation.weights[0] == 0
     assert allocation.cash_after == pytest.approx(0, abs=1e-6)
+
+
+def test_orders_through_zero_are_two_where_brokers_tell_short_sales():
+    allocation = plan([0.9, -0.2, 0.3], [5, -1], 1000, cost=0.0)  # wealth of 1060
+    np.testing.assert_allclose(allocation.trades, [-10.6 - 5, 7.95 + 1])
+    rows = order_rows(allocation, "alpaca", "USD")[1]
+    assert [row[:3] for row in rows] == [
+        ["A", 5, "sell"], ["A", 10.6, "sell"], ["B", 1, "buy"], ["B", 7.95, "buy"],
+    ]  # fmt: skip
+    with pytest.raises(QfolioError, match="An order at Schwab has whole shares"):
+        order_rows(allocation, "schwab", "USD")
+    whole = plan([0.9, -0.2, 0.3], [5, -1], 1000, cost=0.0, whole_shares=True)
+    header, rows = order_rows(whole, "schwab", "USD")
+    assert header[2:4] == ["instruction", "quantity"]
+    assert [row[:4] for row in rows] == [
+        ["A", "EQUITY", "SELL", 5], ["A", "EQUITY", "SELL_SHORT", 10],
+        ["B", "EQUITY", "BUY_TO_COVER", 1], ["B", "EQUITY", "BUY", 8],
+    ]  # fmt: skip
 
 
 def test_whole_shares_by_hand():

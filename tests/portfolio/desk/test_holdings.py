@@ -40,6 +40,14 @@ def test_names_and_money_that_are_given_otherwise(tmp_path: Path):
         read_holdings(None, ASSETS, float("nan"))
 
 
+def test_shorts_and_loans_where_they_are_allowed(tmp_path: Path):
+    path = write(tmp_path, "asset,shares\nAAA,-1.5\nBBB,4\ncash,-7\n")
+    shares, cash = read_holdings(path, ASSETS, None, debts=True)
+    assert (shares.tolist(), cash) == ([-1.5, 4, 0], -7)
+    with pytest.raises(QfolioError, match="has -inf shares; give a number"):
+        read_holdings(write(tmp_path, "asset,shares\nAAA,-inf\n"), ASSETS, None, debts=True)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -91,6 +91,24 @@ def test_returns_equal_the_replay_of_the_same_decisions(model, seed):
     assert found.wealth[-1] == pytest.approx(earned)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_shorts_and_loans_equal_the_replay_of_the_same_decisions(seed):
+    prices, model = table(seed=seed), Itemized(0.001, cash_rate="0.05", spread="0.02")
+    rng = np.random.default_rng(seed)
+    assets = rng.uniform(-0.4, 0.9, (4, 3))
+    targets = np.column_stack([1 - assets.sum(1), assets])
+    rows = [10, 11, 12, 13]
+    found = mark(traded(prices, model, rows, targets), prices, model, lag=0)
+    decisions = np.full((len(prices) - 1 - 10, 4), np.nan)
+    decisions[:4] = targets
+    replay = simulate(
+        prices.values, decisions, first=10, cost=model, lag=0, long_only=False,
+        conditions=Conditions.of(prices, model.columns),
+    )  # fmt: skip
+    assert (targets < 0).any()
+    np.testing.assert_allclose(found.returns[:4], replay.returns[:4], atol=1e-12)
+
+
 def by_hand(values, shares, cash, trades):
     prices = Prices(np.datetime64("2024-01-01") + np.arange(len(values)), ("A",), np.array(values))
     plan = Allocation(

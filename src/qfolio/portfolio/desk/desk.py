@@ -48,6 +48,11 @@ class Desk:
     def ledger(self) -> Ledger:
         return Ledger(self.folder / "ledger")
 
+    @property
+    def debts(self) -> bool:
+        """Whether its mandate lets assets be sold short or cash be borrowed."""
+        return not next(iter(self.run.tasks.values())).feasible.long_only
+
     def followed(self, name: str, stored: str | None = None) -> Policy | Rule:
         """An agent's policy (default: the newest), or a baseline."""
         if name in self.run.agents:

@@ -19,7 +19,7 @@ CASH = "cash"
 
 
 def read_holdings(
-    path: Path | None, assets: Sequence[str], capital: float | None
+    path: Path | None, assets: Sequence[str], capital: float | None, *, debts: bool = False
 ) -> tuple[np.ndarray, float]:
     """Shares of each asset, of shape (assets,), and cash.
 
@@ -29,10 +29,11 @@ def read_holdings(
             Without it, all is cash.
         assets: The assets that may be held.
         capital: Cash, if the table does not give it.
+        debts: Whether shares may be negative (sold short), and cash (a loan).
 
     Raises:
         QfolioError: The file is not such a table, names an unknown asset or one asset twice, a
-            number cannot be read or is negative, or cash is given twice.
+            number cannot be read or is negative without debts, or cash is given twice.
     """
     if capital is not None and not 0 <= capital < math.inf:
         raise QfolioError(f"--capital is {capital}; it must be a sum of money, at least 0.")
@@ -64,8 +65,9 @@ def read_holdings(
             raise QfolioError(f"{where}: there is no number of shares of {quote(name)}.")
         if wrong[i] or (name != CASH and CURRENCIES & set(str(cells[i]))):
             raise QfolioError(f"{where}: {not_a_number(cells[i], table.decimal)}.")
-        if not 0 <= amount < math.inf:
-            raise QfolioError(f"{where}: {quote(name)} has {amount:g} shares; give 0 or more.")
+        if not math.isfinite(amount) or (amount < 0 and not debts):
+            wanted = "a number" if debts else "0 or more: the backtest is long-only"
+            raise QfolioError(f"{where}: {quote(name)} has {amount:g} shares; give {wanted}.")
         held[name] = amount
     cash = held.pop(CASH, capital or 0.0)
     for name, amount in held.items():

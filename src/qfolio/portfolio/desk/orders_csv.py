@@ -81,9 +81,43 @@ def _interactive_brokers(allocation: Allocation, currency: str) -> tuple[list[st
     return header, rows
 
 
+def _alpaca(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
+    """Market orders for the day, in the fields of POST /v2/orders; Alpaca imports no file.
+
+    Source: Alpaca, "Working with /orders".
+    """
+    header = ["symbol", "qty", "side", "type", "time_in_force"]
+    return header, [
+        [allocation.assets[i], quantity, "buy" if side.startswith("BUY") else "sell", "market",
+         "day"]
+        for i, side, quantity in _legs(allocation)
+    ]  # fmt: skip
+
+
+def _schwab(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
+    """Market orders for the day, in the fields of the Trader API; accounts import no file.
+
+    Source: Schwab Trader API, "Place Order": instruction, quantity, symbol and assetType are those
+    of a leg in ``orderLegCollection``; orderStrategyType is SINGLE.
+    """
+    header = [
+        "symbol", "assetType", "instruction", "quantity", "orderType", "session", "duration",
+    ]  # fmt: skip
+    rows: Rows = []
+    for i, instruction, quantity in _legs(allocation):
+        if quantity != int(quantity):
+            raise QfolioError("An order at Schwab has whole shares; add --whole-shares.")
+        rows.append(
+            [allocation.assets[i], "EQUITY", instruction, int(quantity), "MARKET", "NORMAL", "DAY"]
+        )
+    return header, rows
+
+
 LAYOUTS: dict[str, Callable[[Allocation, str], tuple[list[str], Rows]]] = {
     "generic": _generic,
     "ib": _interactive_brokers,
+    "alpaca": _alpaca,
+    "schwab": _schwab,
 }
 """Columns by name."""
 
@@ -100,3 +134,18 @@ def _orders(allocation: Allocation) -> list[tuple[int, str, float]]:
             found.append((i, side, int(size) if size == int(size) else size))
     sales = [order for order in found if order[1] == "SELL"]
     return sales + [order for order in found if order[1] == "BUY"]
+
+
+def _legs(allocation: Allocation) -> list[tuple[int, str, float]]:
+    """The orders, with short sales told from others: SELL, SELL_SHORT, BUY_TO_COVER or BUY.
+
+    What goes through zero is two orders, of which the first closes the position.
+    """
+    found = []
+    for i, side, quantity in _orders(allocation):
+        held = float(allocation.shares[i])
+        closed = min(quantity, max(held if side == "SELL" else -held, 0.0))
+        first, then = ("SELL", "SELL_SHORT") if side == "SELL" else ("BUY_TO_COVER", "BUY")
+        sizes = ((first, closed), (then, round(quantity - closed, DIGITS)))
+        found += [(i, name, size) for name, size in sizes if size]
+    return found

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT
 from qfolio.portfolio.backtest.verdict import p_value
 from qfolio.portfolio.study.folder import Result
 from qfolio.portfolio.study.pooling import Pooled, Pools
@@ -10,11 +11,18 @@ _SPACE = "\N{NARROW NO-BREAK SPACE}"
 
 
 def verdicts(agents: Mapping[str, Pools]) -> dict[str, list[str]]:
-    """Three sentences on each agent: against the reference, its best rebalancing, and by table."""
+    """Sentences on each agent: against the reference, its best rebalancing, and by table.
+
+    Only equal weights are rebalanced at several speeds.
+    """
     return {
         name: [
             f"{_claim(name, pools)}: {_numbers(pools.to_reference)}.",
-            f"{_claim_at_best(name, pools)}: {_numbers(pools.to_rebalanced)}.",
+            *(
+                [f"{_claim_at_best(name, pools)}: {_numbers(pools.to_rebalanced)}."]
+                if _reference(pools) == EQUAL_WEIGHT
+                else []
+            ),
             _tables(pools),
         ]
         for name, pools in agents.items()
