@@ -1,14 +1,24 @@
 """The entry point; slow imports are left to the commands that need them."""
 
+import functools
 import os
 import sys
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from qfolio.core.text import printable
+from qfolio.core.text import near, printable
 from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 
 OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
+
+
+ABOUT = """Reinforcement learning for portfolio optimization, graded against exact optima.
+
+Examples:
+  qfolio backtest prices.csv     backtest agents on a table of prices
+  qfolio train pendulum          train an agent on a task
+  qfolio backtest --help         show the options of a command
+  qfolio --version               show the version"""
 
 
 def main() -> NoReturn:
@@ -17,39 +27,34 @@ def main() -> NoReturn:
     run()
 
 
+@functools.cache
 def commands() -> dict[str, Callable[..., Any]]:
-    """All commands by name."""
+    """All commands by name, as tyro reads them."""
     from qfolio.commands.allocation import allocate, follow
     from qfolio.commands.board import board
     from qfolio.commands.comparison import compare
     from qfolio.commands.continual import continual
+    from qfolio.commands.parsing import grouped
     from qfolio.commands.portfolio import backtest, prices
     from qfolio.commands.report import report
     from qfolio.commands.study import study
     from qfolio.commands.training import evaluate, train, watch
     from qfolio.commands.tuning import tune
 
-    return {
-        "backtest": backtest, "allocate": allocate, "follow": follow, "prices": prices,
-        "study": study, "train": train, "compare": compare, "evaluate": evaluate, "watch": watch,
-        "tune": tune, "continual": continual, "board": board, "report": report,
-    }  # fmt: skip
+    every = (
+        backtest, allocate, follow, prices, study, train, compare, evaluate, watch, tune, continual,
+        board, report,
+    )  # fmt: skip
+    return {command.__name__: grouped(command) for command in every}
 
 
 def run() -> NoReturn:
     """Runs the command line; a QfolioError becomes one sentence and exit code 2."""
-    import tyro
-
     from qfolio.core.errors import QfolioError
 
     try:
         try:
-            tyro.extras.subcommand_cli_from_dict(
-                commands(),
-                prog="qfolio",
-                description="Reinforcement learning for portfolio optimization, "
-                "graded against exact optima.",
-            )
+            _call(sys.argv[1:])
         finally:
             sys.stdout.flush()  # here, where a broken pipe is expected
     except QfolioError as error:
@@ -69,6 +74,40 @@ def run() -> NoReturn:
         print("qfolio: interrupted", file=sys.stderr)
         sys.exit(EXIT_CODE)
     sys.exit(0)
+
+
+def _call(words: list[str]) -> None:
+    """Runs the command that the words name, or shows the commands."""
+    import tyro
+
+    from qfolio.commands.parsing import description, summary
+    from qfolio.core.errors import QfolioError
+
+    if words == ["--version"]:
+        from qfolio import __version__
+
+        print(f"qfolio {__version__}")
+        return
+    known, name = commands(), words[0] if words else ""
+    if name in known:
+        about = description(known[name])
+        tyro.cli(known[name], prog=f"qfolio {name}", description=about, args=words[1:])
+        return
+    if name and not name.startswith("-"):
+        raise QfolioError(f"there is no command {name!r}; {near(name, known)}")
+    overview = {name: _named(summary(command)) for name, command in known.items()}
+    tyro.extras.subcommand_cli_from_dict(
+        overview, prog="qfolio", description=ABOUT, args=words or ["--help"]
+    )
+
+
+def _named(text: str) -> Callable[[], None]:
+    """A command of which only the summary is of interest."""
+
+    def command() -> None: ...
+
+    command.__doc__ = text
+    return command
 
 
 def _refuse(sentence: str) -> NoReturn:

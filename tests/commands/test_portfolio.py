@@ -38,9 +38,13 @@ def test_a_backtest_shows_itself_in_a_notebook(folder):
 
 def test_resuming_a_finished_backtest_reports_again(folder, monkeypatch, capsys):
     before = (folder / "returns.csv").read_text()
-    assert qfolio(monkeypatch, "backtest", "--resume", folder) == 0
+    assert qfolio(monkeypatch, "backtest", "--resume", folder, "--json") == 0
     assert (folder / "returns.csv").read_text() == before
-    assert "equal-weight" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    reported = json.loads(out)
+    assert reported["report"] == str(folder / "report.html")
+    assert "equal-weight" in reported["strategies"]
+    assert "equal-weight" in err
 
 
 def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):

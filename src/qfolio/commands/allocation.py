@@ -1,12 +1,12 @@
 """The desk: trades for tomorrow from a backtest's policy, and the ledger of those made before."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from qfolio.commands.arguments import File, Modules, Name, Names
+from qfolio.commands.parsing import Document
 from qfolio.commands.tables import Missing, Returns
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
@@ -38,13 +38,16 @@ def allocate(
     features: Names = (),
     returns: Returns = None,
     date: Name = None,
-    as_json: Annotated[bool, arg(name="json")] = False,
-) -> None:
+) -> Document:
     """Compute tomorrow's target weights, and the trades to reach them.
 
     The verdict of the backtest on the agent is printed, too. If the first agent did worse than
     the benchmark, nothing is allocated without --agent or --anyway. Each allocation is recorded in
     the ledger of the folder.
+
+    Examples:
+        qfolio allocate runs/mine --capital 10000
+        qfolio allocate runs/mine --holdings holdings.csv --orders orders.csv
 
     Args:
         folder: Folder of a backtest; its policies are also trained on the latest rows.
@@ -75,7 +78,6 @@ def allocate(
         returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
             shares and orders need prices (default: they are prices).
         date: Column of dates (default: found by its name).
-        as_json: Print JSON instead of a table.
     """
     import msgspec
     import numpy as np
@@ -107,7 +109,7 @@ def allocate(
                 "--reproduce takes its agent from the ledger and trades nothing; leave out "
                 "--agent, --update and --orders."
             )
-        return _reproduce(desk, reproduce, prices, holdings, capital, as_json)
+        return _reproduce(desk, reproduce, prices, holdings, capital)
     name = next(iter(desk.run.agents)) if agent is None else agent
     learned = name not in desk.run.baselines
     standing = Standing.of(folder, name, learned=learned)
@@ -136,21 +138,19 @@ def allocate(
     if isinstance(followed, Policy):
         why = reasons(followed, table, allocation)
         trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
-    if as_json:
-        of = {
-            "agent": name,
-            "trained_until": trained,
-            "verdict": standing.verdict or None,
-            "worse": standing.worse,
-            "record": number,
-        }
-        because = {"reasons": msgspec.to_builtins(why)}
-        print(json.dumps({**of, **allocation.to_json(), **because}, indent=2))
-    else:
-        console.print_allocation(allocation, standing, trained)
-        for reason in why:
-            console.say(f"Why {sentence(reason)}")
-        console.say(said)
+    console.print_allocation(allocation, standing, trained)
+    for reason in why:
+        console.say(f"Why {sentence(reason)}")
+    console.say(said)
+    return {
+        "agent": name,
+        "trained_until": trained,
+        "verdict": standing.verdict or None,
+        "worse": standing.worse,
+        "record": number,
+        **allocation.to_json(),
+        "reasons": msgspec.to_builtins(why),
+    }
 
 
 def follow(
@@ -163,12 +163,14 @@ def follow(
     missing: Missing = "error",
     features: Names = (),
     date: Name = None,
-    as_json: Annotated[bool, arg(name="json")] = False,
-) -> None:
+) -> Document:
     """Show what the allocations of a ledger have earned, beside what the backtest promised.
 
     The ledger is marked to market at every row of the prices. A sequential test says whether live
     returns are still consistent with the backtest, and a sentence says when a retrain is due.
+
+    Examples:
+        qfolio follow runs/mine --prices prices.csv
 
     Args:
         folder: Folder of a backtest with a ledger.
@@ -182,7 +184,6 @@ def follow(
         missing: How to treat missing prices.
         features: Columns that hold features (default: those of the backtest).
         date: Column of dates (default: found by its name).
-        as_json: Print JSON instead of a table.
     """
     import numpy as np
 
@@ -215,11 +216,9 @@ def follow(
         title = f"{following.agent}, live and in the backtest"
         text = render_following(title, following.sentences(), rows, following.rows())
         write_bytes(page, text.encode())
-    if as_json:
-        print(json.dumps(following.to_json(), indent=2))
-        return
     console.print_following(following)
     console.say(f"Rows: {path}" + (f", page: {page}" if len(live.returns) else ""))
+    return following.to_json()
 
 
 def _reproduce(
@@ -228,8 +227,7 @@ def _reproduce(
     prices: Path | None,
     holdings: Path | None,
     capital: float | None,
-    as_json: bool,
-) -> None:
+) -> Document:
     """Computes an allocation of the ledger again and says how near it comes."""
     from qfolio.commands import console
     from qfolio.portfolio.desk.holdings import read_holdings
@@ -238,9 +236,6 @@ def _reproduce(
     if holdings is not None or capital is not None:
         held = read_holdings(holdings, desk.run.prices.assets, capital, debts=desk.debts)
     record, again = desk.reproduce(date, prices, held)
-    if as_json:
-        print(json.dumps({"record": record.number, **again.to_json()}, indent=2))
-        return
     off = max(abs(x - y) for x, y in zip(again.weights.tolist(), record.target, strict=True))
     console.say(
         f"Record {record.number} of {record.date} ({record.agent}, made {record.made} by qfolio "
@@ -248,3 +243,4 @@ def _reproduce(
         f"{' and policy' if record.policy else ''} have the digests of the ledger, and no target "
         f"weight is off by more than {off:.1g}."
     )
+    return {"record": record.number, **again.to_json()}

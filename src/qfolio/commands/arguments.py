@@ -19,7 +19,7 @@ Trackers = Annotated[
     tuple[str, ...], arg(metavar="tensorboard|wandb|trackio …", help_behavior_hint="")
 ]
 Sources = Annotated[
-    tuple[str, ...], arg(metavar="NAME=FILE", help_behavior_hint="(repeatable)"), UseAppendAction
+    tuple[str, ...], arg(metavar="NAME=FILE", help_behavior_hint=""), UseAppendAction
 ]
 Assignments = Annotated[
     tuple[str, ...], arg(name="set", metavar="NAME=VALUE …", help_behavior_hint="")

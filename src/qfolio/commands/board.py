@@ -16,6 +16,10 @@ def board(
 
     The page is for this machine alone and changes nothing.
 
+    Examples:
+        qfolio board
+        qfolio board results --no-open
+
     Args:
         runs: Folder of runs.
         port: Port on 127.0.0.1; 0 takes a free one.

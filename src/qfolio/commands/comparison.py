@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from qfolio.commands.arguments import Count, Folder, Modules, Name, Trackers, again, budget_of
+from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
@@ -34,8 +35,12 @@ def compare(
     on: str = "here",
     track: Trackers = (),
     trust: Modules = (),
-) -> None:
+) -> Document:
     """Train several agents on one task, with the same seeds, and write a report that compares them.
+
+    Examples:
+        qfolio compare --agents dqn,sac,ppo
+        qfolio compare finite/cliff --agents q-learning,sarsa --seeds 5
 
     Args:
         task: Task to learn (default: pendulum).
@@ -99,7 +104,7 @@ def compare(
     if run.interrupted:
         parts = [part for one in run.entrants.values() for part in (one.task, one.agent)]
         stop(again("qfolio compare --resume", run.folder, *parts, on=on))
-    _finish(run)
+    return outcome(run.folder, _finish(run))
 
 
 def _entrants(
@@ -160,11 +165,12 @@ def _train(run: "Comparison", executor: "Executor") -> None:
         run.run(listen, executor)
 
 
-def _finish(run: "Comparison") -> None:
+def _finish(run: "Comparison") -> Document:
     from qfolio.commands import console
     from qfolio.report.comparison import write_comparison_report
 
     content = run.finish()
     write_comparison_report(run.folder, content)
     console.print_ranking(content)
-    console.say(f"Report: {run.folder / 'report.html'}")
+    console.say(f"Report: {run.folder / PAGE}")
+    return content

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Trackers
+from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
@@ -37,8 +38,12 @@ def continual(
     resume: Folder = None,
     track: Trackers = (),
     trust: Modules = (),
-) -> None:
+) -> Document:
     """Change a task after training and compare how soon each way to go on recovers, at what cost.
+
+    Examples:
+        qfolio continual --change mass=2
+        qfolio continual --change mass=2 --seeds 5
 
     Args:
         task: Task to learn (default: pendulum).
@@ -94,7 +99,8 @@ def continual(
     write_continual_report(folder, content)
     console.print_ways(content)
     console.say(verdict(content))
-    console.say(f"Report: {folder / 'report.html'}")
+    console.say(f"Report: {folder / PAGE}")
+    return outcome(folder, content)
 
 
 def _plan(

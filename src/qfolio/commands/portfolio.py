@@ -1,18 +1,23 @@
 """The commands about prices: check a table, and backtest agents on it."""
 
-import sys
+import dataclasses
 
 from tyro.conf import Positional
 
 from qfolio.commands.arguments import File, Name, again
 from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points, write_report
+from qfolio.commands.parsing import PAGE, Document, Failed, outcome
 from qfolio.commands.tables import READING, Read
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 
-def prices(file: Positional[File] = None, *, reading: Read = READING) -> None:
+def prices(file: Positional[File] = None, *, reading: Read = READING) -> Document:
     """Check a price table and report errors, warnings and notes by row and column.
+
+    Examples:
+        qfolio prices prices.csv
+        qfolio prices prices.csv --missing forward-fill --json
 
     Args:
         file: CSV or Parquet file, wide (a column per asset), long (date, asset, price) or as
@@ -24,9 +29,12 @@ def prices(file: Positional[File] = None, *, reading: Read = READING) -> None:
 
     table, findings = inspect(file, **reading.reading)
     console.print_findings(findings)
+    found: Document = {"findings": [dataclasses.asdict(finding) for finding in findings]}
     if table is None:
-        sys.exit(2)
-    console.print_prices(describe(table))
+        raise Failed(found)
+    facts = describe(table)
+    console.print_prices(facts)
+    return facts | found
 
 
 def backtest(
@@ -34,8 +42,13 @@ def backtest(
     *,
     options: Shared = DEFAULTS,
     title: Name = None,
-) -> None:
+) -> Document:
     """Train agents walk-forward on a price table and compare them with classical allocators.
+
+    Examples:
+        qfolio backtest prices.csv
+        qfolio backtest prices.csv --agents tilts --cost-bps 5 --out runs/mine
+        qfolio backtest --resume runs/mine
 
     Args:
         file: CSV or Parquet with prices, which qfolio prices checks (default: 20 US stocks that
@@ -49,6 +62,7 @@ def backtest(
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import JobsProgress, stop
+    from qfolio.core.files import read_json
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.backtest.attribution.explain import explain
@@ -88,4 +102,5 @@ def backtest(
     for sentences in why.diagnosis.values():
         for sentence in sentences:
             console.say(f"Diagnosis: {sentence}")
-    console.say(f"Report: {folder / 'report.html'}")
+    console.say(f"Report: {folder / PAGE}")
+    return outcome(folder, read_json(folder / "summary.json"))

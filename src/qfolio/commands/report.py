@@ -6,17 +6,22 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from qfolio.commands.arguments import Modules
+from qfolio.commands.parsing import PAGE, Document
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 FILES = ("comparison.json", "continual.json", "study.json", "config.json")
 """The files that say of which kind a folder is."""
 
-PAGE, PDF = "report.html", "report.pdf"
+PDF = "report.pdf"
 
 
-def report(folder: Positional[Path], *, pdf: bool = False, trust: Modules = ()) -> None:
+def report(folder: Positional[Path], *, pdf: bool = False, trust: Modules = ()) -> Document:
     """Write the report of a finished run again, and print it as PDF.
+
+    Examples:
+        qfolio report runs/mine
+        qfolio report runs/mine --pdf
 
     Args:
         folder: Folder of qfolio train, backtest, study, compare, tune or continual.
@@ -40,6 +45,7 @@ def report(folder: Positional[Path], *, pdf: bool = False, trust: Modules = ()) 
         with console.console.status("Printing"):
             print_pdf(folder / PAGE, folder / PDF)
         console.say(f"PDF: {folder / PDF}")
+    return {"folder": folder, "report": folder / PAGE, "pdf": folder / PDF if pdf else None}
 
 
 def _kind(folder: Path) -> str:

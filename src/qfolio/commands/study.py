@@ -8,6 +8,7 @@ from tyro.conf import Positional, arg
 
 from qfolio.commands.arguments import again
 from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points, write_report
+from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
@@ -28,8 +29,12 @@ def study(
     lags: Numbers = None,
     costs_bps: Numbers = None,
     after: Folders = (),
-) -> None:
+) -> Document:
     """Backtest one configuration on many price tables and pool the evidence.
+
+    Examples:
+        qfolio study us.csv europe.csv --agents tilts
+        qfolio study us.csv eu=europe.csv --lags 2 --costs-bps 20,50
 
     Args:
         sets: CSV or Parquet files with prices, a table each, as qfolio backtest reads them; NAME=
@@ -40,6 +45,8 @@ def study(
         after: Folders of earlier studies; their looks at the same tables are counted (default:
             none).
     """
+    import msgspec
+
     from qfolio.core import devices
 
     devices.configure()
@@ -87,7 +94,8 @@ def study(
         result = run.result()
         write_study_report(run)
     console.print_study(result)
-    console.say(f"Report: {run.folder / 'report.html'}")
+    console.say(f"Report: {run.folder / PAGE}")
+    return outcome(run.folder, msgspec.to_builtins(result))
 
 
 def _tables(sets: tuple[str, ...], load: Any) -> "dict[str, Prices]":

@@ -2,14 +2,13 @@
 
 import contextlib
 import datetime
-import json
 import re
 import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from qfolio.commands.arguments import (
     Assignments,
@@ -21,6 +20,7 @@ from qfolio.commands.arguments import (
     again,
     budget_of,
 )
+from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
@@ -47,8 +47,13 @@ def train(
     trust: Modules = (),
     compare: bool = True,
     live: bool = False,
-) -> None:
+) -> Document:
     """Train agents on a task, grade them against the exact optimum and write a report.
+
+    Examples:
+        qfolio train
+        qfolio train catch --seeds 5
+        qfolio train pendulum/grid --agent q-learning --set discount=0.98
 
     Args:
         task: Task to learn (default: pendulum): pendulum, pendulum/grid, pendulum/hidden or catch;
@@ -121,7 +126,7 @@ def train(
         contrast = _contrast(run, folder, executor)
     if contrast is not None and contrast.interrupted:
         stop(_resume(run, folder, on))
-    _finish(run, folder, contrast)
+    return outcome(folder, _finish(run, folder, contrast))
 
 
 def evaluate(
@@ -129,16 +134,18 @@ def evaluate(
     *,
     episodes: Count = None,
     trust: Modules = (),
-    as_json: Annotated[bool, arg(name="json")] = False,
-) -> None:
+) -> Document:
     """Grade a run's greedy policies from fixed start states against the optimum.
+
+    Examples:
+        qfolio evaluate runs/mine --episodes 100
+        qfolio evaluate runs/mine --json
 
     Args:
         folder: Folder of a run.
         episodes: Number of start states, the same for every run and agent (default: 1,024, or 100
             for environments of Gymnasium).
         trust: Modules of your own code that the folder may name (default: none).
-        as_json: Print JSON instead of a table.
     """
     if episodes is not None and episodes < 1:
         raise QfolioError(f"--episodes is {episodes}; it must be at least 1.")
@@ -146,21 +153,21 @@ def evaluate(
 
     devices.configure()
     registry.trust(trust)
+    from qfolio.commands.console import print_result
     from qfolio.experiments.run import Run
 
     run = Run.open(folder)
     episodes = episodes or run.population.starts
     result = run.grade(episodes)
-    if as_json:
-        print(json.dumps({"folder": str(folder), "starts": episodes, **result}, indent=2))
-    else:
-        from qfolio.commands.console import print_result
-
-        print_result(run.population.seeds, result)
+    print_result(run.population.seeds, result)
+    return {"folder": folder, "starts": episodes, **result}
 
 
 def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -> None:
     """Show a run's first agent in a window; without a display, write episode.gif.
+
+    Examples:
+        qfolio watch runs/mine
 
     Args:
         folder: Folder of a run.
@@ -298,7 +305,7 @@ def write_again(folder: Path) -> None:
     write_report(folder, report_data(run, summary, contrast, _command(run)))
 
 
-def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
+def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
     from qfolio.commands.console import console, print_result, print_rule, say
     from qfolio.report.collect import report_data
     from qfolio.report.training import write_report
@@ -315,7 +322,8 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> None:
         f"training ({summary['steps_per_second']:,.0f} a second), "
         f"{summary['seconds_compile']:.1f} s of compiling."
     )
-    say(f"Report: {folder / 'report.html'}")
+    say(f"Report: {folder / PAGE}")
+    return summary
 
 
 def _resume(run: "Run", folder: Path | None, on: str = "here") -> str:

@@ -18,6 +18,7 @@ from qfolio.commands.arguments import (
     again,
     budget_of,
 )
+from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
@@ -46,8 +47,12 @@ def tune(
     on: str = "here",
     track: Trackers = (),
     trust: Modules = (),
-) -> None:
+) -> Document:
     """Search an agent's hyperparameters and report which of them matter.
+
+    Examples:
+        qfolio tune --trials 32
+        qfolio tune --agent sac --search learning_rate=1e-4..1e-2
 
     Args:
         task: Task to learn, any that qfolio train knows (default: pendulum).
@@ -112,9 +117,9 @@ def tune(
         console.say(
             f"Other processes are training {count} trials; the last to finish writes the report."
         )
-        return
+        return {"folder": work.folder, "report": None}
     try:
-        _conclude(work, resume, executor)
+        return outcome(work.folder, _conclude(work, resume, executor))
     except KeyboardInterrupt:
         stop(resume)
 
@@ -191,7 +196,7 @@ def _new(
     )
 
 
-def _conclude(work: "Tuning", resume: str, executor: "Executor") -> None:
+def _conclude(work: "Tuning", resume: str, executor: "Executor") -> Document:
     from qfolio.commands.console import console, print_search, say
     from qfolio.report.tuning import sweep, write_tuning_report
 
@@ -203,7 +208,8 @@ def _conclude(work: "Tuning", resume: str, executor: "Executor") -> None:
         write_tuning_report(work.folder, data)
     print_search(summary, data.verdicts)
     say(f"\nTrain the best configuration with:\n{train}")
-    say(f"Report: {work.folder / 'report.html'}")
+    say(f"Report: {work.folder / PAGE}")
+    return summary
 
 
 def command(work: "Tuning", values: dict[str, Any]) -> str:

@@ -1,7 +1,9 @@
 """Text that comes from files, made safe for messages, the terminal and CSV cells."""
 
+import difflib
 import re
 import unicodedata
+from collections.abc import Iterable
 from typing import Any
 
 UNSAFE = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
@@ -22,6 +24,13 @@ def quote(value: object, limit: int = 60) -> str:
     """Any value in quotation marks, on one line and cut to ``limit`` characters."""
     text = str(value)
     return f"'{printable(text if len(text) <= limit else text[: limit - 1] + '…')}'"
+
+
+def near(name: str, known: Iterable[str]) -> str:
+    """What a message says after a wrong name: "did you mean …?", or all known names."""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]}?" if close else f"choose from {', '.join(names)}."
 
 
 def csv_cell(value: Any) -> Any:

@@ -1,0 +1,123 @@
+"""How commands are typed: --help, --version, --json, and what is said of wrong words."""
+
+import dataclasses
+import inspect
+import json
+import math
+from pathlib import Path
+from typing import Annotated, get_args
+
+import pytest
+from tyro.conf import Positional
+
+import qfolio
+from qfolio.cli import commands
+from qfolio.commands.parsing import Document, Failed, description, example, grouped
+
+from shell import qfolio as typed
+from tables import write_table
+
+EVERY = commands()
+
+
+def helped(part):
+    """The options of a command, those in groups included, with their help."""
+    for option in inspect.signature(part).parameters.values():
+        kind, *marks = get_args(option.annotation)
+        if dataclasses.is_dataclass(kind):
+            yield from helped(kind)
+        else:
+            yield option, next(mark.help for mark in marks if getattr(mark, "help", None))
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_option_names_its_default_once(name):
+    """But for what must be given, and for switches, which are off."""
+    for option, text in helped(EVERY[name]):
+        silent = option.default is False or option.default is option.empty
+        assert (text.count("(default: ") == 0) if silent else (text.count("(default: ") == 1), text
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_command_has_examples_of_itself(name, monkeypatch, capsys):
+    lines = example(EVERY[name])
+    assert lines
+    assert all(line.startswith(f"qfolio {name}") for line in lines)
+    monkeypatch.setenv("COLUMNS", "80")
+    assert typed(monkeypatch, name, "--help") == 0
+    page = capsys.readouterr().out
+    assert all(f"  {line}\n" in page for line in lines)
+    assert max(map(len, page.splitlines())) <= 80
+    assert description(EVERY[name]) in page
+
+
+def test_options_are_in_groups(monkeypatch, capsys):
+    assert typed(monkeypatch, "backtest", "--help") == 0
+    page = capsys.readouterr().out
+    titles = ["price", "split", "cost and mandate", "learning", "comparison", "run", "output"]
+    places = [page.index(f"{title} options") for title in titles]
+    assert places == sorted(places)
+    assert places[2] < page.index("--cap FLOAT") < places[3]
+    assert "Largest weight of one asset, from 0 to 1 (default: 1)." in page
+
+
+def test_the_version(monkeypatch, capsys):
+    assert typed(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out == f"qfolio {qfolio.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["bactest"], "did you mean backtest?"),
+        (["xyz"], "choose from backtest, allocate"),
+        (["backtest", "--bechmark", "x"], "qfolio backtest --help"),
+        (["prices", "--missing", "x"], "qfolio prices --help"),
+        (["evaluate"], "qfolio evaluate --help"),
+        ([], ""),
+    ],
+)
+def test_wrong_words(monkeypatch, capsys, words, said):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert typed(monkeypatch, *words) == (2 if words else 0)
+    printed = capsys.readouterr()
+    assert said in printed.err
+    assert bool(printed.out) == (not words)
+
+
+def test_prices_as_json(monkeypatch, capsys, tmp_path):
+    good = write_table(tmp_path / "good.csv")
+    assert typed(monkeypatch, "prices", good, "--json") == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["rows"] == 260
+    assert "260 rows of 3 assets" in err
+    bad = tmp_path / "bad.csv"
+    bad.write_text(good.read_text().replace("2020-01-05,", "2020-01-05,-", 1))
+    assert typed(monkeypatch, "prices", bad, "--json") == 2
+    found, *_ = json.loads(capsys.readouterr().out)["findings"]
+    assert (found["severity"], found["row"]) == ("error", 6)
+    assert typed(monkeypatch, "prices", tmp_path / "none.csv", "--json") == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert err.startswith("qfolio: ")
+    assert err.count("\n") == 1
+
+
+def test_json_holds_any_document(capsys):
+    def command(place: Annotated[Positional[Path], ""], *, wrong: bool = False) -> Document:
+        """Report."""
+        print("a note")
+        if wrong:
+            raise Failed({"wrong": True})
+        return {"place": place, "numbers": [1.5, math.nan, (math.inf,)]}
+
+    call = grouped(command)
+    call(place=Path("a"), wrong=False, output_options=Output(True))
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"place": "a", "numbers": [1.5, None, [None]]}
+    assert err == "a note\n"
+
+
+class Output:
+    def __init__(self, as_json):
+        self.as_json = as_json
