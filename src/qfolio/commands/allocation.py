@@ -94,6 +94,7 @@ def allocate(
     from qfolio.portfolio.desk.holdings import read_holdings
     from qfolio.portfolio.desk.orders_csv import order_rows
     from qfolio.portfolio.desk.standing import Standing
+    from qfolio.portfolio.mandate.mandate import lots
     from qfolio.portfolio.policy import Policy
     from qfolio.portfolio.prices.findings import amount, day
 
@@ -116,6 +117,10 @@ def allocate(
     if not anyway:
         standing.require_sound(folder, named=agent is not None)
     followed = desk.followed(name)
+    if returns and lots(followed.mandate) is not None:
+        raise QfolioError(
+            "The mandate has lots, and --returns gives no prices of shares; bring prices."
+        )
     table = desk.table(followed, prices)
     require_fresh(table, as_of)
     shares, cash = read_holdings(holdings, table.assets, capital, debts=desk.debts)

@@ -199,6 +199,11 @@ class Policy:
         return self.task.costs
 
     @property
+    def mandate(self) -> str:
+        """Text of the mandate that it was trained under."""
+        return self.task.mandate
+
+    @property
     def seeds(self) -> int:
         """How many members the policy has, one for each seed."""
         return int(jax.tree.leaves(self.members)[0].shape[0])

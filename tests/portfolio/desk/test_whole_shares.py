@@ -7,11 +7,14 @@ import pytest
 
 from qfolio.portfolio.costs import Proportional
 from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.mandate.mandate import settled
 from qfolio.portfolio.prices.table import Prices
 
 
 class Fixed:
     """Wants the same weights whatever it sees."""
+
+    mandate = ""
 
     def __init__(self, wanted, cost):
         self.wanted, self.costs = wanted, Proportional(cost)
@@ -63,6 +66,29 @@ def test_no_more_is_spent_than_there_is(seed, fractions):
     assert left >= -1e-8 * whole.wealth
     # A trade is never a share or more off, except that fewer are bought where money is short.
     assert (whole.trades < ideal.trades + 1).all()
+
+
+def test_lots_of_a_mandate_are_traded_whole_and_single_shares_of_a_split_are_the_same():
+    """A lot of ten shares is a share of ten times the price."""
+    differ = 0
+    for seed in range(30):
+        _, whole, _, cost = case(seed)
+        names, lot = whole.assets, np.arange(1.0, 1 + len(whole.assets)) * 5
+        finer = Prices(
+            np.arange(2).astype("datetime64[D]"), names, np.tile(whole.prices / lot, (2, 1))
+        )
+        policy = Fixed(whole.weights, cost)
+        policy.mandate = settled(
+            {"trading": {"lot": dict(zip(names, lot.tolist(), strict=True))}}, names
+        )
+        found = Allocation.of(policy, finer, whole.shares * lot, whole.cash)
+        np.testing.assert_allclose(found.trades, whole.trades * lot, rtol=1e-9)
+        assert found.cash_after == pytest.approx(whole.cash_after, abs=1e-8 * whole.wealth)
+        policy.mandate = settled({"trading": {"lot": 10}}, names)
+        tens = Allocation.of(policy, finer, whole.shares * lot, whole.cash).trades
+        np.testing.assert_array_equal(tens % 10, 0)
+        differ += int((tens != found.trades).any())
+    assert differ > 10
 
 
 def test_the_rounding_is_nearly_the_best_of_all():

@@ -5,7 +5,7 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate import checks
-from qfolio.portfolio.mandate.mandate import Mandate, feasible, parse, settled
+from qfolio.portfolio.mandate.mandate import Mandate, feasible, lots, parse, settled
 
 ASSETS = ["SPY", "TLT", "XLE", "XOM"]
 ALL = np.ones(4, bool)
@@ -36,6 +36,17 @@ def written(folder: Path, text: str = FILE, groups: str = GROUPS) -> Path:
     (folder / "groups.csv").write_text(groups)
     (folder / "mandate.toml").write_text(text)
     return folder / "mandate.toml"
+
+
+def test_lots_are_for_all_assets_or_for_some():
+    assert lots("") is None
+    assert lots(settled({"assets": {"cap": 0.5}}, ASSETS)) is None
+    assert lots(settled({"trading": {"lot": 100}}, ASSETS)).tolist() == [100] * 4
+    assert lots(settled({"trading": {"lot": {"TLT": 10}}}, ASSETS)).tolist() == [1, 10, 1, 1]
+    with pytest.raises(QfolioError, match=r"trading\.lot of the mandate names 'TTL'.*TLT"):
+        settled({"trading": {"lot": {"TTL": 10}}}, ASSETS)
+    with pytest.raises(QfolioError, match=r"trading\.lot"):
+        settled({"trading": {"lot": 0}}, ASSETS)
 
 
 def test_a_file_says_the_limits(tmp_path):

@@ -14,6 +14,7 @@ from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import Context, CostModel
 from qfolio.portfolio.desk.whole_shares import whole_shares as rounded
 from qfolio.portfolio.itemized import Itemized
+from qfolio.portfolio.mandate.mandate import lots
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 
@@ -30,6 +31,9 @@ class Followed(Protocol):
 
     @property
     def costs(self) -> CostModel: ...
+
+    @property
+    def mandate(self) -> str: ...
 
     def weights(self, prices: Any, holdings: Any = None) -> dict[str, float]: ...
 
@@ -68,6 +72,7 @@ class Allocation:
             shares: Shares held now, of shape (assets,).
             cash: Cash held now, in money.
             whole_shares: Whether to trade whole shares only, as near to the target as they come.
+                Where the mandate has lots, whole lots are traded in any case.
 
         Raises:
             QfolioError: There is nothing to allocate.
@@ -90,10 +95,11 @@ class Allocation:
             remainder = float(policy.costs.trade(held, weights, context)[0])
             money = remainder * weights[1:] * wealth
             trades = np.divide(money, known, out=np.zeros_like(money), where=known > 0) - shares
-            if whole_shares:
+            lot = lots(policy.mandate)
+            if whole_shares or lot is not None:
                 trades[abs(weights - held)[1:] <= NOISE] = 0.0
                 ideal = remainder * weights[0] * wealth
-                trades = rounded(trades, shares, known, ideal, lambda trades: after(trades)[0])
+                trades = rounded(trades, shares, known, ideal, lambda trades: after(trades)[0], lot)
         cash_after, costs = after(trades) if trades.any() else (cash, {})
         return Allocation(
             date=day(prices.dates[-1]),

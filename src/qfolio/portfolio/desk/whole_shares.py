@@ -1,4 +1,4 @@
-"""Trades in whole shares that leave a portfolio as near as possible to its target."""
+"""Trades in whole shares, or lots, that leave a portfolio as near as possible to its target."""
 
 from collections.abc import Callable
 
@@ -14,13 +14,15 @@ def whole_shares(
     prices: np.ndarray,
     cash: float,
     cash_after: Callable[[np.ndarray], float],
+    lots: np.ndarray | None = None,
 ) -> np.ndarray:
     """The trades in whole shares that track the ideal ones best.
 
     Each trade is rounded down or up. The distance to the target is the sum of squares of what each
     asset and the cash are off, in money. From all trades rounded down, the best change of one trade
     or of two is made until none makes the distance smaller. That is no proof of the optimum; the
-    tests compare it with every rounding. Fractions of a share that are held are never sold.
+    tests compare it with every rounding. Fractions of a share, or of a lot, that are held are never
+    sold.
 
     Args:
         ideal: Shares to buy, negative to sell, of shape (assets,).
@@ -29,7 +31,13 @@ def whole_shares(
         cash: What the ideal trades leave.
         cash_after: The cash that trades leave, after costs; at the result it is not negative, or
             no larger a loan than that of the ideal trades.
+        lots: Shares of each asset that are traded together (default: single shares).
     """
+    if lots is not None:  # a lot is a share of so many times the price
+        number = whole_shares(
+            ideal / lots, shares / lots, prices * lots, cash, lambda n: cash_after(n * lots)
+        )
+        return number * lots
     low, high = np.floor(ideal + EXACT), np.ceil(ideal - EXACT)
     least = np.minimum(shares + ideal, 0.0)  # a holding is not sold short by rounding
     low = np.where(shares + low < least - EXACT, np.minimum(high, low + 1), low)

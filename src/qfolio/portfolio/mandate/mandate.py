@@ -19,6 +19,7 @@
     turnover = 0.3
     smallest_trade = 0.005
     holdings = 10
+    lot = 100
     calendar = "monthly"
 
     [costs]                   # of the cost model "itemized"
@@ -39,7 +40,7 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
@@ -48,6 +49,7 @@ from qfolio.portfolio.mandate.projection import Limits
 
 Weight = Annotated[float, msgspec.Meta(ge=-3, le=3)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Lot = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -80,13 +82,15 @@ class Cash(Section, frozen=True):
 class Trading(Section, frozen=True):
     """Limits of a decision. turnover: the sum of all changes of weights, bought and sold.
 
-    calendar: as ``calendars.decision_rows`` takes it.
+    calendar: as ``calendars.decision_rows`` takes it. lot: shares that are traded together, a
+    number for all assets or for some; allocation alone knows shares, and rounds to them.
     """
 
     calendar: str = ""
     turnover: Annotated[float, msgspec.Meta(gt=0, le=20)] | None = None
     smallest_trade: Share = 0.0
     holdings: Annotated[int, msgspec.Meta(ge=1, le=100_000)] | None = None
+    lot: Lot | dict[str, Lot] | None = None
 
 
 class Exposure(Section, frozen=True):
@@ -153,6 +157,7 @@ class Mandate(Section, frozen=True):
             "assets.cap": _named(self.assets.cap),
             "assets.floor": _named(self.assets.floor),
             "assets.forbidden": self.assets.forbidden,
+            "trading.lot": _named(self.trading.lot),
         }
         for place, names in named.items():
             for name in names:
@@ -243,6 +248,13 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
     )
 
 
+def lots(text: str) -> Float[np.ndarray, " asset"] | None:
+    """Shares of each asset that are traded together (default: 1); None if there is no such rule."""
+    if not text or (lot := parse(text)[1].trading.lot) is None:
+        return None
+    return _by_asset(lot, parse(text)[0], 1.0)
+
+
 def largest_weight(text: str) -> float:
     """The highest cap of an asset, at most 1."""
     assets, mandate = parse(text)
@@ -259,7 +271,7 @@ def _by_asset(given: float | dict[str, float], assets: Sequence[str], default: f
     return np.full(len(assets), given)
 
 
-def _named(given: float | dict[str, float]) -> Sequence[str]:
+def _named(given: float | dict[str, float] | None) -> Sequence[str]:
     return list(given) if isinstance(given, dict) else []
 
 
