@@ -155,6 +155,7 @@ def test_names_that_look_like_something_else(tmp_path: Path):
     assert load(numbered).assets == ("NAME", "VALUE")  # wide: two assets of these names
     ids = pd.DataFrame({"date": DAYS * 2, "asset": [10001] * 5 + [10002] * 5, "price": A + B})
     assert load(ids).assets == ("10001", "10002")
+    assert load(ids.rename(columns={"asset": "tic", "price": "close"})).assets == ("10001", "10002")
 
 
 def test_adjusted_prices_come_before_plain_ones():
