@@ -95,9 +95,13 @@ def _call(words: list[str]) -> None:
         return
     if name and not name.startswith("-"):
         raise QfolioError(f"there is no command {name!r}; {near(name, known)}")
+    completing = name in ("--tyro-print-completion", "--tyro-write-completion")
     overview = {name: _named(summary(command)) for name, command in known.items()}
     tyro.extras.subcommand_cli_from_dict(
-        overview, prog="qfolio", description=ABOUT, args=words or ["--help"]
+        known if completing else overview,
+        prog="qfolio",
+        description=ABOUT,
+        args=words or ["--help"],
     )
 
 

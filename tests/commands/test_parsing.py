@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import json
 import math
+import subprocess
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -121,3 +122,21 @@ def test_json_holds_any_document(capsys):
 class Output:
     def __init__(self, as_json):
         self.as_json = as_json
+
+
+def test_bash_completes_commands_and_options(monkeypatch, tmp_path):
+    script = tmp_path / "qfolio"
+    assert typed(monkeypatch, "--tyro-write-completion", "bash", script) is None
+    for words, completed in (
+        (["qfolio", "backt"], "backtest"),
+        (["qfolio", "prices", "--miss"], "--missing"),
+    ):
+        line = " ".join(words)
+        asked = (
+            f"source {script}; complete -p qfolio >/dev/null || exit 3; "
+            f"COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; COMP_LINE='{line}'; "
+            f"COMP_POINT={len(line)}; $(complete -p qfolio | sed 's/.*-F \\([^ ]*\\).*/\\1/'); "
+            "echo ${COMPREPLY[@]}"
+        )
+        found = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=True)
+        assert completed in found.stdout.split()
