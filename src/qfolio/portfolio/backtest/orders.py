@@ -144,21 +144,6 @@ def drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
     return np.asarray(worth / worth.sum())
 
 
-def without_small_drift(targets: Floats, prices: Floats, band: float) -> Floats:
-    """Targets of successive rows, NaN where what is held has not drifted beyond the band.
-
-    targets: shape (rows, N + 1), cash first, NaN for no order; the first is ordered. prices: of
-    the same rows, shape (rows, N).
-    """
-    found, last = targets.copy(), 0
-    for row in range(1, len(targets)):
-        if beyond(band, targets[row], drifted(targets[last], prices[last], prices[row])):
-            last = row
-        else:
-            found[row] = np.nan
-    return found
-
-
 def beyond(band: float, target: Floats, held: Floats) -> bool:
     """Whether a target is ordered; band: as ``calendars.band``."""
     return not band or bool(abs(target - held).max() > band)
