@@ -58,7 +58,8 @@ class Options(Reading):
             that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
             own as module:Name (default: the preset's).
         strategy: Strategies of your own, each a CSV of target weights (date, and a column an
-            asset), of returns (date, return) or of an index (date, level); may be repeated.
+            asset), of orders in shares (date, asset, shares), of returns (date, return) or of an
+            index (date, level); may be repeated.
         benchmark: What all strategies are compared with: the name of a baseline, an asset (bought
             and held) or a strategy of your own, or such a CSV (default: equal-weight).
         baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight

@@ -219,7 +219,14 @@ HOURS = Prices(np.datetime64("2020-01-01T09:30", "s") + np.arange(ROWS) * np.tim
         (weights([100], A=["x"]), None, "row 0 .*column 'A': 'x' is not a number"),
         (weights([100], A=[0.1], B=[None]), None, "column 'B': it is missing; give a number"),
         (weights([159], A=[1.0]), None, "orders nothing up to 2020-06-06"),
-        (weights([100], asset=["A"], shares=[3]), None, "orders in shares.*give target weights"),
+        (weights([100], asset=["Z"], shares=[3]), None, "no asset 'Z'"),
+        (weights([100], asset=["A"], shares=[3]), None, r"is worth 0.00; give the money that it"),
+        (weights([99, 100], asset=["cash"] * 2, shares=[3, 3]), None, "paid in after the first"),
+        (weights([99, 99], asset=["cash", "A"], shares=[10, 3]), None, "weight of .*long-only"),
+        (
+            weights([100, 100], asset=["cash", "C"], shares=[10, 3]), table(late=120),
+            "C has no price yet",
+        ),
         (weights([100], asset=["Z"], weight=[1]), None, "no asset 'Z'"),
         (weights([100, 100], asset=["A", "A"], weight=[1, 1]), None, "'A' appears twice"),
         (weights([100, 101], A=[1, 1]).assign(date="soon"), None, "row 0: .*write dates as"),
@@ -251,7 +258,8 @@ def test_a_return_on_a_day_between_rows_is_refused():
     [
         ("pathwise", None, "has a strategy pathwise already"),
         ("pathwise-together", None, "already"), ("momentum", None, "already"),
-        ("equal-weight at 0.3", None, "already"), ("a/b", None, "cannot be called 'a/b'"),
+        ("equal-weight at 0.3", None, "already"), ("/b", None, "cannot be called '/b'"),
+        ("pathwise/0", None, "has a strategy pathwise/0 already"), ("_b", None, "cannot be called"),
         ("mine", "pathwise", "benchmark pathwise is an agent"),
         ("mine", "min", r"'min' is no strategy .* no asset and no file \(did you mean 'mine'\?\)"),
     ],
@@ -259,6 +267,43 @@ def test_a_return_on_a_day_between_rows_is_refused():
 def test_names_that_are_refused(name, benchmark, message):
     with pytest.raises(QfolioError, match=message):
         create(strategies={name: np.full((ROWS, 3), 0.3)}, benchmark=benchmark)
+
+
+def test_orders_in_shares_hold_shares():
+    """100 shares of A are bought, 40 sold and 50 of B bought; in between nothing is traded."""
+    prices = table()
+    a, b = prices.values[:, 0], prices.values[:, 1]
+    orders = weights([20, 20, 110, 120], asset=["cash", "A", "A", "B"], shares=[8000, 100, -40, 50])
+    backtest = create(strategies={"60/40 (old, house)": orders}, cost=0.0)
+    entry = backtest.replay.own("strategy", backtest._own["60/40 (old, house)"])
+    days_ordered = np.flatnonzero(~np.isnan(entry.decisions[0, :, 0])) + FIRST
+    np.testing.assert_array_equal(days_ordered, [FIRST, 110, 120])
+    cash = 8000 - 100 * a[20]
+    expected = 100 * a[FIRST] / (cash + 100 * a[FIRST])
+    assert entry.decisions[0, 0, 1] == pytest.approx(expected)
+    cash += 40 * a[110] - 50 * b[120]
+    total = cash + 60 * a[120] + 50 * b[120]
+    weight = entry.decisions[0, 120 - FIRST]
+    np.testing.assert_allclose(weight[:3], [cash / total, 60 * a[120] / total, 50 * b[120] / total])
+
+
+def test_the_report_says_where_a_strategy_breaks_the_mandate():
+    mine = np.full((ROWS, 3), np.nan)
+    mine[[100, 120, 130]] = [[0.3, 0.3, 0.3], [0.6, 0.2, 0.1], [0.7, 0.2, 0.1]]
+    fund = np.full(ROWS, 0.001)
+    mandate = {"assets": {"cap": 0.5}, "trading": {"turnover": 0.5}}
+    backtest = create(mandate=mandate, strategies={"mine": mine, "fund": fund}, benchmark="A")
+    _, notes = backtest.replay.others({}, backtest._own, "A")
+    (said,) = (note for note in notes if note.startswith("mine breaks"))
+    assert "in 3 of its 3 orders, which are carried out as they are" in said
+    assert "a weight is above its cap (2, by up to 0.2)" in said
+    assert "turnover is too high (2, by up to 0.4)" in said
+    assert any("fund has returns only" in note for note in notes)
+    assert not any(note.startswith("A ") and "mandate" in note for note in notes)
+    calm = np.full((ROWS, 3), 0.15)
+    backtest = create(mandate=mandate, strategies={"calm": calm})
+    notes = backtest.replay.others({}, backtest._own, "equal-weight")[1]
+    assert any(note.startswith("calm keeps the mandate in all of its 60 orders") for note in notes)
 
 
 def test_benchmarks_by_name():

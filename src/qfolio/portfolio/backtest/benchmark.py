@@ -17,7 +17,7 @@ from qfolio.portfolio.prices.table import Prices
 BENCHMARK = "benchmark"
 """Name of a benchmark that is given as a data frame or an array."""
 
-_NAME = re.compile(r"[\w.&+-][\w.&+ -]{0,59}")
+_NAME = re.compile(r"[A-Za-z0-9.&+%(-][\w.&+%()/:, -]{0,59}")
 
 
 class Field(NamedTuple):
@@ -59,10 +59,11 @@ def field_of(
     def add(name: str, source: Any) -> None:
         if not _NAME.fullmatch(name):
             raise QfolioError(
-                f"A strategy cannot be called {quote(name)}; use up to 60 letters, digits, spaces "
-                "and the signs . & + - _."
+                f"A strategy cannot be called {quote(name)}; begin with a letter or digit, and use "
+                "up to 60 letters, digits, spaces and the signs . , : & + - _ / % ( )."
             )
-        if name in taken or name in own or name.startswith(f"{EQUAL_WEIGHT} at "):
+        of_agent = name.rpartition("/")[0] in agents  # a column of returns.csv
+        if name in taken or name in own or of_agent or name.startswith(f"{EQUAL_WEIGHT} at "):
             raise QfolioError(
                 f"The backtest has a strategy {name} already; give yours another name."
             )

@@ -3,6 +3,7 @@
 ``own_tables.py`` reads them from files and data frames.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -13,6 +14,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.folds import spell
 from qfolio.portfolio.backtest.measures import Floats
 from qfolio.portfolio.backtest.orders import TOLERANCE, drifted
+from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.prices.findings import amount, day
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -102,7 +104,7 @@ def place(name: str, own: Own, prices: Prices, days: slice, task: Portfolio, cap
 def _placed_weights(
     name: str, own: Own, prices: Prices, days: slice, cap: float, decisions: Floats
 ) -> Placed:
-    rows, moved = _rows(name, own.dates, prices)
+    rows, moved = rows_at(name, own.dates, prices)
     notes = []
     if moved.size:
         notes.append(
@@ -144,6 +146,38 @@ def _placed_weights(
     return Placed(decisions, None, tuple(notes))
 
 
+def kept(
+    name: str, decisions: Floats, turnover: Floats, mandates: Sequence[tuple[slice, Mandated]]
+) -> str:
+    """Says where a strategy's orders break the mandate; they are carried out all the same.
+
+    Args:
+        name: Of the strategy.
+        decisions: Its orders, of shape (D, N + 1), cash first, NaN for no order.
+        turnover: Of each, of shape (D,).
+        mandates: What is allowed on some of the D days.
+    """
+    broken: dict[str, list[float]] = {}
+    orders = days = 0
+    for some, allowed in mandates:
+        given = ~np.isnan(decisions[some, 0])
+        found = allowed.violations(decisions[some][given])
+        found["turnover is too high by"] = turnover[some][given] - float(allowed.limits.turnover)
+        excess = np.array(list(found.values()))
+        orders, days = orders + int(given.sum()), days + int((excess > TOLERANCE).any(0).sum())
+        for said, by in zip(found, excess, strict=True):
+            broken.setdefault(said.removesuffix(" by"), []).extend(by[by > TOLERANCE].tolist())
+    if not days:
+        return f"{name} keeps the mandate in all of its {amount(orders, 'order')}."
+    how = ", ".join(
+        f"{said} ({len(by)}, by up to {max(by):.2g})" for said, by in broken.items() if by
+    )
+    return (
+        f"{name} breaks the mandate in {days} of its {amount(orders, 'order')}, which are carried "
+        f"out as they are: {how}."
+    )
+
+
 def _require_long_only(name: str, own: Own) -> None:
     least = own.values.min(axis=1)
     if (short := least < 0).any():
@@ -154,7 +188,7 @@ def _require_long_only(name: str, own: Own) -> None:
         )
 
 
-def _rows(name: str, dates: Dates, prices: Prices) -> tuple[Rows, Dates]:
+def rows_at(name: str, dates: Dates, prices: Prices) -> tuple[Rows, Dates]:
     """The rows at which dates count, the number of rows if they are later, and those in between."""
     ours, days = prices.dates, dates.astype("datetime64[D]")
     by_day = ours.astype("datetime64[D]")
@@ -174,7 +208,7 @@ def _rows(name: str, dates: Dates, prices: Prices) -> tuple[Rows, Dates]:
 
 def _returns(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
     """Returns as they are given."""
-    rows, moved = _rows(name, own.dates, prices)
+    rows, moved = rows_at(name, own.dates, prices)
     first, last = prices.dates[earned][[0, -1]].astype("datetime64[D]")
     if (inside := moved[(moved > first) & (moved < last)]).size:
         raise QfolioError(

@@ -1,7 +1,7 @@
 """Reads strategies of the user's own from files, data frames and arrays.
 
 The columns say what a table holds: target weights (a column an asset, and perhaps cash; or the
-columns date, asset and weight), returns, or the levels of an index.
+columns date, asset and weight), orders in shares, returns, or the levels of an index.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
 from qfolio.portfolio.backtest.measures import Floats
-from qfolio.portfolio.backtest.own import Own
+from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.desk.holdings import ASSET_NAMES, CASH, SHARES_NAMES
 from qfolio.portfolio.prices.cells import is_missing, label, not_a_number, numbers
 from qfolio.portfolio.prices.columns import text_columns
@@ -29,8 +29,8 @@ ROUNDING = 1e-3
 """How far a row of weights may be off a sum of 1, as rounded weights are; it is then scaled."""
 
 FORMS = (
-    "A strategy is a table of weights (date, and a column an asset), of returns (date, return) or "
-    "of an index (date, level)."
+    "A strategy is a table of weights (date, and a column an asset), of orders in shares (date, "
+    "asset, shares), of returns (date, return) or of an index (date, level)."
 )
 
 
@@ -88,11 +88,9 @@ def _from_table(source: Any, prices: Prices) -> Own:
     if not others:
         raise QfolioError(f"the table has no column beside its dates. {FORMS}")
     asset = next((j for j in others if names[j] in ASSET_NAMES), None)
-    if asset is not None and any(names[j] in SHARES_NAMES for j in others):
-        raise QfolioError(
-            "the table has orders in shares, which depend on the capital; give target weights "
-            "instead: a column of dates, and a column an asset."
-        )
+    shares = next((j for j in others if names[j] in SHARES_NAMES), None)
+    if asset is not None and shares is not None:
+        return _share_orders(table, when, asset, shares, prices)
     weight = next((j for j in others if names[j] in WEIGHT_NAMES), None)
     if asset is not None and weight is not None:
         return _long_weights(table, when, asset, weight, prices)
@@ -167,6 +165,55 @@ def _long_weights(table: Table, when: int, asset: int, weight: int, prices: Pric
     cash = weights[:, 0] if named.any() else None
     held = np.nan_to_num(weights[:, 1:])
     return Own("weights", moments, _with_cash(held, cash, [day(moment) for moment in moments]))
+
+
+def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Prices) -> Own:
+    """Weights at each date with an order, from cash that is paid in and shares that are traded.
+
+    Shares count at the close of the row that decides; what costs and the lag change is not known
+    yet.
+    """
+    dates = _dates(table, when)
+    traded = _numbers(table, shares, dates)
+    rows, _ = rows_at("It", dates, prices)
+    holding, cash = np.zeros(len(prices.assets)), 0.0
+    moments: list[np.datetime64] = []
+    weights: list[np.ndarray] = []
+    names = [label(cell) for cell in table.columns[asset].tolist()]
+    for row in np.unique(rows[rows < len(prices)]).tolist():
+        close = prices.values[row]
+        for i in np.flatnonzero(rows == row).tolist():
+            place = _asset(names[i], prices)
+            if place is None:
+                raise QfolioError(
+                    f"row {table.first_row + i} ({day(dates[i])}): the prices have no asset "
+                    f"{quote(names[i])}{hint(names[i], prices.assets)}."
+                )
+            if place == -1:
+                if moments:
+                    raise QfolioError(
+                        f"row {table.first_row + i} ({day(dates[i])}): cash is paid in after the "
+                        "first order; give all of it at the date of that order."
+                    )
+                cash += traded[i]
+                continue
+            if np.isnan(close[place]):
+                raise QfolioError(
+                    f"row {table.first_row + i} ({day(dates[i])}): {names[i]} has no price yet."
+                )
+            holding[place] += traded[i]
+            cash -= traded[i] * close[place]
+        values = np.append(cash, holding * np.nan_to_num(close))
+        if not values.sum() > 0:
+            raise QfolioError(
+                f"its holding of {day(prices.dates[row])} is worth {values.sum():,.2f}; give the "
+                "money that it begins with as the shares of cash, in a row of the first date."
+            )
+        moments.append(prices.dates[row])
+        weights.append(values / values.sum())
+    if not moments:
+        raise QfolioError("no order is within the dates of the prices.")
+    return Own("weights", np.array(moments), np.array(weights))
 
 
 def _asset(name: str, prices: Prices) -> int | None:

@@ -15,7 +15,7 @@ from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeight
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
 from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import orders
-from qfolio.portfolio.backtest.own import Placed
+from qfolio.portfolio.backtest.own import Placed, kept
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.calendars import band
 from qfolio.portfolio.conditions import Conditions
@@ -198,6 +198,8 @@ class Replay:
         for name, placed in own.items():
             entries[name] = self.own("baseline" if name == benchmark else "strategy", placed)
             notes += placed.notes
+            if self.task.mandate and name != benchmark:
+                notes.append(self._kept(name, entries[name]))
         speeds = SPEEDS if benchmark == EQUAL_WEIGHT else ()
         slower = {f"{EQUAL_WEIGHT} at {speed:g}": EqualWeightAt(speed) for speed in speeds}
         for kind, rules in (("baseline", baselines), ("rebalancing", slower)):
@@ -205,6 +207,17 @@ class Replay:
                 entries[name], said = self.baseline(kind, name, rule)
                 notes += said
         return entries, notes
+
+    def _kept(self, name: str, entry: Entry) -> str:
+        """Says whether a strategy of the user's own keeps the mandate."""
+        if not entry.weighted:
+            return f"{name} has returns only, so whether it keeps the mandate is not known."
+        first = self.folds[0].decisions.start
+        allowed = [
+            (slice(fold.decisions.start - first, fold.decisions.stop - first), made)
+            for fold, (made, _) in zip(self.folds, self._relaxed, strict=True)
+        ]
+        return kept(name, entry.decisions[0], entry.simulation.turnover[0], allowed)
 
     def entry(self, kind: str, decisions: np.ndarray, costs: CostModel | None = None) -> Entry:
         """Decisions of shape (seed, day, entry), carried out; costs: instead of the task's."""
