@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from qfolio.commands.arguments import Name, Names
+from qfolio.commands.arguments import File, Name, Names
 
 if TYPE_CHECKING:
     from qfolio.portfolio.prices.table import Prices
 
 Missing = Literal["error", "drop-asset", "forward-fill"]
 Late = Literal["error", "drop-asset", "trim", "join"]
+Ended = Literal["gap", "cash-out"]
 Returns = Annotated[
     Literal["percent", "fraction"] | None, arg(metavar="percent|fraction", help_behavior_hint="")
 ]
@@ -25,6 +26,11 @@ class Reading:
     Args:
         missing: How to treat missing prices.
         late: How to treat assets that start later than the table.
+        ended: How to treat prices that end early: as missing ones, or as a delisting, at which a
+            holding becomes cash at the last price.
+        delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
+        members: Table of the assets that may be bought at each date: a column of dates and one of
+            0 or 1 for each asset, or the columns asset, from and to (default: all).
         features: Columns that hold features for agents instead of prices.
         columns: Columns that hold a number for the whole market, such as a cash rate, which costs
             may use and agents do not see.
@@ -35,6 +41,9 @@ class Reading:
 
     missing: Missing = "error"
     late: Late = "error"
+    ended: Ended = "gap"
+    delisting_haircut: float = 0.0
+    members: File = None
     features: Names = ()
     columns: Names = ()
     returns: Returns = None

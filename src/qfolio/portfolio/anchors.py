@@ -43,16 +43,19 @@ def path(name: str, prices: Prices) -> Weights:
     if chosen is None:
         return _column(name.removeprefix(COLUMN), prices)
     month, values = prices.month, prices.values
+    # Targets of every row are spread anew whenever an asset comes or goes.
+    anew = prices.tradable is not None and chosen.calendar == "fold"
     held = np.eye(values.shape[1] + 1)[0]
     rows = np.empty(values.shape)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a table's first rows are too few for any estimate
         for row in range(len(values)):
             # The first two rows are too few for a baseline, which has a training window in a test.
-            if row % month == 0 or row == 2 or chosen.calendar == "row":
+            if row % month == 0 or row == 2 or chosen.calendar == "row" or anew:
                 rule = chosen if row >= 2 else EqualWeight()
-                history = _history(prices, row, month)
-                wanted = rule.decide(history, held)
+                history = _history(prices, row, month, rule.estimates)
+                nothing = np.eye(len(held))[0]
+                wanted = rule.decide(history, held) if history.tradable.any() else nothing
                 held = held if wanted is None else checked(name, wanted, history)
             rows[row] = held[1:]
             if row + 1 < len(values) and chosen.calendar != "fold":
@@ -60,12 +63,14 @@ def path(name: str, prices: Prices) -> Weights:
     return rows
 
 
-def _history(prices: Prices, row: int, month: int) -> History:
+def _history(prices: Prices, row: int, month: int, estimates: bool) -> History:
     """What a baseline knows at a row; it estimates from five years, or from one after a start."""
     known = ~np.isnan(prices.values[: row + 1])
     tradable = known[max(0, row - 12 * month) :].all(0)
     if not tradable.any():
         tradable = known[row]
+    if prices.tradable is not None:
+        tradable = prices.tradable[row] & (tradable | (not estimates))
     first = max(0, row - MONTHS * month)
     if not known[first:, tradable].all():
         first = max(0, row - 12 * month)

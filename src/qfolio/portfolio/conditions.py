@@ -24,26 +24,31 @@ class Conditions(NamedTuple):
 
     years: time of each row since the first, shape (row,). values: each column at each row, of shape
     (row, asset), or (row, 1) if all assets share it, by name. sums: their integrals over the years
-    since the first row, likewise; between two rows a column keeps its value at the first.
+    since the first row, likewise; between two rows a column keeps its value at the first. listed:
+    1 where an asset has a price, of shape (row, asset); None if none is ever delisted.
     """
 
     years: Any
     values: dict[str, Any]
     sums: dict[str, Any]
+    listed: Any = None
 
     @staticmethod
     def of(prices: Prices, columns: Sequence[str]) -> "Conditions":
         """The columns that a cost model asks for. Raises QfolioError if the table lacks one."""
         values = {name: _column(name, prices) for name in columns if name != "years"}
+        listed = None if prices.listed is None else prices.listed.astype(float)
         if not columns:
-            return Conditions(np.empty(0), {}, {})
+            return Conditions(np.empty(0), {}, {}, listed)
         years = (prices.dates - prices.dates[0]) / np.timedelta64(1, "s") / YEAR
-        return Conditions(years, values, {name: _sums(x, years) for name, x in values.items()})
+        sums = {name: _sums(x, years) for name, x in values.items()}
+        return Conditions(years, values, sums, listed)
 
     def part(self, start: int, stop: int) -> "Conditions":
         """Those of some rows, for tables that begin with the first of them."""
         values, sums = ({k: x[start:stop] for k, x in d.items()} for d in (self.values, self.sums))
-        return Conditions(self.years[start:stop], values, sums)
+        listed = None if self.listed is None else self.listed[start:stop]
+        return Conditions(self.years[start:stop], values, sums, listed)
 
     def trade(self, row: Any, rows: Any, wealth: Any = 1.0) -> Context:
         """The circumstances of trades at some rows, ``rows`` after their decisions."""
@@ -52,10 +57,12 @@ class Conditions(NamedTuple):
 
     def holding(self, start: Any, end: Any) -> Context:
         """The holding periods from some rows to others."""
+        listed = None if self.listed is None else self.listed[end]
         if not self.years.shape[0]:
-            return Context(rows=end - start)
+            return Context(rows=end - start, listed=listed)
         columns = {name: x[end] - x[start] for name, x in self.sums.items()}
-        return Context(end - start, self.years[end] - self.years[start], columns)
+        years = self.years[end] - self.years[start]
+        return Context(end - start, years, columns, listed=listed)
 
 
 def _column(name: str, prices: Prices) -> Floats:

@@ -33,12 +33,15 @@ class Context(NamedTuple):
     the holding period. columns: those that the cost model asks for, by name, of shape (..., 1) or
     (..., N): their values in the row of the trade, or their integrals over the years of the holding
     period. wealth: before the trade, in multiples of the wealth at the start, of shape (...).
+    listed: 1 for each asset that has a price at the end of the holding period, or else 0, of shape
+    (..., N); None if all have.
     """
 
     rows: Any = 1
     years: Any = 0.0
     columns: Mapping[str, Any] = {}
     wealth: Any = 1.0
+    listed: Any = None
 
 
 class CostModel(abc.ABC):
@@ -92,10 +95,17 @@ class CostModel(abc.ABC):
 
     def growth(self, weights: Any, relatives: Any, context: Context) -> Any:
         """Growth factors of each entry of a holding, of shape (..., N + 1), by its sign."""
-        owned, owed = self.carry(relatives, context), self.owe(relatives, context)
+        owned = delisted(self.carry(relatives, context), relatives, context.listed)
+        owed = self.owe(relatives, context)
         if owed is None:
             return owned
+        owed = delisted(owed, relatives, context.listed)
         return weights.__array_namespace__().where(weights < 0, owed, owned)
+
+    def held(self, weights: Any, relatives: Any, context: Context) -> Any:
+        """Weights after a holding period, without a trade; what is delisted by then is cash."""
+        after = grown(weights, self.growth(weights, relatives, context))
+        return after if context.listed is None else cashed(after, context.listed)
 
 
 @dataclass(frozen=True)
@@ -210,6 +220,28 @@ def grown(weights: Any, growth: Any) -> Any:
     """Weights after each entry has grown by its factor, both of shape (..., N + 1)."""
     worth = weights * growth
     return worth / worth.sum(-1, keepdims=True)
+
+
+def delisted(growth: Any, relatives: Any, listed: Any) -> Any:
+    """Growth factors, in which assets without a price earn their cash-out and then what cash does.
+
+    Args:
+        growth: Of cash and of each asset, of shape (..., N + 1).
+        relatives: New price over old price of each asset, of shape (..., N).
+        listed: Whether an asset has a price at the end, likewise; None if all have.
+    """
+    if listed is None:
+        return growth
+    xp = growth.__array_namespace__()
+    paid_out = relatives * growth[..., :1]
+    return xp.concat([growth[..., :1], xp.where(listed > 0, growth[..., 1:], paid_out)], axis=-1)
+
+
+def cashed(weights: Any, listed: Any) -> Any:
+    """Weights of shape (..., N + 1) with those of assets that are not listed, (..., N), in cash."""
+    kept = weights[..., 1:] * listed
+    cash = weights[..., :1] + (weights[..., 1:] - kept).sum(-1, keepdims=True)
+    return weights.__array_namespace__().concat([cash, kept], axis=-1)
 
 
 def with_cash(relatives: Any) -> Any:

@@ -148,7 +148,7 @@ class Menu(eqx.Module):
     def tilted(signalled: Signalled, tilt: Float[Array, " signal"]) -> Float[Array, " entry"]:
         """The anchor times exp(signals·tilt), with the anchor's sum."""
         weights = signalled.anchor * jnp.exp(signalled.signals @ tilt)
-        weights = weights * signalled.anchor.sum() / weights.sum()
+        weights = weights * signalled.anchor.sum() / jnp.maximum(weights.sum(), 1e-9)
         return jnp.append(1 - weights.sum(), weights)
 
 
@@ -219,6 +219,10 @@ class Market(ExogenousTask):
         """The set of weights that may be ordered."""
         return CappedSimplex(self.limits)
 
+    def feasible_at(self, market: PyTree) -> Feasible:
+        """The set of weights that may be ordered in a state of the market."""
+        return self.feasible
+
     @property
     def gross(self) -> float:
         """The largest sum of absolute weights of the assets."""
@@ -243,7 +247,7 @@ class Market(ExogenousTask):
         weights = action
         if self.menu:
             weights = self._menu.weights(held, action, self.signalled(market))
-        return self.feasible.project(weights, held)
+        return self.feasible_at(market).project(weights, held)
 
     def intent(self, state: Position, action: Array) -> Float[Array, " entry"]:
         return self.target(state.market, state.holding.weights, action)
@@ -278,7 +282,7 @@ class Market(ExogenousTask):
         normal = jax.random.normal(key, (signalled.signals.shape[1],))
         tilt = menu.tilts.max() * jax.random.uniform(spread_key) * normal
         weights = menu.tilted(signalled, tilt)
-        return self.hold(self.feasible.project(weights, weights))
+        return self.hold(self.feasible_at(market).project(weights, weights))
 
     def reference(self, market: PyTree, next_market: PyTree) -> Float[Array, ""] | None:
         """That of holding the anchor, if there is one."""
@@ -313,9 +317,7 @@ class Market(ExogenousTask):
         # What is held next is the target, drifted.
         after = step.next_state.holding.weights
         target = grown(after, 1 / costs.growth(after, moved.coming, at.coming))
-        before, after = (
-            grown(w, costs.growth(w, moved.waiting, at.waiting)) for w in (held, target)
-        )
+        before, after = (costs.held(w, moved.waiting, at.waiting) for w in (held, target))
         remainder, paid = costs.trade(before, after, at.trade)
         assets = target[1:]
         measured = {
@@ -337,11 +339,11 @@ class Market(ExogenousTask):
         costs = self.costs
         wealth_may_end = costs.depends_on_wealth or not self.feasible.long_only
         moved, at = self.relatives(market, next_market), self.contexts(market, next_market)
-        before = grown(holding.weights, costs.growth(holding.weights, moved.waiting, at.waiting))
-        after = grown(target, costs.growth(target, moved.waiting, at.waiting))
+        before = costs.held(holding.weights, moved.waiting, at.waiting)
+        after = costs.held(target, moved.waiting, at.waiting)
         remainder, paid = costs.trade(before, after, at.trade)
         growth = remainder * (after * costs.growth(after, moved.earning, at.earning)).sum()
-        drifted = grown(target, costs.growth(target, moved.coming, at.coming))
+        drifted = costs.held(target, moved.coming, at.coming)
         if wealth_may_end:
             lives = growth > RUIN
             growth = jnp.where(lives, growth, RUIN)

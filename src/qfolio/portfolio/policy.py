@@ -247,6 +247,7 @@ class Policy:
                 f"The price table has {len(table)} rows; the policy's signals look back on "
                 f"{looked}, so bring at least {looked + 1}."
             )
+        table.require_still("a policy for tomorrow")
         table = table.select(self.assets)
         # An asset that may be held needs prices in the whole window, the others at its end.
         tradable, last = np.asarray(self.task.limits) > 0, len(table) - 1

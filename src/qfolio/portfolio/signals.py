@@ -242,10 +242,12 @@ def compute(
     prices: Floats,
     scale: str = "rank",
     columns: Mapping[str, Floats] | None = None,
+    tradable: NDArray[np.bool_] | None = None,
 ) -> Floats:
     """Signals of shape (row, asset, signal), 0 where one is unknown.
 
-    prices, columns: of shape (row, asset), NaN where unknown.
+    prices, columns: of shape (row, asset), NaN where unknown. tradable: which assets are compared
+    at each row, likewise (default: all); the others' signals are 0.
 
     Raises QfolioError if the scale or a column is unknown, or if a signal has the wrong shape or
     looks ahead.
@@ -257,8 +259,12 @@ def compute(
         else _checked(signal, prices)
         for signal in signals
     ]  # fmt: skip
+    shared = [_is_shared(signal, x) for signal, x in zip(signals, values, strict=True)]
+    if tradable is not None:
+        values = [np.where(tradable, x, np.nan) for x in values]
     found = [
-        _scaled(x, _is_shared(s, x), s.scale or scale) for s, x in zip(signals, values, strict=True)
+        _scaled(x, same, s.scale or scale)
+        for s, x, same in zip(signals, values, shared, strict=True)
     ]
     return np.stack(found, -1) if found else np.zeros((*prices.shape, 0))
 

@@ -22,12 +22,13 @@ from qfolio.core.mdp import Actions, Box, Position, Simplex
 from qfolio.portfolio import anchors, signals
 from qfolio.portfolio.calendars import band, decision_rows
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.costs import grown
+from qfolio.portfolio.costs import cashed
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Feasible, Mandated
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight, settled
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.universe import Present
 
 Row = Int[Array, ""]
 
@@ -49,6 +50,7 @@ class Portfolio(Market):
     scale: Float[Array, " channel"]
     conditions: Conditions  # the columns that the cost model reads; empty if it reads none
     decides: Bool[Array, " decision"]  # whether a row is for decisions; no rows if all are
+    tradable: Bool[Array, "row asset"] | None  # at each row; None if all assets always are
     first_decision: Row
     last_decision: Row
     window: int = static(60)  # rows that are observed
@@ -76,7 +78,7 @@ class Portfolio(Market):
         if "mandate" in settings:
             settings["mandate"] = settled(settings["mandate"], prices.assets)
         task = Portfolio.blank(len(prices.assets), len(prices.feature_names), **settings)
-        first = ~np.isnan(prices.values[0])
+        first = ~np.isnan(prices.values[0]) if prices.tradable is None else None
         return task.on(prices).part(0, len(prices) - 1, first)
 
     @staticmethod
@@ -92,6 +94,7 @@ class Portfolio(Market):
             scale=jnp.ones(1 + channels),
             conditions=Conditions(jnp.zeros(0), {}, {}),
             decides=jnp.zeros(0, bool),
+            tradable=None,
             first_decision=jnp.array(0, jnp.int32),
             last_decision=jnp.array(0, jnp.int32),
             allowed=_allowed(settings.get("mandate", ""), np.ones(assets, bool), 1.0),
@@ -107,15 +110,33 @@ class Portfolio(Market):
         logs = np.zeros(prices.values.shape)
         logs[1:] = np.nan_to_num(np.diff(np.log(prices.values), axis=0))
         columns = dict(zip(prices.feature_names, np.moveaxis(prices.features, -1, 0), strict=True))
-        computed = signals.compute(chosen, prices.values, self.signal_scale, columns)
+        known = prices.values if prices.listed is None else prices.known
+        computed = signals.compute(chosen, known, self.signal_scale, columns, prices.tradable)
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
         followed = anchors.path(self.anchor, prices) if self.anchor else logs[:0]
-        where = lambda t: (t.log_relatives, t.extra, t.anchors, t.conditions, t.decides)  # noqa: E731
-        known = Conditions.of(prices, self.costs.columns)
-        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (logs, extra, followed, known))
+        then = Conditions.of(prices, self.costs.columns)
+        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (logs, extra, followed, then))
         decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)
         decides[-1:] = True  # tomorrow's weights may be asked for on any day
-        return eqx.tree_at(where, self, (*arrays, jnp.asarray(decides)))
+        tradable = None if prices.tradable is None else jnp.asarray(prices.tradable)
+        self._require_movable(prices)
+        return eqx.tree_at(
+            lambda t: (t.log_relatives, t.extra, t.anchors, t.conditions, t.decides, t.tradable),
+            self,
+            (*arrays, jnp.asarray(decides), tradable),
+            is_leaf=lambda x: x is None,
+        )
+
+    def _require_movable(self, prices: Prices) -> None:
+        """Raises QfolioError if assets come and go, and a setting needs all of them."""
+        menu = self.menu and not self.menu.startswith("signals")
+        needs = {"a mandate": self.mandate, f"menu={self.menu}": menu}
+        found = next((name for name, chosen in needs.items() if chosen), None)
+        if prices.tradable is not None and found:
+            raise QfolioError(
+                f"The assets of this table come and go, and {found} needs all of them at every "
+                "row; leave it out, or read the table without ended=cash-out and members."
+            )
 
     def deciding_at(self, row: int) -> "Portfolio":
         """The same task with a decision at a row, whatever the calendar says."""
@@ -163,6 +184,8 @@ class Portfolio(Market):
         channels = np.concatenate(
             [np.asarray(self.log_relatives)[rows, :, None], np.asarray(self.extra)[rows]], axis=2
         )[:, usable]
+        if self.tradable is not None:
+            channels = channels[np.asarray(self.tradable)[rows][:, usable]][:, None]
         center, scale = channels.mean((0, 1)), channels.std((0, 1))
         center[0] = 0.0  # the sign of a return means something
         limits = np.where(usable, self.max_weight, 0.0)
@@ -241,6 +264,24 @@ class Portfolio(Market):
     def feasible(self) -> Feasible:
         return super().feasible if self.allowed is None else self.allowed
 
+    def feasible_at(self, market: Row) -> Feasible:
+        """Without the assets that cannot be traded at a row."""
+        return self.feasible if self.tradable is None else Present(self._limits(market))
+
+    def _limits(self, market: Row) -> Float[Array, " asset"]:
+        """The largest weights at a row."""
+        if self.tradable is None:
+            return self.limits
+        there = lax.dynamic_index_in_dim(self.tradable, market, keepdims=False)
+        return jnp.where(there, self.limits, 0.0)
+
+    def draw_reachable(self, market: Row, key: PRNGKeyArray) -> Holding:
+        drawn = super().draw_reachable(market, key)
+        if self.tradable is None:
+            return drawn
+        there = lax.dynamic_index_in_dim(self.tradable, market, keepdims=False)
+        return drawn._replace(weights=cashed(drawn.weights, there))
+
     def reset_market(self, key: PRNGKeyArray) -> Row:
         starts = self.last_decision - self.first_decision + 1 - self.horizon + 1
         drawn = jnp.floor(jax.random.uniform(key) * starts).astype(jnp.int32)
@@ -269,11 +310,17 @@ class Portfolio(Market):
         if not self.anchor:
             return None
         weights = lax.dynamic_index_in_dim(self.anchors, market, keepdims=False)
-        open_to = self.limits > 0
+        limits = self._limits(market)
+        open_to = limits > 0
         kept = jnp.where(open_to, weights, 0.0)
         share = kept / jnp.maximum(kept.sum(), 1e-9)
-        share = (1 - LEAST) * share + LEAST * open_to / open_to.sum()
-        return jnp.minimum(weights.sum() * share, self.limits)
+        share = (1 - LEAST) * share + LEAST * open_to / self._count(open_to)
+        return jnp.minimum(weights.sum() * share, limits)
+
+    def _count(self, open_to: Bool[Array, " asset"]) -> Int[Array, ""]:
+        """How many assets are open to trade; 1 if there is none at a row."""
+        count = open_to.sum()
+        return count if self.tradable is None else jnp.maximum(count, 1)
 
     @property
     def tilting(self) -> int:
@@ -285,8 +332,9 @@ class Portfolio(Market):
             return None
         anchor = self.anchor_weights(market)
         if anchor is None:
-            open_to = self.limits > 0
-            anchor = jnp.minimum(open_to / open_to.sum(), self.limits)
+            limits = self._limits(market)
+            open_to = limits > 0
+            anchor = jnp.minimum(open_to / self._count(open_to), limits)
         others = lax.dynamic_index_in_dim(self.extra, market, keepdims=False)
         return Signalled(anchor, others[:, others.shape[1] - self.tilting :])
 
@@ -336,7 +384,7 @@ class Portfolio(Market):
         """Weights one row after they were held at a row, without a trade."""
         last = self.log_relatives.shape[0] - 1
         period = self.conditions.holding(row, jnp.minimum(row + 1, last))
-        return grown(weights, self.costs.growth(weights, self.coming(row), period))
+        return self.costs.held(weights, self.coming(row), period)
 
     def coming(self, row: Row) -> Float[Array, " asset"]:
         """Relatives from a row to the next; 1 after the table's last row."""

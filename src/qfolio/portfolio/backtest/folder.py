@@ -161,6 +161,7 @@ class BacktestFolder:
             "values": prices.values,
             "features": prices.features,
             "market": prices.market,
+            **prices.masks,
         }
         write_arrays(self.path / "prices.safetensors", arrays)
         if own:
@@ -185,6 +186,8 @@ class BacktestFolder:
                 note=str(config.prices.get("note", "")),
                 market=arrays.get("market", np.empty(0)),
                 market_names=tuple(config.prices.get("columns", ())),
+                listed=arrays.get("listed"),
+                members=arrays.get("members"),
             )
         except (KeyError, ValueError, QfolioError) as error:
             raise QfolioError(f"{path} is damaged ({error}); restore it or start over.") from None

@@ -51,6 +51,7 @@ def orders(
     month: int = 21,
     decides: Bools | None = None,
     band: float = 0.0,
+    universe: Bools | None = None,
 ) -> Orders:
     """Ask a baseline for its decisions on every row of the folds.
 
@@ -69,6 +70,9 @@ def orders(
         month: Rows in a month.
         decides: Which rows are for decisions, of shape (rows,), instead of the baseline's calendar.
         band: As ``calendars.band``; a target of the calendar "fold" is one of every row.
+        universe: Which assets may be bought at each row, of shape (rows, N), if they come and go.
+            One that estimates may hold those of them with prices in all of the fold's training
+            rows. A target of the calendar "fold" is asked for at every row.
 
     Returns:
         Decisions for all rows of the folds, and notes that name the fold.
@@ -85,11 +89,14 @@ def orders(
     parts, notes = [], []
     for number, fold in enumerate(folds):
         chosen = None if tradable is None else np.asarray(tradable, dtype=bool)[number]
-        allowed = _tradable(fold, prices, chosen)
+        may = ~np.isnan(prices[fold.train]).any(axis=0) if baseline.estimates else True
+        allowed = _tradable(fold, prices, chosen) if universe is None else universe & may
         rows = range(len(prices))[fold.decisions]
         asked = set(_asked(baseline, rows, folds[0].decisions.start, month, decides))
         trading = np.ones(len(rows), bool) if decides is None else decides[fold.decisions]
         mandated = None if feasible is None else feasible[number]
+        each = universe is not None and baseline.calendar == "fold"
+        asked |= {row for row in rows if each and (decides is None or decides[row])}
         again = (mandated is not None or band > 0) and baseline.calendar == "fold"
         part = np.full((len(rows), len(ordered)), np.nan)
         with warnings.catch_warnings(record=True) as caught:
@@ -98,14 +105,16 @@ def orders(
                 held = drifted(ordered, prices[row_ordered], prices[row])
                 if row in asked:
                     known = slice(0, row + 1)
-                    history = History(dates[known], prices[known], fold.train, allowed, cap, month)
-                    wanted = baseline.decide(history, held)
+                    open_to = allowed if universe is None else allowed[row]
+                    history = History(dates[known], prices[known], fold.train, open_to, cap, month)
+                    nothing = np.eye(len(ordered))[0]
+                    wanted = baseline.decide(history, held) if open_to.any() else nothing
                 if wanted is not None and (trading[row - rows[0]] or not again):
                     target = obeying(name, wanted, held, history, mandated)
                     if beyond(band, target, held):
                         ordered, row_ordered = target, row
                         part[row - rows[0]] = ordered
-        if baseline.calendar == "fold" and not again and not np.isnan(part[0]).any():
+        if baseline.calendar == "fold" and not (again or each or np.isnan(part[0]).any()):
             part[:] = np.where(trading[:, None], part[0], np.nan)
             row_ordered = rows[np.flatnonzero(trading)[-1]] if trading.any() else row_ordered
         said = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)

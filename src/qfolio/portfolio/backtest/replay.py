@@ -101,12 +101,16 @@ class Replay:
     cap: float
 
     def left_out(self) -> list[str]:
-        """A note on each fold that leaves out assets."""
+        """A note on each fold that leaves out assets, and on those that are delisted."""
+        listed, assets = self.prices.listed, self.prices.assets
+        if self.prices.tradable is not None:
+            ended = [] if listed is None else np.flatnonzero(~listed[-1])
+            return [f"Delisted: {listing(assets[j] for j in ended)}."] if len(ended) else []
         folds = ((fold.name, fold.tradable(self.prices.values)) for fold in self.folds)
         return [
             f"Fold {name} leaves out {listing(late)}, which started too late."
             for name, tradable in folds
-            if (late := [self.prices.assets[j] for j in np.flatnonzero(~tradable)])
+            if (late := [assets[j] for j in np.flatnonzero(~tradable)])
         ]
 
     def mandated(self) -> list[str]:
@@ -119,6 +123,10 @@ class Replay:
             for fold, (_, lowered) in zip(self.folds, self._relaxed, strict=True)
             for said in lowered
         ]
+
+    @cached_property
+    def _complete(self) -> list[Fold]:
+        return [fold.complete(self.prices.values) for fold in self.folds]
 
     @cached_property
     def _conditions(self) -> Conditions:
@@ -170,9 +178,10 @@ class Replay:
         given = orders(
             name,
             baseline,
-            self.folds,
+            self.folds if table.tradable is None else self._complete,
             table.dates,
             table.values,
+            universe=table.tradable,
             cap=min(self.cap, largest_weight(text)) if text else self.cap,
             feasible=[made for made, _ in self._relaxed] if text else None,
             month=table.month,

@@ -68,9 +68,10 @@ class Backtest:
         self.prices, self.config, self._kept = prices, config, Kept(folder)
         dates, length, expanding = prices.dates, config.train, config.expanding
         folds = walk_forward(dates, length, config.test, config.lag, expanding)
-        self.folds = [fold.complete(prices.values) for fold in folds]
-        last = latest(LATEST, dates, length, expanding).complete(prices.values)
-        self._jobs = [*self.folds, last]
+        last = latest(LATEST, dates, length, expanding)
+        if prices.tradable is None:  # else agents also learn from assets that come and go
+            folds, last = [f.complete(prices.values) for f in folds], last.complete(prices.values)
+        self.folds, self._jobs = folds, [*folds, last]
         given = agents or {}
         self.agents = {
             name: given[name] if name in given else agent_of(entry.agent, entry.settings)
@@ -412,8 +413,9 @@ class Backtest:
         return task.deciding_at(self.folds[0].decisions.start)
 
     def _part(self, task: Portfolio, job: Fold) -> Portfolio:
-        values = self.prices.values
-        return task.part(job.train.start, job.train.stop - 1, job.tradable(values))
+        still = self.prices.tradable is None
+        usable = job.tradable(self.prices.values) if still else None
+        return task.part(job.train.start, job.train.stop - 1, usable)
 
     def _missing(self, name: str, executor: Executor) -> list[FoldsJob]:
         """The folds that are still to be trained, in groups that fill a worker's devices."""

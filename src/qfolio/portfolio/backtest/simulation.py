@@ -19,7 +19,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.costs import Context, CostModel, Proportional, traded, with_cash
+from qfolio.portfolio.costs import (
+    Context,
+    CostModel,
+    Proportional,
+    cashed,
+    delisted,
+    traded,
+    with_cash,
+)
 
 TOLERANCE = 1e-6
 """How far weights may be off the simplex; within it they are projected back."""
@@ -101,7 +109,8 @@ def simulate(
             of the costs of trading and holding.
         lag: Rows between a decision and its trade, 0 or more.
         start: Weights held at row ``first``, of shape (N + 1,) or (..., N + 1) (default: all cash).
-        conditions: The columns of the table that the cost model reads, at the rows of ``values``.
+        conditions: The columns of the table that the cost model reads, at the rows of ``values``,
+            and which assets are listed: what is held of others at a trade is cash.
         long_only: Whether negative weights are refused.
 
     Returns:
@@ -191,6 +200,8 @@ class _Market:
         long_only: bool,
     ) -> None:
         self.prices, self.costs, self.conditions = prices, costs, conditions
+        self.listed = conditions.listed  # at all rows of the table
+        self.index = None if self.listed is None else self._index(first)
         self.begun = None if begun.all() else np.insert(begun, 0, True, axis=1)
         self.first, self.lag, self.long_only = first, lag, long_only
         self.days = len(prices) - lag - 1
@@ -206,8 +217,33 @@ class _Market:
         """Growth from days of decisions to the trades of later days' decisions, cash first."""
         return self.grown(decided, trade + self.lag)
 
+    def _index(self, first: int) -> list[Floats]:
+        """The product of growth factors from the first row to each.
+
+        An asset that is delisted within a period then earns what cash does for the rest of it.
+        """
+        start = np.arange(len(self.prices) - 1)
+        relatives = self.prices[1:] / self.prices[:-1]
+        context = self.conditions.holding(start + first, start + first + 1)
+        found = self.costs.carry(relatives, context), self.costs.owe(relatives, context)
+        ones = np.ones((1, relatives.shape[1] + 1))
+        return [
+            np.cumprod(np.concatenate([ones, delisted(x, relatives, context.listed)]), axis=0)
+            for x in found
+            if x is not None
+        ]
+
+    def cashed(self, weights: Floats, days: slice) -> Floats:
+        """Weights at the trades of some days, of shape (S, days, N + 1), after cash-outs."""
+        if self.listed is None:
+            return weights
+        begin = self.first + self.lag
+        return np.asarray(cashed(weights, self.listed[begin + days.start : begin + days.stop]))
+
     def grown(self, start: Rows, end: Rows) -> list[Floats]:
         """Growth factors of each entry from one row to another, owned and owed."""
+        if self.index is not None:
+            return [np.asarray(index[end] / index[start]) for index in self.index]
         relatives = self.prices[end] / self.prices[start]
         context = self.conditions.holding(start + self.first, end + self.first)
         found = self.costs.carry(relatives, context), self.costs.owe(relatives, context)
@@ -273,7 +309,7 @@ def _replay(
         growth = grown.sum(0)
         before = grown[..., :-1] / growth[:, :-1]
 
-        before, after = np.moveaxis(before, 0, -1), np.moveaxis(after, 0, -1)
+        before, after = (market.cashed(np.moveaxis(x, 0, -1), now) for x in (before, after))
         remainder, costs, wealth = _traded(market, before, after, given, growth[:, 1:], wealth, now)
         here = some, now
         result.returns[here] = remainder * growth[:, 1:] - 1

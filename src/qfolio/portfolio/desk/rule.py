@@ -40,6 +40,7 @@ class Rule:
     def table(self, prices: Any, **options: Any) -> Prices:
         """The prices with the assets of the backtest, in its order."""
         table = load(prices, **options)
+        table.require_still("a baseline's orders for tomorrow")
         if set(table.assets) != set(self.assets):
             off = sorted(set(table.assets) ^ set(self.assets))
             raise QfolioError(

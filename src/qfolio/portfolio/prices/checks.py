@@ -10,7 +10,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import quote
 from qfolio.portfolio.prices.columns import find_columns
 from qfolio.portfolio.prices.findings import Finding, Findings, day
-from qfolio.portfolio.prices.gaps import complete
+from qfolio.portfolio.prices.gaps import cash_outs, complete
 from qfolio.portfolio.prices.grid import arrange
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.moves import check_moves
@@ -19,6 +19,7 @@ from qfolio.portfolio.prices.returns import UNITS, cumulate
 
 MISSING = ("error", "drop-asset", "forward-fill")
 LATE = ("error", "drop-asset", "trim", "join")
+ENDED = ("gap", "cash-out")
 
 
 @dataclass(frozen=True)
@@ -27,17 +28,26 @@ class Choices:
 
     missing: str = "error"
     late: str = "error"
+    ended: str = "gap"
+    delisting_haircut: float = 0.0
+    members: Any = None
     features: Sequence[str] = ()
     columns: Sequence[str] = ()
     returns: str | None = None
     date: str | None = None
 
     def __post_init__(self) -> None:
-        known = {"missing": MISSING, "late": LATE, "returns": (None, *UNITS)}
+        known = {"missing": MISSING, "late": LATE, "ended": ENDED, "returns": (None, *UNITS)}
         for name, choices in known.items():
             if (value := getattr(self, name)) not in choices:
                 listed = ", ".join(choice for choice in choices if choice)
                 raise QfolioError(f"{name} is {quote(value)}; it must be one of {listed}.")
+        haircut = self.delisting_haircut
+        if not 0 <= haircut <= 1 or (haircut and self.ended != "cash-out"):
+            raise QfolioError(
+                f"delisting_haircut is {haircut}; it must be from 0 to 1, and be given with "
+                "ended=cash-out (--ended cash-out)."
+            )
         for name in ("features", "columns"):
             given = getattr(self, name)
             names = (given,) if isinstance(given, str) else tuple(given)
@@ -58,7 +68,8 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Findin
     check_cells(grid, findings)
     if not ordered or not grid.assets or len(grid.dates) < FEWEST_ROWS:
         return {}, findings
-    rest = complete(grid, choices.missing, choices.late, findings)
+    delists = choices.ended == "cash-out"
+    rest = complete(grid, choices.missing, choices.late, findings, delists=delists)
     if not len(rest.assets):
         return {}, findings
     check_moves(grid, rest, findings)
@@ -71,11 +82,13 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Findin
         "dates": dates,
         "assets": tuple(grid.assets[j] for j in rest.assets),
         "values": rest.values,
-        "features": rest.features[..., : len(features)],
+        "features": np.array(rest.features[..., : len(features)]),
         "feature_names": features,
         "market": market,
         "market_names": shared,
     }
+    if delists:
+        content |= cash_outs(rest.values, content["features"], choices.delisting_haircut)
     return content, findings
 
 

@@ -28,6 +28,7 @@ class _Span(NamedTuple):
     start: np.ndarray  # (assets,): the row of the first price; the number of rows if there is none
     end: np.ndarray  # (assets,): the row after the last price
     gaps: np.ndarray  # (rows, assets): after the first price, and without one
+    delists: bool  # whether there are no gaps after the last price
 
     @property
     def empty(self) -> np.ndarray:
@@ -35,27 +36,59 @@ class _Span(NamedTuple):
         return self.start >= self.end
 
 
-def complete(grid: Grid, missing: str, late: str, findings: Findings) -> Rest:
-    """Close gaps and drop assets as the user chose: first ``missing``, then ``late``."""
-    span = _span(grid)
+LEAST_PAID = 1e-9
+"""Share of the last price that a haircut leaves at least; prices stay positive."""
+
+
+def cash_outs(values: np.ndarray, features: np.ndarray, haircut: float) -> dict[str, np.ndarray]:
+    """Prices and features that go on after assets' last rows, and where assets are listed.
+
+    values: of shape (rows, assets). After its last price, an asset's is what is paid out for it,
+    less the haircut. features: (rows, assets, features); their last ones stay. ``listed`` is left
+    out if no asset ends.
+    """
+    priced = ~np.isnan(values)
+    listed = np.logical_or.accumulate(priced[::-1])[::-1]  # or before the first row
+    if listed.all():
+        return {}
+    paid = np.where(listed, 1.0, max(1 - haircut, LEAST_PAID))
+    last = _fill_forward(features.reshape(len(values), -1)).reshape(features.shape)
+    return {
+        "values": np.where(listed, values, _fill_forward(values) * paid),
+        "features": np.where(listed[..., None], features, last),
+        "listed": listed & priced,
+    }
+
+
+def complete(
+    grid: Grid, missing: str, late: str, findings: Findings, *, delists: bool = False
+) -> Rest:
+    """Close gaps and drop assets as the user chose: first ``missing``, then ``late``.
+
+    delists: whether an asset ends with its last price, so that none is missing after it.
+    """
+    span = _span(grid, delists)
     if span.head:
         findings.warn(f"left out at the start: {amount(span.head, 'row')} without prices")
     values, channels, keep = _treat_gaps(grid, span, missing, findings)
     head, keep = _treat_late_starts(grid, span, keep, late, findings)
     if grid.assets and not keep.any():
         findings.error("no asset is left", advice="Look at the gaps of the table first.")
+    if delists:
+        keep = keep & (span.end > head)
     channels = [np.broadcast_to(channel, values.shape) for channel in channels]
     features = np.stack(channels, axis=-1) if channels else np.empty((*values.shape, 0))
     return Rest(head, np.flatnonzero(keep), values[head:, keep], features[head:, keep])
 
 
-def _span(grid: Grid) -> _Span:
+def _span(grid: Grid, delists: bool) -> _Span:
     present = ~np.isnan(grid.prices.values) | grid.prices.wrong
     count, some = len(present), present.any(axis=0)
     start = np.where(some, present.argmax(axis=0), count)
     end = np.where(some, count - present[::-1].argmax(axis=0), 0)
-    gaps = ~present & (np.arange(count)[:, None] >= start)
-    return _Span(int(start.min()) if some.any() else 0, start, end, gaps)
+    rows = np.arange(count)[:, None]
+    gaps = ~present & (rows >= start) & (rows < (end if delists else count))
+    return _Span(int(start.min()) if some.any() else 0, start, end, gaps, delists)
 
 
 def _treat_gaps(
@@ -69,6 +102,7 @@ def _treat_gaps(
         np.isnan(block.values)
         & ~block.wrong
         & (rows >= (span.start if block.by_asset else span.head))
+        & (rows < (span.end if block.by_asset and span.delists else len(rows)))
         for block in grid.features
     ]
     keep = ~span.empty
@@ -88,7 +122,9 @@ def _treat_gaps(
     if missing == "forward-fill":
         if span.gaps.any():
             _report_filled(grid, span.gaps, findings)
-        values, channels = _fill_forward(values), [_fill_forward(channel) for channel in channels]
+        filled = _fill_forward(values)
+        values = np.where(span.gaps, filled, values) if span.delists else filled
+        channels = [_fill_forward(channel) for channel in channels]
         holes = [h & np.isnan(channel) for h, channel in zip(holes, channels, strict=True)]
     if missing == "error":
         advice = (
@@ -97,10 +133,12 @@ def _treat_gaps(
         )
         within = span.gaps & (rows < span.end)
         report_cells(grid, grid.prices, within, "is missing", advice, findings)
+        ends = ~span.empty & (span.end < len(values)) & (not span.delists)
         _report_assets(
-            grid, ~span.empty & (span.end < len(values)),
+            grid, ends,
             lambda j: f"there are no prices after {day(grid.dates[span.end[j] - 1])}",
-            "whose prices end early", advice, findings,
+            "whose prices end early",
+            f"{advice} If they were delisted, choose ended='cash-out' (--ended).", findings,
         )  # fmt: skip
     advice = (
         "Fill the cells, start the table where the features do, or choose "

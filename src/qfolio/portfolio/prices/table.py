@@ -8,6 +8,7 @@ import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,16 @@ from qfolio.portfolio.prices.checks import Choices, examine
 from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.findings import Finding, day, hint
 from qfolio.portfolio.prices.frequency import periods_per_year
+from qfolio.portfolio.prices.members import membership
 
 DEFAULT_SOURCE = "skfolio: 20 US stocks"
 DEFAULT_NOTE = (
     "20 US stocks, chosen in hindsight from those still listed in 2022 (survivors): strategies "
     "that hold them look better than they could have been at the time."
 )
+OF_ALL = ("ended", "delisting_haircut", "members")
+"""Choices that only a whole table can follow, not one asset's file of a folder."""
+
 DEFAULT_TRIALS = 177
 """Earlier trials on the default table, as docs/results/real_prices.md lists them."""
 
@@ -38,7 +43,8 @@ class Prices:
         dates: datetime64[s] of shape (rows,), strictly increasing.
         assets: Names of the columns, each different.
         values: float64 of shape (rows, assets), finite and positive; NaN only before an asset's
-            first row, if loaded with late="join".
+            first row, if loaded with late="join". After an asset's last row they are what is paid
+            out for it.
         features: float64 of shape (rows, assets, channels); NaN only before an asset's first row.
         feature_names: Names of the channels.
         source: The origin of the table.
@@ -46,6 +52,9 @@ class Prices:
         market: float64 of shape (rows, names), finite: columns of the whole market, such as a cash
             rate, which agents do not see.
         market_names: Names of these columns.
+        listed: Whether an asset has a price, bool of shape (rows, assets); None if none ends.
+        members: Whether an asset may be bought, likewise; None if all may be as long as they are
+            listed.
 
     Raises:
         QfolioError: The arrays break one of these rules.
@@ -60,6 +69,8 @@ class Prices:
     note: str = ""
     market: np.ndarray = field(default_factory=lambda: np.empty(0))
     market_names: tuple[str, ...] = ()
+    listed: np.ndarray | None = None
+    members: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         dates = np.array(self.dates, dtype="datetime64[s]")
@@ -95,6 +106,10 @@ class Prices:
         if np.isinf(features).any() or np.isnan(features[started]).any():
             raise QfolioError("features must be finite from an asset's first row on.")
         arrays = {"dates": dates, "values": values, "features": features, "market": market}
+        for name, mask in self.masks.items():
+            arrays[name] = np.array(mask, dtype=bool)
+            if arrays[name].shape != shape:
+                raise QfolioError(f"{name} has the shape {mask.shape}; it must be {shape}.")
         for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
@@ -109,6 +124,34 @@ class Prices:
 
     def __len__(self) -> int:
         return len(self.dates)
+
+    @property
+    def masks(self) -> dict[str, np.ndarray]:
+        """``listed`` and ``members``, those that are not None."""
+        both = {"listed": self.listed, "members": self.members}
+        return {name: mask for name, mask in both.items() if mask is not None}
+
+    @cached_property
+    def tradable(self) -> np.ndarray | None:
+        """Whether an asset may be bought at a row, bool of shape (rows, assets).
+
+        None if assets neither end nor have a membership: then any may be from its first row on.
+        """
+        masks = list(self.masks.values())
+        return np.logical_and.reduce([~np.isnan(self.values), *masks]) if masks else None
+
+    @property
+    def known(self) -> np.ndarray:
+        """The prices, with NaN after an asset's last row, too."""
+        return self.values if self.listed is None else np.where(self.listed, self.values, np.nan)
+
+    def require_still(self, who: str) -> None:
+        """Raises QfolioError if assets end or have a membership."""
+        if self.tradable is not None:
+            raise QfolioError(
+                f"The assets of this table come and go, which {who} does not know yet; read it "
+                "without ended=cash-out and members."
+            )
 
     @property
     def relatives(self) -> np.ndarray:
@@ -150,6 +193,8 @@ class Prices:
         if self.market_names:
             sha.update(repr(self.market_names).encode("utf-8", "surrogatepass"))
             sha.update(self.market.astype("<f8").tobytes())
+        for name, mask in self.masks.items():
+            sha.update(name.encode() + mask.astype("u1").tobytes())
         return sha.hexdigest()
 
     def select(self, assets: Sequence[str]) -> "Prices":
@@ -177,6 +222,7 @@ class Prices:
             self.dates[rows], tuple(np.array(self.assets, dtype=object)[columns]),
             self.values[rows][:, columns], self.features[rows][:, columns], self.feature_names,
             self.source, self.note, self.market[rows], self.market_names,
+            **{name: mask[rows][:, columns] for name, mask in self.masks.items()},
         )  # fmt: skip
 
 
@@ -185,6 +231,9 @@ def load(
     *,
     missing: str = "error",
     late: str = "error",
+    ended: str = "gap",
+    delisting_haircut: float = 0.0,
+    members: Any = None,
     features: Sequence[str] = (),
     columns: Sequence[str] = (),
     returns: str | None = None,
@@ -207,6 +256,12 @@ def load(
         late: How to treat assets that start later than the table: "error", "drop-asset", "trim"
             (the table starts with the last of them) or "join" (they are NaN before their first
             row).
+        ended: How to treat prices that end before the table does: "gap" (as missing prices) or
+            "cash-out" (the asset is delisted: a holding becomes cash at the last price).
+        delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
+        members: Which assets may be bought at each date: a file or data frame with a column of
+            dates and one of 0 or 1 for each asset, each row of which stands until the next, or with
+            the columns asset, from and to (default: all).
         features: Columns that hold features: in a long table one number for each asset and date,
             in a wide table one for the whole market, or, under a header on two levels, a kind such
             as Volume, which has a column per asset.
@@ -222,8 +277,8 @@ def load(
     if isinstance(source, Prices):
         return source
     prices, findings = inspect(
-        source, missing=missing, late=late, features=features, columns=columns, returns=returns,
-        date=date,
+        source, missing=missing, late=late, ended=ended, delisting_haircut=delisting_haircut,
+        members=members, features=features, columns=columns, returns=returns, date=date,
     )  # fmt: skip
     if prices is None:
         errors = [finding for finding in findings if finding.severity == "error"]
@@ -260,7 +315,8 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
     chosen = Choices(**choices)
     if joined := isinstance(source, str | Path) and os.path.isdir(source):
         label = Path(source).resolve().name
-        source = folder.join(Path(source), lambda file: load(file, **choices))
+        alone = {name: value for name, value in choices.items() if name not in OF_ALL}
+        source = folder.join(Path(source), lambda file: load(file, **alone))
         chosen = replace(chosen, returns=None, date="date")
     table = reading.read(source, lambda names: text_columns(names, chosen.date))
     content, findings = examine(table, chosen)
@@ -268,7 +324,10 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
         findings = [replace(finding, row=None) for finding in findings]
     if not content:
         return None, findings
-    return Prices(**content, source=label or table.source, note=note), findings
+    prices = Prices(**content, source=label or table.source, note=note)
+    if chosen.members is not None:
+        prices = replace(prices, members=membership(chosen.members, prices.dates, prices.assets))
+    return prices, findings
 
 
 def describe(prices: Prices) -> dict[str, Any]:
@@ -283,6 +342,8 @@ def describe(prices: Prices) -> dict[str, Any]:
         "features": list(prices.feature_names),
         "columns": list(prices.market_names),
         "late_assets": int((prices.first_rows > 0).sum()),
+        "delisted_assets": 0 if prices.listed is None else int((~prices.listed[-1]).sum()),
+        "has_members": prices.members is not None,
         "digest": prices.digest,
         "note": prices.note,
     }

@@ -54,9 +54,12 @@ class Baseline(ABC):
             is the target of every row of the fold, so that drift is traded back at every row.
             "month": every ``History.month`` rows from the first decision of the test on; between,
             the holding drifts. "row": at every row; None then lets the holding drift.
+        estimates: Whether ``decide`` reads past prices. If not, it may hold any asset that is there
+            at the decision, where assets come and go.
     """
 
     calendar: ClassVar[Literal["fold", "month", "row"]] = "fold"
+    estimates: ClassVar[bool] = True
 
     @abstractmethod
     def decide(self, history: History, held: Floats) -> Floats | None:

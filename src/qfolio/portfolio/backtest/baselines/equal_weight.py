@@ -20,6 +20,8 @@ SPEEDS = (0.3, 0.1, 0.03, 0.01, 0.0)
 class EqualWeight(Baseline):
     """The same weight in every asset, rebalanced at every row."""
 
+    estimates = False
+
     def decide(self, history: History, held: Floats) -> Floats:
         return with_cash(equal_weights(history), history)
 
@@ -38,6 +40,7 @@ class EqualWeightAt(Baseline):
     """
 
     calendar = "row"
+    estimates = False
 
     def __init__(self, speed: float) -> None:
         self.speed = speed  # share of the way, from 0 (never) to 1
@@ -62,6 +65,7 @@ class EqualWeightBand(Baseline):
     """
 
     calendar = "row"
+    estimates = False
     width: ClassVar[float] = 0.2
 
     def decide(self, history: History, held: Floats) -> Floats | None:
@@ -76,6 +80,7 @@ class BuyAndHold(Baseline):
     """Equal weights bought once and never traded again."""
 
     calendar = "row"
+    estimates = False
 
     def decide(self, history: History, held: Floats) -> Floats | None:
         return None if held[1:].any() else with_cash(equal_weights(history), history)

@@ -1,0 +1,97 @@
+"""Which assets are members of a universe at each date, such as the constituents of an index."""
+
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.text import quote
+from qfolio.portfolio.prices.cells import is_missing, label, numbers
+from qfolio.portfolio.prices.dates import read_dates
+from qfolio.portfolio.prices.findings import hint
+from qfolio.portfolio.prices.layout import Table
+from qfolio.portfolio.prices.reading import read
+from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, plain
+
+SPANS = ("from", "to")
+
+
+def membership(source: Any, dates: np.ndarray, assets: tuple[str, ...]) -> np.ndarray:
+    """Whether an asset is a member at each date, bool of shape (rows, assets).
+
+    Args:
+        source: A file or a data frame, with a column of dates and one of 0 or 1 for each asset
+            (a row stands until the next one), or with the columns asset, from and to (both are days
+            of membership; an empty one is open).
+        dates: Of the price table, ascending, of shape (rows,).
+        assets: Of the price table.
+
+    Raises:
+        QfolioError: The source cannot be read, or does not say of each asset when it is a member.
+    """
+    table = read(source, lambda names: {0, *range(len(names))} if _spans(names) else {0})
+    try:
+        found = _of_spans if _spans(table.names) else _of_rows
+        return found(table, dates, assets)
+    except QfolioError as error:
+        raise QfolioError(f"The members in {quote(table.source)}: {error}") from None
+
+
+def _spans(names: tuple[str, ...]) -> bool:
+    return set(SPANS) <= {plain(name) for name in names}
+
+
+def _of_rows(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.ndarray:
+    _require_all(table.names[1:], assets)
+    since = _dates(table, 0)
+    if np.isnat(since).any():
+        raise QfolioError("a row has no date; the first column must hold the dates.")
+    order = np.argsort(since, kind="stable")
+    latest = np.searchsorted(since[order], dates, side="right") - 1
+    known = np.empty((len(since), len(assets)), bool)
+    for j, name in enumerate(assets):
+        column = table.names.index(name)
+        values, wrong = numbers(table.columns[column])
+        if (bad := wrong | ~np.isin(values, (0, 1))).any():
+            row = table.first_row + int(bad.argmax())
+            raise QfolioError(f"{quote(name)} is neither 0 nor 1 in row {row}; write one of both.")
+        known[:, j] = values == 1
+    return np.where((latest >= 0)[:, None], known[order][np.maximum(latest, 0)], False)
+
+
+def _of_spans(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.ndarray:
+    names = [plain(name) for name in table.names]
+    place = next((j for j, name in enumerate(names) if name in ASSET_NAMES), None)
+    if place is None:
+        raise QfolioError("there is no column of assets beside from and to; name it asset.")
+    labels = [label(cell) for cell in table.columns[place].tolist()]
+    _require_all(labels, assets)
+    begin, end = (_dates(table, names.index(name)) for name in SPANS)
+    members = np.zeros((len(dates), len(assets)), bool)
+    for i, name in enumerate(labels):
+        if name in assets:
+            after = np.isnat(begin[i]) | (dates >= begin[i])
+            until = np.isnat(end[i]) | (dates < end[i].astype("datetime64[D]") + 1)
+            members[:, assets.index(name)] |= after & until
+    return members
+
+
+def _dates(table: Table, column: int) -> np.ndarray:
+    """A column's dates, NaT where a cell is empty."""
+    cells = table.columns[column]
+    moments, complaints, _ = read_dates(cells)
+    for i, said in complaints.items():
+        if not is_missing(cells[i]):
+            row = table.first_row + i
+            raise QfolioError(f"{quote(table.names[column])} in row {row}: {said}.")
+    return moments
+
+
+def _require_all(named: Any, assets: tuple[str, ...]) -> None:
+    """The members may be of a larger universe, but must say something of each asset."""
+    for name in assets:
+        if name not in named:
+            raise QfolioError(
+                f"they do not name {quote(name)}{hint(name, list(named))}; add it, or remove the "
+                "asset from the prices."
+            )
