@@ -84,6 +84,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             raise QfolioError(f"render_mode is {render_mode!r}; it must be 'ansi' or None.")
         self.render_mode = render_mode
         self.prices = load(prices)
+        self.prices.require_still("the environment of Gymnasium")
         chosen = settings.convert(Portfolio, task)
         self.task = Portfolio.of(self.prices, **chosen)
         self._conditions = Conditions.of(self.prices, self.task.costs.columns)

@@ -19,7 +19,7 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Box, Position, Simplex
-from qfolio.portfolio import anchors, signals
+from qfolio.portfolio import anchors, signals, universe
 from qfolio.portfolio.calendars import band, decision_rows
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import cashed
@@ -28,7 +28,6 @@ from qfolio.portfolio.mandate.feasible import Feasible, Mandated
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight, settled
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
-from qfolio.portfolio.universe import Present
 
 Row = Int[Array, ""]
 
@@ -119,24 +118,14 @@ class Portfolio(Market):
         decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)
         decides[-1:] = True  # tomorrow's weights may be asked for on any day
         tradable = None if prices.tradable is None else jnp.asarray(prices.tradable)
-        self._require_movable(prices)
+        if tradable is not None:
+            universe.require_support(self.mandate, self.menu)
         return eqx.tree_at(
             lambda t: (t.log_relatives, t.extra, t.anchors, t.conditions, t.decides, t.tradable),
             self,
             (*arrays, jnp.asarray(decides), tradable),
             is_leaf=lambda x: x is None,
         )
-
-    def _require_movable(self, prices: Prices) -> None:
-        """Raises QfolioError if assets come and go, and a setting needs all of them."""
-        menu = self.menu and not self.menu.startswith("signals")
-        needs = {"a mandate": self.mandate, f"menu={self.menu}": menu}
-        found = next((name for name, chosen in needs.items() if chosen), None)
-        if prices.tradable is not None and found:
-            raise QfolioError(
-                f"The assets of this table come and go, and {found} needs all of them at every "
-                "row; leave it out, or read the table without ended=cash-out and members."
-            )
 
     def deciding_at(self, row: int) -> "Portfolio":
         """The same task with a decision at a row, whatever the calendar says."""
@@ -266,7 +255,7 @@ class Portfolio(Market):
 
     def feasible_at(self, market: Row) -> Feasible:
         """Without the assets that cannot be traded at a row."""
-        return self.feasible if self.tradable is None else Present(self._limits(market))
+        return self.feasible if self.tradable is None else universe.Present(self._limits(market))
 
     def _limits(self, market: Row) -> Float[Array, " asset"]:
         """The largest weights at a row."""

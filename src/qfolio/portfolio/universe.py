@@ -3,9 +3,21 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate.feasible import CappedSimplex
 
 TINY = 1e-9
+
+
+def require_support(mandate: str, menu: str) -> None:
+    """Raises QfolioError for a setting of the task that needs all assets at every row."""
+    grid = menu and not menu.startswith("signals")
+    found = "a mandate" if mandate else f"menu={menu}" if grid else ""
+    if found:
+        raise QfolioError(
+            f"The assets of this table come and go, and {found} needs all of them at every row; "
+            "leave it out, or read the table without ended=cash-out and members."
+        )
 
 
 class Present(CappedSimplex):

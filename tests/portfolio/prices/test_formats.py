@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,7 +27,7 @@ def refusal(path: Path) -> str:
     return str(raised.value)
 
 
-def attempt(path: Path, **options: str) -> Prices | str:
+def attempt(path: Path, **options: Any) -> Prices | str:
     """The prices, or why they are refused; any other error is the caller's."""
     try:
         return load(path, **options)

@@ -104,8 +104,9 @@ class Replay:
         """A note on each fold that leaves out assets, and on those that are delisted."""
         listed, assets = self.prices.listed, self.prices.assets
         if self.prices.tradable is not None:
-            ended = [] if listed is None else np.flatnonzero(~listed[-1])
-            return [f"Delisted: {listing(assets[j] for j in ended)}."] if len(ended) else []
+            last = np.ones(len(assets), bool) if listed is None else listed[-1]
+            names = [assets[j] for j in np.flatnonzero(~last)]
+            return [f"Delisted: {listing(names)}."] if names else []
         folds = ((fold.name, fold.tradable(self.prices.values)) for fold in self.folds)
         return [
             f"Fold {name} leaves out {listing(late)}, which started too late."

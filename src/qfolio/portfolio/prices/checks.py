@@ -78,17 +78,18 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Findin
     market = _shared(rest.features[..., len(features) :], dates, shared, findings)
     if findings.bad:
         return {}, findings
+    seen = np.array(rest.features[..., : len(features)])
     content = {
         "dates": dates,
         "assets": tuple(grid.assets[j] for j in rest.assets),
         "values": rest.values,
-        "features": np.array(rest.features[..., : len(features)]),
+        "features": seen,
         "feature_names": features,
         "market": market,
         "market_names": shared,
     }
     if delists:
-        content |= cash_outs(rest.values, content["features"], choices.delisting_haircut)
+        content |= cash_outs(rest.values, seen, choices.delisting_haircut)
     return content, findings
 
 

@@ -1,0 +1,365 @@
+"""Assets that join, are delisted, and are members for a time."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.presets import preset
+from qfolio.portfolio.anchors import path
+from qfolio.portfolio.backtest.baselines import baseline
+from qfolio.portfolio.backtest.folds import Fold
+from qfolio.portfolio.backtest.orders import orders
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.itemized import Itemized
+from qfolio.portfolio.prices.gaps import cash_outs
+from qfolio.portfolio.prices.table import Prices, check, load
+from qfolio.portfolio.task import Portfolio
+from qfolio.portfolio.universe import Present
+
+NAMES = tuple("ABCDEFGH")
+SIGNALS = {"signals": "momentum:5,volatility:5", "anchor": "equal-weight"}
+
+
+def moving(seed: int, rows: int, assets: int, haircut: float = 0.0) -> tuple[Prices, np.ndarray]:
+    """A random table, in which the first asset stays, and the last row of each asset.
+
+    Some assets join late, some are delisted, and some are members for a time.
+    """
+    rng = np.random.default_rng(seed)
+    dates = np.busday_offset("2024-01-01", np.arange(rows), roll="forward")
+    values = 50 * np.exp(np.cumsum(0.03 * rng.normal(size=(rows, assets)), 0))
+    late = rng.random(assets) < 0.4
+    begin = np.where(late, rng.integers(1, rows // 2, assets), 0)
+    ends = rng.random(assets) < 0.5
+    last = np.where(ends, rng.integers(rows // 2, rows - 1, assets), rows - 1)
+    begin[0], last[0] = 0, rows - 1
+    row = np.arange(rows)[:, None]
+    values[(row < begin) | (row > last)] = np.nan
+    paid = cash_outs(values, np.empty((rows, assets, 0)), haircut)
+    paid.pop("features", None)
+    member = rng.random((rows, assets)) < 0.8
+    member[:, 0] = True
+    content: dict[str, Any] = {"values": values, **paid, "members": member}
+    return Prices(dates.astype("datetime64[s]"), NAMES[:assets], **content), last
+
+
+class Ledger:
+    """Shares and money, one trade and one day at a time; prices after the last are not read."""
+
+    def __init__(self, model: Itemized, prices: Prices, last: np.ndarray, haircut: float) -> None:
+        self.model, self.last, self.haircut = model, last, haircut
+        self.prices = np.where(np.isnan(prices.values), 1.0, prices.values)
+        self.days = np.diff(prices.dates) / np.timedelta64(1, "D")
+
+    def held(
+        self, shares: np.ndarray, cash: float, start: int, end: int
+    ) -> tuple[np.ndarray, float]:
+        """Shares and cash some rows later; an asset is cashed out at its last price."""
+        shares = shares.copy()
+        for row in range(start, end):
+            years = float(self.days[row]) / 365
+            for i in range(len(shares)):
+                if self.last[i] == row:
+                    cash += shares[i] * self.prices[row, i] * (1 - self.haircut)
+                    shares[i] = 0
+            cash *= math.exp(float(self.model.cash_rate) * years)
+            shares *= math.exp(float(self.model.carry_rate) * years)
+        return shares, cash
+
+    def worth(self, shares: np.ndarray, cash: float, row: int) -> float:
+        priced = row <= self.last
+        return float((shares * self.prices[row])[priced].sum() + cash)
+
+    def paid(
+        self, shares: np.ndarray, target: np.ndarray, wealth: float, left: float, row: int
+    ) -> float:
+        cost, total = self.model.cost, 0.0
+        for i in range(len(shares)):
+            if row > self.last[i]:
+                assert shares[i] == target[1 + i] == 0
+                continue
+            change = target[1 + i] * left - shares[i] * self.prices[row, i]
+            total += abs(change) * (cost / (1 - cost) if change > 0 else cost)
+            if abs(target[1 + i] - shares[i] * self.prices[row, i] / wealth) > 1e-6:
+                total += self.model.fixed
+        return total
+
+    def run(self, decisions: np.ndarray, lag: int) -> np.ndarray:
+        shares, cash, returns = np.zeros(decisions.shape[1] - 1), self.model.capital, []
+        for day, order in enumerate(decisions):
+            row = day + lag
+            wealth = self.worth(shares, cash, row)
+            if not np.isnan(order).any():
+                wanted, money = self.held(order[1:] / self.prices[day], order[0], day, row)
+                worth = self.worth(wanted, money, row)
+                target = np.append(money, wanted * self.prices[row]) / worth
+                left = wealth
+                for _ in range(14):  # each repetition is right for two more digits
+                    left = wealth - self.paid(shares, target, wealth, left, row)
+                shares, cash = target[1:] * left / self.prices[row], target[0] * left
+            shares, cash = self.held(shares, cash, row, row + 1)
+            returns.append(self.worth(shares, cash, row + 1) / wealth - 1)
+        return np.array(returns)
+
+
+def random_decisions(rng: np.random.Generator, prices: Prices, days: int) -> np.ndarray:
+    """Orders that hold assets which are there alone; about a third of the rows have none."""
+    assert prices.tradable is not None
+    decisions = rng.dirichlet(np.ones(len(prices.assets) + 1), days)
+    decisions[:, 1:] *= prices.tradable[:days]
+    decisions[:, 0] += 1 - decisions.sum(-1)
+    decisions[rng.random(days) < 0.3] = np.nan
+    return decisions
+
+
+def replayed(prices: Prices, decisions: np.ndarray, model: Itemized, lag: int) -> Any:
+    known = Conditions.of(prices, model.columns)
+    return simulate(prices.values, decisions, first=0, cost=model, lag=lag, conditions=known)
+
+
+@pytest.mark.parametrize(
+    "group", [0, *(pytest.param(group, marks=pytest.mark.slow) for group in range(1, 5))]
+)
+def test_equals_a_ledger(group: int) -> None:
+    """A hundred random tables, haircuts, memberships, costs, lags and orders a group."""
+    rows, ended = 10, 0
+    for case in range(100 * group, 100 * group + 100):
+        rng = np.random.default_rng(case)
+        haircut = float(rng.choice([0, 0.3, 0.9]))
+        prices, last = moving(case, rows, 4, haircut)
+        draw = lambda value, none: value if rng.random() < 0.5 else none  # noqa: B023, E731
+        model = Itemized(
+            cost=draw(0.01, 0.0), fixed=draw(20.0, 0.0), cash_rate=draw("0.05", "0"),
+            carry_rate=draw("-0.02", "0"), capital=1e5,
+        )  # fmt: skip
+        lag = int(rng.integers(0, 4))
+        decisions = random_decisions(rng, prices, rows - lag - 1)
+        result = replayed(prices, decisions, model, lag)
+        expected = Ledger(model, prices, last, haircut).run(decisions, lag)
+        np.testing.assert_allclose(result.returns, expected, rtol=0, atol=1e-10)
+        over = np.arange(lag, rows - 1)[:, None] > last
+        assert (result.weights[:, 1:][over] == 0).all()
+        ended += int(over.any())
+    assert ended > 40
+
+
+@pytest.mark.parametrize("lag", [0, 1, 3])
+def test_training_earns_what_the_replay_earns(lag: int) -> None:
+    prices, _ = moving(3, 40, 5, haircut=0.5)
+    text = "itemized(cash_rate=0.04, carry_rate=0.03)"
+    task = Portfolio.of(prices, window=5, lag=lag, horizon=10, cost=0.002, cost_model=text)
+    days = 40 - lag - 1
+    decisions = random_decisions(np.random.default_rng(0), prices, days)
+    decisions[np.isnan(decisions)] = np.tile([0.2, 0.8, 0, 0, 0, 0], (days, 1))[np.isnan(decisions)]
+    assert isinstance(task.costs, Itemized)
+    result = replayed(prices, decisions, task.costs, lag)
+    settle = jax.jit(lambda *moves: task.settle(*moves))
+    holding, growth = task.hold(jnp.eye(6)[0]), []
+    for row in range(days):
+        action = jnp.asarray(decisions[row], jnp.float32)
+        reward, holding = settle(jnp.array(row), jnp.array(row + 1), holding, action)
+        growth.append(float(reward))
+    np.testing.assert_allclose(growth, result.growth, rtol=0, atol=3e-6)
+    assert result.returns.min() < -0.05  # a haircut
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_comes_and_goes_later_changes_nothing_before(seed: int) -> None:
+    prices, _ = moving(seed, 60, 6, haircut=0.4)
+    now = 30 + 5 * seed
+    gone = np.array(prices.listed)
+    gone[now + 1 :, 0] = False  # the asset that stays is delisted after all
+    members = np.array(prices.members)
+    members[now + 1 :] ^= True
+    values = np.array(prices.values)
+    values[now + 1 :] *= np.linspace(0.5, 2, 6)
+    other = replace(prices, values=values, listed=gone, members=members)
+    one, two = (
+        Portfolio.of(p, window=5, horizon=5, **SIGNALS).part(0, now) for p in (prices, other)
+    )
+    wanted = jnp.asarray(np.random.default_rng(seed).dirichlet(np.ones(7)), jnp.float32)
+    view = jax.jit(lambda task, row: (task.view(row, wanted), task.target(row, wanted, wanted)))
+    for row in range(6, now + 1):
+        seen = [jax.tree.map(np.asarray, view(task, jnp.array(row))) for task in (one, two)]
+        jax.tree.map(np.testing.assert_array_equal, *seen)
+        there = prices.tradable[row]  # type: ignore[index]
+        assert (seen[0][1][1:][~there] == 0).all()
+        assert (seen[0][0].anchor[~there] == 0).all()
+    for name in ("equal-weight", "inverse-volatility"):
+        np.testing.assert_array_equal(path(name, prices)[: now + 1], path(name, other)[: now + 1])
+    folds = [Fold("one", slice(0, 20), slice(20, 59), slice(0, 20))]
+    for name in ("equal-weight", "buy-and-hold", "inverse-volatility", "pamr"):
+        given = [
+            orders(name, baseline(name), folds, p.dates, p.values, universe=p.tradable)
+            for p in (prices, other)
+        ]
+        decided = [x.decisions[: now - 19] for x in given]
+        np.testing.assert_array_equal(decided[0], decided[1], err_msg=name)
+
+
+def test_equal_weights_are_spread_over_what_is_there() -> None:
+    prices, _ = moving(1, 60, 6)
+    assert prices.tradable is not None
+    equal = prices.tradable / prices.tradable.sum(1, keepdims=True)
+    folds = [Fold("one", slice(0, 20), slice(20, 59), slice(0, 20))]
+    given = orders(
+        "equal-weight", baseline("equal-weight"), folds, prices.dates, prices.values,
+        universe=prices.tradable,
+    )  # fmt: skip
+    np.testing.assert_allclose(given.decisions[:, 1:], equal[20:59], atol=1e-15)
+    np.testing.assert_allclose(path("equal-weight", prices), equal, atol=1e-15)
+    anchored = Portfolio.of(prices, window=5, horizon=5, **SIGNALS)
+    weights = jax.vmap(anchored.anchor_weights)(jnp.arange(60))
+    assert weights is not None
+    np.testing.assert_allclose(weights, equal, atol=1e-6)
+
+
+def test_signals_rank_those_that_are_there() -> None:
+    prices, _ = moving(2, 60, 6)
+    assert prices.tradable is not None
+    task = Portfolio.of(prices, window=5, horizon=5, **SIGNALS)
+    momentum = np.asarray(task.extra[..., 0])
+    assert (momentum[~prices.tradable] == 0).all()
+    for row in range(40, 60):
+        known = prices.tradable[row] & ~np.isnan(prices.known[row - 5])
+        if known.sum() > 1:
+            assert sorted(momentum[row, known]) == pytest.approx(np.linspace(-1, 1, known.sum()))
+
+
+def test_a_policy_over_all_assets_becomes_one_over_those_that_are_there() -> None:
+    feasible = Present(jnp.array([0.6, 0.0, 0.6]))
+    project = lambda *weights: feasible.project(jnp.array(weights), jnp.array(weights))  # noqa: E731
+    np.testing.assert_allclose(project(0.2, 0.2, 0.4, 0.2), [0.2, 0.4, 0, 0.4], atol=1e-6)
+    np.testing.assert_allclose(project(0.0, 0.3, 0.7, 0.0), [0.4, 0.6, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(project(0.5, 0.0, 0.5, 0.0), [1.0, 0, 0, 0], atol=1e-6)
+    np.testing.assert_array_equal(project(0.25, 0.5, 0, 0.25), [0.25, 0.5, 0, 0.25])
+
+
+def test_a_complete_table_has_no_masks() -> None:
+    frame = frame_of(30, 3)
+    task = Portfolio.of(load(frame, ended="cash-out"), window=5, horizon=5)
+    assert task.tradable is None
+    assert task.conditions.listed is None
+
+
+def test_survivors_alone_look_better_than_the_truth() -> None:
+    """A third of a made-up market dies after a fall, with nothing left for its holders."""
+    rng = np.random.default_rng(5)
+    logs = 0.01 * rng.normal(size=(750, 30)) + 0.0003
+    for asset, end in enumerate(rng.integers(300, 740, 10)):
+        logs[end - 40 : end, asset] -= 0.02
+        logs[end:, asset] = np.nan
+    frame = pd.DataFrame(100 * np.exp(np.cumsum(logs, 0)), pd.bdate_range("2020", periods=750))
+    frame.columns = [f"X{j}" for j in range(30)]
+    true = load(frame, ended="cash-out", delisting_haircut=1)
+    survivors = load(frame.iloc[:, 10:])
+    growth = []
+    for table in (true, survivors):
+        folds = [Fold("one", slice(0, 200), slice(200, 748), slice(0, 200))]
+        given = orders(
+            "equal-weight", baseline("equal-weight"), folds, table.dates, table.values,
+            universe=table.tradable,
+        )  # fmt: skip
+        known = Conditions.of(table, ())
+        result = simulate(table.values, given.decisions, first=200, cost=0.001, conditions=known)
+        growth.append(result.growth.sum())
+    assert growth[1] > growth[0] + 0.3
+
+
+def test_a_backtest_keeps_its_universe(tmp_path: Path) -> None:
+    prices, _ = moving(4, 160, 4, haircut=0.2)
+    agents = {"tilts": preset("fast", "portfolio", "tilts")}
+    made = Backtest.create(
+        prices, agents, train="100d", test="30d", out=tmp_path / "run",
+        baselines=["equal-weight"],
+    )  # fmt: skip
+    again = Backtest.open(tmp_path / "run").prices
+    assert again.digest == made.prices.digest
+    np.testing.assert_array_equal(again.tradable, prices.tradable)
+    with pytest.raises(QfolioError, match="come and go, and a mandate"):
+        Portfolio.of(prices, mandate={"assets": {"cap": 0.5}})
+    with pytest.raises(QfolioError, match="menu=grid:10 needs all of them"):
+        Portfolio.of(prices, menu="grid:10")
+
+
+# Reading.
+
+
+def frame_of(rows: int, assets: int) -> pd.DataFrame:
+    rng = np.random.default_rng(0)
+    values = 100 * np.exp(np.cumsum(0.01 * rng.normal(size=(rows, assets)), 0))
+    dates = pd.bdate_range("2024-01-01", periods=rows, name="date")
+    return pd.DataFrame(values, dates, list(NAMES[:assets]))
+
+
+def test_a_table_with_leavers_is_read(tmp_path: Path) -> None:
+    frame = frame_of(30, 4)
+    frame.loc[frame.index[:6], "B"] = np.nan
+    frame.loc[frame.index[20:], "C"] = np.nan
+    file = tmp_path / "prices.csv"
+    frame.to_csv(file)
+    said = " ".join(f"{finding} {finding.advice}" for finding in check(file, late="join"))
+    assert "no prices after 2024-01-26" in said
+    assert "--ended" in said
+    prices = load(file, late="join", ended="cash-out", delisting_haircut=0.25)
+    assert prices.tradable is not None
+    np.testing.assert_array_equal(prices.tradable, frame.notna())
+    np.testing.assert_allclose(prices.values[20:, 2], 0.75 * frame["C"].iloc[19], rtol=1e-12)
+    np.testing.assert_allclose(prices.values[prices.tradable], frame.to_numpy()[frame.notna()])
+    frame.loc[frame.index[10], "C"] = np.nan  # a gap inside remains one
+    with pytest.raises(QfolioError, match="is missing"):
+        load(frame, late="join", ended="cash-out")
+    filled = load(frame, late="join", ended="cash-out", missing="forward-fill")
+    assert filled.listed is not None
+    assert filled.listed[:, 2].sum() == 20
+    with pytest.raises(QfolioError, match=r"delisting_haircut is 0\.5; .*ended=cash-out"):
+        load(frame, delisting_haircut=0.5)
+
+
+def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
+    frame = frame_of(30, 3)
+    rows = pd.DataFrame(
+        {"A": [1, 1], "B": [0, 1], "C": [1, 0], "Z": [1, 1]},
+        pd.Index(["2024-01-03", "2024-01-15"], name="date"),
+    )
+    rows.to_csv(tmp_path / "rows.csv")
+    (tmp_path / "spans.csv").write_text(
+        "asset,from,to\nA,2024-01-03,\nB,2024-01-15,\nC,2024-01-03,2024-01-14\nZ,,\n"
+    )
+    day = frame.index
+    wanted = np.stack(
+        [
+            day >= "2024-01-03",
+            day >= "2024-01-15",
+            (day >= "2024-01-03") & (day < "2024-01-15"),
+        ],
+        -1,
+    )
+    for source in (rows, tmp_path / "rows.csv", tmp_path / "spans.csv"):
+        np.testing.assert_array_equal(load(frame, members=source).members, wanted)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("date,A,B\n2024-01-01,1,1\n", "do not name 'C'"),
+        ("date,A,B,C\n2024-01-01,1,2,1\n", "'B' is neither 0 nor 1 in row 2"),
+        ("date,A,B,C\nsoon,1,1,1\n", "in row 2"),
+        ("name,from,to\nA,,\n", "name it asset|do not name"),
+        ("asset,from,to\nA,,\nB,,\nC,never,\n", "'from' in row 4"),
+    ],
+)
+def test_members_that_cannot_be_read(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "members.csv").write_text(text)
+    with pytest.raises(QfolioError, match=said):
+        load(frame_of(30, 3), members=tmp_path / "members.csv")
