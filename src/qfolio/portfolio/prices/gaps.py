@@ -76,6 +76,8 @@ def complete(
         findings.error("no asset is left", advice="Look at the gaps of the table first.")
     if delists:
         keep = keep & (span.end > head)
+        if (gone := keep & (span.end < len(values))).any():
+            findings.note(f"delisted before the last row: {amount(int(gone.sum()), 'asset')}")
     channels = [np.broadcast_to(channel, values.shape) for channel in channels]
     features = np.stack(channels, axis=-1) if channels else np.empty((*values.shape, 0))
     return Rest(head, np.flatnonzero(keep), values[head:, keep], features[head:, keep])
