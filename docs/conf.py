@@ -1,9 +1,11 @@
 """Settings of the documentation; `make docs` builds it, and any warning fails the build."""
 
+import os
 import sys
 from pathlib import Path
 
 import jax
+from nbclient import NotebookClient
 from pygments.lexers.special import TextLexer
 from sphinx.highlighting import lexers
 
@@ -31,9 +33,15 @@ myst_enable_extensions = ["colon_fence", "dollarmath", "html_image"]
 myst_heading_anchors = 4
 # Notebooks run when they change; an error or a cell of more than five minutes fails the build.
 nb_execution_mode = "cache"
-nb_execution_in_temp = True
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+# What a command prints comes in pieces, which break in the middle of words; they are joined.
+NotebookClient.coalesce_streams = True
+# Notebooks type commands as readers do, and draw in the style of the reports.
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+os.environ["MATPLOTLIBRC"] = str(Path(__file__).parent / "matplotlibrc")
+os.environ["TTY_COMPATIBLE"] = "0"  # no colours and no moving bars
 
 autodoc_member_order = "bysource"
 napoleon_use_ivar = True
