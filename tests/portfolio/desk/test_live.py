@@ -23,6 +23,8 @@ def table(rows=60, seed=0):
 
 
 class Fixed:
+    mandate = ""
+
     def __init__(self, wanted, costs):
         self.wanted, self.costs = wanted, costs
 

@@ -41,8 +41,10 @@ def written(folder: Path, text: str = FILE, groups: str = GROUPS) -> Path:
 def test_lots_are_for_all_assets_or_for_some():
     assert lots("") is None
     assert lots(settled({"assets": {"cap": 0.5}}, ASSETS)) is None
-    assert lots(settled({"trading": {"lot": 100}}, ASSETS)).tolist() == [100] * 4
-    assert lots(settled({"trading": {"lot": {"TLT": 10}}}, ASSETS)).tolist() == [1, 10, 1, 1]
+    for lot, each in ((100, [100] * 4), ({"TLT": 10}, [1, 10, 1, 1])):
+        found = lots(settled({"trading": {"lot": lot}}, ASSETS))
+        assert found is not None
+        assert found.tolist() == each
     with pytest.raises(QfolioError, match=r"trading\.lot of the mandate names 'TTL'.*TLT"):
         settled({"trading": {"lot": {"TTL": 10}}}, ASSETS)
     with pytest.raises(QfolioError, match=r"trading\.lot"):
