@@ -155,6 +155,7 @@ def own(tmp_path, monkeypatch):
     sys.modules.pop("tracking", None)
 
 
+@pytest.mark.slow
 def test_a_tracker_of_ones_own_on_the_command_line(own, monkeypatch, tmp_path):
     words = ["train", "--episodes", 8, "--no-compare", "--out", "run", *TINY]
     assert qfolio(monkeypatch, *words, "--track", "tracking:Mine") == 0

@@ -61,6 +61,7 @@ def test_a_gradient_reaches_both_edges_wherever_they_are(biases):
     assert np.all((low > 0) & (low <= high) & (high < 1))
 
 
+@pytest.mark.slow
 def test_a_band_that_almost_never_trades_becomes_narrow():
     task = NoTrade(cost=0.0, horizon=40)
     state = begin(task, AGENT, jnp.array(0, jnp.uint32))

@@ -57,6 +57,7 @@ def test_ctrl_c_while_it_compiles(tmp_path, count):
         assert time.perf_counter() - begun < 5
 
 
+@pytest.mark.slow
 def test_a_reader_that_leaves(tmp_path):
     """A closed pipe, as ``| head`` leaves it, is no error."""
     with start(tmp_path / "run") as process:

@@ -92,6 +92,7 @@ def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_backtest_obeys_a_mandate(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     write_table(tmp_path / "prices.csv")

@@ -73,6 +73,7 @@ def test_a_training_is_reported_again(tmp_path, monkeypatch, capsys):
     assert "qfolio train --resume" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_comparison_is_reported_again(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     assert qfolio(monkeypatch, "compare", "finite/cliff", "--agents", "q-learning,sarsa",
@@ -83,6 +84,7 @@ def test_a_comparison_is_reported_again(tmp_path, monkeypatch):
     assert (folder / "report.html").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_study_is_reported_again(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     tables = [write_table(tmp_path / f"{name}.csv", rows=160, seed=seed)

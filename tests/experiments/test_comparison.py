@@ -294,6 +294,7 @@ def test_resuming_gives_the_same(finished, tmp_path, stop):
         assert run.results[name].env_steps == expected.env_steps
 
 
+@pytest.mark.slow
 def test_on_workers_it_is_the_same(tmp_path, one_core):
     """Also for an agent that diverges, and for one whose seeds were trained in part."""
     rates, made = {"slow": 1e-3, "wild": 1e29, "quick": 1e-2}, list[Comparison]()

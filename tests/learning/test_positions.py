@@ -122,8 +122,7 @@ SLOW = pytest.mark.slow
     "name",
     [
         "ppo",
-        "sac",
-        *(pytest.param(name, marks=SLOW) for name in ("a2c", "reinforce", "ddpg", "td3")),
+        *(pytest.param(name, marks=SLOW) for name in ("a2c", "reinforce", "ddpg", "td3", "sac")),
     ],
 )
 def test_each_agent_finds_planted_momentum(name):

@@ -144,6 +144,7 @@ def test_drift_is_that_of_an_independent_ledger(mandate: dict | None) -> None:
             assert 1 <= orders < len(decisions) / 2, name
 
 
+@pytest.mark.slow
 def test_every_strategy_of_a_backtest_keeps_to_the_calendar() -> None:
     prices = table()
     agents = {

@@ -82,6 +82,7 @@ class Shares(Listener):
         self.shares.append(training.share)
 
 
+@pytest.mark.slow
 def test_processes_equal_this_process(here, tmp_path):
     heard: dict[str, list[float]] = {}
     backtest = create(tmp_path / "run")

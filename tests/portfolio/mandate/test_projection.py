@@ -69,6 +69,7 @@ def test_it_is_the_point_that_a_convex_solver_finds(short, turnover):
 
 
 @pytest.mark.parametrize(("short", "turnover"), KINDS)
+@pytest.mark.slow
 def test_derivatives_are_those_of_finite_differences(short, turnover):
     _, (wanted, held, limits) = cases(1, short, turnover)
     rng = np.random.default_rng(2)
