@@ -22,7 +22,7 @@ from qfolio.experiments.presets import PRESETS
 
 
 class Commands(SphinxDirective):
-    """Every command: what it does, and a table for each group of its arguments."""
+    """Every command: what it does, and a table of its arguments, in groups."""
 
     def run(self) -> list[nodes.Node]:
         text = "\n\n".join(command(name, action) for name, action in commands().items())
@@ -49,10 +49,13 @@ def command(name: str, action: Any) -> str:
     for argument in parser._actions:
         if argument.dest != "help":
             typed = f"{', '.join(argument.option_strings)} {argument.metavar or ''}".strip()
-            title = argument.container.title or "options"
-            groups.setdefault(title, []).append([f"`{typed}`", linked(argument.help or "")])
-    tables = [table([title.capitalize(), "Meaning"], rows) for title, rows in groups.items()]
-    return "\n\n".join([f"## qfolio {name}", linked(parser.description or ""), *tables])
+            title = (argument.container.title or "options").capitalize()
+            groups.setdefault(title, [[f"**{title}**", ""]]).append(
+                [f"`{typed}`", linked(argument.help or "")]
+            )
+    rows = [row for group in groups.values() for row in group]
+    about = linked(parser.description or "")
+    return "\n\n".join([f"## qfolio {name}", about, table(["Argument", "Meaning"], rows)])
 
 
 def part(kind: Any, name: str) -> str:
@@ -86,7 +89,7 @@ def described(kind: type) -> str:
 
 def linked(text: str) -> str:
     """A text of the program, whose pages become links."""
-    return re.sub(r"docs/([\w/]+)\.md", r"[docs/\1.md](../\1.md)", text)
+    return re.sub(r"docs/([\w/]+?)(\w+)\.md", r"[\2](../\1\2.md)", text)
 
 
 def budget(chosen: Budget) -> str:
