@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 NOW := $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: demo test test-all check format bench bench-gpu docs linkcheck clean
+.PHONY: demo test test-all check format examples bench bench-gpu docs linkcheck clean
 
 demo: .venv/installed
 	$(BIN)/qfolio train pendulum --no-compare --out runs/demo-$(NOW)/pendulum
@@ -29,6 +29,11 @@ check: .venv/installed-dev
 format: .venv/installed-dev
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
+
+# The first script that fails stops the others.
+examples: .venv/installed
+	set -e; for script in mandate own_agent own_signal_and_cost pendulum prices_to_orders; do \
+		echo "examples/$$script.py"; $(BIN)/python examples/$$script.py; done
 
 # The site, in docs/_build/html. Any warning fails: a broken link, a page that the navigation does not reach.
 docs: .venv/installed-docs
