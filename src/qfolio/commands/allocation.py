@@ -88,6 +88,7 @@ def allocate(
     devices.configure()
     registry.trust(trust)
     from qfolio.commands import console
+    from qfolio.core.text import amount
     from qfolio.portfolio.backtest.attribution.drivers import reasons, sentence
     from qfolio.portfolio.desk.allocation import Allocation, require_fresh
     from qfolio.portfolio.desk.desk import Desk
@@ -96,7 +97,7 @@ def allocate(
     from qfolio.portfolio.desk.standing import Standing
     from qfolio.portfolio.mandate.mandate import lots
     from qfolio.portfolio.policy import Policy
-    from qfolio.portfolio.prices.findings import amount, day
+    from qfolio.portfolio.prices.findings import day
 
     if returns and (holdings or whole_shares or orders):
         raise QfolioError(

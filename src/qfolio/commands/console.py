@@ -13,7 +13,7 @@ from rich.text import Text
 
 from qfolio.core.registry import short
 from qfolio.core.statistics import FEWEST_SEEDS
-from qfolio.core.text import printable
+from qfolio.core.text import amount, printable
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -57,7 +57,7 @@ def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., 
 def describe_run(run: "Run", budget: "Budget") -> str:
     """Agent, task and seeds of a run, and its budget if rounding makes it larger."""
     config, planned = run.config, budget.planned(run.population)
-    seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
+    seeds = amount(config.seeds, "seed")
     return (
         f"{short(config.agent).upper()} on {config.task} · preset {config.preset or 'none'} · "
         f"{seeds} · {config.device}"
@@ -148,7 +148,7 @@ def print_prices(facts: dict[str, Any]) -> None:
 
 def describe_search(work: "Tuning") -> str:
     config, budget = work.config, work.config.budget
-    seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
+    seeds = amount(config.seeds, "seed")
     space = "\n".join(f"  {dim.name:<20} {dim}  ({dim.scale})" for dim in work.space)
     return (
         f"{short(config.agent).upper()} on {config.task} · preset {config.preset} · "
@@ -176,10 +176,11 @@ def describe_backtest(backtest: "Backtest") -> str:
 
     config, size = backtest.config, memory.needed(backtest.prices, backtest.config)
     large = f" It needs about {size / 2**30:.1f} GiB of memory, beside what training takes."
+    folds, seeds = amount(len(backtest.folds), "fold"), amount(config.seeds, "seed")
     return (
-        f"{len(backtest.folds)} folds ({backtest.folds[0].name} to {str(backtest.dates[-1])[:10]}) "
-        f"· {len(backtest.prices.assets)} assets · {' and '.join(backtest.agents)} · "
-        f"{config.seeds} seeds · {config.cost * 1e4:g} bp · lag {config.lag} · {config.device}"
+        f"{folds} ({backtest.folds[0].name} to {str(backtest.dates[-1])[:10]}) · "
+        f"{amount(len(backtest.prices.assets), 'asset')} · {' and '.join(backtest.agents)} · "
+        f"{seeds} · {config.cost * 1e4:g} bp · lag {config.lag} · {config.device}"
         + (f".{large}" if size > memory.MENTIONED else "")
     )
 
@@ -247,8 +248,8 @@ def _written(measures: "Mapping[str, Measure]", formats: dict[str, str]) -> list
 def describe_study(study: "Study") -> str:
     """Tables, variants and agents of a study, and why tables are left out."""
     config = study.config
-    variants = f"{len(config.variants)} variant" + "s" * (len(config.variants) > 1)
-    tables = f"{len(config.tables)} table" + "s" * (len(config.tables) > 1)
+    variants = amount(len(config.variants), "variant")
+    tables = amount(len(config.tables), "table")
     left_out = (f"{name} is left out: {why}" for name, why in config.left_out.items())
     about = f"{tables} · {variants} · {' and '.join(config.agents)} · {config.device}"
     return "\n".join([about, *left_out])

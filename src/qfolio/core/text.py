@@ -26,6 +26,11 @@ def quote(value: object, limit: int = 60) -> str:
     return f"'{printable(text if len(text) <= limit else text[: limit - 1] + '…')}'"
 
 
+def amount(count: int, noun: str) -> str:
+    """1 row, 2 rows."""
+    return f"{count:,} {noun}" + "s" * (count != 1)
+
+
 def near(name: str, known: Iterable[str]) -> str:
     """What a message says after a wrong name: "did you mean …?", or all known names."""
     names = list(known)

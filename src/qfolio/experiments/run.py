@@ -19,6 +19,7 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
 from qfolio.core.population import Population
 from qfolio.core.registry import short
+from qfolio.core.text import amount
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
@@ -122,7 +123,7 @@ class Run:
 
     def __repr__(self) -> str:
         config, unit = self.config, self.budget.unit
-        seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
+        seeds = amount(config.seeds, "seed")
         done = f"{self.done(unit):,} of {self.budget.amount:,} {unit}"
         where = f", in {self.folder}" if self.folder else ""
         return f"<Run: {config.agent} on {config.task}, {seeds}, {done}{where}>"

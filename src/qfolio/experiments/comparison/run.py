@@ -26,6 +26,7 @@ from qfolio.core.files import locked, new_folder, read_json
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
 from qfolio.core.statistics import regret
+from qfolio.core.text import amount
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.conclusion import conclusion, listed
@@ -199,7 +200,7 @@ class Comparison:
             cells = (known.get("return"), known.get("regret"), seconds)
             rows.append((name, *map(number, cells), self.failures.get(name, "")))
         done = f"{len(self.results)} of {len(self.entrants)} agents"
-        seeds = f"{config.seeds} seed" + "s" * (config.seeds > 1)
+        seeds = amount(config.seeds, "seed")
         header = ("agent", "return", "regret", "seconds", "")
         facts = [done, seeds, *config.conclusion[:1], str(self.folder)]
         return card(f"Comparison on {config.task}", facts, header, rows)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import amount
 from qfolio.core.version import __version__
 from qfolio.experiments.executor import Job
 from qfolio.experiments.fit import Listener
@@ -192,7 +193,7 @@ def _connect(ray: Any, address: str | None) -> None:
 
 
 def _cores(count: int) -> str:
-    return f"{count} core" + "s" * (count > 1)
+    return amount(count, "core")
 
 
 def _reason(error: Exception) -> str:

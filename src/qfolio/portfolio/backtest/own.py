@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import amount
 from qfolio.portfolio.backtest.folds import spell
 from qfolio.portfolio.backtest.measures import Floats
 from qfolio.portfolio.backtest.orders import TOLERANCE, drifted
 from qfolio.portfolio.mandate.feasible import Mandated
-from qfolio.portfolio.prices.findings import amount, day
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 

@@ -20,6 +20,7 @@ from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
 from qfolio.core.registry import BASELINES, short
+from qfolio.core.text import amount
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, at_once, carry_out
@@ -215,8 +216,8 @@ class Backtest:
         return cls(files.read_prices(config), config, files, agents, files.read_own(config))
 
     def __repr__(self) -> str:
-        seeds = f"{self.config.seeds} seed" + "s" * (self.config.seeds > 1)
-        folds = f"{len(self.folds)} fold" + "s" * (len(self.folds) > 1)
+        seeds = amount(self.config.seeds, "seed")
+        folds = amount(len(self.folds), "fold")
         where = f", in {self.folder}" if self.folder else ""
         return (
             f"<Backtest: {', '.join(self.agents)} on {len(self.prices.assets)} assets, {folds} "

@@ -9,6 +9,7 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import write_csv
+from qfolio.core.text import amount
 from qfolio.portfolio.backtest.folder import BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
 from qfolio.portfolio.backtest.measures import drawdown
@@ -17,7 +18,7 @@ from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.ledger import Record
 from qfolio.portfolio.desk.live import Live, mark
 from qfolio.portfolio.desk.reference import reference
-from qfolio.portfolio.prices.findings import amount, day
+from qfolio.portfolio.prices.findings import day
 
 SEED = 0
 """Of the bootstrap: the same ledger gives the same evidence whenever one looks."""

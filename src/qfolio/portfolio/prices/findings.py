@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from qfolio.core.text import quote
+from qfolio.core.text import amount, quote
 
 LISTED = 5  # findings of one kind that are listed; the others are counted
 
@@ -74,11 +74,6 @@ def day(moment: Any) -> str:
     """A date, with its time unless that is midnight."""
     text = str(np.datetime64(moment, "s"))
     return text.removesuffix("T00:00:00").replace("T", " ")
-
-
-def amount(count: int, noun: str) -> str:
-    """1 row, 2 rows."""
-    return f"{count:,} {noun}" + "s" * (count != 1)
 
 
 def listing(names: Iterable[str]) -> str:

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qfolio.core.text import quote
-from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day, listing
+from qfolio.core.text import amount, quote
+from qfolio.portfolio.prices.findings import LISTED, Findings, day, listing
 from qfolio.portfolio.prices.grid import Grid, report_cells
 
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from qfolio.core.text import quote
+from qfolio.core.text import amount, quote
 from qfolio.portfolio.prices.cells import currencies, label, numbers
 from qfolio.portfolio.prices.columns import Columns
 from qfolio.portfolio.prices.dates import NO_DATE, read_dates, with_times
-from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day
+from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.layout import Table
 
 MOST_CELLS, SPARSEST = 100_000_000, 0.05  # a long table that would be this large and this empty

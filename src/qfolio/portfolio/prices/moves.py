@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day
+from qfolio.core.text import amount
+from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Grid
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from qfolio.core.text import quote
+from qfolio.core.text import amount, quote
 from qfolio.portfolio.prices.cells import not_a_number
-from qfolio.portfolio.prices.findings import LISTED, Findings, amount, day
+from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.frequency import every_day, spacing
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Block, Grid, report_cells

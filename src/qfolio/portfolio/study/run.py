@@ -19,6 +19,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.statistics import holm
+from qfolio.core.text import amount
 from qfolio.experiments.executor import Executor, Here
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
@@ -150,7 +151,7 @@ class Study:
         return cls(StudyFolder(Path(folder)).read(), Path(folder), agents)
 
     def __repr__(self) -> str:
-        tables = f"{len(self.config.tables)} table" + "s" * (len(self.config.tables) > 1)
+        tables = amount(len(self.config.tables), "table")
         done = f"{len(self.config.looks)} of {len(self.places)} backtests finished"
         return f"<Study: {', '.join(self.config.agents)} on {tables}, {done}, in {self.folder}>"
 
