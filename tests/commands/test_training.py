@@ -139,7 +139,12 @@ def test_wrong_input_gets_one_sentence_and_code_2(
     assert list(Path().iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [[], ["trian"], ["train", "--episodes", "many"]])
+def test_without_arguments_it_shows_the_help(monkeypatch, capsys):
+    assert qfolio(monkeypatch) == 0
+    assert "backtest" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [["trian"], ["train", "--episodes", "many"]])
 def test_what_the_parser_refuses_is_code_2_too(monkeypatch, capsys, arguments):
     assert qfolio(monkeypatch, *arguments) == 2
 
