@@ -2,7 +2,7 @@
 
 import pytest
 
-from qfolio.core.text import csv_cell, printable, quote
+from qfolio.core.text import amount, closest, csv_cell, listed, near, printable, quote
 
 
 @pytest.mark.parametrize(
@@ -22,6 +22,20 @@ def test_a_terminal_obeys_nothing(text: str, shown: str | None):
 def test_quotes_are_short():
     assert quote("x" * 99) == f"'{'x' * 59}…'"
     assert quote("\x1b") == r"'\x1b'"
+
+
+def test_a_wrong_name_gets_advice():
+    known = ["dqn", "PPO", "", *(f"number-{i}" for i in range(30))]
+    assert near("dqm", known) == "did you mean dqn?"
+    assert near("ppo", known) == "did you mean PPO?"
+    assert closest("xyz", known) is None
+    assert near("xyz", known[:2]) == "choose from dqn, PPO."
+    assert near("xyz", known).endswith("number-16, …")
+
+
+def test_counts_and_lists():
+    assert [amount(n, "row") for n in (0, 1, 2000)] == ["0 rows", "1 row", "2,000 rows"]
+    assert [listed(list("abc")[:n], "or") for n in (1, 2, 3)] == ["a", "a or b", "a, b or c"]
 
 
 @pytest.mark.parametrize(

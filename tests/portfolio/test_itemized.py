@@ -286,7 +286,7 @@ def test_debts_are_refused_where_weights_must_be_positive() -> None:
         ("itemized(", "must be written like"),
         ("itemized(=5)", "must be written like"),
         ("itemized(fixed=5,)", "must be written like"),
-        ("itemized(fee=5)", "did you mean|there are"),
+        ("itemized(fee=5)", "did you mean|choose from"),
         ("itemized(fixed=-5)", "at least 0"),
         ("itemized(cash_rate=5)", "from -1 to 1"),
         ("itemized(spread=column:nothing)", "does not have"),

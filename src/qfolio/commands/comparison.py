@@ -13,6 +13,7 @@ from qfolio.commands.arguments import Count, Folder, Modules, Name, Trackers, ag
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import amount
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -96,7 +97,7 @@ def compare(
         run = Comparison.open(resume)
     seeds = run.config.seeds
     console.say(
-        f"{len(run.entrants)} agents on {run.config.task} · {seeds} seed{'s' * (seeds > 1)} "
+        f"{len(run.entrants)} agents on {run.config.task} · {amount(seeds, 'seed')} "
         f"each · {run.config.device}"
     )
     with tracked(*following):

@@ -128,14 +128,15 @@ def print_findings(findings: "list[Finding]") -> None:
         say(f"{finding.severity}: {finding}. {finding.advice}".rstrip())
     if findings:
         counts = (sum(f.count for f in findings if f.severity == kind) for kind in severities)
-        said = (f"{n:,} {kind}{'s' * (n != 1)}" for n, kind in zip(counts, severities, strict=True))
+        said = (amount(n, kind) for n, kind in zip(counts, severities, strict=True))
         say(f"{', '.join(said)}.")
 
 
 def print_prices(facts: dict[str, Any]) -> None:
     """The content of a price table, from ``prices.describe``."""
     say(
-        f"{printable(facts['source'])}: {facts['rows']:,} rows of {facts['assets']:,} assets, "
+        f"{printable(facts['source'])}: {amount(facts['rows'], 'row')} of "
+        f"{amount(facts['assets'], 'asset')}, "
         f"{facts['first']} to {facts['last']}, about {facts['periods_per_year']:g} a year."
     )
     if facts["features"]:

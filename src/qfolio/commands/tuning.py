@@ -21,6 +21,7 @@ from qfolio.commands.arguments import (
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import amount
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -115,7 +116,8 @@ def tune(
         stop(resume)
     if count := work.journal.in_hand():
         console.say(
-            f"Other processes are training {count} trials; the last to finish writes the report."
+            f"Other processes are training {amount(count, 'trial')}; "
+            "the last to finish writes the report."
         )
         return {"folder": work.folder, "report": None}
     try:

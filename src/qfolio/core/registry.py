@@ -8,7 +8,6 @@ from someone else: they must be in modules that have already been imported (``im
 ``build``).
 """
 
-import difflib
 import os
 import sys
 from collections.abc import Iterable, Mapping
@@ -20,6 +19,7 @@ from typing import Any, Literal, NamedTuple
 
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError, one_line
+from qfolio.core.text import closest
 
 TASKS = {
     "pendulum": "qfolio.tasks.pendulum:Pendulum",
@@ -262,8 +262,8 @@ def _require_imported(kind: Kind, name: str, module: str) -> None:
 def _unknown(kind: Kind, name: str) -> QfolioError:
     table = ENTRIES[kind].where(kind)
     first, colon, _ = name.partition(":")
-    if close := difflib.get_close_matches(first, table, n=1):
-        hint = f"did you mean {close[0]}?"
+    if close := closest(first, table):
+        hint = f"did you mean {close}?"
     elif colon:
         hint = f"a module {first} is neither installed nor in this folder."
     else:

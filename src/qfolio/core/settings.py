@@ -1,7 +1,6 @@
 """Settings as text and JSON: from ``name=value`` to an object's fields, and back."""
 
 import dataclasses
-import difflib
 import json
 import math
 import typing
@@ -9,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import near
 
 T = TypeVar("T")
 
@@ -46,9 +46,7 @@ def convert(kind: type, settings: Mapping[str, Any]) -> dict[str, Any]:
     known = sorted(types)
     for name in settings:
         if name not in known:
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}."
-            raise QfolioError(f"{kind.__name__} has no setting {name!r}; {hint}")
+            raise QfolioError(f"{kind.__name__} has no setting {name!r}; {near(name, known)}")
     return {name: _convert(name, types[name], value) for name, value in settings.items()}
 
 

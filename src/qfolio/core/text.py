@@ -3,12 +3,15 @@
 import difflib
 import re
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 UNSAFE = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
 """Unicode categories that a terminal may obey instead of showing: control, format (which may
 reverse text), unassigned, private, surrogates, line and paragraph separators."""
+
+MENTIONED = 20
+"""Names that a message lists at most."""
 
 _FORMULA = re.compile(r"(^|[;\t\r\n])([^\S\t\r\n]*[=+\-@＝＋－＠])")
 
@@ -28,14 +31,33 @@ def quote(value: object, limit: int = 60) -> str:
 
 def amount(count: int, noun: str) -> str:
     """1 row, 2 rows."""
-    return f"{count:,} {noun}" + "s" * (count != 1)
+    return f"{count:,} {plural(noun, count)}"
+
+
+def plural(noun: str, count: int) -> str:
+    """The noun, with an s unless there is one of it."""
+    return noun if count == 1 else f"{noun}s"
+
+
+def listed(names: Sequence[str], word: str = "and") -> str:
+    """Names joined for a sentence: a, b and c."""
+    return f" {word} ".join([*([", ".join(names[:-1])] if names[1:] else []), names[-1]])
+
+
+def closest(name: str, known: Iterable[str]) -> str | None:
+    """The known name that a wrong one resembles, whatever its case; None if none does."""
+    names = {other.casefold(): other for other in known if other}
+    close = difflib.get_close_matches(name.casefold(), names, n=1)
+    return names[close[0]] if close else None
 
 
 def near(name: str, known: Iterable[str]) -> str:
-    """What a message says after a wrong name: "did you mean …?", or all known names."""
+    """What a message says after a wrong name: "did you mean …?", or the known names."""
     names = list(known)
-    close = difflib.get_close_matches(name, names, n=1)
-    return f"did you mean {close[0]}?" if close else f"choose from {', '.join(names)}."
+    if close := closest(name, names):
+        return f"did you mean {close}?"
+    more = ", …" if len(names) > MENTIONED else "."
+    return f"choose from {', '.join(names[:MENTIONED])}{more}"
 
 
 def csv_cell(value: Any) -> Any:

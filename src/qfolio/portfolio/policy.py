@@ -18,6 +18,7 @@ from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Agent
 from qfolio.core.population import Population
+from qfolio.core.text import amount
 from qfolio.core.training import episode_steps
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Listener, fit
@@ -237,15 +238,15 @@ class Policy:
             )
         if len(table) <= self.task.window:
             raise QfolioError(
-                f"The price table has {len(table)} rows; the policy's window needs at least "
-                f"{self.task.window + 1}."
+                f"The price table has {amount(len(table), 'row')}; the policy's window "
+                f"needs at least {self.task.window + 1}."
             )
         # A policy that learned from a shorter table has never known its longest signals.
         looked = min(signals.lookback(signals.parse(self.task.signals)), self.rows - 1)
         if len(table) <= looked:
             raise QfolioError(
-                f"The price table has {len(table)} rows; the policy's signals look back on "
-                f"{looked}, so bring at least {looked + 1}."
+                f"The price table has {amount(len(table), 'row')}; the policy's signals "
+                f"look back on {looked}, so bring at least {looked + 1}."
             )
         table.require_still("a policy for tomorrow")
         table = table.select(self.assets)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import static
 from qfolio.core.registry import SIGNALS, build
+from qfolio.core.text import amount
 
 Floats = NDArray[np.float64]
 
@@ -47,8 +48,8 @@ class Signal(eqx.Module):
     def __check_init__(self) -> None:
         if not 0 <= self.skip < self.rows <= 100_000:
             raise QfolioError(
-                f"A signal looks back on {self.rows} rows and skips {self.skip}; it must look back "
-                "on 1 to 100,000 and skip fewer."
+                f"A signal looks back on {amount(self.rows, 'row')} and skips {self.skip}; it must "
+                "look back on 1 to 100,000 and skip fewer."
             )
 
     def __call__(self, prices: Floats) -> Floats:

@@ -12,8 +12,8 @@ from jaxtyping import Array, PyTree
 
 from qfolio.core.evaluation import greedy, play, start_keys
 from qfolio.core.mdp import Agent, Box, Policy, Position
+from qfolio.core.text import listed
 from qfolio.core.training import episode_steps
-from qfolio.experiments.comparison.conclusion import listed
 from qfolio.experiments.presets import changes, preset
 from qfolio.experiments.run import Run
 from qfolio.portfolio.backtest.assessment import Assessment

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qfolio.core.statistics import FEWEST_SEEDS, band, interquartile_mean
+from qfolio.core.text import plural
 from qfolio.experiments.comparison.conclusion import amount, share, span
 from qfolio.experiments.comparison.ranking import HEADLINE, THRESHOLDS, Result, curve
 from qfolio.report import palette, rendering
@@ -308,7 +309,9 @@ def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:
     near = f"{percent(HEADLINE, 0)}"
     arrived = {name: _headline(data, name) for name in results}
     arrived = {name: entry for name, entry in arrived.items() if entry["steps"] is not None}
-    facts = [("Agents", str(len(results)), f"{ranking['seeds']} seeds each")]
+    facts = [
+        ("Agents", str(len(results)), f"{ranking['seeds']} {plural('seed', ranking['seeds'])} each")
+    ]
     if data.graded and optimum is not None:
         facts.append(
             ("Exact optimum", tidy(amount(optimum)), f"on {number(data.starts, 0)} fixed starts")

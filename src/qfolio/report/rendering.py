@@ -9,6 +9,7 @@ from typing import Any
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from qfolio.core.statistics import FEWEST_SEEDS, Floats
+from qfolio.core.text import plural
 from qfolio.report import palette
 
 THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
@@ -87,7 +88,7 @@ def amount(count: float) -> str:
 def counted(count: int, noun: str) -> str:
     """Return a count in words to begin a sentence, for example 'Two agents'."""
     word = _NUMBER_WORDS[count] if count < len(_NUMBER_WORDS) else str(count)
-    return f"{word} {noun}{'s' if count != 1 else ''}"
+    return f"{word} {plural(noun, count)}"
 
 
 def duration(seconds: float) -> str:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from qfolio.core.files import write_bytes
+from qfolio.core.text import amount
 from qfolio.portfolio.backtest.verdict import p_value
 from qfolio.portfolio.study.folder import Result, StudyConfig, Variant
 from qfolio.portfolio.study.pooling import Active, Evidence, Pools
@@ -89,7 +90,7 @@ def render_study(
         "study.html",
         data=config,
         result=result,
-        title=f"{agents} on {tables} table{'s' * (tables != 1)}",
+        title=f"{agents} on {amount(tables, 'table')}",
         spelled=_spelled(main.variant),
         facts=_facts(config, result),
         looks=looks_sentence(result),
@@ -122,8 +123,8 @@ def _facts(config: StudyConfig, result: Result) -> list[tuple[str, str, str]]:
         ("Tested", f"{number(sum(one.years for one in known))} years", "all tables together"),
         ("Folds", config.test, f"after {config.train} of training"),
         ("Cost", f"{main.variant.bps:g}{THIN_SPACE}bp", f"lag {main.variant.lag}"),
-        ("Looks", number(result.looks, 0), f"{variants} variant{'s' * (variants > 1)}{earlier}"),
-        ("z by luck", decimal(result.threshold), f"best of {number(result.trials, 0)} trials"),
+        ("Looks", number(result.looks, 0), f"{amount(variants, 'variant')}{earlier}"),
+        ("z by luck", decimal(result.threshold), f"best of {amount(result.trials, 'trial')}"),
     ]
 
 

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from qfolio.core.statistics import mean_interval, regret
+from qfolio.core.text import plural
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Trial, best_of
 from qfolio.experiments.tuning.search import Dimension, Value
@@ -147,13 +148,18 @@ def _facts(data: Sweep) -> list[tuple[str, str, str]]:
     failed = sum(math.isnan(trial.value) for trial in data.trials)
     config = data.config
     trained = [x for x in data.summary["return_per_seed"] if x is not None]
-    seeds = len(data.summary["seeds"])
-    note = f"retrained, {seeds} seeds, graded starts"
+    count = len(data.summary["seeds"])
+    seeds = f"{count} {plural('seed', count)}"
+    note = f"retrained, {seeds}, graded starts"
     if data.summary["optimum"] is not None:
-        note = f"retrained, {seeds} seeds; optimum {number(data.summary['optimum'], digits)}"
+        note = f"retrained, {seeds}; optimum {number(data.summary['optimum'], digits)}"
     hour = 3600 / float(np.mean([trial.seconds for trial in data.trials]))
     return [
-        ("Trials", number(len(data.trials), 0), f"{config['seeds']} seeds each, {failed} diverged"),
+        (
+            "Trials",
+            number(len(data.trials), 0),
+            f"{config['seeds']} {plural('seed', config['seeds'])} each, {failed} diverged",
+        ),
         ("Best found", number(best.value, digits), f"trial {best.number + 1}, on tuning starts"),
         ("Best, graded", number(float(np.mean(trained)), digits) if trained else "–", note),
         ("Trials an hour", number(hour, 0), f"{config['batch']} at once, one process"),

@@ -5,7 +5,6 @@ steps it. This file provides the shapes that agents need and converts observatio
 """
 
 import copy
-import difflib
 import json
 import math
 from functools import cache
@@ -20,6 +19,7 @@ from qfolio.core.fields import require, static
 from qfolio.core.host import HostTask
 from qfolio.core.mdp import Box, Discrete, Step
 from qfolio.core.registry import import_own
+from qfolio.core.text import near
 
 UNLIMITED = 1000
 """Steps after which an episode is truncated if the environment itself has no time limit."""
@@ -174,8 +174,7 @@ def _spec(id: str) -> Any:
     except gymnasium.error.Error as reason:
         space = name.rpartition("/")[0]
         there = [other for other in gymnasium.registry if other.rpartition("/")[0] == space]
-        close = difflib.get_close_matches(name, there, n=1, cutoff=0.5)
-        hint = f"did you mean {close[0]}?" if close else _sentence(reason)
+        hint = near(name, there) if there else _sentence(reason)
         raise QfolioError(f"Gymnasium has no environment {name!r}; {hint}") from None
 
 

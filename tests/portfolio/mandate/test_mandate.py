@@ -94,7 +94,7 @@ def test_its_text_is_whole_and_is_for_any_order_of_assets(tmp_path):
         ("[trading]\nholdings = 2.5", "trading.holdings: expected .*int"),
         ("[cash", "is no TOML"),
         ("[assets]\nforbidden = ['SPX']", "'SPX', which is no asset of.* mean SPY"),
-        ("[assets.cap]\nQQQ = 0.1", "assets.cap of the mandate names 'QQQ'.*there are SPY"),
+        ("[assets.cap]\nQQQ = 0.1", "assets.cap of the mandate names 'QQQ'.*choose from SPY"),
         ("[groups.sector.Energy]\ncap = 0.1", "sector Energy has none of the table's assets"),
         ("[groups]\nfile = 'none.csv'\n[groups.a.b]\ncap = 1", "cannot be read"),
         ("[groups]\nfile = 'groups.csv'\n[groups.sectors.Energy]\ncap = 1", "did you mean sector?"),

@@ -346,7 +346,7 @@ def test_many_faults_are_counted_not_listed():
 
 
 def test_unknown_choices_and_columns():
-    with pytest.raises(QfolioError, match="missing is 'backward-fill'; it must be one of error, "):
+    with pytest.raises(QfolioError, match="missing is 'backward-fill'; did you mean forward-fill"):
         load(frame(), missing="backward-fill")
     with pytest.raises(QfolioError, match="late is 'never'"):
         check(frame(), late="never")

@@ -101,7 +101,7 @@ def test_a_unit_that_is_unlikely():
     )  # fmt: skip
     with pytest.raises(QfolioError, match="−100 % or less"):
         load(100 * rates, returns="fraction")
-    with pytest.raises(QfolioError, match="returns is 'log'; it must be one of percent, fraction"):
+    with pytest.raises(QfolioError, match="returns is 'log'; choose from percent, fraction"):
         load(rates, returns="log")
 
 

@@ -1,16 +1,16 @@
 """The conclusions of a comparison in sentences, and the format of its numbers."""
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
+from qfolio.core.text import listed, plural
 from qfolio.experiments.comparison.ranking import HEADLINE
 
 
 def conclusion(ranking: dict[str, Any]) -> list[str]:
     """The conclusions that a ranking supports, in sentences."""
     first, seeds = ranking["order"][0], ranking["seeds"]
-    each = f"with {seeds} seed{'s' if seeds > 1 else ''} each"
+    each = f"with {seeds} {plural('seed', seeds)} each"
     beaten = {
         row["second"]: row["told_apart"] and row["probability"] > 0.5
         for row in ranking["pairs"]
@@ -72,11 +72,6 @@ def amount(value: float) -> str:
 def span(seconds: float) -> str:
     """Seconds as text, with two significant digits."""
     return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:,.0f} s"
-
-
-def listed(names: Sequence[str], word: str = "and") -> str:
-    """Names joined for a sentence."""
-    return f" {word} ".join([*([", ".join(names[:-1])] if names[1:] else []), names[-1]])
 
 
 def _quickest(ranking: dict[str, Any]) -> str:

@@ -26,10 +26,10 @@ from qfolio.core.files import locked, new_folder, read_json
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
 from qfolio.core.statistics import regret
-from qfolio.core.text import amount
+from qfolio.core.text import amount, listed
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
-from qfolio.experiments.comparison.conclusion import conclusion, listed
+from qfolio.experiments.comparison.conclusion import conclusion
 from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.ranking import Result, rank
 from qfolio.experiments.described import agent_of, describe, task_of

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import AGENTS, GYM, TASKS
+from qfolio.core.text import listed, near
 from qfolio.experiments.presets import finite, gymnasium, markets, pendulum, portfolio
 from qfolio.experiments.presets.preset import Preset, Presets
 
@@ -47,10 +48,25 @@ def presets_of(task: str, agent: str) -> dict[str, Preset]:
 def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
     """The preset of that name; raises QfolioError if there is none."""
     presets = presets_of(task, agent)
+    if not presets:
+        raise QfolioError(f"{agent} has no preset for {task}; {_fitting(task, agent)}.")
     if name not in presets:
-        there = f"choose from {', '.join(presets)}" if presets else "there are none"
-        raise QfolioError(f"there is no preset {name!r} for {agent} on {task}; {there}.")
+        raise QfolioError(
+            f"there is no preset {name!r} for {agent} on {task}; {near(name, presets)}"
+        )
     return presets[name]
+
+
+def _fitting(task: str, agent: str) -> str:
+    """What to use instead of a task and an agent that do not go together."""
+    suited = [other for other, name in PRESETS if name == agent]
+    twins = [other for other in suited if other.partition("/")[0] == task.partition("/")[0]]
+    others = f"on {task} use {listed([name for other, name in PRESETS if other == task], 'or')}"
+    if twins:
+        return f"use it on {listed(twins, 'or')}, or {others}"
+    if suited == ["portfolio"]:
+        return f"it is an agent for price tables (qfolio backtest); {others}"
+    return others
 
 
 def changes(config: RunConfig, task: type[Task]) -> tuple[str, dict[str, tuple[Any, Any]]] | None:

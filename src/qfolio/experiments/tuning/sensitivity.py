@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qfolio.experiments.comparison.conclusion import listed
+from qfolio.core.text import listed
 from qfolio.experiments.tuning.journal import Trial
 from qfolio.experiments.tuning.search import Dimension, positions
 

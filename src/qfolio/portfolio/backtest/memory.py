@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from qfolio.core import devices, settings
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import amount
 from qfolio.portfolio.backtest.attribution.replays import AT_ONCE
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS
 from qfolio.portfolio.backtest.folder import BacktestConfig
@@ -63,7 +64,7 @@ def require(prices: Prices, config: BacktestConfig) -> None:
     if there is not None and wanted > there:
         raise QfolioError(
             f"A backtest of {len(prices.assets):,} assets on {len(prices):,} rows with "
-            f"{config.seeds} seeds needs about {wanted / 2**30:,.1f} GiB of memory, but there are "
-            f"only {there / 2**30:,.1f}; give fewer assets, rows, agents, signals, baselines or "
-            "seeds."
+            f"{amount(config.seeds, 'seed')} needs about {wanted / 2**30:,.1f} GiB of "
+            f"memory, but there are only {there / 2**30:,.1f}; give fewer assets, rows, "
+            "agents, signals, baselines or seeds."
         )

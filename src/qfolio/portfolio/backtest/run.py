@@ -20,7 +20,7 @@ from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
 from qfolio.core.registry import BASELINES, short
-from qfolio.core.text import amount
+from qfolio.core.text import amount, near
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, at_once, carry_out
@@ -217,10 +217,9 @@ class Backtest:
 
     def __repr__(self) -> str:
         seeds = amount(self.config.seeds, "seed")
-        folds = amount(len(self.folds), "fold")
         where = f", in {self.folder}" if self.folder else ""
         return (
-            f"<Backtest: {', '.join(self.agents)} on {len(self.prices.assets)} assets, {folds} "
+            f"<Backtest: {', '.join(self.agents)} on {self._counts} "
             f"from {day(self.dates[0])} to {day(self.dates[-1])}, {seeds}{where}>"
         )
 
@@ -228,8 +227,7 @@ class Backtest:
         trained = sum(self._kept.has(a, f.name) for a in self.agents for f in self._jobs)
         facts = [
             f"{trained} of {len(self.agents) * len(self._jobs)} trainings done",
-            f"{len(self.prices.assets)} assets",
-            f"{len(self.folds)} folds, {day(self.dates[0])} to {day(self.dates[-1])}",
+            f"{self._counts}, {day(self.dates[0])} to {day(self.dates[-1])}",
             f"{self.config.cost * 1e4:g} bp",
             f"lag {self.config.lag}",
             *([] if self.folder is None else [str(self.folder)]),
@@ -272,12 +270,16 @@ class Backtest:
             self.interrupted = carry_out(executor, jobs, listen, self.store, log)
 
     @property
+    def _counts(self) -> str:
+        return f"{amount(len(self.prices.assets), 'asset')}, {amount(len(self.folds), 'fold')}"
+
+    @property
     def _about(self) -> dict[str, Any]:
         """What the log says of the backtest."""
         config = self.config
         return {
             "kind": config.kind,
-            "task": f"{len(self.prices.assets)} assets, {len(self.folds)} folds",
+            "task": self._counts,
             "agents": list(self.agents),
             "seeds": config.seeds,
         }
@@ -392,9 +394,7 @@ class Backtest:
         """An agent's name (default: the first); raises QfolioError if it is unknown."""
         name = next(iter(self.agents)) if agent is None else agent
         if name not in self.agents:
-            raise QfolioError(
-                f"The backtest has no agent {name!r}; choose from {', '.join(self.agents)}."
-            )
+            raise QfolioError(f"The backtest has no agent {name!r}; {near(name, self.agents)}")
         return name
 
     # Training ------------------------------------------------------------------------------------

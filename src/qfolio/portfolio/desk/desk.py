@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import near, quote
 from qfolio.core.version import __version__
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.run import Backtest
@@ -70,10 +70,8 @@ class Desk:
                 mandate=task.mandate,
                 band=band(task.calendar),
             )
-        raise QfolioError(
-            f"The backtest has no agent {quote(name)}; choose from {', '.join(self.run.agents)}, "
-            f"or follow a baseline: {', '.join(self.run.baselines)}."
-        )
+        known = near(name, (*self.run.agents, *self.run.baselines))
+        raise QfolioError(f"The backtest has no agent or baseline {quote(name)}; {known}")
 
     def table(self, followed: Policy | Rule, prices: Path | None) -> Prices:
         """The prices to decide on (default: those of the backtest)."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import near, quote
 from qfolio.portfolio.desk.allocation import Allocation
 
 DIGITS = 6
@@ -28,7 +28,7 @@ def order_rows(allocation: Allocation, layout: str, currency: str) -> tuple[list
         QfolioError: The layout is unknown, or cannot hold the trades.
     """
     if layout not in LAYOUTS:
-        raise QfolioError(f"--layout is {quote(layout)}; choose from {', '.join(LAYOUTS)}.")
+        raise QfolioError(f"--layout is {quote(layout)}; {near(layout, LAYOUTS)}")
     return LAYOUTS[layout](allocation, currency)
 
 

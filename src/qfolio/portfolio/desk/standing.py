@@ -5,6 +5,7 @@ from pathlib import Path
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json
+from qfolio.core.text import near
 from qfolio.portfolio.backtest.folder import followed
 
 
@@ -41,9 +42,7 @@ class Standing:
                 return Standing(agent, _measured(strategies[agent]["measures"]), False, learned)
             agents = [name for name, entry in strategies.items() if entry["kind"] == "agent"]
             if agent not in agents:
-                raise QfolioError(
-                    f"The backtest has no agent {agent!r}; choose from {', '.join(agents)}."
-                )
+                raise QfolioError(f"The backtest has no agent {agent!r}; {near(agent, agents)}")
             name = followed(agent, strategies)
             worse = any(
                 strategies[name][key] is not None

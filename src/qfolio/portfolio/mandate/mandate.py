@@ -30,7 +30,6 @@ docs/guides/mandate.md describes every key. ``checks.py`` says whether the limit
 """
 
 import csv
-import difflib
 import re
 import tomllib
 from collections.abc import Sequence
@@ -43,7 +42,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import near, quote
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.projection import Limits
 
@@ -164,7 +163,7 @@ class Mandate(Section, frozen=True):
                 if name not in assets:
                     raise QfolioError(
                         f"{place} of the mandate names {quote(name)}, which is no asset of the "
-                        f"table; {_near(name, assets)}"
+                        f"table; {near(name, assets)}"
                     )
         for column, value, group in self.every_group:
             if not set(group.assets) & set(assets):
@@ -275,12 +274,6 @@ def _named(given: float | dict[str, float] | None) -> Sequence[str]:
     return list(given) if isinstance(given, dict) else []
 
 
-def _near(name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1)
-    some = ", ".join(known[:8]) + (", …" if len(known) > 8 else "")
-    return f"did you mean {close[0]}?" if close else f"there are {some}."
-
-
 def _converted(content: Any, source: str) -> Mandate:
     """The mandate in a dictionary; source: where it comes from, for the message."""
     try:
@@ -292,7 +285,7 @@ def _converted(content: Any, source: str) -> Mandate:
             known = _fields(where)
             inside = f"[{where}]" if where else "the mandate"
             raise QfolioError(
-                f"{source}: {inside} has no key {quote(unknown[1])}; {_near(unknown[1], known)}"
+                f"{source}: {inside} has no key {quote(unknown[1])}; {near(unknown[1], known)}"
             ) from None
         raise QfolioError(
             f"{source}: {where or 'the mandate'}: {text[:1].lower()}{text[1:]}; see "
@@ -325,14 +318,14 @@ def _with_members(mandate: Mandate, file: Path, source: str) -> Mandate:
     for column, value, group in mandate.every_group:
         if column not in columns:
             raise QfolioError(
-                f"{source}: [groups.{column}] is no column of {file}; {_near(column, columns[1:])}"
+                f"{source}: [groups.{column}] is no column of {file}; {near(column, columns[1:])}"
             )
         members = tuple(row["asset"].strip() for row in table if _cell(row, column) == value)
         if not members:
             values = sorted({_cell(row, column) for row in table})
             raise QfolioError(
                 f"{source}: no asset of {file} has the {column} {quote(value)}; "
-                f"{_near(value, values)}"
+                f"{near(value, values)}"
             )
         given = msgspec.structs.replace(group, assets=members)
         groups.setdefault(column, {})[value] = given

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import near, quote
 from qfolio.portfolio.prices.columns import find_columns
 from qfolio.portfolio.prices.findings import Finding, Findings, day
 from qfolio.portfolio.prices.gaps import cash_outs, complete
@@ -40,8 +40,8 @@ class Choices:
         known = {"missing": MISSING, "late": LATE, "ended": ENDED, "returns": (None, *UNITS)}
         for name, choices in known.items():
             if (value := getattr(self, name)) not in choices:
-                listed = ", ".join(choice for choice in choices if choice)
-                raise QfolioError(f"{name} is {quote(value)}; it must be one of {listed}.")
+                advice = near(str(value), filter(None, choices))
+                raise QfolioError(f"{name} is {quote(value)}; {advice}")
         haircut = self.delisting_haircut
         if not 0 <= haircut <= 1 or (haircut and self.ended != "cash-out"):
             raise QfolioError(

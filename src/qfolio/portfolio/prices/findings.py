@@ -1,13 +1,12 @@
 """Findings: errors, warnings and notes on a price table, with advice."""
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
-from qfolio.core.text import amount, quote
+from qfolio.core.text import amount, closest, quote
 
 LISTED = 5  # findings of one kind that are listed; the others are counted
 
@@ -85,5 +84,5 @@ def listing(names: Iterable[str]) -> str:
 
 def hint(name: str, known: Iterable[str]) -> str:
     """A question in brackets with the closest known name; empty if none is close."""
-    close = difflib.get_close_matches(name, [k for k in known if k], n=1)
-    return f" (did you mean {quote(close[0])}?)" if close else ""
+    close = closest(name, known)
+    return f" (did you mean {quote(close)}?)" if close else ""

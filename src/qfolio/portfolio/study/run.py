@@ -19,7 +19,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.statistics import holm
-from qfolio.core.text import amount
+from qfolio.core.text import amount, near
 from qfolio.experiments.executor import Executor, Here
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
@@ -170,8 +170,8 @@ class Study:
     def backtest(self, table: str, variant: Variant | None = None) -> Backtest:
         """The backtest of a table (default: in the main variant)."""
         if table not in self.config.tables:
-            known = ", ".join(self.config.tables)
-            raise QfolioError(f"The study has no table {table!r}; choose from {known}.")
+            known = near(table, self.config.tables)
+            raise QfolioError(f"The study has no table {table!r}; {known}")
         place = self._files.place(table, variant or self.config.variants[0])
         return Backtest.open(place, self._agents)
 
@@ -222,7 +222,7 @@ class Study:
         """What the log says of the study."""
         config = self.config
         tables, variants = len(config.tables), len(config.variants)
-        about = f"{tables} table{'s' * (tables > 1)}, {variants} variant{'s' * (variants > 1)}"
+        about = f"{amount(tables, 'table')}, {amount(variants, 'variant')}"
         return {"kind": config.kind, "task": about, "agents": config.agents}
 
     def _conclude(

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from qfolio.core.text import amount
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT
 from qfolio.portfolio.backtest.verdict import p_value
 from qfolio.portfolio.study.folder import Result
@@ -69,7 +70,7 @@ def looks_sentence(result: Result) -> str:
     earlier = (
         f"; {result.earlier:,} earlier looks at its tables are known" if result.earlier else ""
     )
-    sentence = f"This study took {result.looks:,} look{'s' * (result.looks != 1)}{earlier}."
+    sentence = f"This study took {amount(result.looks, 'look')}{earlier}."
     if result.trials > 1:
         sentence += (
             f" The best of {result.trials:,} configurations without skill is expected to reach a "
@@ -79,7 +80,7 @@ def looks_sentence(result: Result) -> str:
 
 
 def counted(tables: int) -> str:
-    return f"{tables} table{'s' * (tables != 1)}"
+    return amount(tables, "table")
 
 
 def percent(value: float | None) -> str:

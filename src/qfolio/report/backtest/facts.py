@@ -6,6 +6,7 @@ from collections import Counter
 from typing import Any
 
 from qfolio.core.statistics import FEWEST_SEEDS
+from qfolio.core.text import plural
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import THIN_SPACE, number
@@ -30,7 +31,7 @@ def key_facts(data: BacktestData) -> list[str]:
 
 
 def _counted(count: int, noun: str) -> str:
-    return f"{number(count, 0)} {noun}{'' if count == 1 else 's'}"
+    return f"{number(count, 0)} {plural(noun, count)}"
 
 
 def unit_of(periods_per_year: float) -> str:

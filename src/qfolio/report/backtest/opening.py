@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
-from qfolio.experiments.comparison.conclusion import listed
+from qfolio.core.text import listed
 from qfolio.portfolio.backtest.assessment import JUDGED, StrategyAssessment
 from qfolio.portfolio.backtest.estimates import Measured
 from qfolio.report.backtest.data import BacktestData, followed_names, shown_order

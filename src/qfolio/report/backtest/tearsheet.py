@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from qfolio.core.text import plural
 from qfolio.portfolio.backtest.tearsheet import (
     contributions,
     falls,
@@ -135,7 +136,7 @@ def _drawdowns(series: StrategySeries, data: BacktestData) -> list[list[str]]:
             spelled(fall.trough),
             spelled(fall.end),
             percent(fall.depth),
-            f"{number(fall.length, 0)} {unit}{'' if fall.length == 1 else 's'}",
+            f"{number(fall.length, 0)} {plural(unit, fall.length)}",
         ]
         for fall in falls(series.returns.mean(axis=0), DRAWDOWNS)
     ]
