@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 NOW := $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: demo test test-all check format examples bench bench-gpu docs linkcheck clean
+.PHONY: demo test test-all check format examples bench bench-gpu docs linkcheck release-check clean
 
 demo: .venv/installed
 	$(BIN)/qfolio train pendulum --no-compare --out runs/demo-$(NOW)/pendulum
@@ -43,6 +43,15 @@ docs: .venv/installed-docs
 linkcheck: .venv/installed-docs
 	$(BIN)/sphinx-build --builder linkcheck --doctree-dir docs/_build/doctrees --quiet docs docs/_build/linkcheck
 
+# The wheel and the sdist in dist/, and a first session with the wheel in an environment that holds nothing else.
+release-check: .venv/installed-release
+	rm -rf dist .venv-wheel
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
+	$(PYTHON) -m venv .venv-wheel
+	.venv-wheel/bin/python -m pip install --quiet dist/*.whl
+	.venv-wheel/bin/python -I .ci/try_wheel.py
+
 bench: .venv/installed-dev
 	$(BIN)/python bench/run.py
 
@@ -50,7 +59,7 @@ bench-gpu: .venv/installed
 	$(BIN)/python bench/gpu.py
 
 clean:
-	rm -rf .venv .venv-bench
+	rm -rf .venv .venv-bench .venv-wheel dist
 
 .venv/installed: pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -63,5 +72,9 @@ clean:
 	touch $@
 
 .venv/installed-docs: .venv/installed-dev
-	$(BIN)/python -m pip install --quiet --group docs
+	$(BIN)/python -m pip install --quiet --editable ".[docs]"
+	touch $@
+
+.venv/installed-release: .venv/installed
+	$(BIN)/python -m pip install --quiet --group release
 	touch $@
