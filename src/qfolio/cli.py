@@ -4,6 +4,7 @@ import functools
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NoReturn
 
 from qfolio.core.text import near, printable
@@ -11,6 +12,8 @@ from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 
 OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
 
+SHELLS = ("bash", "zsh", "fish")
+"""Shells whose completion can be installed."""
 
 ABOUT = """Reinforcement learning for portfolio optimization, graded against exact optima.
 
@@ -96,6 +99,8 @@ def _call(words: list[str]) -> None:
     if name and not name.startswith("-"):
         raise QfolioError(f"there is no command {name!r}; {near(name, known)}")
     completing = name in ("--tyro-print-completion", "--tyro-write-completion")
+    if completing:
+        _prepare_completion(*words[1:])
     overview = {name: _named(summary(command)) for name, command in known.items()}
     tyro.extras.subcommand_cli_from_dict(
         known if completing else overview,
@@ -103,6 +108,16 @@ def _call(words: list[str]) -> None:
         description=ABOUT,
         args=words or ["--help"],
     )
+
+
+def _prepare_completion(shell: str = "bash", script: str | None = None, *_: str) -> None:
+    """Raises QfolioError for other shells, and makes the folder of the script."""
+    from qfolio.core.errors import QfolioError
+
+    if shell not in SHELLS:
+        raise QfolioError(f"{shell!r} gets no completion; {near(shell, SHELLS)}")
+    if script is not None:
+        Path(script).parent.mkdir(parents=True, exist_ok=True)
 
 
 def _named(text: str) -> Callable[[], None]:

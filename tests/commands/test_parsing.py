@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import json
 import math
+import re
 import subprocess
 from pathlib import Path
 from typing import Annotated, get_args
@@ -62,6 +63,13 @@ def test_options_are_in_groups(monkeypatch, capsys):
     assert "Largest weight of one asset, from 0 to 1 (default: 1)." in page
 
 
+@pytest.mark.parametrize("name", EVERY)
+def test_every_option_is_in_a_group(name):
+    options = inspect.signature(EVERY[name]).parameters.values()
+    loose = [option.name for option in options if option.kind is option.KEYWORD_ONLY]
+    assert not [option for option in loose if not option.endswith("_options")]
+
+
 def test_the_version(monkeypatch, capsys):
     assert typed(monkeypatch, "--version") == 0
     assert capsys.readouterr().out == f"qfolio {qfolio.__version__}\n"
@@ -104,6 +112,19 @@ def test_prices_as_json(monkeypatch, capsys, tmp_path):
     assert err.count("\n") == 1
 
 
+REPORTING = [name for name, call in EVERY.items() if "as_json" in str(inspect.signature(call))]
+
+
+@pytest.mark.parametrize("name", REPORTING)
+def test_an_error_leaves_the_json_output_empty(monkeypatch, capsys, tmp_path, name):
+    monkeypatch.chdir(tmp_path)
+    assert typed(monkeypatch, name, "there-is-none", "--json") == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert re.fullmatch(r"qfolio: .+[.?]\n", err)
+    assert not list(tmp_path.iterdir())
+
+
 def test_json_holds_any_document(capsys):
     def command(place: Annotated[Positional[Path], ""], *, wrong: bool = False) -> Document:
         """Report."""
@@ -125,8 +146,9 @@ class Output:
 
 
 def test_bash_completes_commands_and_options(monkeypatch, tmp_path):
-    script = tmp_path / "qfolio"
+    script = tmp_path / "new" / "qfolio"
     assert typed(monkeypatch, "--tyro-write-completion", "bash", script) is None
+    assert typed(monkeypatch, "--tyro-write-completion", "tcsh", tmp_path / "other") == 2
     for words, completed in (
         (["qfolio", "backt"], "backtest"),
         (["qfolio", "prices", "--miss"], "--missing"),

@@ -1,8 +1,10 @@
 """Names from files, made harmless."""
 
+import math
+
 import pytest
 
-from qfolio.core.text import amount, closest, csv_cell, listed, near, printable, quote
+from qfolio.core.text import amount, closest, csv_cell, figure, listed, near, printable, quote
 
 
 @pytest.mark.parametrize(
@@ -31,6 +33,16 @@ def test_a_wrong_name_gets_advice():
     assert closest("xyz", known) is None
     assert near("xyz", known[:2]) == "choose from dqn, PPO."
     assert near("xyz", known).endswith("number-16, …")
+
+
+def test_no_number_is_a_negative_zero():
+    assert [figure(x, "+.2%") for x in (-1e-9, 0.0, -0.5)] == ["+0.00%", "+0.00%", "−50.00%"]
+    assert [figure(x, ",.1f") for x in (-0.04, -1234.5, None, math.nan)] == [
+        "0.0",
+        "−1,234.5",
+        "–",
+        "–",
+    ]
 
 
 def test_counts_and_lists():

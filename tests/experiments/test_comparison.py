@@ -197,7 +197,7 @@ def test_one_seed_has_no_intervals():
 @pytest.mark.parametrize(
     ("value", "text"),
     [(0.0, "0 %"), (2e-7, "0 %"), (-2e-7, "0 %"), (0.000193, "0.019 %"), (0.0134, "1.3 %"),
-     (0.134, "13 %"), (10.36, "1,036 %"), (-0.004, "-0.40 %"), (0.00005, "0.005 %")],
+     (0.134, "13 %"), (10.36, "1,036 %"), (-0.004, "−0.40 %"), (0.00005, "0.005 %")],
 )  # fmt: skip
 def test_shares_show_the_digits_that_matter(value, text):
     assert share(value) == text
@@ -452,7 +452,7 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
         (["--agents", "dqn,dqx"], "no agent 'dqx'"), (["--agents", "dqn:fst,dqn"], "preset 'fst'"),
         (["--agents", "dqn"], "two agents or more"), ([], "two agents or more"),
         (["--agents", "dqn,dqn:fast"], "the preset fast twice: dqn, dqn:fast"),
-        (["--agents", "dqn,pathwise"], "no preset 'fast' for pathwise"),
+        (["--agents", "dqn,pathwise"], "pathwise has no preset for pendulum"),
         (["pendulm", "--agents", "dqn,dqn:bold"], "no task 'pendulm'"),
         (["--agents", "dqn,dqn:bold", "--seeds", 0], "seeds is 0"),
         (["--agents", "dqn,dqn:bold", "--episodes", 4, "--steps", 9], "give one of them"),
@@ -525,7 +525,7 @@ def test_reports_of_hard_cases():
 
 
 def test_tidy_leaves_names_alone():
-    text = tidy("double-q-2 is at -0.40 % after 51,200 steps, q-learning 3,4")
+    text = tidy("double-q-2 is at −0.40 % after 51,200 steps, q-learning 3,4")
     assert text.startswith("double-q-2 is at \N{MINUS SIGN}0.40\N{NARROW NO-BREAK SPACE}% after 51")
     assert text.endswith("q-learning 3,4")
 

@@ -5,7 +5,7 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -13,7 +13,7 @@ from qfolio.commands.arguments import Count, Folder, Modules, Name, Trackers, ag
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import amount
+from qfolio.core.text import amount, figure
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -172,6 +172,39 @@ def _finish(run: "Comparison") -> Document:
 
     content = run.finish()
     write_comparison_report(run.folder, content)
-    console.print_ranking(content)
+    _print_ranking(content)
     console.say(f"Report: {run.folder / PAGE}")
     return content
+
+
+def _print_ranking(content: dict[str, Any]) -> None:
+    """A row for each agent, best first, and the conclusion."""
+    from qfolio.commands import console
+    from qfolio.core.statistics import FEWEST_SEEDS
+    from qfolio.experiments.comparison import conclusion
+    from qfolio.experiments.comparison.ranking import HEADLINE
+
+    ranking = content["ranking"]
+    write = conclusion.share if ranking["measure"] == "regret" else conclusion.amount
+    near = f"steps to {HEADLINE:.0%}"
+    spread = "95 % interval" if ranking["seeds"] >= FEWEST_SEEDS else "range of seeds"
+    heads = ("agent", ranking["measure"], spread, "worst", near, "s a seed", "parameters")
+    rows = []
+    for name in ranking["order"]:
+        measures, result = ranking["agents"][name], content["results"][name]
+        final = measures["final"]
+        few = min(final["per_seed"]), max(final["per_seed"])
+        low, high = (write(end) for end in final["interval"] or few)
+        within = next(x for x in measures["within"] if x["threshold"] == HEADLINE)
+        cells = (
+            write(final["iqm"]),
+            f"{low.removesuffix(' %')} … {high}",
+            write(final["worst"]),
+            figure(within["steps"], ",.0f"),
+            conclusion.span(result["seconds_per_seed"]).removesuffix(" s"),
+            f"{result['parameters']:,}",
+        )
+        rows.append((name, *(cell.replace(" %", "%") for cell in cells)))
+    console.print_table(heads, rows)
+    for sentence in [*content["conclusion"], *content["notes"]]:
+        console.say(sentence)

@@ -2,9 +2,9 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import rich.progress
 from rich.console import Console
@@ -13,7 +13,7 @@ from rich.text import Text
 
 from qfolio.core.registry import short
 from qfolio.core.statistics import FEWEST_SEEDS
-from qfolio.core.text import amount, printable
+from qfolio.core.text import amount, figure, printable
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -54,6 +54,31 @@ def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., 
         yield partial(live.update, live.add_task(text, total=total, completed=done))
 
 
+def print_table(
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    bold: Container[str] = (),
+    width: int = 0,
+) -> None:
+    """A table; its first column names the rows, and numbers in the others are aligned.
+
+    Args:
+        heads: The columns' names.
+        rows: Their cells.
+        bold: Names of the rows to emphasize.
+        width: Characters that each column has at least.
+    """
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for i, head in enumerate(heads):
+        side: Literal["left", "right"] = "right" if i else "left"
+        table.add_column(Text(printable(head)), justify=side, no_wrap=True, min_width=width)
+    for row in rows:
+        cells = (Text(printable(cell)) for cell in row)
+        table.add_row(*cells, style="bold" if row[0] in bold else None)
+    console.print(table)
+
+
 def describe_run(run: "Run", budget: "Budget") -> str:
     """Agent, task and seeds of a run, and its budget if rounding makes it larger."""
     config, planned = run.config, budget.planned(run.population)
@@ -71,21 +96,19 @@ def describe_run(run: "Run", budget: "Budget") -> str:
 
 def print_result(seeds: list[int], result: dict[str, Any]) -> None:
     """A row for each seed and their mean, from ``Run.grade``."""
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for name in ("seed", "return", "optimum", "regret", "overestimation"):
-        table.add_column(name, justify="right", min_width=9)
+    heads = ("seed", "return", "optimum", "regret", "overestimation")
     returns, over = result["return_per_seed"], result["overestimation_per_seed"]
     regrets = result["regret_per_seed"] or [math.nan] * len(returns)
     optimum = number(result["optimum"])
-    for seed, *values in zip(seeds, returns, regrets, over, strict=True):
-        table.add_row(str(seed), *_cells(optimum, *values))
-    table.add_section()
+    rows = [
+        (str(seed), *_cells(optimum, *values))
+        for seed, *values in zip(seeds, returns, regrets, over, strict=True)
+    ]
     means = (
         sum(math.nan if x is None else x for x in column) / len(column)
         for column in (returns, regrets, over)
     )
-    table.add_row("mean", *_cells(optimum, *means))
-    console.print(table)
+    print_table(heads, [*rows, ("mean", *_cells(optimum, *means))], width=9)
     if result["return_ci95"]:
         low, high = result["return_ci95"]
         say(f"95 % interval of the mean return over seeds: {number(low)} to {number(high)}")
@@ -98,27 +121,24 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
 
 def number(value: float | None) -> str:
     """One decimal, or four significant digits for small numbers."""
-    if value is None or math.isnan(value):
-        return "–"
-    return f"{value:,.1f}" if abs(value) >= 10 or not value else f"{value:#.4g}"
+    return figure(value, ",.1f" if not value or abs(value) >= 10 else "#.4g")
 
 
 def _cells(optimum: str, value: float, regret: float, over: float | None) -> tuple[str, ...]:
-    share = "–" if math.isnan(regret) else f"{round(regret, 4) + 0.0:.2%}"
-    return number(value), optimum, share, number(over)
+    return number(value), optimum, figure(regret, ".2%"), number(over)
 
 
 def print_rule(rule: dict[str, Any]) -> None:
     """The numbers of the learned policies beside the exact ones, from ``Run.grade``."""
     from qfolio.report.rule import rows
 
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column("rule")
-    for name in ("exact", "learned, mean", "farthest seed"):
-        table.add_column(name, justify="right")
-    for name, *values in rows(rule):
-        table.add_row(name, *("none" if value is None else f"{value:.4f}" for value in values))
-    console.print(table)
+    print_table(
+        ("rule", "exact", "learned, mean", "farthest seed"),
+        [
+            (name, *("none" if value is None else figure(value, ".4f") for value in values))
+            for name, *values in rows(rule)
+        ],
+    )
 
 
 def print_findings(findings: "list[Finding]") -> None:
@@ -191,10 +211,7 @@ def print_assessment(assessment: "Assessment") -> None:
     from qfolio.portfolio.backtest.assessment import JUDGED
     from qfolio.portfolio.backtest.verdict import bound_sentence, verdicts
 
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column("a year, net")
-    for name in ("growth", "vol.", "Sharpe", "drawdown", "turnover", "cost drag"):
-        table.add_column(name, justify="right", no_wrap=True)
+    heads = ("a year, net", "growth", "vol.", "Sharpe", "drawdown", "turnover", "cost drag")
     shown = {
         "growth": ".2%",
         "volatility": ".1%",
@@ -203,12 +220,16 @@ def print_assessment(assessment: "Assessment") -> None:
         "turnover": ".1f",
         "cost_drag": ".2%",
     }
-    for name, strategy in assessment.strategies.items():
-        if strategy.kind == "rebalancing" and name != assessment.rebalanced:
-            continue
-        style = "bold" if strategy.kind in JUDGED else None
-        table.add_row(name, *_written(strategy.measures, shown), style=style)
-    console.print(table)
+    entries = {
+        name: strategy
+        for name, strategy in assessment.strategies.items()
+        if strategy.kind != "rebalancing" or name == assessment.rebalanced
+    }
+    print_table(
+        heads,
+        [(name, *_written(entry.measures, shown)) for name, entry in entries.items()],
+        bold=[name for name, entry in entries.items() if entry.kind in JUDGED],
+    )
     _print_relative(assessment)
     if bound := bound_sentence(assessment):
         say(bound)
@@ -221,10 +242,7 @@ def _print_relative(assessment: "Assessment") -> None:
     """A row for agents, the user's own strategies and the best baseline, beside the benchmark."""
     from qfolio.portfolio.backtest.assessment import JUDGED
 
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column(f"to {assessment.reference}, a year", no_wrap=True)
-    for name in ("active", "tracking", "IR", "beta", "up", "down", "share"):
-        table.add_column(name, justify="right", no_wrap=True)
+    first = f"to {assessment.reference}, a year"
     shown = {
         "active_return": "+.2%",
         "tracking_error": ".1%",
@@ -234,16 +252,19 @@ def _print_relative(assessment: "Assessment") -> None:
         "down_capture": ".0%",
         "active_share": ".0%",
     }
-    for name, strategy in assessment.strategies.items():
-        if strategy.relative and (strategy.kind in JUDGED or name == assessment.best_baseline):
-            table.add_row(name, *_written(strategy.relative, shown))
-    console.print(table)
+    print_table(
+        (first, "active", "tracking", "IR", "beta", "up", "down", "share"),
+        [
+            (name, *_written(entry.relative, shown))
+            for name, entry in assessment.strategies.items()
+            if entry.relative and (entry.kind in JUDGED or name == assessment.best_baseline)
+        ],
+    )
 
 
 def _written(measures: "Mapping[str, Measure]", formats: dict[str, str]) -> list[str]:
     """The means of some measures; a dash for what is not known."""
-    means = {key: measures[key].mean for key in formats}
-    return ["–" if math.isnan(x) else f"{x:{formats[key]}}" for key, x in means.items()]
+    return [figure(measures[key].mean, form) for key, form in formats.items()]
 
 
 def describe_study(study: "Study") -> str:
@@ -266,20 +287,17 @@ def print_study(result: "Result") -> None:
 
     main, *_ = result.variants
     for agent, pools in main.agents.items():
-        table = Table(box=None, header_style="bold", pad_edge=False)
-        table.add_column(agent, no_wrap=True)
-        for name in ("a year", "95 % interval", "IR", "t", "rebal.", "Sharpe"):
-            table.add_column(name, justify="right", no_wrap=True)
+        rows: list[tuple[str, ...]] = []
         for name, known in pools.evidence.items():
             active = known.to_reference
             ratios = (active.information_ratio, active.t, known.to_rebalanced.t, known.sharpe)
-            table.add_row(name, *_growth(active), *map(decimal, ratios))
+            rows.append((name, *_growth(active), *map(decimal, ratios)))
         for entry in result.variants:
             pooled, rest = entry.agents[agent].to_reference, entry.agents[agent].to_rebalanced
-            name, style = f"pooled, {spell(entry.variant)}", "bold" if entry is main else None
-            cells = (*_growth(pooled), "", decimal(pooled.z), decimal(rest.z))
-            table.add_row(name, *cells, style=style)
-        console.print(table)
+            cells = (*_growth(pooled), "", decimal(pooled.z), decimal(rest.z), "")
+            rows.append((_pooled(entry.variant), *cells))
+        heads = (agent, "a year", "95 % interval", "IR", "t", "rebal.", "Sharpe")
+        print_table(heads, rows, bold=[_pooled(main.variant)])
     say(
         "Growth is what exceeds the benchmark's, t against it (pooled: Stouffer's z), rebal. the t "
         "(or z) against its best rebalancing, Sharpe the ratio less that of the best baseline."
@@ -290,11 +308,13 @@ def print_study(result: "Result") -> None:
     say(looks_sentence(result))
 
 
+def _pooled(variant: "Variant") -> str:
+    return f"pooled, {spell(variant)}"
+
+
 def _growth(entry: "Active | Pooled") -> tuple[str, str]:
     """An active growth and its interval."""
-    growth, low, high = (
-        "–" if x is None else f"{x:+.1%}" for x in (entry.growth, entry.low, entry.high)
-    )
+    growth, low, high = (figure(x, "+.1%") for x in (entry.growth, entry.low, entry.high))
     return growth, f"{low.removesuffix('%')} … {high}"
 
 
@@ -310,25 +330,17 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
         console.print(Text(f"WARNING. {printable(found)}", style="bold red"))
     else:
         say(found)
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column("asset")
-    for name in ("price", "weight now", "target", "after", "trade, money", "trade, shares"):
-        table.add_column(name, justify="right")
+    heads = ("asset", "price", "weight now", "target", "after", "trade, money", "trade, shares")
+    rows: list[tuple[str, ...]] = []
     held, targets, after = allocation.held, allocation.weights, allocation.reached
     for i, asset in enumerate(allocation.assets):
         trade, price = allocation.trades[i], allocation.prices[i]
         if held[1 + i] or targets[1 + i] or trade:
-            table.add_row(
-                Text(printable(asset)),
-                f"{price:,.2f}",
-                f"{held[1 + i]:.2%}",
-                f"{targets[1 + i]:.2%}",
-                f"{after[1 + i]:.2%}",
-                f"{trade * price:+,.2f}",
-                f"{trade:+,.4g}",
-            )
-    table.add_row("cash", "", f"{held[0]:.2%}", f"{targets[0]:.2%}", f"{after[0]:.2%}", "", "")
-    console.print(table)
+            weights = (figure(float(x[1 + i]), ".2%") for x in (held, targets, after))
+            money = figure(trade * price, "+,.2f")
+            rows.append((asset, figure(price, ",.2f"), *weights, money, figure(trade, "+,.4g")))
+    cash = (figure(float(x[0]), ".2%") for x in (held, targets, after))
+    print_table(heads, [*rows, ("cash", "", *cash, "", "")])
     kinds = ", ".join(f"{kind} {money:,.2f}" for kind, money in allocation.costs.items())
     say(
         f"After the close of {allocation.date}: wealth {allocation.wealth:,.2f}, expected cost "
@@ -339,75 +351,16 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
 
 def print_following(following: "Following") -> None:
     """A row for live, the benchmark and the backtest, and what is to be said of them."""
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column("net")
-    for name in ("growth", "a year", "volatility", "Sharpe", "drawdown"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for name, found in following.rows().items():
-        cells = ["–"] * 5
-        if found:
-            growth, year, volatility, sharpe, drawdown = found.values()
-            cells = [f"{x:.1%}" for x in (growth, year, volatility)]
-            cells += [f"{sharpe:.2f}", f"{drawdown:.1%}"]
-        table.add_row(Text(name), *cells)
-    console.print(table)
+    forms = (".1%", ".1%", ".1%", ".2f", ".1%")
+    print_table(
+        ("net", "growth", "a year", "volatility", "Sharpe", "drawdown"),
+        [
+            (name, *map(figure, found.values() if found else [None] * len(forms), forms))
+            for name, found in following.rows().items()
+        ],
+    )
     for sentence in following.sentences():
         if sentence.startswith("ALARM"):
             console.print(Text(printable(sentence), style="bold red"))
         else:
             say(sentence)
-
-
-def print_ranking(content: dict[str, Any]) -> None:
-    """A row for each agent, best first, and the conclusion."""
-    from qfolio.core.statistics import FEWEST_SEEDS
-    from qfolio.experiments.comparison.conclusion import amount, share, span
-    from qfolio.experiments.comparison.ranking import HEADLINE
-
-    ranking = content["ranking"]
-    write = share if ranking["measure"] == "regret" else amount
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    near = f"steps to {HEADLINE:.0%}".replace("%", " %")
-    table.add_column("agent", no_wrap=True)
-    spread = "95 % interval" if ranking["seeds"] >= FEWEST_SEEDS else "range of seeds"
-    for name in (ranking["measure"], spread, "worst", near, "s a seed", "parameters"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for name in ranking["order"]:
-        measures, result = ranking["agents"][name], content["results"][name]
-        final = measures["final"]
-        few = min(final["per_seed"]), max(final["per_seed"])
-        ends = [write(end) for end in final["interval"] or few]
-        within = next(x for x in measures["within"] if x["threshold"] == HEADLINE)
-        table.add_row(
-            Text(name),
-            write(final["iqm"]),
-            " … ".join([*(end.removesuffix(" %") for end in ends[:-1]), *ends[-1:]]) or "–",
-            write(final["worst"]),
-            "–" if within["steps"] is None else f"{within['steps']:,.0f}",
-            span(result["seconds_per_seed"]).removesuffix(" s"),
-            f"{result['parameters']:,}",
-        )
-    console.print(table)
-    for sentence in [*content["conclusion"], *content["notes"]]:
-        say(sentence)
-
-
-def print_ways(content: dict[str, Any]) -> None:
-    """A row for each way."""
-    from qfolio.core.statistics import interquartile_mean
-
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    table.add_column("way")
-    for name in ("regret", "worst seed", "steps to recover", "recovered", "steps", "old world"):
-        table.add_column(name, justify="right")
-    for way, course in content["courses"].items():
-        recovery = content["recovery"][way]
-        reached = sum(step is not None for step in recovery["per_seed"])
-        final, other = (interquartile_mean(course[name]) for name in ("final", "other"))
-        middle = recovery["middle"]
-        table.add_row(
-            way, f"{final:.1%}", f"{max(course['final']):.1%}",
-            "–" if middle is None else f"{middle:,.0f}", f"{reached} of {content['seeds']}",
-            f"{course['steps'][-1]:,}", f"{other:.1%}",
-        )  # fmt: skip
-    console.print(table)

@@ -13,6 +13,7 @@ from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name,
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import figure
 
 if TYPE_CHECKING:
     from qfolio.experiments.continual import Plan
@@ -97,7 +98,7 @@ def continual(
     if content is None:
         stop(f"qfolio continual --resume {folder}")
     write_continual_report(folder, content)
-    console.print_ways(content)
+    _print_ways(content)
     console.say(verdict(content))
     console.say(f"Report: {folder / PAGE}")
     return outcome(folder, content)
@@ -134,3 +135,22 @@ def _plan(
         seeds=preset.seeds if seeds is None else seeds,
         **options,
     )
+
+
+def _print_ways(content: dict[str, Any]) -> None:
+    """A row for each way."""
+    from qfolio.commands import console
+    from qfolio.core.statistics import interquartile_mean
+
+    heads = ("way", "regret", "worst seed", "steps to recover", "recovered", "steps", "old world")
+    rows = []
+    for way, course in content["courses"].items():
+        recovery = content["recovery"][way]
+        reached = sum(step is not None for step in recovery["per_seed"])
+        final, other = (float(interquartile_mean(course[name])) for name in ("final", "other"))
+        middle = recovery["middle"]
+        rows.append((
+            way, figure(final, ".1%"), figure(max(course["final"]), ".1%"), figure(middle, ",.0f"),
+            f"{reached} of {content['seeds']}", f"{course['steps'][-1]:,}", figure(other, ".1%"),
+        ))  # fmt: skip
+    console.print_table(heads, rows)

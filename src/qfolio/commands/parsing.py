@@ -22,16 +22,17 @@ Document = dict[str, Any]
 """What a command reports: JSON values, paths, and numbers that may be infinite or missing."""
 
 GROUPS = {
-    "price": "prices missing late features columns returns date",
+    "price": "prices missing late ended delisting_haircut members features columns returns date",
+    "account": "holdings capital whole_shares as_of",
     "split": "train test rolling lag lags",
     "cost and mandate": "cost_bps costs_bps cost_model cap mandate calendar",
     "learning": "agents agent preset signals seeds seed episodes steps assignments batch search "
     "change rate renewal epsilon",
     "comparison": "baselines strategy benchmark trials after",
-    "run": "resume join on track trust",
-    "output": "out title compare live pdf orders layout currency dry_run as_json",
+    "run": "anyway update reproduce resume join on track trust",
+    "output": "out title compare live port open pdf orders layout currency dry_run as_json",
 }
-"""The options of each group in ``--help``; all others come first."""
+"""The options of each group in ``--help``."""
 
 _GROUP_OF = {option: group for group, options in GROUPS.items() for option in options.split()}
 

@@ -39,6 +39,17 @@ def plural(noun: str, count: int) -> str:
     return noun if count == 1 else f"{noun}s"
 
 
+def figure(value: float | None, form: str) -> str:
+    """A number in one of Python's formats, such as ``+.1%``, as the terminal shows it.
+
+    Negative numbers have a true minus sign, which zero never has. A dash stands for NaN and None.
+    """
+    if value is None or value != value:
+        return "–"
+    sign, rest = (form[:1], form[1:]) if form[:1] in "+-" else ("", form)
+    return f"{value:{sign}z{rest}}".replace("-", "\N{MINUS SIGN}")
+
+
 def listed(names: Sequence[str], word: str = "and") -> str:
     """Names joined for a sentence: a, b and c."""
     return f" {word} ".join([*([", ".join(names[:-1])] if names[1:] else []), names[-1]])

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from qfolio.core.text import listed, plural
+from qfolio.core.text import figure, listed, plural
 from qfolio.experiments.comparison.ranking import HEADLINE
 
 
@@ -16,7 +16,7 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
         for row in ranking["pairs"]
         if row["first"] == first
     }
-    valued = {name: f"{name} ({figure(ranking, name)})" for name in beaten}
+    valued = {name: f"{name} ({result_of(ranking, name)})" for name in beaten}
     tied = [valued[name] for name, worse in beaten.items() if not worse]
     worse = [valued[name] for name, worse in beaten.items() if worse]
     best = (
@@ -35,10 +35,10 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
             f"{each.capitalize()} {none} be told apart, whatever their results; this needs "
             f"{ranking['seeds_needed']} seeds or more."
         )
-    return [f"{best} {figure(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
+    return [f"{best} {result_of(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
 
 
-def figure(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
+def result_of(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
     """An agent's final regret or return as text.
 
     ``interval`` adds its 95 % interval, or the seeds' range if there are too few for one.
@@ -59,14 +59,14 @@ def share(fraction: float) -> str:
     if size < 5e-4:
         return "0 %"
     digits = min(3, max(0, 1 - math.floor(math.log10(size))))
-    return f"{100 * fraction:,.{digits}f} %"
+    return f"{figure(100 * fraction, f',.{digits}f')} %"
 
 
 def amount(value: float) -> str:
     """A number with four significant digits."""
     if abs(value) >= 1000:
-        return f"{value:,.0f}"
-    return f"{value:#.4g}" if abs(value) >= 1 else f"{value:.4g}"
+        return figure(value, ",.0f")
+    return figure(value, "#.4g" if abs(value) >= 1 else ".4g")
 
 
 def span(seconds: float) -> str:

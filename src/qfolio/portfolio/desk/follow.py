@@ -9,7 +9,7 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import write_csv
-from qfolio.core.text import amount
+from qfolio.core.text import amount, figure
 from qfolio.portfolio.backtest.folder import BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
 from qfolio.portfolio.backtest.measures import drawdown
@@ -67,13 +67,14 @@ class Following:
         since = f"{amount(count, 'allocation')} of {agents} since {self.records[0].date}"
         if not len(live.returns):
             return [f"{since}: no trade has earned a return yet.", self._retrain()]
-        low, middle, high = (f"{x - 1:+.1%}" for x in self.band[:, -1])
+        low, middle, high = (figure(x - 1, "+.1%") for x in self.band[:, -1])
         earned, other = self.growth[-1], np.prod(1 + self.reference)
         place = " Live is below the band." if earned < self.band[0, -1] else ""
         place = " Live is above the band." if earned > self.band[2, -1] else place
         said = [
             f"{since}, {amount(len(live.returns), 'row')} up to {day(live.dates[-1])}: "
-            f"{earned - 1:+.1%} after costs, and {self.benchmark} {other - 1:+.1%}.",
+            f"{figure(earned - 1, '+.1%')} after costs, and {self.benchmark} "
+            f"{figure(other - 1, '+.1%')}.",
             f"Of histories like the backtest's, 95 % end between {low} and {high}, half of them "
             f"above {middle}.{place}",
         ]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json
-from qfolio.core.text import near
+from qfolio.core.text import figure, near
 from qfolio.portfolio.backtest.folder import followed
 
 
@@ -80,6 +80,7 @@ class Standing:
 def _measured(measures: dict[str, dict[str, float]]) -> str:
     growth, sharpe, turnover = (measures[k]["mean"] for k in ("growth", "sharpe", "turnover"))
     return (
-        f"A baseline, which learned nothing: it grew by {growth:.1%} a year after costs, with a "
-        f"Sharpe ratio of {sharpe:.2f} and a turnover of {turnover:.1f} a year."
+        f"A baseline, which learned nothing: it grew by {figure(growth, '.1%')} a year after "
+        f"costs, with a Sharpe ratio of {figure(sharpe, '.2f')} and a "
+        f"turnover of {turnover:.1f} a year."
     )

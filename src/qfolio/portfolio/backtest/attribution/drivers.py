@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from qfolio.core.mdp import Discrete
+from qfolio.core.text import figure
 from qfolio.portfolio.backtest.attribution.gradients import integrated
 from qfolio.portfolio.backtest.attribution.replays import channel_names
 from qfolio.portfolio.desk.allocation import NOISE, Allocation
@@ -73,12 +74,13 @@ def sentence(reason: Reason) -> str:
     """A reason in words, with its largest drivers."""
     moving = [each for each in reason.drivers if abs(each.weight) >= VISIBLE]
     if not moving:
-        change = f"{reason.asset} {reason.change:+.2%}"
+        change = f"{reason.asset} {figure(reason.change, '+.2%')}"
         return f"{change}: no signal moves it, so that it is the same on a typical day."
-    shown = [f"{each.name} {each.weight:+.2%}" for each in moving[:SHOWN]]
+    shown = [f"{each.name} {figure(each.weight, '+.2%')}" for each in moving[:SHOWN]]
     if len(moving) > SHOWN:
-        shown.append(f"other signals {sum(each.weight for each in moving[SHOWN:]):+.2%}")
+        others = sum(each.weight for each in moving[SHOWN:])
+        shown.append(f"other signals {figure(others, '+.2%')}")
     return (
-        f"{reason.asset} {reason.change:+.2%}: {', '.join(shown)}; on a typical day it would be "
-        f"{reason.rest:+.2%}."
+        f"{reason.asset} {figure(reason.change, '+.2%')}: {', '.join(shown)}; on a typical day it "
+        f"would be {figure(reason.rest, '+.2%')}."
     )
