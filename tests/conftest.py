@@ -1,6 +1,6 @@
 """Types are checked in every test: shapes by jaxtyping, the rest by beartype.
 
-Compiling takes most of a test's time, so programs are hardly optimised here; ``make test-all`` runs
+Compiling takes most of a test's time, so programs are hardly optimized here; ``make test-all`` runs
 them as users do (QFOLIO_TEST_OPTIMIZED=1).
 """
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from qfolio.portfolio.study.folder import Look, Result, StudyConfig, TableConfig, Variant
 from qfolio.portfolio.study.pooling import TableReturns
-from qfolio.portfolio.study.run import summarise
+from qfolio.portfolio.study.run import summarize
 
 from backtests import weekdays
 
@@ -64,4 +64,4 @@ def study(count: int, lags: int = 1, costs: int = 1, **names: str) -> tuple[Stud
         for _ in each
     ]
     config = msgspec.structs.replace(config, looks=looks)
-    return config, summarise(config, found)
+    return config, summarize(config, found)

@@ -100,7 +100,7 @@ class Actor(eqx.Module):
 
     network: Callable[[PyTree], Array]
     actions: Actions
-    observations: Moments | None = None  # those it normalises by; None while it learns
+    observations: Moments | None = None  # those it normalizes by; None while it learns
 
     def seen(self, observation: PyTree) -> PyTree:
         """Observations as the network reads them."""
@@ -123,7 +123,7 @@ L = TypeVar("L", bound=Learned)
 class ActorCriticState(eqx.Module, Generic[L]):
     """The state of an agent."""
 
-    learned: L  # of normalised observations and rewards
+    learned: L  # of normalized observations and rewards
     replay: Replay  # of those before
     steps: Int[Array, ""]  # of each environment
     rewards: Float[Array, "2"]  # the lowest and the highest so far

@@ -266,7 +266,7 @@ class DQN(Agent):
         return epsilon_greedy(key, merits, epsilon, last, self.persistence)
 
     def _merits(self, weights: Weights, observation: PyTree) -> Float[Array, "batch action"]:
-        """What a greedy action maximises: its value, or its cautious advantage."""
+        """What a greedy action maximizes: its value, or its cautious advantage."""
         if isinstance(weights, Heads):
             values = self._head_values(weights, observation)
             return cautious(values, self.caution)

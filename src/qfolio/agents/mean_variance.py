@@ -2,7 +2,7 @@
 
 The policy estimates a covariance from its window of returns (``learning/covariance.py``), takes the
 best weights for it (``core/quadratic.py``), and trades a share of the way there, outside a band.
-All that it learns is trained together, by the gradient of realised variance and costs through whole
+All that it learns is trained together, by the gradient of realized variance and costs through whole
 paths, as in ``pathwise.py``.
 
 With returns, several members learn which ones to expect, each without some blocks of the data. As
@@ -111,7 +111,7 @@ class MeanVarianceState(eqx.Module):
 
 
 class MeanVariance(Onlooker):
-    """Gradient ascent on mean return less realised variance and costs."""
+    """Gradient ascent on mean return less realized variance and costs."""
 
     returns: bool = static(True)  # learn expected returns, too
     members: int = static(4)  # members; each leaves out some blocks of the data

@@ -40,7 +40,7 @@ class PolicyAndValue(eqx.Module):
     log_std: Float[Array, " coordinate"]  # the same in all states; one for all assets of a market
     critic: Network
     actions: Actions = eqx.field(static=True)
-    observations: Moments | None = None  # those it normalises by; None while it learns
+    observations: Moments | None = None  # those it normalizes by; None while it learns
 
     def policy(self, observation: PyTree) -> Distribution:
         seen = normalized(self.observations, observation)
@@ -52,7 +52,7 @@ class PolicyAndValue(eqx.Module):
 
 
 class OnPolicyState(eqx.Module):
-    weights: PolicyAndValue  # of normalised observations
+    weights: PolicyAndValue  # of normalized observations
     optimizer: optimizer.Optimizer
     normalizer: Normalizer
 
@@ -69,7 +69,7 @@ class Batch(NamedTuple):
 
 
 class OnPolicy(Agent):
-    """Acting, the networks and the optimiser's step; subclasses define ``improve``."""
+    """Acting, the networks and the optimizer's step; subclasses define ``improve``."""
 
     network: str = static("flat")  # flat, or a kind of docs/concepts/networks.md
     hidden: tuple[int, ...] = sizes(64, 64)  # units of each hidden layer of actor and critic
@@ -171,7 +171,7 @@ class OnPolicy(Agent):
     def learn(
         self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        # Observations are normalised as they were when the policy acted on them.
+        # Observations are normalized as they were when the policy acted on them.
         before, after = state.normalizer, state.normalizer.update(rollout, self.discount)
         rollout = rollout._replace(
             observation=before.observation(rollout.observation),
@@ -185,7 +185,7 @@ class OnPolicy(Agent):
     def improve(
         self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        """Learns from a rollout of normalised observations and rewards."""
+        """Learns from a rollout of normalized observations and rewards."""
 
     def judge(self, weights: PolicyAndValue, rollout: Transition, gae_lambda: Scalar) -> Batch:
         """A rollout of these weights with its advantages and targets.
@@ -220,7 +220,7 @@ class OnPolicy(Agent):
         return log_prob * self.weighed(batch)
 
     def weighed(self, batch: Batch) -> Float[Array, " batch"]:
-        """The advantages in the objective, normalised if so set."""
+        """The advantages in the objective, normalized if so set."""
         if not self.normalize_advantages:
             return batch.advantage
         return standardized(batch.advantage, batch.counted)

@@ -1,8 +1,8 @@
-"""Proximal policy optimisation (Schulman et al. 2017).
+"""Proximal policy optimization (Schulman et al. 2017).
 
 A rollout is used for several epochs of gradient steps on minibatches. The clipped objective keeps
 the policy near the one that made the rollout: it does not reward a probability ratio beyond
-1 ± ``clip_range``. Advantages are generalised (Schulman et al. 2016).
+1 ± ``clip_range``. Advantages are generalized (Schulman et al. 2016).
 docs/algorithms/policy_gradients.md has the formulas and the deviations from the paper.
 """
 
@@ -19,7 +19,7 @@ from qfolio.learning.targets import Scalar
 
 
 class PPO(OnPolicy):
-    """Proximal policy optimisation with the clipped objective."""
+    """Proximal policy optimization with the clipped objective."""
 
     num_envs: int = static(1)
     rollout_length: int = static(2048)

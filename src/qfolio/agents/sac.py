@@ -1,6 +1,6 @@
 """Soft actor-critic (Haarnoja et al. 2018, "Soft actor-critic algorithms and applications").
 
-The agent maximises reward plus α times the policy's entropy. Two critics regress Q(s, a) towards
+The agent maximizes reward plus α times the policy's entropy. Two critics regress Q(s, a) towards
 r + γ V'(s') with the soft value V(s) = E[min Q(s, a) − α log π(a|s)]; the actor ascends V; the
 temperature α is tuned so that the entropy meets a target. Actions are squashed normal numbers,
 weights on a simplex, or numbered (then expectations are sums, Christodoulou 2019).
@@ -166,7 +166,7 @@ class SAC(ActorCritic[Learned]):
     ) -> Float[Array, "batch action"] | None:
         """Q(s, ·) in units of reward, if actions are numbered; includes later entropy.
 
-        None if they are in units of normalised rewards.
+        None if they are in units of normalized rewards.
         """
         if weights.critics is None or self.normalize_rewards:
             return None

@@ -42,7 +42,7 @@ def evaluate(
     """Follows the greedy policy from each key's start state over the horizon and ``tail`` steps.
 
     The return covers the horizon. The overestimation is the mean, over the states visited within
-    it, of max_a Q(s, a) minus the realised discounted return (van Hasselt et al. 2016, section 3);
+    it, of max_a Q(s, a) minus the realized discounted return (van Hasselt et al. 2016, section 3);
     the tail keeps that return from being cut off. Starts from which the task itself ends within
     the tail, such as the last rows of a price table, are left out of it.
     """

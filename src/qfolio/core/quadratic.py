@@ -24,7 +24,7 @@ def best(
     cap: Float[Array, ""] | float = 1.0,
     near: Float[Array, "*batch asset"] | None = None,
 ) -> Float[Array, "*batch asset"]:
-    """The weights w that maximise gain·w − w'Σw/2 with Σw = 1, 0 ≤ w ≤ cap, and 0 if not open.
+    """The weights w that maximize gain·w − w'Σw/2 with Σw = 1, 0 ≤ w ≤ cap, and 0 if not open.
 
     An interior-point method, as in ``solvers.minimum_variance``, finds which weights lie strictly
     between their bounds. Given that, they follow from one linear system, which is what is

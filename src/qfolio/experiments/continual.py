@@ -303,7 +303,7 @@ def recovery(course: Course) -> dict[str, Any]:
 def renew(agent: Agent, learned: TrainingState, fresh: TrainingState) -> TrainingState:
     """Members before their first step with the weights of ``learned``.
 
-    Stored experience is dropped; the optimiser and all counters, which set the schedules, are those
+    Stored experience is dropped; the optimizer and all counters, which set the schedules, are those
     of ``fresh``.
     """
 

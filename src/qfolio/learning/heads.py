@@ -139,7 +139,7 @@ def draw_noise(network: PyTree, key: PRNGKeyArray) -> PyTree:
 def duel(z: Float[Array, "batch outputs atom"]) -> Float[Array, "batch action atom"]:
     """Action values from a state's value, which comes first, and its actions' advantages.
 
-    Advantages are centred on their mean over the actions (Wang et al. 2016, eq. 9).
+    Advantages are centered on their mean over the actions (Wang et al. 2016, eq. 9).
     """
     value, advantage = z[:, :1], z[:, 1:]
     return value + advantage - advantage.mean(1, keepdims=True)

@@ -1,6 +1,6 @@
-"""Running normalisation of observations and rewards.
+"""Running normalization of observations and rewards.
 
-Observations are centred and divided by their standard deviation; rewards are divided by the
+Observations are centered and divided by their standard deviation; rewards are divided by the
 standard deviation of the discounted return so far, as ``VecNormalize`` of stable-baselines3 does
 (Raffin et al. 2021; the scale of rewards: Engstrom et al. 2020, "Implementation matters in deep
 policy gradients", section 3). The statistics are part of an agent's state. Those of the
@@ -21,7 +21,7 @@ from qfolio.core.mdp import Task, Transition
 from qfolio.learning.targets import Scalar, Weights
 
 LIMIT = 10.0
-"""Largest absolute value of a normalised number."""
+"""Largest absolute value of a normalized number."""
 
 EPSILON = 1e-8
 """Added to variances, so that constants do not divide by zero."""
@@ -72,7 +72,7 @@ class RewardScale(eqx.Module):
 
 
 class Normalizer(eqx.Module):
-    """An agent's statistics; None where it does not normalise, which changes nothing."""
+    """An agent's statistics; None where it does not normalize, which changes nothing."""
 
     observations: Moments | None
     rewards: RewardScale | None
@@ -105,7 +105,7 @@ class Normalizer(eqx.Module):
 
     @property
     def unit(self) -> Float[Array, ""] | float:
-        """The reward that is normalised to 1."""
+        """The reward that is normalized to 1."""
         return 1.0 if self.rewards is None else self.rewards.moments.std
 
 
@@ -117,7 +117,7 @@ def normalized(moments: Moments | None, observation: PyTree) -> PyTree:
 
 
 class NormalizationConfig(NamedTuple):
-    """An agent's settings of normalisation; the names are those of the settings."""
+    """An agent's settings of normalization; the names are those of the settings."""
 
     normalize_observations: bool
     normalize_rewards: bool

@@ -20,11 +20,11 @@ from qfolio.learning.targets import Scalar
 Weights = TypeVar("Weights", bound=PyTree)
 
 KINDS = ("adam", "rmsprop", "rmsprop-centered", "sgd")
-"""Optimisers by name: RMSProp as in Mnih et al. (2016), or centred as in Mnih et al. (2015)."""
+"""Optimisers by name: RMSProp as in Mnih et al. (2016), or centered as in Mnih et al. (2015)."""
 
 
 class OptimizerConfig(NamedTuple):
-    """An agent's settings of its optimiser; the names are those of the settings."""
+    """An agent's settings of its optimizer; the names are those of the settings."""
 
     optimizer: str = "adam"
     rmsprop_decay: float = 0.99  # of the running mean of squared gradients
@@ -41,7 +41,7 @@ ADAM = OptimizerConfig()
 
 
 class Optimizer(eqx.Module):
-    """The state of an optimiser; arrays that its kind does not use stay zero."""
+    """The state of an optimizer; arrays that its kind does not use stay zero."""
 
     count: Int[Array, ""]  # gradient steps so far
     mu: PyTree  # means of the gradients

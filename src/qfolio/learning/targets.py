@@ -121,7 +121,7 @@ def advantages(
     discount: Scalar,
     gae_lambda: Scalar,
 ) -> Float[Array, "time environment"]:
-    """Generalised advantage estimates (Schulman et al. 2016, eq. 16; ``gae_lambda`` is λ).
+    """Generalized advantage estimates (Schulman et al. 2016, eq. 16; ``gae_lambda`` is λ).
 
     ``next_value`` is that of the true next observation: a truncation bootstraps from it, while the
     sum of later errors stops there.

@@ -142,7 +142,7 @@ class Policy:
         """The policy after further learning from the last rows of a newer table.
 
         It learns from as many rows as in its first training, and keeps the scale of its
-        observations. Networks and optimiser continue from their states, at a constant tenth of the
+        observations. Networks and optimizer continue from their states, at a constant tenth of the
         learning rate; experience from the old table is dropped.
 
         Args:

@@ -1,6 +1,6 @@
 """Rewards of a market's step: a utility of net growth, or of the path that led to it.
 
-A reward is a function of its own state, which may summarise earlier steps, and of the step's
+A reward is a function of its own state, which may summarize earlier steps, and of the step's
 outcome. ``reward=NAME`` of a market names one of them, or a user's own as module:Name. Every field
 has a default, and a field with the name of a market's setting (``risk_aversion``, ``sharpe_rate``)
 takes its value.

@@ -33,7 +33,7 @@ def almgren_chriss(
 
     Within each of the steps, of length τ = T/N, n shares are sold at n/τ a unit of time. This
     lowers their own price by η n/τ and all later ones by γ n; besides, the price is a random walk
-    of volatility σ. The sale that minimises E + λV is
+    of volatility σ. The sale that minimizes E + λV is
 
         x_j = X sinh κ(T − jτ) / sinh κT,   2 (cosh κτ − 1) = κ̃²τ²,   κ̃² = λσ² / (η − γτ/2),
 

@@ -31,7 +31,7 @@ def garleanu_pedersen(
 
     Positions x_t and profits are additive, in shares and money: the returns over t to t+1 are B f_t
     plus noise of covariance Σ, with f_{t+1} = (1 − φ) f_t + ε. The agent sees f_t, chooses x_t and
-    maximises E Σ_t [(1 − ρ)^{t+1} (x_t'B f_t − ½γ x_t'Σx_t) − (1 − ρ)^t ½ Δx_t'ΛΔx_t].
+    maximizes E Σ_t [(1 − ρ)^{t+1} (x_t'B f_t − ½γ x_t'Σx_t) − (1 − ρ)^t ½ Δx_t'ΛΔx_t].
 
     Source: N. Gârleanu and L. H. Pedersen, "Dynamic Trading with Predictable Returns and
     Transaction Costs" (2013), propositions 1 and 2: V(x, f) = −½x'A x + x'C f + …, and the best

@@ -22,7 +22,7 @@ from qfolio.core.files import cache_directory, read_arrays, write_arrays
 from qfolio.core.mdp import Discrete, Step, Task
 
 OPTIMIZED: dict[str, int | str | bool] = {"xla_backend_optimization_level": 3}
-"""Options of the compiler, whatever its flags say: solving takes long without optimisation."""
+"""Options of the compiler, whatever its flags say: solving takes long without optimization."""
 
 
 class GridOptimum:

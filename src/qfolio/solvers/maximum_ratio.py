@@ -10,9 +10,9 @@ from qfolio.solvers.sifting import Floats, sift
 def maximum_ratio(
     mean: ArrayLike, covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-10
 ) -> Floats:
-    """The weights w that maximise μ'w/√(w'Σw) with Σw = 1 and 0 ≤ w ≤ cap.
+    """The weights w that maximize μ'w/√(w'Σw) with Σw = 1 and 0 ≤ w ≤ cap.
 
-    The ratio does not depend on the scale of w, so that w = y/Σy, where y minimises
+    The ratio does not depend on the scale of w, so that w = y/Σy, where y minimizes
     ½ y'Σy − μ'y with 0 ≤ y ≤ cap Σy (cf. G. Cornuéjols and R. Tütüncü, "Optimization Methods in
     Finance", 2006, section 8.2). A primal-dual interior-point method (Wright 1997, chapter 5)
     finds y, with multipliers z of y ≥ 0 and v of cap Σy − y ≥ 0. An iteration solves one system. Of

@@ -21,7 +21,7 @@ class GrowthOptimum(NamedTuple):
 def growth_optimal(
     relatives: ArrayLike, probabilities: ArrayLike | None = None, tol: float = 1e-9
 ) -> GrowthOptimum:
-    """The weights b on the simplex that maximise E log(b·x) over finitely many scenarios.
+    """The weights b on the simplex that maximize E log(b·x) over finitely many scenarios.
 
     On the rows of a price history this is the best constant-rebalanced portfolio. Since
     b·∇E log(b·x) = 1, the maximum of E log(b·x) − Σb over b ≥ 0 lies on the simplex by itself, and

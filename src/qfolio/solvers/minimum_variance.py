@@ -8,7 +8,7 @@ from qfolio.solvers.sifting import Floats, sift
 
 
 def minimum_variance(covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-12) -> Floats:
-    """The weights w that minimise w'Σw with Σw = 1 and 0 ≤ w ≤ cap.
+    """The weights w that minimize w'Σw with Σw = 1 and 0 ≤ w ≤ cap.
 
     A primal-dual interior-point method (Wright 1997, chapter 5) from equal weights, with
     multipliers z of w ≥ 0 and v of w ≤ cap: Σw − y − z + v = 0 holds after a full step, and the

@@ -25,7 +25,7 @@ def regime(stay: ArrayLike, means: ArrayLike, cost_log: float) -> RegimeOptimum:
 
     In each step the agent sees the regime s and its position, chooses the position for this step,
     pays ``cost_log`` if that is a switch, and earns position × means[s], the mean of the regime it
-    *saw*; then the regime changes. It maximises the average reward. Only the advantage Δ of being
+    *saw*; then the regime changes. It maximizes the average reward. Only the advantage Δ of being
     in rather than out matters (an optimal stopping problem): u = m + P Δ, Δ = clip(u, −κ, κ). The
     agent enters where u > κ, leaves where u < −κ, and gains Σ π_s (u_s − κ)⁺ a step. Of the nine
     ways to clip, the self-consistent one is found by linear solves.

@@ -9,7 +9,7 @@ from qfolio.solvers.shared import require
 def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> NDArray[np.float64]:
     """The weights w > 0 with w_i (Σw)_i equal for all i (risk parity).
 
-    They minimise ½ w'Σw − Σ ln(w_i)/N up to a factor. The function is strictly convex, so Newton's
+    They minimize ½ w'Σw − Σ ln(w_i)/N up to a factor. The function is strictly convex, so Newton's
     method with damped steps finds them (F. Spinu, "An Algorithm for Computing Risk Parity Weights",
     2013).
 

@@ -54,7 +54,7 @@ class Result:
         steps_per_second: Environment steps of all seeds.
         operations_per_step: Multiplications and additions in products of matrices for each
             environment step, learning included; None if nothing is compiled.
-        state_bytes: A seed's training state: weights, optimiser, replay, environments.
+        state_bytes: A seed's training state: weights, optimizer, replay, environments.
         policy_bytes, parameters: The size of the policy, in bytes and in numbers.
     """
 

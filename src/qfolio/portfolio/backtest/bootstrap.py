@@ -44,12 +44,12 @@ def block_length(series: ArrayLike) -> float:
     values = np.asarray(series, dtype=float)
     count = values.size
     longest = max(1.0, math.ceil(min(3 * math.sqrt(count), count / 3)))
-    centred = deviations(values)
-    if count < 3 or not centred.any():
+    centered = deviations(values)
+    if count < 3 or not centered.any():
         return 1.0
     run = max(5, math.ceil(math.sqrt(math.log10(count))))
     lags = min(math.ceil(math.sqrt(count)) + run, count - 1)
-    covariance = np.array([centred[k:] @ centred[: count - k] for k in range(lags + 1)]) / count
+    covariance = np.array([centered[k:] @ centered[: count - k] for k in range(lags + 1)]) / count
     small = np.abs(covariance) < 2 * math.sqrt(math.log10(count) / count) * covariance[0]
     quiet = (m for m in range(lags - run + 1) if small[m + 1 : m + 1 + run].all())
     window = min(2 * max(next(quiet, lags), 1), lags)

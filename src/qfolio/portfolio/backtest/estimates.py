@@ -111,7 +111,7 @@ def estimate(ours: Floats, theirs: Floats, periods_per_year: float) -> dict[Meas
     logs = paired_difference(log_growth(ours), log_growth(theirs).mean(axis=0))
     mine, other = _moments(ours), _moments(theirs)
     scale = (mine.deviation**2 + (other.deviation**2).mean()) / 2
-    squares = mine.centred**2 - (other.centred**2).mean(axis=0)
+    squares = mine.centered**2 - (other.centered**2).mean(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return {
             "growth": _estimate(periods_per_year * logs.mean(axis=1), periods_per_year * logs),
@@ -151,20 +151,20 @@ def luckiest(family: list[Estimate], draws: int, rng: np.random.Generator) -> Fl
 class _Moments(NamedTuple):
     """Moments of returns of shape (seeds, periods), by seed."""
 
-    centred: Floats  # (seeds, periods)
+    centered: Floats  # (seeds, periods)
     deviation: Floats  # (seeds,)
     sharpe: Floats  # (seeds,), per period
 
     def sharpe_part(self) -> Floats:
         """Each day's contribution to the Sharpe ratio's error, (seeds, periods)."""
-        score = ratio_or_zero(self.centred, self.deviation[:, None])
+        score = ratio_or_zero(self.centered, self.deviation[:, None])
         return np.asarray(score - self.sharpe[:, None] / 2 * (score**2 - 1))
 
 
 def _moments(returns: Floats) -> _Moments:
-    centred = deviations(returns)
-    deviation = np.sqrt((centred**2).sum(axis=1) / max(returns.shape[1] - 1, 1))
-    return _Moments(centred, deviation, ratio_or_zero(returns.mean(axis=1), deviation))
+    centered = deviations(returns)
+    deviation = np.sqrt((centered**2).sum(axis=1) / max(returns.shape[1] - 1, 1))
+    return _Moments(centered, deviation, ratio_or_zero(returns.mean(axis=1), deviation))
 
 
 def _estimate(per_seed: Floats, contributions: Floats) -> Estimate:

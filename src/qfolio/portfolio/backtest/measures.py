@@ -26,7 +26,7 @@ def measures(
     periods_per_year: float,
     risk_free: ArrayLike | None = None,
 ) -> dict[str, Floats]:
-    """Compute the usual measures of track records, annualised.
+    """Compute the usual measures of track records, annualized.
 
     Args:
         returns: Simple returns net of costs, shape (..., periods), each at least −1.
@@ -108,7 +108,7 @@ def per_period(track: Floats, centre: Floats, free: Floats | None) -> Floats:
     With returns of cash there are 9; the downside is that of returns over them.
     """
     returns, turnover, cost = track
-    deviation = returns - centre[..., None]  # centred, or the variance would lose precision
+    deviation = returns - centre[..., None]  # centered, or the variance would lose precision
     ruined = returns == -1
     log_net = np.log1p(np.where(ruined, 0, returns))
     log_free = log_net - np.log1p(-cost)

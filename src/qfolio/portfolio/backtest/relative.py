@@ -24,7 +24,7 @@ def relative(
     periods_per_year: float,
     share: ArrayLike | None = None,
 ) -> dict[str, Floats]:
-    """Compute measures of track records beside a benchmark, annualised where it says so.
+    """Compute measures of track records beside a benchmark, annualized where it says so.
 
     Args:
         returns: Simple returns of shape (..., periods).
@@ -94,7 +94,7 @@ def _per_period(returns: Floats, benchmark: Floats, share: Floats) -> Floats:
     other = np.broadcast_to(benchmark, returns.shape)
     active = paired_difference(returns, other)
     mean = np.broadcast_to(active.mean(axis=-1, keepdims=True), returns.shape)
-    # Centred, or the variances would lose precision.
+    # Centered, or the variances would lose precision.
     spread, mine = active - mean, returns - returns.mean(axis=-1, keepdims=True)
     theirs = other - benchmark.mean()
     logs, rises = np.log1p(np.maximum([returns, other], _WORST)), (other > 0, other < 0)

@@ -90,10 +90,10 @@ def _sharpe_variance(sharpe: float, skewness: float, kurtosis: float) -> float:
 
 def skewness_and_kurtosis(returns: Floats) -> tuple[float, float]:
     """Skewness and kurtosis, averaged over the rows; 0 and 3 for constant rows."""
-    centred = deviations(returns)
-    spread = np.sqrt((centred**2).mean(axis=-1))
+    centered = deviations(returns)
+    spread = np.sqrt((centered**2).mean(axis=-1))
     still = spread == 0
-    score = centred / np.where(still, 1, spread)[..., None]
+    score = centered / np.where(still, 1, spread)[..., None]
     return (
         float((score**3).mean(axis=-1).mean()),
         float(np.where(still, 3, (score**4).mean(axis=-1)).mean()),

@@ -272,7 +272,7 @@ def _replay(
     """Computes the result of some orders of shape (S, D, N + 1), a few days at a time.
 
     Arrays in here have the shape (N + 1, S, days). Between trades, weights times relatives give
-    values, which are normalised only by their sums.
+    values, which are normalized only by their sums.
     """
     orders, held = orders[some], held[some]
     start, given = _checked(market, held[:, None], 0)

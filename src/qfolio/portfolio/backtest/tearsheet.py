@@ -65,7 +65,7 @@ def value_at_risk(returns: ArrayLike, tail: float = TAIL) -> tuple[float, float]
 
 
 def rolling_sharpe(returns: ArrayLike, window: int, periods_per_year: float) -> Floats:
-    """Return the annualised Sharpe ratio of the last ``window`` returns, NaN before there are any.
+    """Return the annualized Sharpe ratio of the last ``window`` returns, NaN before there are any.
 
     Args:
         returns: Simple returns of shape (..., periods).

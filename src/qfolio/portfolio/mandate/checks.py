@@ -81,7 +81,7 @@ def _found(
     """Long positions, short ones, and what rows are exceeded by; None if the limits cannot be met.
 
     kept: the limits to obey, numbered as in ``_said`` (default: all). value: what a weight is worth
-    in the sum to maximise, which what rows are exceeded by counts against. slack: the rows that may
+    in the sum to maximize, which what rows are exceeded by counts against. slack: the rows that may
     be exceeded.
     """
     from scipy.optimize import linprog

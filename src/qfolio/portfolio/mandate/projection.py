@@ -2,7 +2,7 @@
 
 The set is low ≤ w ≤ high, rows·w ≤ most, Σ|w| ≤ gross and Σ|w − held| ≤ turnover. Given a
 multiplier for each condition but the first, the problem falls apart into one for each asset, which
-has a closed form. The multipliers maximise a concave, piecewise quadratic function: a semismooth
+has a closed form. The multipliers maximize a concave, piecewise quadratic function: a semismooth
 Newton method (Qi & Sun 1993), projected onto their bounds (Bertsekas 1982), finds the piece of the
 maximum, and then its last step is exact. That step is also what is differentiated.
 """

@@ -248,7 +248,7 @@ class Study:
             raise QfolioError(
                 f"The study is not finished; continue with qfolio study --resume {self.folder}."
             )
-        result = summarise(
+        result = summarize(
             config,
             [
                 {
@@ -285,7 +285,7 @@ class Study:
         self._files.write(self.config)
 
 
-def summarise(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]]) -> Result:
+def summarize(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]]) -> Result:
     """Pool the evidence of a study.
 
     Args:

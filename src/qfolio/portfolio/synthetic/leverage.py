@@ -42,7 +42,7 @@ class Leverage(SyntheticMarket):
 
     Returns over a quarter are drawn from a fixed set of log-normal scenarios; the third asset is
     best sold short. An action is the weights of the assets, of any size and sign; cash is the rest.
-    The best weights maximise the expected utility of the next step, with constant relative risk
+    The best weights maximize the expected utility of the next step, with constant relative risk
     aversion (1: log growth). At the default rates those with an aversion below 1.6 borrow, those
     above 3.2 lend, and those between hold no cash.
     """

@@ -33,7 +33,7 @@ def lognormal_table(
 class Merton(SyntheticMarket):
     """Three assets whose returns are drawn from a fixed set of log-normal scenarios, with cash.
 
-    The best weights maximise E log(b·x) over the simplex (Merton 1969; with the constraint, the
+    The best weights maximize E log(b·x) over the simplex (Merton 1969; with the constraint, the
     conditions of Cover 1984); one asset is not worth holding.
     """
 

@@ -1,4 +1,4 @@
-"""Paths of a strategy over the days of the test, summarised over its seeds, and their numbers."""
+"""Paths of a strategy over the days of the test, summarized over its seeds, and their numbers."""
 
 import math
 

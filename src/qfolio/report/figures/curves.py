@@ -82,7 +82,7 @@ def draw_learning_curve(data: ReportData, width: float) -> Figure:
 
 
 def draw_overestimation(data: ReportData, width: float) -> Figure:
-    """Draw how far the action values lie above the realised returns."""
+    """Draw how far the action values lie above the realized returns."""
     figure = new_figure(width, 3.5 if width > NARROW else 3.2)
     axes = figure.subplots()
     _line_axes(axes, "", data)
@@ -96,7 +96,7 @@ def draw_overestimation(data: ReportData, width: float) -> Figure:
     axes.set_ylim(low, high)
     # On a phone, long names do not fit beside each other.
     beside = width > NARROW or sum(len(curve.label) for curve in curves) < 32
-    axes.set_title("Action value minus realised return", pad=26 if beside else 40)
+    axes.set_title("Action value minus realized return", pad=26 if beside else 40)
     if clipped:
         _line_label(axes, high, "beginning off the scale", below=True, color=palette.MUTED)
     axes.legend(

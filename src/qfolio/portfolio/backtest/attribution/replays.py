@@ -1,7 +1,7 @@
 """Replays of a policy that sees some of its channels shuffled.
 
 Two shuffles take a channel's information away and leave its distribution: the assets swap what is
-seen of them, or blocks of rows swap places. Assets are relabelled anew every quarter of a year, not
+seen of them, or blocks of rows swap places. Assets are relabeled anew every quarter of a year, not
 every row: else a slow signal would become noise that a policy pays costs to follow, and its value
 would be confused with that of trading less. All else is as it was: prices, holdings, costs.
 """
@@ -71,7 +71,7 @@ class Shuffles(NamedTuple):
 
     @staticmethod
     def drawn(stretches: Sequence[Stretch], count: int, block: int, seed: int) -> "Shuffles":
-        """Draws with a fixed seed, in blocks of rows; only tradable assets are relabelled."""
+        """Draws with a fixed seed, in blocks of rows; only tradable assets are relabeled."""
         task, folds = stretches[0].task, [fold for *_, fold in stretches]
         longest = max(fold.decisions.stop - fold.decisions.start for fold in folds)
         begin, end = folds[0].decisions.start - task.window + 1, folds[-1].decisions.stop

@@ -13,12 +13,12 @@ def ledoit_wolf(returns: Floats) -> Floats:
     min(Σ‖xₜxₜ' − S‖² / (N T²), d²) / d².
     """
     rows, assets = returns.shape
-    centred = returns - returns.mean(axis=0)
-    sample = centred.T @ centred / rows
+    centered = returns - returns.mean(axis=0)
+    sample = centered.T @ centered / rows
     mean = np.trace(sample) / assets
     spread = ((sample - mean * np.eye(assets)) ** 2).sum()
     # Σ‖xx' − S‖² = Σ‖x‖⁴ − T‖S‖²
-    noise = (((centred**2).sum(axis=1) ** 2).sum() - rows * (sample**2).sum()) / rows**2
+    noise = (((centered**2).sum(axis=1) ** 2).sum() - rows * (sample**2).sum()) / rows**2
     intensity = min(noise / spread, 1.0) if spread > 0 else 1.0
     return np.asarray((1 - intensity) * sample + intensity * mean * np.eye(assets))
 
@@ -31,8 +31,8 @@ def nonlinear(returns: Floats) -> Floats:
     transform H are estimated with Epanechnikov's kernel of bandwidth T^(−1/3) λ.
     """
     rows, assets = len(returns) - 1, returns.shape[1]  # a row less, for the mean
-    centred = returns - returns.mean(axis=0)
-    eigenvalues, vectors = np.linalg.eigh(centred.T @ centred / rows)
+    centered = returns - returns.mean(axis=0)
+    eigenvalues, vectors = np.linalg.eigh(centered.T @ centered / rows)
     kept = np.maximum(eigenvalues[max(0, assets - rows) :], 1e-12 * eigenvalues[-1])
     width = rows ** (-1 / 3)
     scale = width * kept  # of each eigenvalue's kernel
