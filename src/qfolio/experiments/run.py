@@ -395,11 +395,25 @@ def train(
     listeners: Sequence[Listener] = (),
     executor: Executor | None = None,
 ) -> Run:
-    """Trains ``seeds`` agents side by side, from seeds ``seed``, ``seed + 1``, …
+    """Train agents of one kind on a task, side by side.
 
-    episodes, steps: the budget of each; one of the two. out: a new folder for the run; without it
-    nothing is written. executor: where groups of seeds train (default: all in this process); see
-    ``qfolio.on``. ``run.summary()`` grades it.
+    Args:
+        task: The task to learn.
+        agent: The agent, with its settings.
+        episodes: Training episodes of each seed; give these or ``steps``.
+        steps: Environment steps of each seed.
+        seeds: Number of agents.
+        seed: The first seed; the others follow it.
+        out: New folder for the run (default: nothing is written).
+        listeners: Hear of the training.
+        executor: Where groups of seeds train (default: all in this process); see ``qfolio.on``.
+
+    Returns:
+        The trained run; ``run.summary()`` grades it.
+
+    Raises:
+        QfolioError: The agent does not fit the task, a setting is out of range, the folder exists,
+            or a loss is not finite.
     """
     devices.configure()
     run = Run.create(task, agent, episodes=episodes, steps=steps, seeds=seeds, seed=seed, out=out)

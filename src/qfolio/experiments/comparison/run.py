@@ -119,7 +119,9 @@ class ComparisonConfig(Config, frozen=True):
 
 
 class Comparison:
-    """Made by ``create`` or ``open``; ``run`` trains and grades the agents without a result.
+    """Several agents on one task, with the same seeds.
+
+    ``create`` or ``open`` makes one; ``run`` trains and grades the agents without a result.
 
     results: of the finished agents, by name. failures: the errors of the others.
     """

@@ -46,7 +46,16 @@ def presets_of(task: str, agent: str) -> dict[str, Preset]:
 
 
 def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
-    """The preset of that name; raises QfolioError if there is none."""
+    """The preset of that name for an agent on a task.
+
+    Args:
+        name: Such as "fast".
+        task: A name that ``qfolio train`` knows, or "portfolio".
+        agent: A name that ``qfolio train`` knows.
+
+    Raises:
+        QfolioError: There is no such preset; the message says what there is.
+    """
     presets = presets_of(task, agent)
     if not presets:
         raise QfolioError(f"{agent} has no preset for {task}; {_fitting(task, agent)}.")

@@ -53,7 +53,10 @@ FOLDS_AT_ONCE = 8
 
 
 class Backtest:
-    """Made by ``create`` or ``open``; ``run`` trains what is missing and ``entries`` replays it.
+    """A walk-forward test of agents on a price table, beside classical baselines.
+
+    ``create`` or ``open`` makes one, ``run`` trains what is missing, ``entries`` replays all
+    strategies and ``assess`` compares them.
 
     interrupted: whether Ctrl-C stopped the last ``run``.
     """

@@ -52,7 +52,9 @@ Report = Callable[[Backtest, dict[str, Entry], Assessment, list[str], Why | None
 
 
 class Study:
-    """Made by ``create`` or ``open``; ``run`` does what is missing and ``result`` pools it.
+    """One configuration of agents, backtested on many price tables.
+
+    ``create`` or ``open`` makes one, ``run`` does what is missing and ``result`` pools it.
 
     interrupted: whether Ctrl-C stopped the last ``run``.
     """
