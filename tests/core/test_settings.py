@@ -91,3 +91,10 @@ def test_counts_shape_the_program():
 
     with pytest.raises(QfolioError, match=r"size of Careless .*; declare it as size: int = static"):
         Careless()
+
+
+def test_settings_are_divided_by_their_owners():
+    parts = settings.divide({"discount": "0.5", "horizon": "3"}, OneState, DQN)
+    assert parts == [{"horizon": "3"}, {"discount": "0.5"}]
+    with pytest.raises(QfolioError, match=r"neither OneState nor DQN .* did you mean discount\?"):
+        settings.divide({"discont": 1}, OneState, DQN)

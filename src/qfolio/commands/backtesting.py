@@ -212,6 +212,7 @@ def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
 def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
     """Presets with changed settings: of one agent (dqn.discount), of all that have it, or of the
     task. Imports the modules of parts that they name."""
+    from qfolio.portfolio.prices.findings import hint
     from qfolio.portfolio.task import Portfolio
 
     used = set()
@@ -238,8 +239,14 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
             task={**preset.task, **settings.convert(Portfolio, task)},
         )
     for key in chosen.keys() - used:
+        kinds: list[type] = [
+            Portfolio,
+            *(registry.find("agent", preset.agent) for preset in presets.values()),
+        ]
+        known = set().union(*map(settings.names, kinds)) - own_options
+        name = key.rpartition(".")[2]
         raise QfolioError(
-            f"--set {key}: none of {', '.join(presets)} has this setting, nor the portfolio task "
-            "(its lag, costs, cap and mandate have options of their own)."
+            f"--set {key}: none of {', '.join(presets)} has this setting, nor the portfolio task"
+            f"{hint(name, known)}; its lag, costs, cap and mandate have options of their own."
         )
     return changed

@@ -118,14 +118,13 @@ def _plan(
     from qfolio.experiments.continual import Plan
 
     task_class = registry.find("task", task_name)
-    registry.find("agent", agent_name)
+    agent_class = registry.find("agent", agent_name)
     preset = presets.preset(preset_name, task_name, agent_name)
     if not change:
         raise QfolioError(
             "--change is missing: name the task's new numbers, for example --change mass=2."
         )
-    chosen = settings.parse(assignments)
-    before = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
+    before, chosen = settings.divide(settings.parse(assignments), task_class, agent_class)
     before = {**preset.task, **before}
     return Plan(
         task=settings.build(task_class, before),

@@ -221,12 +221,12 @@ def _new_run(
     from qfolio.experiments.run import Run
 
     task_class = registry.find("task", task_name)
-    registry.find("agent", agent_name)
+    agent_class = registry.find("agent", agent_name)
     preset = presets.preset(preset_name, task_name, agent_name)
-    task_settings = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
+    task_settings, agent_settings = settings.divide(chosen, task_class, agent_class)
     return Run.create(
         settings.build(task_class, {**preset.task, **task_settings}),
-        preset.build(**chosen),
+        preset.build(**agent_settings),
         budget=budget or preset.budget,
         seeds=preset.seeds if seeds is None else seeds,
         seed=seed,

@@ -170,8 +170,7 @@ def _new(
     task_class = registry.find("task", task_name)
     agent_class = registry.find("agent", agent_name)
     preset = presets.preset(preset_name, task_name, agent_name)
-    chosen = settings.parse(assignments)
-    task_settings = {name: chosen.pop(name) for name in settings.names(task_class) & chosen.keys()}
+    task_settings, chosen = settings.divide(settings.parse(assignments), task_class, agent_class)
     space = search.parse(ranges, agent_class)
     if both := [dim.name for dim in space if dim.name in chosen]:
         raise QfolioError(f"--set and --search both name {both[0]}; name it in one of them.")

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import near
+from qfolio.core.text import listed, near
 
 T = TypeVar("T")
 
@@ -61,6 +61,19 @@ def parse(assignments: Iterable[str]) -> dict[str, str]:
             )
         pairs[name.strip().replace("-", "_")] = value.strip()
     return pairs
+
+
+def divide(chosen: Mapping[str, T], *kinds: type) -> list[dict[str, T]]:
+    """Settings by the class that has them, the first of several; raises QfolioError if none has."""
+    parts: list[dict[str, T]] = [{} for _ in kinds]
+    for name, value in chosen.items():
+        owner = next((i for i, kind in enumerate(kinds) if name in names(kind)), None)
+        if owner is None:
+            owners = listed([kind.__name__ for kind in kinds], "nor")
+            advice = near(name, sorted(set().union(*map(names, kinds))))
+            raise QfolioError(f"neither {owners} has a setting {name!r}; {advice}")
+        parts[owner][name] = value
+    return parts
 
 
 def called(text: str) -> tuple[str, dict[str, str]]:

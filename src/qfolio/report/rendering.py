@@ -35,7 +35,7 @@ def render(template: str, **context: Any) -> str:
         loader=FunctionLoader(source),
     )
     environment.filters.update(number=number, percent=percent)
-    environment.globals.update(bands=bands)
+    environment.globals.update(bands=bands, plural=plural)
     return environment.get_template(template).render(palette=palette, **context)
 
 
