@@ -125,7 +125,7 @@ def number(value: float | None) -> str:
 
 
 def _cells(optimum: str, value: float, regret: float, over: float | None) -> tuple[str, ...]:
-    return number(value), optimum, figure(regret, ".2%"), number(over)
+    return number(value), optimum, figure(regret, ",.2%"), number(over)
 
 
 def print_rule(rule: dict[str, Any]) -> None:
@@ -184,9 +184,11 @@ def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
     for name, row in (("best", "return_per_seed"), ("preset", "preset_return_per_seed")):
         returns = [math.nan if x is None else x for x in summary[row]]
         mean = sum(returns) / len(returns)
-        say(f"{name:<8}{mean:>9.2f}   worst seed {min(returns):.2f}")
+        worst = figure(min(returns), ".2f")
+        say(f"{name:<8}{figure(mean, '.2f'):>9}   worst seed {worst}")
     if summary["optimum"] is not None:
-        say(f"optimum {summary['optimum']:>9.2f}   ({len(returns)} fresh seeds, graded starts)")
+        seeds = amount(len(returns), "fresh seed")
+        say(f"optimum {figure(summary['optimum'], '.2f'):>9}   ({seeds}, graded starts)")
     say("")
     for sentence in verdicts:
         say(sentence)
@@ -341,11 +343,13 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
             rows.append((asset, figure(price, ",.2f"), *weights, money, figure(trade, "+,.4g")))
     cash = (figure(float(x[0]), ".2%") for x in (held, targets, after))
     print_table(heads, [*rows, ("cash", "", *cash, "", "")])
-    kinds = ", ".join(f"{kind} {money:,.2f}" for kind, money in allocation.costs.items())
+    kinds = ", ".join(f"{kind} {figure(money, ',.2f')}" for kind, money in allocation.costs.items())
     say(
-        f"After the close of {allocation.date}: wealth {allocation.wealth:,.2f}, expected cost "
-        f"{allocation.cost:,.2f}{f' ({kinds})' if len(allocation.costs) > 1 else ''}, cash left "
-        f"{allocation.cash_after:,.2f}. Assets that are neither held nor wanted are not shown."
+        f"After the close of {allocation.date}: wealth {figure(allocation.wealth, ',.2f')}, "
+        f"expected cost {figure(allocation.cost, ',.2f')}"
+        f"{f' ({kinds})' if len(allocation.costs) > 1 else ''}, "
+        f"cash left {figure(allocation.cash_after, ',.2f')}. "
+        "Assets that are neither held nor wanted are not shown."
     )
 
 
