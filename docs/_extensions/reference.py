@@ -120,6 +120,8 @@ def code(value: Any) -> str:
 def plain(value: Any) -> str:
     if isinstance(value, tuple | list):
         return ",".join(map(plain, value))
+    if isinstance(value, float):
+        return f"{value:.10g}"
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
