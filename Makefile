@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 NOW := $(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: demo test test-all check format examples bench bench-gpu docs linkcheck release-check clean
+.PHONY: demo test test-all check format examples bench bench-gpu docs linkcheck film release-check clean
 
 demo: .venv/installed
 	$(BIN)/qfolio train pendulum --no-compare --out runs/demo-$(NOW)/pendulum
@@ -51,6 +51,11 @@ release-check: .venv/installed-release
 	$(PYTHON) -m venv .venv-wheel
 	.venv-wheel/bin/python -m pip install --quiet dist/*.whl
 	.venv-wheel/bin/python -I .ci/try_wheel.py
+
+# The moving pictures in docs/images. Needs Chromium.
+film: .venv/installed-dev
+	$(BIN)/python -m pip install --quiet --group film
+	$(BIN)/python bench/film.py
 
 bench: .venv/installed-dev
 	$(BIN)/python bench/run.py
