@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -45,6 +46,26 @@ def test_resuming_a_finished_backtest_reports_again(folder, monkeypatch, capsys)
     assert reported["report"] == str(folder / "report.html")
     assert "equal-weight" in reported["strategies"]
     assert "equal-weight" in err
+
+
+@pytest.mark.slow
+def test_a_backtest_goes_on_and_its_ledger_is_still_reproduced(
+    folder, monkeypatch, capsys, tmp_path
+):
+    run, prices = shutil.copytree(folder, tmp_path / "run"), write_table(tmp_path / "p.csv", 280)
+    before = (run / "returns.csv").read_text()
+    asked = ["allocate", run, "--capital", 1000, "--as-of", "2020-09-16", "--anyway"]
+    assert qfolio(monkeypatch, *asked) == 0
+    assert qfolio(monkeypatch, "backtest", prices, "--resume", run, "--cap", 0.5) == 2
+    assert "--resume keeps the backtest's settings" in capsys.readouterr().err
+    assert qfolio(monkeypatch, "backtest", prices, "--resume", run) == 0
+    after = (run / "returns.csv").read_text()
+    assert after.startswith(before)
+    assert after.count("\n") == before.count("\n") + 20
+    assert qfolio(monkeypatch, "allocate", run, "--reproduce", "2020-09-16") == 0
+    capsys.readouterr()
+    assert qfolio(monkeypatch, "follow", run, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["rows"] == 19  # the first of 20 has the trade
 
 
 def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):

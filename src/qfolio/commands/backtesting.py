@@ -20,7 +20,7 @@ from qfolio.commands.arguments import (
     Trackers,
     sources,
 )
-from qfolio.commands.tables import Reading
+from qfolio.commands.tables import READING, Reading
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 
@@ -72,7 +72,7 @@ class Options(Reading):
         assignments: Hyperparameters of all agents that have them (learning_rate=1e-3) or of one
             (dqn.discount=0.9), or of the task (window=20 reward=crra).
         out: New folder (default: one in runs/).
-        resume: Folder to resume.
+        resume: Folder to resume; a backtest goes on with a table that has more rows at its end.
         on: Where agents train: here, processes:4 (or another number), ray or ray://HOST:10001.
         track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
             module:Name (default: none).
@@ -105,10 +105,13 @@ class Options(Reading):
     track: Trackers = ()
     trust: Modules = ()
 
-    @property
-    def only_resumes(self) -> bool:
-        """Whether nothing but ``resume``, ``on``, ``track`` and ``trust`` is given."""
-        rest = dataclasses.replace(self, resume=None, on=DEFAULTS.on, track=(), trust=())
+    def only_resumes(self, table: bool = False) -> bool:
+        """Whether nothing but ``resume``, ``on``, ``track`` and ``trust`` is given.
+
+        table: Whether the options for reading a table may be given, too.
+        """
+        read = READING.reading if table else {}
+        rest = dataclasses.replace(self, resume=None, on=DEFAULTS.on, track=(), trust=(), **read)
         return rest == DEFAULTS
 
     def folder(self, kind: str) -> Path:

@@ -49,10 +49,12 @@ def backtest(
         qfolio backtest prices.csv
         qfolio backtest prices.csv --agents tilts --cost-bps 5 --out runs/mine
         qfolio backtest --resume runs/mine
+        qfolio backtest prices.csv --resume runs/mine
 
     Args:
         file: CSV or Parquet with prices, which qfolio prices checks (default: 20 US stocks that
-            come with skfolio).
+            come with skfolio). With --resume, the backtest's table with more rows at its end, read
+            with the same options: finished folds keep their policies, new ones are trained.
         title: Title of the report (default: the agents, the table and its years).
     """
     from qfolio.core import devices
@@ -81,11 +83,14 @@ def backtest(
             out=folder,
             **options.settings(),
         )
-    elif file is None and title is None and options.only_resumes:
+    elif title is None and options.only_resumes(table=file is not None):
         run, folder = Backtest.open(options.resume), options.resume
+        if file is not None:
+            run = run.extended(options.like(run.prices).load(file))
     else:
         raise QfolioError(
-            "--resume keeps the backtest's settings; add only --on, --track and --trust."
+            "--resume keeps the backtest's settings; add only --on, --track, --trust, or a table "
+            "with more rows."
         )
     console.say(console.describe_backtest(run))
     with console.bar("compiling") as update, tracked(*following):

@@ -16,7 +16,8 @@ from qfolio.experiments.fit import Listener
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.processes import Processes
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio.backtest.run import LATEST, Backtest
+from qfolio.portfolio.backtest.kept import LATEST
+from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.study.run import Study
 

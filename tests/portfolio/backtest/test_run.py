@@ -14,9 +14,10 @@ from qfolio.experiments.events import read
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.folder import MOST_WEIGHTS, rows_written
+from qfolio.portfolio.backtest.kept import LATEST
 from qfolio.portfolio.backtest.replay import Stretch, decide
 from qfolio.portfolio.backtest.results import write_tables
-from qfolio.portfolio.backtest.run import LATEST, Backtest
+from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.following import follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices

@@ -1,6 +1,7 @@
 """The folder of a backtest.
 
-It holds config.json (settings, written once), prices.safetensors (the table),
+It holds config.json (settings, written once), prices.safetensors (the table, which may have grown
+since),
 strategies.safetensors (the user's own strategies, if there are any),
 policies/AGENT/FOLD.safetensors (weights, written as soon as a group of folds is trained; for the
 latest policy, the whole learning state, with latest-N.safetensors after its Nth update),
@@ -156,23 +157,36 @@ class BacktestFolder:
     def write(self, config: BacktestConfig, prices: Prices, own: Mapping[str, Own]) -> None:
         """Writes the configuration, the prices and the user's own strategies."""
         write_config(self.path / "config.json", config)
+        self.write_prices(prices)
+        if own:
+            write_arrays(self.path / STRATEGIES, _own_arrays(own))
+
+    def write_prices(self, prices: Prices, trained: Sequence[tuple[int, int]] = ()) -> None:
+        """Writes the table; trained: as ``Backtest`` takes it."""
         arrays = {
             "dates": prices.dates.astype("datetime64[s]").astype(np.int64),
             "values": prices.values,
             "features": prices.features,
             "market": prices.market,
+            **({"trained": np.array(trained)} if trained else {}),
             **prices.masks,
         }
         write_arrays(self.path / "prices.safetensors", arrays)
-        if own:
-            write_arrays(self.path / STRATEGIES, _own_arrays(own))
+
+    def grow(self, prices: Prices, trained: Sequence[tuple[int, int]]) -> None:
+        """Replaces the table by a longer one; the backtest is unfinished until it has run."""
+        (self.path / "summary.json").unlink(missing_ok=True)
+        self.write_prices(prices, trained)
 
     def read_config(self) -> BacktestConfig:
         """Raises QfolioError if the folder holds no backtest of this version."""
         return read_config(self.path / "config.json", BacktestConfig)
 
-    def read_prices(self, config: BacktestConfig) -> Prices:
-        """The table; raises QfolioError if it is damaged or not the configuration's."""
+    def read_prices(self, config: BacktestConfig) -> tuple[Prices, list[tuple[int, int]]]:
+        """The table, and ``trained`` as ``write_prices`` takes it.
+
+        Raises QfolioError if it is damaged or does not begin with the rows of the configuration.
+        """
         path = self.path / "prices.safetensors"
         arrays = read_arrays(path)
         try:
@@ -189,11 +203,12 @@ class BacktestFolder:
                 listed=arrays.get("listed"),
                 members=arrays.get("members"),
             )
-        except (KeyError, ValueError, QfolioError) as error:
+            first = prices.between(0, int(config.prices["rows"]))
+        except (KeyError, TypeError, ValueError, QfolioError) as error:
             raise QfolioError(f"{path} is damaged ({error}); restore it or start over.") from None
-        if prices.digest != config.prices["digest"]:
+        if first.digest != config.prices["digest"]:
             raise QfolioError(f"{path} does not belong to config.json beside it; restore the two.")
-        return prices
+        return prices, [(int(n), int(rows)) for n, rows in arrays.get("trained", ())]
 
     def policies(self, agent: str) -> list[str]:
         """The names of an agent's policies."""

@@ -11,7 +11,7 @@ from qfolio.experiments.fit import Row
 from qfolio.portfolio.backtest.folder import BacktestFolder
 
 LATEST = "latest"
-"""Name of the policies trained on the last rows of the table."""
+"""Name of the first policies trained on the last rows of the table; see ``tomorrow``."""
 
 _UPDATED = re.compile(rf"{LATEST}-([0-9]+)")
 
@@ -39,11 +39,13 @@ class Kept:
             return [fold for name, fold in self._policies if name == agent]
         return self.folder.policies(agent)
 
+    def updates(self, agent: str) -> int:
+        """Updates of an agent's newest policy for tomorrow; -1 before it has one."""
+        return max(map(updates_of, self.names(agent)), default=-1)
+
     def newest(self, agent: str) -> str:
-        """The name of an agent's newest policy: latest, or latest-N after N updates."""
-        found = map(_UPDATED.fullmatch, self.names(agent))
-        updates = [int(match[1]) for match in found if match]
-        return f"{LATEST}-{max(updates)}" if updates else LATEST
+        """The name of an agent's newest policy for tomorrow."""
+        return tomorrow(max(self.updates(agent), 0))
 
     def policy(self, agent: str, fold: str, template: Any) -> Any:
         """A policy, in the structure of the template; raises QfolioError if it is not trained."""
@@ -74,6 +76,17 @@ class Kept:
             self._policies[agent, fold] = policy
         else:
             self.folder.write_policy(agent, fold, policy)
+
+
+def tomorrow(updates: int) -> str:
+    """Name of the policies for tomorrow: latest, or latest-N after N updates."""
+    return f"{LATEST}-{updates}" if updates else LATEST
+
+
+def updates_of(name: str) -> int:
+    """The updates of a policy for tomorrow; -1 for that of a fold."""
+    match = _UPDATED.fullmatch(name)
+    return int(match[1]) if match else -(name != LATEST)
 
 
 def learning(learner: Any, updates: int, learned: np.datetime64) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from qfolio.core import devices, settings
@@ -33,7 +34,7 @@ from qfolio.portfolio.backtest.benchmark import field_of
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
 from qfolio.portfolio.backtest.folds import Fold, latest, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
-from qfolio.portfolio.backtest.kept import LATEST, Kept, learning
+from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow, updates_of
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
@@ -42,6 +43,7 @@ from qfolio.portfolio.mandate.mandate import Mandate, settled
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.growth import require_grown
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
 
@@ -68,14 +70,26 @@ class Backtest:
         folder: BacktestFolder | None,
         agents: Mapping[str, Agent] | None = None,
         own: Mapping[str, Own] | None = None,
+        trained: Sequence[tuple[int, int]] = (),
     ) -> None:
+        """Args: as ``create`` or ``open`` make them.
+
+        trained: for each table so far, the updates of the policies for tomorrow before they were
+            trained on it, and its rows (default: one table).
+        """
+        self._trained = list(trained) or [(0, len(prices))]
+        if len(prices) > config.prices["rows"]:
+            config = msgspec.structs.replace(config, prices=describe(prices))
         self.prices, self.config, self._kept = prices, config, Kept(folder)
+        self._given_own = own or {}
         dates, length, expanding = prices.dates, config.train, config.expanding
         folds = walk_forward(dates, length, config.test, config.lag, expanding)
-        last = latest(LATEST, dates, length, expanding)
+        last = [latest(tomorrow(n), dates[:rows], length, expanding) for n, rows in self._trained]
+        every = [*folds, *last]
         if prices.tradable is None:  # else agents also learn from assets that come and go
-            folds, last = [f.complete(prices.values) for f in folds], last.complete(prices.values)
-        self.folds, self._jobs = folds, [*folds, last]
+            every = [fold.complete(prices.values) for fold in every]
+        self.folds = every[: len(folds)]
+        self._jobs = [*self.folds, every[-1]]
         given = agents or {}
         self.agents = {
             name: given[name] if name in given else agent_of(entry.agent, entry.settings)
@@ -91,13 +105,13 @@ class Backtest:
         days = slice(self.folds[0].decisions.start, self.folds[-1].decisions.stop)
         self._own = {
             name: place(name, each, prices, days, task, config.cap)
-            for name, each in (own or {}).items()
+            for name, each in self._given_own.items()
         }
         self.interrupted = False
         self._parts = {
             (name, fold.name): self._part(task, fold)
             for name, task in self.tasks.items()
-            for fold in self._jobs
+            for fold in every
         }
 
     @classmethod
@@ -216,7 +230,39 @@ class Backtest:
         """
         files = BacktestFolder(Path(folder))
         config = files.read_config()
-        return cls(files.read_prices(config), config, files, agents, files.read_own(config))
+        prices, trained = files.read_prices(config)
+        return cls(prices, config, files, agents, files.read_own(config), trained)
+
+    def extended(self, prices: Prices) -> "Backtest":
+        """The same backtest on its table with more rows at the end, in the same folder.
+
+        Finished folds keep their policies, and the last one decides up to its end. ``run`` then
+        trains the folds that are new and policies for tomorrow, beside those before them.
+
+        Raises:
+            QfolioError: The table does not begin with the backtest's rows; the error names the
+                first row and column that differ.
+        """
+        require_grown(self.prices, prices)
+        if len(prices) == len(self.prices):
+            return self
+        prices = dataclasses.replace(prices, source=self.prices.source, note=self.prices.note)
+        updates = 1 + max(self._kept.updates(name) for name in self.agents)
+        earlier = [each for each in self._trained if each[0] < updates]
+        trained = [*earlier, (updates, len(prices))]
+        longer = Backtest(prices, self.config, None, self.agents, self._given_own, trained)
+        before = [fold.name for fold in self.folds]
+        if [fold.name for fold in longer.folds[: len(before)]] != before:
+            raise QfolioError(
+                "The new rows are less than a day apart and the earlier ones are not; start a new "
+                "backtest."
+            )
+        memory.require(prices, longer.config)
+        longer._kept = self._kept
+        if self.folder is not None:
+            with locked(self.folder):
+                BacktestFolder(self.folder).grow(prices, trained)
+        return longer
 
     def __repr__(self) -> str:
         seeds = amount(self.config.seeds, "seed")
@@ -273,6 +319,11 @@ class Backtest:
             self.interrupted = carry_out(executor, jobs, listen, self.store, log)
 
     @property
+    def _latest(self) -> str:
+        """The policies for tomorrow that are trained on the whole table."""
+        return tomorrow(self._trained[-1][0])
+
+    @property
     def _counts(self) -> str:
         return f"{amount(len(self.prices.assets), 'asset')}, {amount(len(self.folds), 'fold')}"
 
@@ -296,8 +347,8 @@ class Backtest:
         agent = job.name.partition("/")[0]
         for fold, result in trained.items():
             policy = result.kept
-            if fold == LATEST:
-                policy = learning(policy, 0, self.prices.dates[-1])
+            if fold == self._latest:
+                policy = learning(policy, self._trained[-1][0], self.prices.dates[-1])
             self._kept.write(agent, fold, result.rows, policy)
 
     @property
@@ -313,7 +364,8 @@ class Backtest:
         """
         name = self._name(agent)
         stored = self.newest(name) if stored is None else stored
-        task, trained = self._parts[name, LATEST], self.agents[name]
+        base = max(n for n, _ in self._trained if n <= updates_of(stored))
+        task, trained = self._parts[name, tomorrow(base)], self.agents[name]
         state = state_template(task, trained, self.config.seeds)
         kept = self._kept.policy(name, stored, learning(state, 0, self.prices.dates[-1]))
         return Policy(
@@ -330,10 +382,10 @@ class Backtest:
     def keep(self, agent: str | None, policy: Policy) -> None:
         """Stores an updated policy as the agent's policy for tomorrow, beside those before it."""
         kept = learning(policy.learner, policy.updates, policy.learned)
-        self._kept.write_policy(self._name(agent), f"{LATEST}-{policy.updates}", kept)
+        self._kept.write_policy(self._name(agent), tomorrow(policy.updates), kept)
 
     def newest(self, agent: str) -> str:
-        """The name of the agent's newest policy: latest, or latest-N after N updates."""
+        """The name of the agent's newest policy for tomorrow, see ``kept.tomorrow``."""
         return self._kept.newest(agent)
 
     def stretches(self, agent: str) -> list[Stretch]:
@@ -436,6 +488,6 @@ class Backtest:
             tuple(self._parts[name, fold.name] for fold in folds),
             tuple(seed_range(self.config.seeds, self.config.seed)),
             Budget(self.config.agents[name].episodes),
-            LATEST,
+            self._latest,
             most,
         )

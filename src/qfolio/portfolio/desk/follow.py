@@ -176,7 +176,7 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
     table = run.prices if prices is None else known.table(desk.load(prices))
     live = mark(records, table, known.costs, lag)
     other, count = run.config.benchmark, len(live.returns)
-    tested, before = _tested(desk, agent), _tested(desk, other)
+    tested, before = (_tested(desk, name, records[0]) for name in (agent, other))
     theirs, note = reference(desk, table, live.first - lag, count, benchmark)
     rng = np.random.default_rng(SEED)
     band, evidence = np.ones((3, count)), np.ones(count)
@@ -209,9 +209,15 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
     )
 
 
-def _tested(desk: Desk, name: str) -> np.ndarray:
-    """The net returns of a strategy in the backtest, all seeds of an agent together."""
-    _, columns = BacktestFolder(desk.folder).read_returns()
+def _tested(desk: Desk, name: str, first: Record) -> np.ndarray:
+    """The net returns of a strategy in the backtest, all seeds of an agent together.
+
+    Rows by which the table has grown since the first allocation are live, and left out.
+    """
+    files, dates = BacktestFolder(desk.folder), desk.run.prices.dates
+    last = dates[files.read_config().prices["rows"] - 1]
+    count = int((desk.run.dates <= max(last, first.moment)).sum())
+    _, columns = files.read_returns()
     column = followed(name, columns)
     if column not in columns:
         column = f"{name}/{desk.run.config.seed}"
@@ -220,7 +226,7 @@ def _tested(desk: Desk, name: str) -> np.ndarray:
             f"returns.csv has no {name}; write it again with qfolio backtest --resume "
             f"{desk.folder}."
         )
-    return columns[column]
+    return columns[column][:count]
 
 
 def _measures(returns: np.ndarray, year: float) -> dict[str, float]:

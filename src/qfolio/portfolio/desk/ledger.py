@@ -141,12 +141,13 @@ class Ledger:
         return record, said
 
     def prices(self, record: Record, known: Prices) -> Prices:
-        """The table that a record used: ``known`` or what the ledger stored.
+        """The table that a record used: rows of ``known``, or what the ledger stored.
 
         Raises:
             QfolioError: The ledger did not store it, or its file is damaged.
         """
         wanted = record.digests["prices"]
+        known = known.between(None, int((known.dates <= record.moment).sum()))
         if known.sha256 == wanted:
             return known
         path = self._prices(wanted)

@@ -1,0 +1,122 @@
+"""A backtest goes on with a table that has more rows at its end."""
+
+import dataclasses
+import shutil
+
+import jax
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.executor import Here
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.prices.table import Prices
+
+ROWS, FIRST = 160, 130  # folds of 30 rows begin at 60, 90, 120 and 150; the third has 10 at first
+SETTINGS = {"rollout_length": 5, "num_envs": 2, "hidden": (4,)}
+AGENT = Preset("pathwise", SETTINGS, episodes=4, seeds=1, task={"window": 5, "horizon": 10})
+
+
+def table(rows=ROWS):
+    rng = np.random.default_rng(3)
+    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (ROWS, 3)), axis=0))
+    volumes = rng.uniform(1, 2, (ROWS, 3, 1))
+    dates = np.datetime64("2020-01-01") + np.arange(ROWS)
+    prices = Prices(dates, ("A", "B", "C"), values, volumes, ("volume",), "made up")
+    return prices.between(0, rows)
+
+
+def finished(folder, prices):
+    run = Backtest.create(
+        prices, {"pathwise": AGENT}, out=folder, train="60d", test="30d", seeds=1,
+        baselines=("momentum",),
+    )  # fmt: skip
+    run.run()
+    return run
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    return finished(tmp_path_factory.mktemp("growth") / "run", table(FIRST))
+
+
+def policies(run):
+    return {
+        stretch.fold.name: jax.tree.leaves(stretch.members) for stretch in run.stretches("pathwise")
+    }
+
+
+def returns(run):
+    entries, _ = run.entries()
+    return {name: entry.simulation.returns for name, entry in entries.items()}
+
+
+def assert_same(one, other):
+    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_going_on_equals_one_run_and_keeps_what_was_there(first, tmp_path):
+    shutil.copytree(first.folder, tmp_path / "run")
+    tomorrow, before = first.policy(), returns(first)
+    named = dataclasses.replace(table(), source="another file")
+    jobs = []
+
+    def note(job, done, share):
+        jobs.append(job)
+        return ()
+
+    Backtest.open(tmp_path / "run").extended(named).run(note)
+    on, whole = Backtest.open(tmp_path / "run"), finished(None, table())
+    assert [fold for job in jobs for fold in job.folds] == [on.folds[-1].name, "latest-1"]
+    assert len(on.folds) == 4
+    assert_same(policies(on), policies(whole))
+    after = returns(on)
+    assert_same(after, returns(whole))
+    for name, series in before.items():
+        np.testing.assert_array_equal(after[name][:, : series.shape[1]], series, err_msg=name)
+    # Policies for tomorrow: one of all rows, and the one before it, which orders may have followed.
+    now = on.policy()
+    assert_same(now.learner, whole.policy().learner)
+    assert (now.updates, now.learned) == (1, table().dates[-1])
+    stored = on.policy(stored="latest")
+    assert stored.weights(table(FIRST)) == tomorrow.weights(table(FIRST))
+    assert now.weights(table()) == whole.policy().weights(table())
+    assert on.config.prices["rows"] == ROWS
+    assert on.config.prices["source"] == "made up"
+
+
+def test_the_same_table_trains_nothing(first):
+    assert first.extended(table(FIRST)).jobs(Here()) == []
+
+
+def changed(**columns):
+    return dataclasses.replace(table(), **columns)
+
+
+def moved(array, *place):
+    array = array.copy()
+    array[place] = array[place] + 1
+    return array
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (lambda: changed(values=moved(table().values, 7, 1)), "for 'B' on 2020-01-08 where"),
+        (lambda: changed(features=moved(table().features, 9, 2, 0)), "'volume of C' on 2020-01-10"),
+        (lambda: changed(dates=moved(table().dates, 4)), "of 2020-01-05 00:00:01 where .*-05;"),
+        (lambda: table().between(1, None), "of 2020-01-02 where .* 2020-01-01"),
+        (lambda: table().select(["A", "C"]), "no asset 'B'"),
+        (lambda: changed(assets=("A", "C", "B")), "assets in another order"),
+        (lambda: changed(feature_names=("size",)), "no feature 'volume'"),
+        (lambda: table(FIRST - 1), "129 rows up to 2020-05-08, fewer than"),
+        (lambda: changed(members=np.ones((ROWS, 3), bool)), "Assets come and go"),
+    ],
+)
+def test_other_rows_are_refused_by_name(first, other, message):
+    kept = (first.folder / "prices.safetensors").read_bytes()
+    with pytest.raises(QfolioError, match=message):
+        first.extended(other())
+    assert (first.folder / "prices.safetensors").read_bytes() == kept
