@@ -149,7 +149,7 @@ def test_the_correction_counts_all_agents_and_references():
     pooled = [
         each for name in agents for each in (agents[name].to_reference, agents[name].to_rebalanced)
     ]
-    found = corrected({name: _untested(pools) for name, pools in agents.items()})
+    found = corrected({name: _untested(pools) for name, pools in agents.items()}, True)
     after = [
         each for name in found for each in (found[name].to_reference, found[name].to_rebalanced)
     ]
@@ -163,7 +163,11 @@ def test_the_correction_counts_all_agents_and_references():
         agents["tilts"],
         to_reference=msgspec.structs.replace(agents["tilts"].to_reference, z=-9.0, p=1e-9),
     )
-    assert corrected({"tilts": worse})["tilts"].to_reference.finding == "worse"
+    assert corrected({"tilts": worse}, True)["tilts"].to_reference.finding == "worse"
+    # A reference without rebalancings is one comparison, not two.
+    once = corrected({"tilts": worse}, False)["tilts"]
+    assert once.to_reference.p_holm == pytest.approx(1e-9)
+    assert once.to_rebalanced == once.to_reference
 
 
 def test_short_tables_are_left_out_with_a_reason(tmp_path):

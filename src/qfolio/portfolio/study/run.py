@@ -295,7 +295,8 @@ def summarize(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]])
         tested: The returns on each table, by variant.
     """
     pooled = [pool(tables, config.agents) for tables in tested]
-    pooled[0] = corrected(pooled[0])
+    rebalanced = any(len(table.rebalancings) > 1 for table in tested[0].values())
+    pooled[0] = corrected(pooled[0], rebalanced)
     before = [table.trials + trials_on(table.source) for table in config.tables.values()]
     trials = max(before) + len(config.variants) * len(config.agents)
     return Result(
@@ -317,14 +318,21 @@ def looks_of(folder: Path | str) -> list[Look]:
     return [*config.earlier, *config.looks]
 
 
-def corrected(agents: Mapping[str, Pools]) -> dict[str, Pools]:
-    """The pooled evidence with Holm's correction over all agents and references, which decides."""
-    pooled: list[Pooled] = [getattr(agents[name], key) for name in agents for key in AGAINST]
+def corrected(agents: Mapping[str, Pools], rebalanced: bool) -> dict[str, Pools]:
+    """The pooled evidence with Holm's correction over all agents and references, which decides.
+
+    rebalanced: whether the reference has rebalancings; without, there is one comparison an agent.
+    """
+    against = AGAINST if rebalanced else AGAINST[:1]
+    pooled: list[Pooled] = [getattr(agents[name], key) for name in agents for key in against]
     p_holm = holm([1.0 if each.p is None else each.p for each in pooled]).tolist()
-    found = iter([_found(each, p) for each, p in zip(pooled, p_holm, strict=True)])
+    decided = [_found(each, p) for each, p in zip(pooled, p_holm, strict=True)]
+    count = len(against)
     return {
-        name: msgspec.structs.replace(pools, to_reference=next(found), to_rebalanced=next(found))
-        for name, pools in agents.items()
+        name: msgspec.structs.replace(
+            pools, to_reference=decided[count * i], to_rebalanced=decided[count * i + count - 1]
+        )
+        for i, (name, pools) in enumerate(agents.items())
     }
 
 
