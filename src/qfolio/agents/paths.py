@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
-from qfolio.core.market import View
+from qfolio.core.market import SEARCHED, View
 from qfolio.core.mdp import Agent, ExogenousTask, Metrics, Position, Task, Transition
 from qfolio.core.training import episode_steps
 from qfolio.learning.optimizer import CosineSchedule
@@ -123,7 +123,10 @@ class OnPaths(Agent):
         first = jnp.arange(self.rollout_length) == 0
         market, next_market = rollout.state.market, rollout.next_state.market
         moves = (market, next_market, first, rollout.observation.anchor, given)
-        return lax.scan(jax.checkpoint(step), (start,) * len(trades), moves)[1]
+        # The backward pass computes each step again, except for what a projection searched for.
+        kept = jax.checkpoint_policies.save_only_these_names(SEARCHED)
+        again = jax.checkpoint(step, policy=kept)
+        return lax.scan(again, (start,) * len(trades), moves)[1]
 
 
 class Onlooker(OnPaths):

@@ -7,6 +7,12 @@ from jaxtyping import Array, Float
 
 from qfolio.core.mdp import Discrete
 
+SEARCHED = "searched"
+"""Name of what a market finds by a search that has no derivative, such as the limits that bind.
+
+``jax.checkpoint`` can keep it, so that the backward pass need not search again.
+"""
+
 
 class View(NamedTuple):
     """An observation of a market: the features of each asset and the weights held.

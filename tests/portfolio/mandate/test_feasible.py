@@ -71,6 +71,14 @@ def test_what_a_mandate_projects_or_draws_is_allowed(trading):
     np.testing.assert_allclose(again, found, atol=2e-6)
 
 
+def test_no_rounding_makes_a_loan():
+    fully = feasible(settled({"cash": {"max": 0.0}}, "ABCDE"), np.ones(5, bool))
+    wanted = jnp.asarray(np.random.default_rng(0).dirichlet(np.ones(6), 500), jnp.float32)
+    found = jax.jit(jax.vmap(fully.project))(wanted, wanted)
+    assert float(found.min()) > -2e-7
+    assert largest(fully.violations(found)) <= 2e-6
+
+
 def test_small_trades_are_left_out_and_others_made():
     made = mandated(smallest_trade=0.03)
     held = jnp.array([0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.2])

@@ -116,3 +116,14 @@ def test_without_other_limits_it_is_the_capped_simplex():
     wanted = rng.dirichlet(np.ones(4), 50)[:, 1:].astype(np.float32)
     found = jax.vmap(lambda x: nearest(x, x, Limits(*map(jnp.asarray, limits))))(wanted)
     np.testing.assert_array_equal(found, np.minimum(wanted, caps.astype(np.float32)))
+
+
+def test_a_batch_of_batches_is_one_batch():
+    _, stacked = cases(4, short=True, turnover=True)
+    with jax.enable_x64(True):
+        apart = jax.tree.map(lambda x: jnp.asarray(x).reshape(CASES // 3, 3, *x.shape[1:]), stacked)
+        flat = jax.jit(jax.vmap(nearest))(*stacked)
+        twice = jax.jit(jax.vmap(jax.vmap(nearest)))(*apart)
+        alone = nearest(*jax.tree.map(lambda x: jnp.asarray(x[7]), stacked))
+    np.testing.assert_allclose(twice.reshape(CASES, ASSETS), flat, atol=1e-13)
+    np.testing.assert_allclose(alone, flat[7], atol=1e-13)

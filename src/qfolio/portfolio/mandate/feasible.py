@@ -7,11 +7,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jax import lax
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from numpy.typing import NDArray
 
 from qfolio.core import simplex
-from qfolio.portfolio.mandate.projection import Limits, excess, nearest
+from qfolio.core.market import SEARCHED
+from qfolio.portfolio.mandate.projection import (
+    Limits,
+    approximate,
+    excess,
+    nearest,
+    search,
+    solution,
+)
+
+Multipliers = Float[Array, " condition"]
+
+ROUNDS = 3
+"""Projections of which each leaves what changed little in the one before."""
 
 BARELY = 5e-6
 """Excesses of a limit up to this are rounding errors in float32."""
@@ -108,66 +123,65 @@ class Mandated(Feasible):
         self, wanted: Float[Array, " entry"], held: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
         aim, now, limits = wanted[1:], held[1:], self.limits
-        weights = nearest(aim, now, limits)
         if self.holdings and self.holdings < len(aim):
-            weights, limits = self._fewer(aim, now, weights)
+            limits = self._fewer(aim, now)
         if self.smallest_trade:
-            weights = self._without_small(aim, now, weights, limits)
+            found, left = checkpoint_name(self._without_small(aim, now, limits), SEARCHED)
+            limits = _fixed(limits, left, now)
+        else:
+            found = checkpoint_name(search(aim, now, limits), SEARCHED)
+        weights = solution(found, aim, now, limits)
+        if self.long:  # rounding may leave no cash, and less
+            weights /= jnp.maximum(weights.sum(), 1.0)
         return simplex.with_rest(weights)
 
-    def _fewer(
-        self,
-        wanted: Float[Array, " asset"],
-        held: Float[Array, " asset"],
-        weights: Float[Array, " asset"],
-    ) -> tuple[Float[Array, " asset"], Limits]:
-        """The nearest weights with the largest alone, and the limits that keep it so.
+    def _fewer(self, wanted: Float[Array, " asset"], held: Float[Array, " asset"]) -> Limits:
+        """Limits that keep all but the largest weights at 0.
 
-        If they need more turnover than there may be, those with what is held alone.
+        If these need more turnover than there may be, the largest with what is held.
         """
 
         def only(size: Array) -> tuple[Array, Limits]:
-            _, kept = jax.lax.top_k(abs(size) + self._needed(size), self.holdings)
+            _, kept = lax.top_k(abs(size) + self._needed(size), self.holdings)
             others = jnp.ones(len(wanted), bool).at[kept].set(False)
             limits = _fixed(self.limits, others, jnp.zeros_like(wanted))
-            return nearest(wanted, held, limits), limits
+            return excess(nearest(wanted, held, limits), held, limits).max(), limits
 
-        largest, as_held = only(weights), only(held)
-        over, over_as_held = (
-            excess(found, held, limits).max() for found, limits in (largest, as_held)
-        )
-        better = (over <= BARELY) | (over <= over_as_held)
-        return jax.tree.map(lambda one, other: jnp.where(better, one, other), largest, as_held)
+        sizes = jnp.stack([nearest(wanted, held, self.limits), held])
+        (over, over_as_held), limits = jax.vmap(only)(lax.stop_gradient(sizes))
+        as_held = (over > BARELY) & (over > over_as_held)
+        return jax.tree.map(lambda x: jnp.where(as_held, x[1], x[0]), limits)
 
     def _without_small(
-        self,
-        wanted: Float[Array, " asset"],
-        held: Float[Array, " asset"],
-        weights: Float[Array, " asset"],
-        limits: Limits,
-    ) -> Float[Array, " asset"]:
-        """The weights, with what changes little left as it is held.
+        self, wanted: Float[Array, " asset"], held: Float[Array, " asset"], limits: Limits
+    ) -> tuple[Multipliers, Bool[Array, " asset"]]:
+        """What stays as it is held because it changes little, and the multipliers of the order.
 
         The others take what that leaves over; if it makes their changes too small as well, nothing
         is traded.
         """
         can_stay = (held >= limits.low) & (held <= limits.high)
 
-        def small(weights: Array) -> Array:
-            return can_stay & (abs(weights - held) < self.smallest_trade - BARELY)
+        def small(found: Multipliers, limits: Limits) -> Array:
+            change = approximate(found, wanted, held, limits) - held
+            return can_stay & (abs(change) < self.smallest_trade - BARELY)
 
-        left = small(weights)
-        once = nearest(wanted, held, _fixed(limits, left, held))
-        left |= small(once)
-        fewer = nearest(wanted, held, _fixed(limits, left, held))
+        def leave(before: tuple[Array, Multipliers], _: None) -> tuple[tuple, tuple]:
+            left, found = before
+            fewer = _fixed(limits, left, held)
+            found = search(wanted, held, fewer, found)
+            return (left | small(found, fewer), found), before
 
-        def allowed(weights: Array) -> Array:
-            return excess(weights, held, limits).max() <= BARELY
-
-        fits = allowed(fewer) & ~(small(fewer) & ~left).any()
+        nothing = jnp.zeros(limits.most.shape[0] + 2)
+        none = jnp.zeros_like(can_stay)
+        (left, found), (lefts, founds) = lax.scan(leave, (none, nothing), None, ROUNDS)
+        fewer = _fixed(limits, lefts[-1], held)
+        fits = excess(approximate(found, wanted, held, fewer), held, limits).max() <= BARELY
+        fits &= (left == lefts[-1]).all()
         now = jnp.append(1 - held.sum(), held)
         may_stay = jnp.stack(list(self.violations(now).values())).max() <= BARELY
-        return jnp.where(fits, fewer, jnp.where(may_stay, held, weights))
+        otherwise = _choose(may_stay, (nothing, ~none), (founds[1], none))
+        return _choose(fits, (found, lefts[-1]), otherwise)
 
     def _needed(self, weights: Float[Array, " asset"]) -> Float[Array, " asset"]:
         """Which assets are kept first: those with a floor, then the largest weights of each group
@@ -222,6 +236,10 @@ def exactly(
 @eqx.filter_jit
 def _projected(feasible: Feasible, wanted: Any, held: Any) -> Array:
     return feasible.project(jnp.asarray(wanted), jnp.asarray(held))
+
+
+def _choose(first: Bool[Array, ""], one: PyTree, other: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)
 
 
 def _fixed(limits: Limits, which: Bool[Array, " asset"], to: Float[Array, " asset"]) -> Limits:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float
 
 from qfolio.core import symmetric
@@ -21,7 +22,9 @@ LARGEST, OF_TURNOVER = 100.0, 10.0
 it, turnover is exceeded by as little as they require (an exact penalty)."""
 
 ITERATIONS = 60
-HALVINGS = 16
+LENGTHS, SHORTENING = 8, 4.0
+"""Steps are tried at so many lengths, each a quarter of the one before."""
+
 LONGEST = 4.0
 ROUNDING = 16
 """Excesses up to this many times the precision of a number count as none."""
@@ -38,6 +41,14 @@ class Limits(NamedTuple):
     turnover: Any  # ()
 
 
+class _Found(NamedTuple):
+    """Where a search is."""
+
+    multipliers: Array
+    value: Array
+    error: Array
+
+
 def nearest(
     wanted: Float[Array, " asset"], held: Float[Array, " asset"], limits: Limits
 ) -> Float[Array, " asset"]:
@@ -46,78 +57,122 @@ def nearest(
     Weights within the limits are returned unchanged. Differentiable almost everywhere in ``wanted``
     and ``held``.
     """
-    limits = Limits(*(jnp.asarray(x, wanted.dtype) for x in limits))
-    fixed, now, given = lax.stop_gradient((wanted, held, limits))
+    return solution(search(wanted, held, limits), wanted, held, limits)
+
+
+def search(
+    wanted: Float[Array, " asset"],
+    held: Float[Array, " asset"],
+    limits: Limits,
+    start: Float[Array, " condition"] | None = None,
+) -> Float[Array, " condition"]:
+    """The multipliers of ``nearest``, without derivatives.
+
+    start: multipliers to search from, such as those of limits that differ little (default: 0).
+    """
+    limits = _arrays(limits, wanted)
+    start = jnp.zeros(limits.most.shape[0] + 2, wanted.dtype) if start is None else start
+    given = lax.stop_gradient((wanted, held, limits, start))
+    return lax.stop_gradient(_search(*(jax.tree.map(lambda x: x[..., None], given)))[..., 0])
+
+
+@custom_vmap
+def _search(
+    wanted: Float[Array, "asset path"],
+    held: Float[Array, "asset path"],
+    limits: Limits,
+    start: Float[Array, "condition path"],
+) -> Float[Array, "condition path"]:
+    """As ``search``, with a last axis of paths, which the processor takes side by side."""
     largest = _largest(limits)
     accuracy = ROUNDING * jnp.finfo(wanted.dtype).eps
 
-    def error_of(multipliers: Array) -> Array:
-        """How far the multipliers are from the conditions of the maximum."""
-        over = excess(_weights(multipliers, fixed, now, given), now, given)
-        return abs(multipliers - jnp.clip(multipliers + over, 0.0, largest)).max()
+    def value(multipliers: Array) -> tuple[Array, Array]:
+        """What is maximised, and how far the multipliers are from the maximum's conditions."""
+        weights = approximate(multipliers, wanted, held, limits)
+        over = excess(weights, held, limits)
+        worth = ((weights - wanted) ** 2).sum(0) / 2 + (multipliers * over).sum(0)
+        return worth, _error(multipliers, over, largest)
 
-    def value(multipliers: Array) -> Array:
-        weights = _weights(multipliers, fixed, now, given)
-        return ((weights - fixed) ** 2).sum() / 2 + multipliers @ excess(weights, now, given)
+    def improve(found: _Found) -> _Found:
+        system, over = _newton(found.multipliers, wanted, held, limits)
+        direction = _bounded(symmetric.eliminate(system, over[:, None])[:, 0])
 
-    lengths = 2.0 ** -jnp.arange(HALVINGS, dtype=wanted.dtype)
+        def at(length: Array) -> _Found:
+            tried = jnp.clip(found.multipliers + length * direction, 0.0, largest)
+            return _Found(tried, *value(tried))
 
-    def improve(search: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        step, multipliers, error = search
-        direction = _newton(multipliers, fixed, now, given)
-        tried = jnp.clip(multipliers + lengths[:, None] * direction, 0.0, largest)
-        values, errors = jax.vmap(value)(tried), jax.vmap(error_of)(tried)
+        def better(i: Array, best: _Found) -> _Found:
+            tried = at(SHORTENING**-i)
+            return _choose(tried.value > best.value, tried, best)
+
+        whole = at(jnp.array(1.0))
         # Near the maximum the differences of values are rounding errors, and errors tell more.
-        as_good = values[0] >= value(multipliers) - accuracy
-        chosen = jnp.where(as_good & (errors[0] <= error / 2), 0, values.argmax())
-        return step + 1, tried[chosen], errors[chosen]
+        well = (whole.value >= found.value - accuracy) & (whole.error <= found.error / 2)
+        kept = well | (found.error <= accuracy)
+        others = jnp.where(kept.all(), 1, LENGTHS)
+        best = _choose(well, whole, lax.fori_loop(1, others, better, whole))
+        return _choose(found.error <= accuracy, found, best)
 
-    def going(search: tuple[Array, Array, Array]) -> Array:
-        step, _, error = search
-        return (step < ITERATIONS) & (error > accuracy)
+    def going(search: tuple[Array, _Found]) -> Array:
+        step, found = search
+        return (step < ITERATIONS) & (found.error > accuracy).any()
 
-    start = jnp.zeros(limits.most.shape[0] + 2, wanted.dtype)
-    begin = (jnp.array(0, jnp.int32), start, error_of(start))
-    _, found, error = lax.stop_gradient(lax.while_loop(going, improve, begin))
-    step = _newton(found, wanted, held, limits)
+    begin = jnp.array(0, jnp.int32), _Found(start, *value(start))
+    step = lambda search: (search[0] + 1, improve(search[1]))  # noqa: E731
+    return lax.while_loop(going, step, begin)[1].multipliers
+
+
+@_search.def_vmap
+def _search_many(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
+    """One batch of all paths."""
+    paths = given[0].shape[-1]
+
+    def joined(x: Array, batched: bool) -> Array:
+        every = x if batched else jnp.broadcast_to(x, (size, *x.shape))
+        return jnp.moveaxis(every, 0, -2).reshape(*every.shape[1:-1], size * paths)
+
+    found = _search(*jax.tree.map(joined, given, tuple(batched)))
+    return jnp.moveaxis(found.reshape(-1, size, paths), 1, 0), True
+
+
+def solution(
+    multipliers: Float[Array, " condition"],
+    wanted: Float[Array, " asset"],
+    held: Float[Array, " asset"],
+    limits: Limits,
+) -> Float[Array, " asset"]:
+    """The weights that belong to the multipliers found, with derivatives."""
+    limits = _arrays(limits, wanted)
+    system, over = _newton(multipliers, wanted, held, limits)
+    step = _bounded(symmetric.solve(system, over[:, None])[:, 0])
     last = lax.stop_gradient(step)
+
+    def error_of(multipliers: Array) -> Array:
+        over = excess(approximate(multipliers, wanted, held, limits), held, limits)
+        return _error(multipliers, over, _largest(limits))
+
     # One more step rounds better, unless it has no length; its derivative counts in any case.
-    better = error_of(found + last) < error
-    return _weights(found + jnp.where(better, 0.0, -last) + step, wanted, held, limits)
+    better = lax.stop_gradient(error_of(multipliers + last) < error_of(multipliers))
+    return approximate(multipliers + jnp.where(better, 0.0, -last) + step, wanted, held, limits)
 
 
-def _largest(limits: Limits) -> Array:
-    rows = jnp.full(limits.most.shape[0] + 1, LARGEST, limits.most.dtype)
-    return jnp.append(rows, OF_TURNOVER)
+# Arrays of the functions below may have further axes behind those named.
 
 
-def _newton(multipliers: Array, wanted: Array, held: Array, limits: Limits) -> Array:
-    """The step to the maximum, if no asset and no multiplier left its piece on the way."""
-    weights = _weights(multipliers, wanted, held, limits)
-    over = excess(weights, held, limits)
-    fixed, at, bounds = lax.stop_gradient((weights, over, limits))
-    kinked = jnp.where(multipliers[-2] > 0, fixed == 0, False)
-    kinked |= jnp.where(multipliers[-1] > 0, fixed == lax.stop_gradient(held), False)
-    free = (fixed > bounds.low) & (fixed < bounds.high) & ~kinked
-    signs = jnp.stack([jnp.sign(fixed), jnp.sign(fixed - lax.stop_gradient(held))])
-    slopes = jnp.where(free, jnp.concatenate([bounds.rows, signs]), 0.0)
-    precision = jnp.finfo(fixed.dtype).eps
-    over_all = at > ROUNDING * precision
-    moving = jnp.where(multipliers > 0, (multipliers < _largest(limits)) | ~over_all, over_all)
-    slopes = jnp.where(moving[:, None], slopes, 0.0)
-    system = slopes @ slopes.T
-    ridge = 100 * precision * jnp.maximum(jnp.diagonal(system).max(), 1.0)
-    system += jnp.diag(jnp.where(moving, ridge, 1.0))
-    step = symmetric.solve(system, jnp.where(moving, over, 0.0)[:, None])[:, 0]
-    # If no asset is free, the step has no length; weights differ by 1.
-    return step / jnp.maximum(lax.stop_gradient(abs(step).max()) / LONGEST, 1.0)
+def approximate(
+    multipliers: Float[Array, "condition *path"],
+    wanted: Float[Array, "asset *path"],
+    held: Float[Array, "asset *path"],
+    limits: Limits,
+) -> Float[Array, "asset *path"]:
+    """The weights for given multipliers, as exact as these are.
 
-
-def _weights(multipliers: Array, wanted: Array, held: Array, limits: Limits) -> Array:
-    """The weights for given multipliers: the minimum of
-    ½(w − v)² + gross·|w| + turnover·|w − held| between the bounds, where v = wanted − rows'·λ."""
+    They are the minimum of ½(w − v)² + gross·|w| + turnover·|w − held| between the bounds, where
+    v = wanted − rows'·λ.
+    """
     *_, gross, turnover = multipliers
-    centre = wanted - multipliers[:-2] @ limits.rows
+    centre = wanted - (multipliers[:-2, None] * limits.rows).sum(0)
     short = held < 0
     first, second = jnp.where(short, held, 0.0), jnp.where(short, 0.0, held)
     at_first = jnp.where(short, turnover, gross)
@@ -129,12 +184,58 @@ def _weights(multipliers: Array, wanted: Array, held: Array, limits: Limits) -> 
 
 
 def excess(
-    weights: Float[Array, " asset"], held: Float[Array, " asset"], limits: Limits
-) -> Float[Array, " condition"]:
+    weights: Float[Array, "asset *path"], held: Float[Array, "asset *path"], limits: Limits
+) -> Float[Array, "condition *path"]:
     """By how much each condition is exceeded; −1 for one that does not apply."""
-    long = abs(weights).sum()
-    change = abs(weights - held).sum()
-    over = jnp.append(limits.rows @ weights, jnp.stack([long, change]))
-    most = jnp.append(limits.most, jnp.stack([limits.gross, limits.turnover]))
+    long, change = abs(weights).sum(0), abs(weights - held).sum(0)
+    over = jnp.concatenate([(limits.rows * weights).sum(1), jnp.stack([long, change])])
+    most = jnp.concatenate([limits.most, jnp.stack([limits.gross, limits.turnover])])
     applies = jnp.isfinite(most)
     return jnp.where(applies, over - jnp.where(applies, most, 0.0), -1.0)
+
+
+def _newton(
+    multipliers: Array, wanted: Array, held: Array, limits: Limits
+) -> tuple[Float[Array, "condition condition *path"], Float[Array, "condition *path"]]:
+    """The equations of the step to the maximum, if no asset and no multiplier left its piece on
+    the way."""
+    weights = approximate(multipliers, wanted, held, limits)
+    over = excess(weights, held, limits)
+    fixed, at, bounds = lax.stop_gradient((weights, over, limits))
+    kinked = jnp.where(multipliers[-2] > 0, fixed == 0, False)
+    kinked |= jnp.where(multipliers[-1] > 0, fixed == lax.stop_gradient(held), False)
+    free = (fixed > bounds.low) & (fixed < bounds.high) & ~kinked
+    signs = jnp.stack([jnp.sign(fixed), jnp.sign(fixed - lax.stop_gradient(held))])
+    slopes = jnp.where(free, jnp.concatenate([bounds.rows, signs]), 0.0)
+    precision = jnp.finfo(fixed.dtype).eps
+    over_all = at > ROUNDING * precision
+    moving = jnp.where(multipliers > 0, (multipliers < _largest(limits)) | ~over_all, over_all)
+    slopes = jnp.where(moving[:, None], slopes, 0.0)
+    squares = (slopes**2).sum(1)
+    ridge = jnp.where(moving, 100 * precision * jnp.maximum(squares.max(0), 1.0), 1.0)
+    one = jnp.expand_dims(jnp.eye(len(ridge), dtype=fixed.dtype), range(2, 1 + ridge.ndim))
+    system = (slopes[:, None] * slopes).sum(2) + one * ridge
+    return system, jnp.where(moving, over, 0.0)
+
+
+def _bounded(step: Array) -> Array:
+    """If no asset is free, the step has no length; weights differ by 1."""
+    return step / jnp.maximum(lax.stop_gradient(abs(step).max(0)) / LONGEST, 1.0)
+
+
+def _error(multipliers: Array, over: Array, largest: Array) -> Array:
+    """How far multipliers with these excesses are from the conditions of the maximum."""
+    return abs(multipliers - jnp.clip(multipliers + over, 0.0, largest)).max(0)
+
+
+def _largest(limits: Limits) -> Array:
+    most = jnp.concatenate([limits.most, jnp.stack([limits.gross, limits.turnover])])
+    return jnp.full_like(most, LARGEST).at[-1].set(OF_TURNOVER)
+
+
+def _arrays(limits: Limits, like: Array) -> Limits:
+    return Limits(*(jnp.asarray(x, like.dtype) for x in limits))
+
+
+def _choose(first: Array, one: _Found, other: _Found) -> _Found:
+    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)

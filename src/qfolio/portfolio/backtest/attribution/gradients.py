@@ -109,7 +109,8 @@ def integrated(
             return jax.vmap(slope)(places).mean(0)
 
         pulls = lax.map(pull, jnp.arange(features.shape[-1]))
-        return pulls, features[:, -1], targets(features) - targets(0 * features)
+        end, start = jax.vmap(targets)(jnp.stack([features, 0 * features]))
+        return pulls, features[:, -1], end - start
 
     found: tuple[Array, Array, Array] = lax.map(day, (rows, held))
     return found
