@@ -17,9 +17,9 @@ demo: .venv/installed
 test: .venv/installed-dev
 	$(BIN)/pytest -n 2 --dist loadfile -m "not slow"
 
-# All tests, also those that learn for long, with programs optimised as users have them.
-test-all: .venv/installed-dev
-	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile
+# All tests: those that learn for long follow, with programs optimized as users have them.
+test-all: test
+	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile -m slow
 
 check: .venv/installed-dev
 	$(BIN)/ruff format --check
