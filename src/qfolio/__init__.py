@@ -5,6 +5,7 @@
 >>> agents = {"tilts": qfolio.preset("fast", "portfolio", "tilts")}
 >>> backtest = qfolio.Backtest.create(prices, agents, out="runs/mine")
 >>> backtest.run()
+>>> qfolio.finish(backtest)
 >>> backtest.policy().weights(prices)
 
 >>> run = qfolio.train(qfolio.Pendulum(), qfolio.DQN(), episodes=200, seeds=8)
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from qfolio.portfolio.prices.table import load as load_prices  # noqa: F401
     from qfolio.portfolio.study.run import Study as Study
     from qfolio.portfolio.task import Portfolio as Portfolio
+    from qfolio.report.backtest.finish import finish as finish
     from qfolio.tasks.finite import FiniteMDP as FiniteMDP
     from qfolio.tasks.pendulum import Pendulum as Pendulum
 
@@ -68,6 +70,7 @@ _HOMES = {
     "TD3": "qfolio.agents.td3:TD3",
     "Tilts": "qfolio.agents.tilts:Tilts",
     "Tracker": "qfolio.experiments.log:Tracker",
+    "finish": "qfolio.report.backtest.finish:finish",
     "load_prices": "qfolio.portfolio.prices.table:load",
     "on": "qfolio.experiments.machines.choice:on",
     "preset": "qfolio.experiments.presets:preset",

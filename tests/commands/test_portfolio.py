@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.report.backtest.finish import finish
 
 from shell import qfolio
 from tables import write_table
@@ -35,6 +37,25 @@ def test_a_backtest_shows_itself_in_a_notebook(folder):
     growth = measures["equal-weight"]["measures"]["growth"]["mean"]
     assert f"<td>equal-weight</td><td>{100 * growth:.1f} %</td>" in shown
     assert "equal-weight at" not in shown  # the other speeds of rebalancing
+
+
+def test_python_finishes_a_backtest_as_the_command_does(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    written = {"returns.csv", "weights.csv", "summary.json", "why.json", "wealth.png"}
+    for name in ("report.html", *written):
+        (copy / name).unlink()
+    found = finish(Backtest.open(copy))
+    assert (copy / "report.html").is_file()
+    for name in written:
+        assert (copy / name).read_bytes() == (folder / name).read_bytes(), name
+    assert "pathwise" in found.assessment.strategies
+    assert set(found.entries) == set(found.assessment.strategies)
+    kept = Backtest.open(folder)
+    without = Backtest.create(
+        kept.prices, {"tilts": preset("fast", "portfolio", "tilts")}, train="100d", test="50d"
+    )
+    with pytest.raises(QfolioError, match=r"no folder to write to; create it with out="):
+        finish(without)
 
 
 def test_resuming_a_finished_backtest_reports_again(folder, monkeypatch, capsys):

@@ -26,10 +26,6 @@ from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
     from qfolio.experiments.presets import Preset
-    from qfolio.portfolio.backtest.assessment import Assessment
-    from qfolio.portfolio.backtest.attribution.why import Why
-    from qfolio.portfolio.backtest.replay import Entry
-    from qfolio.portfolio.backtest.run import Backtest
 
 BASIS_POINT = 1e-4
 
@@ -161,21 +157,6 @@ def basis_points(option: str, value: float) -> float:
     if not 0 <= value <= 2000:
         raise QfolioError(f"{option} is {value:g}; it must be from 0 to 2000.")
     return value * BASIS_POINT
-
-
-def write_report(
-    run: "Backtest",
-    entries: "dict[str, Entry]",
-    assessment: "Assessment",
-    notes: list[str],
-    why: "Why | None",
-) -> None:
-    """Writes the report of a backtest into its folder."""
-    from qfolio.report.backtest.page import write_backtest_report
-    from qfolio.report.collect import backtest_data
-
-    assert run.folder is not None
-    write_backtest_report(run.folder, backtest_data(run, entries, assessment, notes, why))
 
 
 def _split(text: str) -> dict[str, str]:

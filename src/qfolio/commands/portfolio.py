@@ -5,7 +5,7 @@ import dataclasses
 from tyro.conf import Positional
 
 from qfolio.commands.arguments import File, Name, again
-from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points, write_report
+from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points
 from qfolio.commands.parsing import PAGE, Document, Failed, outcome
 from qfolio.commands.tables import READING, Read
 from qfolio.core import registry
@@ -67,9 +67,8 @@ def backtest(
     from qfolio.core.files import read_json
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
-    from qfolio.portfolio.backtest.attribution.explain import explain
-    from qfolio.portfolio.backtest.results import write_tables
     from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.report.backtest.finish import finish
 
     executor, following = on(options.on), trackers(options.track)
     if options.resume is None:
@@ -98,13 +97,9 @@ def backtest(
     if run.interrupted:
         stop(again("qfolio backtest --resume", folder, *run.parts, on=options.on))
     with console.console.status("Replaying all strategies, drawing histories, writing the report"):
-        entries, notes = run.entries()
-        assessment = run.assess(entries)
-        why = explain(run, entries)
-        write_tables(run, entries, assessment, why)
-        write_report(run, entries, assessment, notes, why)
-    console.print_assessment(assessment)
-    for sentences in why.diagnosis.values():
+        found = finish(run)
+    console.print_assessment(found.assessment)
+    for sentences in found.why.diagnosis.values():
         for sentence in sentences:
             console.say(f"Diagnosis: {sentence}")
     console.say(f"Report: {folder / PAGE}")

@@ -62,17 +62,17 @@ def _kind(folder: Path) -> str:
 
 
 def _backtest(folder: Path) -> None:
-    from qfolio.commands.backtesting import write_report
     from qfolio.portfolio.backtest.attribution.explain import explain
     from qfolio.portfolio.backtest.attribution.why import Why
     from qfolio.portfolio.backtest.folder import BacktestFolder
     from qfolio.portfolio.backtest.run import Backtest
+    from qfolio.report.backtest.finish import write_page
 
     run = Backtest.open(folder)
     entries, notes = run.entries()
     known = (folder / "why.json").is_file()
     why = Why.read(BacktestFolder(folder).read_why()) if known else explain(run, entries)
-    write_report(run, entries, run.assess(entries), notes, why)
+    write_page(run, entries, run.assess(entries), notes, why)
 
 
 def _study(folder: Path) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from qfolio.commands.arguments import again
-from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points, write_report
+from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
@@ -57,6 +57,7 @@ def study(
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.study.run import Study
+    from qfolio.report.backtest.finish import write_page
     from qfolio.report.study import write_study_report
 
     executor, following = on(options.on), trackers(options.track)
@@ -86,7 +87,7 @@ def study(
             console.say(f"{place} of {len(run.places)}: {table}, {console.spell(variant)}")
             return JobsProgress(update)
 
-        run.run(listen, write_report, executor)
+        run.run(listen, write_page, executor)
     if run.interrupted:
         parts = run.backtest(next(iter(run.config.tables))).parts
         stop(again("qfolio study --resume", run.folder, *parts, on=options.on))

@@ -1,0 +1,55 @@
+"""The end of a backtest: what it found, in its folder."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.assessment import Assessment
+from qfolio.portfolio.backtest.attribution.explain import explain
+from qfolio.portfolio.backtest.attribution.why import Why
+from qfolio.portfolio.backtest.replay import Entry
+from qfolio.portfolio.backtest.results import write_tables
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.report.backtest.page import write_backtest_report
+from qfolio.report.collect import backtest_data
+
+
+class Finished(NamedTuple):
+    """What a backtest found."""
+
+    entries: dict[str, Entry]  # the replay of each strategy
+    assessment: Assessment  # their statistics and verdicts
+    why: Why  # what explains the agents
+
+
+def finish(backtest: Backtest) -> Finished:
+    """Replay all strategies, and write what ``qfolio backtest`` leaves in its folder.
+
+    These are returns.csv, weights.csv, summary.json, which ``qfolio allocate`` reads, why.json and
+    the report.
+
+    Raises:
+        QfolioError: The backtest has no folder.
+    """
+    if backtest.folder is None:
+        raise QfolioError("The backtest has no folder to write to; create it with out=FOLDER.")
+    entries, notes = backtest.entries()
+    assessment = backtest.assess(entries)
+    why = explain(backtest, entries)
+    write_tables(backtest, entries, assessment, why)
+    write_page(backtest, entries, assessment, notes, why)
+    return Finished(entries, assessment, why)
+
+
+def write_page(
+    backtest: Backtest,
+    entries: dict[str, Entry],
+    assessment: Assessment,
+    notes: list[str],
+    why: Why | None,
+) -> None:
+    """Write the report into the backtest's folder."""
+    assert backtest.folder is not None
+    data = backtest_data(backtest, entries, assessment, notes, why)
+    write_backtest_report(backtest.folder, data)
