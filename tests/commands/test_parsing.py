@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Annotated, get_args
 
 import pytest
+from rich.console import Console
 from tyro.conf import Positional
 
 import qfolio
 from qfolio.cli import commands
+from qfolio.commands import console
 from qfolio.commands.parsing import Document, Failed, description, example, grouped
 
 from shell import qfolio as typed
@@ -162,3 +164,15 @@ def test_bash_completes_commands_and_options(monkeypatch, tmp_path):
         )
         found = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=True)
         assert completed in found.stdout.split()
+
+
+def test_a_narrow_terminal_folds_names_and_cuts_no_number(monkeypatch, capsys):
+    narrow = Console(width=50, force_terminal=True, color_system=None)
+    monkeypatch.setattr(console, "console", narrow)
+    with narrow.capture() as shown:
+        console.print_table(("", "growth", "drawdown"), [("a-name-" * 8, "−23.64%", "88.0%")])
+    printed = shown.get()
+    assert "−23.64%" in printed
+    assert "…" not in printed
+    console.tell("A sentence with words that are longer than the terminal is wide, by far.")
+    assert capsys.readouterr().out.split("\n")[0].endswith(" longer than the")

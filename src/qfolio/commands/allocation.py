@@ -146,8 +146,8 @@ def allocate(
         trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
     console.print_allocation(allocation, standing, trained)
     for reason in why:
-        console.say(f"Why {sentence(reason)}")
-    console.say(said)
+        console.tell(f"Why {sentence(reason)}")
+    console.tell(said)
     return {
         "agent": name,
         "trained_until": trained,

@@ -207,4 +207,4 @@ def _print_ranking(content: dict[str, Any]) -> None:
         rows.append((name, *(cell.replace(" %", "%") for cell in cells)))
     console.print_table(heads, rows)
     for sentence in [*content["conclusion"], *content["notes"]]:
-        console.say(sentence)
+        console.tell(sentence)

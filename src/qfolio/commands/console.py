@@ -4,6 +4,7 @@ import contextlib
 import math
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal
 
 import rich.progress
@@ -36,6 +37,13 @@ console = Console(highlight=False)
 def say(text: str) -> None:
     """Prints lines; control characters are escaped."""
     print("\n".join(map(printable, text.split("\n"))), flush=True)
+
+
+def tell(sentences: str) -> None:
+    """Prints sentences; a terminal breaks them between words."""
+    if console.is_terminal:
+        sentences = fill(sentences, console.width, break_long_words=False, break_on_hyphens=False)
+    say(sentences)
 
 
 @contextlib.contextmanager
@@ -72,7 +80,10 @@ def print_table(
     table = Table(box=None, header_style="bold", pad_edge=False)
     for i, head in enumerate(heads):
         side: Literal["left", "right"] = "right" if i else "left"
-        table.add_column(Text(printable(head)), justify=side, no_wrap=True, min_width=width)
+        # On a narrow terminal names are folded, so that no digit is cut off.
+        whole = i > 0
+        name = Text(printable(head))
+        table.add_column(name, justify=side, no_wrap=whole, overflow="fold", min_width=width)
     for row in rows:
         cells = (Text(printable(cell)) for cell in row)
         table.add_row(*cells, style="bold" if row[0] in bold else None)
@@ -145,7 +156,7 @@ def print_findings(findings: "list[Finding]") -> None:
     """The findings on a price table, errors first, then warnings and notes."""
     severities = ("error", "warning", "note")
     for finding in sorted(findings, key=lambda finding: severities.index(finding.severity)):
-        say(f"{finding.severity}: {finding}. {finding.advice}".rstrip())
+        tell(f"{finding.severity}: {finding}. {finding.advice}".rstrip())
     if findings:
         counts = (sum(f.count for f in findings if f.severity == kind) for kind in severities)
         said = (amount(n, kind) for n, kind in zip(counts, severities, strict=True))
@@ -191,7 +202,7 @@ def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
         say(f"optimum {figure(summary['optimum'], '.2f'):>9}   ({seeds}, graded starts)")
     say("")
     for sentence in verdicts:
-        say(sentence)
+        tell(sentence)
 
 
 def describe_backtest(backtest: "Backtest") -> str:
@@ -234,10 +245,10 @@ def print_assessment(assessment: "Assessment") -> None:
     )
     _print_relative(assessment)
     if bound := bound_sentence(assessment):
-        say(bound)
+        tell(bound)
     for sentences in verdicts(assessment).values():
         for sentence in sentences:
-            say(sentence)
+            tell(sentence)
 
 
 def _print_relative(assessment: "Assessment") -> None:
@@ -306,8 +317,8 @@ def print_study(result: "Result") -> None:
     )
     for sentences in result.verdicts.values():
         for sentence in sentences:
-            say(sentence)
-    say(looks_sentence(result))
+            tell(sentence)
+    tell(looks_sentence(result))
 
 
 def _pooled(variant: "Variant") -> str:
@@ -331,7 +342,7 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
     if standing.worse:
         console.print(Text(f"WARNING. {printable(found)}", style="bold red"))
     else:
-        say(found)
+        tell(found)
     heads = ("asset", "price", "weight now", "target", "after", "trade, money", "trade, shares")
     rows: list[tuple[str, ...]] = []
     held, targets, after = allocation.held, allocation.weights, allocation.reached
@@ -367,4 +378,4 @@ def print_following(following: "Following") -> None:
         if sentence.startswith("ALARM"):
             console.print(Text(printable(sentence), style="bold red"))
         else:
-            say(sentence)
+            tell(sentence)

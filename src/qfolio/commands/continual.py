@@ -99,7 +99,7 @@ def continual(
         stop(f"qfolio continual --resume {folder}")
     write_continual_report(folder, content)
     _print_ways(content)
-    console.say(verdict(content))
+    console.tell(verdict(content))
     console.say(f"Report: {folder / PAGE}")
     return outcome(folder, content)
 

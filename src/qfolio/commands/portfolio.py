@@ -101,6 +101,6 @@ def backtest(
     console.print_assessment(found.assessment)
     for sentences in found.why.diagnosis.values():
         for sentence in sentences:
-            console.say(f"Diagnosis: {sentence}")
+            console.tell(f"Diagnosis: {sentence}")
     console.say(f"Report: {folder / PAGE}")
     return outcome(folder, read_json(folder / "summary.json"))
