@@ -119,6 +119,7 @@ def test_orders_through_zero_are_two_where_brokers_tell_short_sales():
     with pytest.raises(QfolioError, match="An order at Schwab has whole shares"):
         order_rows(allocation, "schwab", "USD")
     whole = plan([0.9, -0.2, 0.3], [5, -1], 1000, cost=0.0, whole_shares=True)
+    assert [str(row[1]) for row in order_rows(whole, "alpaca", "USD")[1]] == ["5", "10", "1", "8"]
     header, rows = order_rows(whole, "schwab", "USD")
     assert header[2:4] == ["instruction", "quantity"]
     assert [row[:4] for row in rows] == [

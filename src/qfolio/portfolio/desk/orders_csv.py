@@ -131,7 +131,7 @@ def _orders(allocation: Allocation) -> list[tuple[int, str, float]]:
         size = math.floor(abs(trade) * scale + 1e-3) / scale
         if size:
             side = "BUY" if trade > 0 else "SELL"
-            found.append((i, side, int(size) if size == int(size) else size))
+            found.append((i, side, _number(size)))
     sales = [order for order in found if order[1] == "SELL"]
     return sales + [order for order in found if order[1] == "BUY"]
 
@@ -147,5 +147,10 @@ def _legs(allocation: Allocation) -> list[tuple[int, str, float]]:
         closed = min(quantity, max(held if side == "SELL" else -held, 0.0))
         first, then = ("SELL", "SELL_SHORT") if side == "SELL" else ("BUY_TO_COVER", "BUY")
         sizes = ((first, closed), (then, round(quantity - closed, DIGITS)))
-        found += [(i, name, size) for name, size in sizes if size]
+        found += [(i, name, _number(size)) for name, size in sizes if size]
     return found
+
+
+def _number(shares: float) -> float:
+    """A whole number of shares without a decimal point."""
+    return int(shares) if shares == int(shares) else shares
