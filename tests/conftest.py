@@ -1,7 +1,7 @@
 """Types are checked in every test: shapes by jaxtyping, the rest by beartype.
 
-Compiling takes most of a test's time, so programs are hardly optimized here; the slow
-tests of ``make test-all`` run them as users do (QFOLIO_TEST_OPTIMIZED=1).
+Compiling takes most of a test's time, so programs are hardly optimized here; ``make test-all`` runs
+the slow tests with programs as users have them (QFOLIO_TEST_OPTIMIZED=1).
 """
 
 import ctypes
