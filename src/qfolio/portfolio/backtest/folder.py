@@ -1,8 +1,7 @@
 """The folder of a backtest.
 
 It holds config.json (settings, written once), prices.safetensors (the table, which may have grown
-since),
-strategies.safetensors (the user's own strategies, if there are any),
+since), strategies.safetensors (the user's own strategies, if there are any),
 policies/AGENT/FOLD.safetensors (weights, written as soon as a group of folds is trained; for the
 latest policy, the whole learning state, with latest-N.safetensors after its Nth update),
 training/AGENT/FOLD.csv (a row for each training episode) and, at the end, returns.csv, weights.csv,
