@@ -88,7 +88,7 @@ def _search(
     accuracy = ROUNDING * jnp.finfo(wanted.dtype).eps
 
     def value(multipliers: Array) -> tuple[Array, Array]:
-        """What is maximised, and how far the multipliers are from the maximum's conditions."""
+        """What is maximized, and how far the multipliers are from the maximum's conditions."""
         weights = approximate(multipliers, wanted, held, limits)
         over = excess(weights, held, limits)
         worth = ((weights - wanted) ** 2).sum(0) / 2 + (multipliers * over).sum(0)
@@ -103,10 +103,10 @@ def _search(
             return _Found(tried, *value(tried))
 
         def better(i: Array, best: _Found) -> _Found:
-            tried = at(SHORTENING**-i)
+            tried = at(SHORTENING ** -i.astype(wanted.dtype))
             return _choose(tried.value > best.value, tried, best)
 
-        whole = at(jnp.array(1.0))
+        whole = at(jnp.ones((), wanted.dtype))
         # Near the maximum the differences of values are rounding errors, and errors tell more.
         well = (whole.value >= found.value - accuracy) & (whole.error <= found.error / 2)
         kept = well | (found.error <= accuracy)
