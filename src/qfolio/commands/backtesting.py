@@ -23,6 +23,7 @@ from qfolio.commands.arguments import (
 from qfolio.commands.tables import READING, Reading
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import hint
 
 if TYPE_CHECKING:
     from qfolio.experiments.presets import Preset
@@ -196,7 +197,6 @@ def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
 def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
     """Presets with changed settings: of one agent (dqn.discount), of all that have it, or of the
     task. Imports the modules of parts that they name."""
-    from qfolio.portfolio.prices.findings import hint
     from qfolio.portfolio.task import Portfolio
 
     used = set()

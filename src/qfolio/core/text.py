@@ -62,6 +62,12 @@ def closest(name: str, known: Iterable[str]) -> str | None:
     return names[close[0]] if close else None
 
 
+def hint(name: str, known: Iterable[str]) -> str:
+    """A question in brackets with the closest known name; empty if none is close."""
+    close = closest(name, known)
+    return f" (did you mean {quote(close)}?)" if close else ""
+
+
 def near(name: str, known: Iterable[str]) -> str:
     """What a message says after a wrong name: "did you mean …?", or the known names."""
     names = list(known)

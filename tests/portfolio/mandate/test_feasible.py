@@ -73,9 +73,9 @@ def test_what_a_mandate_projects_or_draws_is_allowed(trading):
 
 def test_no_rounding_makes_a_loan():
     fully = feasible(settled({"cash": {"max": 0.0}}, "ABCDE"), np.ones(5, bool))
-    wanted = jnp.asarray(np.random.default_rng(0).dirichlet(np.ones(6), 500), jnp.float32)
-    found = jax.jit(jax.vmap(fully.project))(wanted, wanted)
-    assert float(found.min()) > -2e-7
+    wanted, held = np.random.default_rng(0).dirichlet(np.ones(6), (2, 5000)).astype(np.float32)
+    found = jax.jit(jax.vmap(fully.project))(wanted, held)
+    assert float(found.min()) > -1.5e-7  # without the last division it is -2.4e-7
     assert largest(fully.violations(found)) <= 2e-6
 
 

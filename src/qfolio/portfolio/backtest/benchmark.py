@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES, short
-from qfolio.core.text import quote
+from qfolio.core.text import hint, quote
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
 from qfolio.portfolio.backtest.own import Own, buy_and_hold
 from qfolio.portfolio.backtest.own_tables import read_own
-from qfolio.portfolio.prices.findings import hint
 from qfolio.portfolio.prices.table import Prices
 
 BENCHMARK = "benchmark"

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import hint, quote
 from qfolio.portfolio.backtest.measures import Floats
 from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.desk.holdings import ASSET_NAMES, CASH, SHARES_NAMES
 from qfolio.portfolio.prices.cells import is_missing, label, not_a_number, numbers
 from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.dates import read_dates
-from qfolio.portfolio.prices.findings import day, hint
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.table import Prices, load

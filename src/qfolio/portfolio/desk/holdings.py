@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.cells import CURRENCIES, is_missing, label, not_a_number, numbers
-from qfolio.portfolio.prices.findings import hint
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.vocabulary import plain
 

@@ -19,6 +19,7 @@ from qfolio.portfolio.mandate.projection import (
     approximate,
     excess,
     nearest,
+    none_binds,
     search,
     solution,
 )
@@ -172,7 +173,7 @@ class Mandated(Feasible):
             found = search(wanted, held, fewer, found)
             return (left | small(found, fewer), found), before
 
-        nothing = jnp.zeros(limits.most.shape[0] + 2)
+        nothing = none_binds(limits)
         none = jnp.zeros_like(can_stay)
         (left, found), (lefts, founds) = lax.scan(leave, (none, nothing), None, ROUNDS)
         fewer = _fixed(limits, lefts[-1], held)

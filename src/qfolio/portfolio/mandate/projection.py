@@ -71,7 +71,7 @@ def search(
     start: multipliers to search from, such as those of limits that differ little (default: 0).
     """
     limits = _arrays(limits, wanted)
-    start = jnp.zeros(limits.most.shape[0] + 2, wanted.dtype) if start is None else start
+    start = none_binds(limits) if start is None else start
     given = lax.stop_gradient((wanted, held, limits, start))
     return lax.stop_gradient(_search(*(jax.tree.map(lambda x: x[..., None], given)))[..., 0])
 
@@ -134,6 +134,11 @@ def _search_many(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
 
     found = _search(*jax.tree.map(joined, given, tuple(batched)))
     return jnp.moveaxis(found.reshape(-1, size, paths), 1, 0), True
+
+
+def none_binds(limits: Limits) -> Float[Array, " condition"]:
+    """The multipliers of weights that no condition moves."""
+    return jnp.zeros_like(_largest(limits))
 
 
 def solution(

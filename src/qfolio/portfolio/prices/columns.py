@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qfolio.core.text import quote
+from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.bars import columns_of_kind, pick_prices
 from qfolio.portfolio.prices.cells import is_missing, numbers
 from qfolio.portfolio.prices.dates import are_times, read_dates, readable_date
-from qfolio.portfolio.prices.findings import LISTED, Findings, hint, listing
+from qfolio.portfolio.prices.findings import LISTED, Findings, listing
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.vocabulary import (
     ADJUSTED_NAMES,

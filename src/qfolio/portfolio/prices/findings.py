@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from qfolio.core.text import amount, closest, quote
+from qfolio.core.text import amount, quote
 
 LISTED = 5  # findings of one kind that are listed; the others are counted
 
@@ -80,9 +80,3 @@ def listing(names: Iterable[str]) -> str:
     quoted = [quote(name) for name in names]
     rest = len(quoted) - LISTED
     return ", ".join(quoted[:LISTED]) + (f" and {rest:,} more" if rest > 0 else "")
-
-
-def hint(name: str, known: Iterable[str]) -> str:
-    """A question in brackets with the closest known name; empty if none is close."""
-    close = closest(name, known)
-    return f" (did you mean {quote(close)}?)" if close else ""

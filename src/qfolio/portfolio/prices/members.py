@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.cells import is_missing, label, numbers
 from qfolio.portfolio.prices.dates import read_dates
-from qfolio.portfolio.prices.findings import hint
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, plain

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import quote
+from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices import folder, reading
 from qfolio.portfolio.prices.checks import Choices, examine
 from qfolio.portfolio.prices.columns import text_columns
-from qfolio.portfolio.prices.findings import Finding, day, hint
+from qfolio.portfolio.prices.findings import Finding, day
 from qfolio.portfolio.prices.frequency import periods_per_year
 from qfolio.portfolio.prices.members import membership
 

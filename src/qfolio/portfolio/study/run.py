@@ -326,14 +326,13 @@ def corrected(agents: Mapping[str, Pools], rebalanced: bool) -> dict[str, Pools]
     against = AGAINST if rebalanced else AGAINST[:1]
     pooled: list[Pooled] = [getattr(agents[name], key) for name in agents for key in against]
     p_holm = holm([1.0 if each.p is None else each.p for each in pooled]).tolist()
-    decided = [_found(each, p) for each, p in zip(pooled, p_holm, strict=True)]
-    count = len(against)
-    return {
-        name: msgspec.structs.replace(
-            pools, to_reference=decided[count * i], to_rebalanced=decided[count * i + count - 1]
-        )
-        for i, (name, pools) in enumerate(agents.items())
-    }
+    found = iter([_found(each, p) for each, p in zip(pooled, p_holm, strict=True)])
+    decided = {}
+    for name, pools in agents.items():
+        first = next(found)
+        second = next(found) if rebalanced else first
+        decided[name] = msgspec.structs.replace(pools, to_reference=first, to_rebalanced=second)
+    return decided
 
 
 def _found(pooled: Pooled, p: float) -> Pooled:

@@ -31,7 +31,7 @@ def verdicts(agents: Mapping[str, Pools]) -> dict[str, list[str]]:
 
 
 def _claim(name: str, pools: Pools) -> str:
-    where = f"{_reference(pools)} in growth after costs over {counted(len(pools.evidence))}"
+    where = f"{_reference(pools)} in growth after costs over {amount(len(pools.evidence), 'table')}"
     if pools.to_reference.finding == "better":
         return f"{name} beats {where}"
     if pools.to_reference.finding == "worse":
@@ -61,7 +61,7 @@ def _numbers(pooled: Pooled) -> str:
 def _tables(pools: Pools) -> str:
     worst = pools.evidence[pools.to_reference.worst].to_reference
     count, total = pools.to_reference.positive, len(pools.evidence)
-    grew = f"It grew more than {worst.reference} on {count} of {counted(total)}"
+    grew = f"It grew more than {worst.reference} on {count} of {amount(total, 'table')}"
     return f"{grew}; its worst is {pools.to_reference.worst}, {percent(worst.growth)} a year."
 
 
@@ -77,10 +77,6 @@ def looks_sentence(result: Result) -> str:
             f"pooled z of {decimal(result.threshold)}."
         )
     return sentence
-
-
-def counted(tables: int) -> str:
-    return amount(tables, "table")
 
 
 def percent(value: float | None) -> str:
