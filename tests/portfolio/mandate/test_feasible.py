@@ -73,7 +73,11 @@ def test_what_a_mandate_projects_or_draws_is_allowed(trading):
 
 def test_no_rounding_makes_a_loan():
     fully = feasible(settled({"cash": {"max": 0.0}}, "ABCDE"), np.ones(5, bool))
-    wanted, held = np.random.default_rng(0).dirichlet(np.ones(6), (2, 5000)).astype(np.float32)
+    random = np.random.default_rng(1)
+    wanted = random.dirichlet(np.full(6, 0.5), 5000).astype(np.float32)
+    held = jax.vmap(fully.draw)(jax.random.split(jax.random.key(0), 5000))
+    held *= np.exp(0.02 * random.standard_normal(held.shape))
+    held /= held.sum(-1, keepdims=True)
     found = jax.jit(jax.vmap(fully.project))(wanted, held)
     assert float(found.min()) > -1.5e-7  # without the last division it is -2.4e-7
     assert largest(fully.violations(found)) <= 2e-6
