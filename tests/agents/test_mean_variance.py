@@ -57,7 +57,9 @@ def test_learns_shorter_half_lives_where_volatility_changes():
 
     def realised(policy):
         rows = jnp.arange(500, 1900)
-        views = jax.vmap(lambda row: market.view(row, jnp.append(1.0, jnp.zeros(6))))(rows)
+        views = jax.vmap(lambda row: market.view(row, market.hold(jnp.append(1.0, jnp.zeros(6)))))(
+            rows
+        )
         weights = policy.target(views)[:, 1:]
         earned = (weights * jnp.expm1(jax.vmap(market.coming)(rows + 1))).sum(-1)
         return float(earned.std())
@@ -82,7 +84,7 @@ def test_without_evidence_it_is_the_least_variance():
     least = MinimumVariance(**SMALL).init(market, jax.random.key(0)).policy
     members = jax.tree.map(lambda x: x + 0.3, policy.learned.members)
     policy = eqx.tree_at(lambda one: one.learned.members, policy, members)
-    view = market.view(jnp.array(500), held)
+    view = market.view(jnp.array(500), market.hold(held))
     np.testing.assert_array_equal(policy(view), least(view))
     full = eqx.tree_at(lambda one: one.share, policy, jnp.array(1.0))
     assert abs(full(view) - least(view)).max() > 0.01

@@ -87,7 +87,7 @@ def test_planted_momentum_is_found_and_tilted_to():
     linear = weights.networks.linear
     assert (linear[:, 0] > 0).all(), "every head values momentum"
     held = jnp.append(0.0, jnp.full(6, 1 / 6))
-    views = jax.vmap(lambda row: task.view(row, held))(jnp.arange(100, 600, 5))
+    views = jax.vmap(lambda row: task.view(row, task.hold(held)))(jnp.arange(100, 600, 5))
     assert (dqn.policy(weights, views) == 1).mean() > 0.5, "towards winners of the last month"
     unsure = agent(caution=1000.0).policy(weights, views)
     assert (unsure == 0).all(), "nobody can be that sure: it follows the anchor"

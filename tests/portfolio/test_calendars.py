@@ -11,7 +11,7 @@ from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
 from qfolio.portfolio.backtest.folds import Fold
-from qfolio.portfolio.backtest.orders import orders
+from qfolio.portfolio.backtest.orders import AT_EVERY_ROW, orders
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.prices.table import Prices
@@ -70,10 +70,10 @@ def test_between_decisions_the_target_is_what_is_held() -> None:
     decides = decision_rows("monthly", prices.dates)
     held, wanted = jnp.eye(5)[1], jnp.eye(5)[2]
     for row in range(200, 260):
-        target = task.target(jnp.array(row), held, wanted)
+        target = task.target(jnp.array(row), task.hold(held), wanted)
         assert (target == (wanted if decides[row] else held)).all()
     last = jnp.array(len(prices) - 1)
-    assert (task.target(last, held, wanted) == wanted).all()
+    assert (task.target(last, task.hold(held), wanted) == wanted).all()
 
 
 def test_orders_wait_for_drift_beyond_the_band() -> None:
@@ -83,7 +83,7 @@ def test_orders_wait_for_drift_beyond_the_band() -> None:
     for _ in range(100):
         held, other = (jnp.asarray(rng.dirichlet(np.ones(5)), jnp.float32) for _ in range(2))
         wanted = held + 0.2 * (other - held)
-        target = task.target(row, held, wanted)
+        target = task.target(row, task.hold(held), wanted)
         beyond = bool(abs(wanted - held).max() > 0.05)
         assert (target == (wanted if beyond else held)).all()
         traded += beyond
@@ -95,7 +95,8 @@ def test_equal_weights_wait_for_drift_as_in_a_ledger_of_shares() -> None:
     fold = Fold("only", slice(0, 100), slice(test.start, test.stop), slice(0, 100))
     rule, equal = type("Once", (EqualWeight,), {"calendar": "fold"})(), np.full(4, 0.25)
     for band in np.random.default_rng(2).uniform(0.005, 0.05, 20):
-        found = orders("x", rule, [fold], prices.dates, prices.values, band=band).decisions
+        terms = AT_EVERY_ROW._replace(band=band)
+        found = orders("x", rule, [fold], prices.dates, prices.values, terms=terms).decisions
         shares = np.zeros(4)
         for row, order in zip(test, found, strict=True):
             worth = shares * prices.values[row]

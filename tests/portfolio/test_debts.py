@@ -28,9 +28,9 @@ def test_an_action_is_the_weights_of_the_assets() -> None:
     assets = jnp.array([0.5, 0.4, 0.3, -0.1, -0.1, -0.1])
     weights = jnp.append(1 - assets.sum(), assets)
     for action in (assets, weights):
-        np.testing.assert_allclose(task.target(row, held, action), weights, atol=1e-6)
+        np.testing.assert_allclose(task.target(row, task.hold(held), action), weights, atol=1e-6)
     # Half as much again is more than the mandate allows.
-    order = task.target(row, held, 1.5 * assets)
+    order = task.target(row, task.hold(held), 1.5 * assets)
     assert abs(order[1:]).sum() <= 1.6 + 1e-5
     assert order[0] >= -1e-6
     assert order[1:].max() <= 0.5 + 1e-6

@@ -8,7 +8,7 @@ from qfolio.agents.pathwise import Pathwise
 from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
-from qfolio.portfolio.following import follow, on_table
+from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -60,4 +60,4 @@ def test_targets_that_are_not_numbers_are_no_silent_holding(policy, prices):
     with pytest.raises(
         QfolioError, match=r"Diverged gives target weights at row 30 .* off 1 by nan"
     ):
-        follow(task, agent, policy.members, 30, np.eye(4)[:2], 2)
+        follow(task, agent, policy.members, 30, begin(task, np.eye(4)[:2]), 2)

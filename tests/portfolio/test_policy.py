@@ -13,7 +13,7 @@ from qfolio.agents.pathwise import Pathwise
 from qfolio.core import population
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio import policy as module
-from qfolio.portfolio.following import follow, on_table
+from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.policy import Policy, train
 from qfolio.portfolio.prices.table import Prices
 
@@ -66,7 +66,8 @@ def same(one, two):
 def test_it_decides_by_the_mean_of_its_agents(policy):
     held = np.array([0.4, 0.3, 0.2, 0.1])
     task = on_table(policy.task, table())
-    each, _ = follow(task, policy.agent, policy.members, 70, np.tile(held, (2, 1)), 1)
+    start = begin(task, np.tile(held, (2, 1)))
+    each, _ = follow(task, policy.agent, policy.members, 70, start, 1)
     targets, after = policy.decide(table(), 70, held, 5)
     np.testing.assert_allclose(targets[0], each[:, 0].mean(0), atol=1e-6)
     moved = np.append(1, table().values[71] / table().values[70])
@@ -74,10 +75,11 @@ def test_it_decides_by_the_mean_of_its_agents(policy):
     again, _ = policy.decide(table(), 71, after[0], 4)
     np.testing.assert_allclose(again, targets[1:], atol=1e-5)
     np.testing.assert_allclose(targets.sum(1), 1, atol=1e-12)
-    replayed = follow(task, policy.agent, policy.members, 70, held[None], 5, together=True)
-    for one, other in zip(replayed, (targets, after), strict=True):
-        assert one.shape == (1, 5, 4)
-        np.testing.assert_allclose(one[0], other, atol=1e-6)
+    start = begin(task, held[None])
+    found, then = follow(task, policy.agent, policy.members, 70, start, 5, together=True)
+    for one, other in zip((found, then.weights), (targets, after), strict=True):
+        assert np.shape(one) == (1, 5, 4)
+        np.testing.assert_allclose(np.asarray(one)[0], other, atol=1e-6)
 
 
 def test_it_comes_back_from_disk(policy, tmp_path):

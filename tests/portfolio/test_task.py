@@ -14,7 +14,7 @@ from qfolio.core.mdp import Discrete, Position, Simplex, Transition
 from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.costs import drift
-from qfolio.portfolio.following import follow
+from qfolio.portfolio.following import begin, follow
 from qfolio.portfolio.market import Menu, Signalled
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -168,7 +168,7 @@ def trained(request):
 def test_no_agent_looks_ahead(trained):
     """Changing every price after t changes no weight decided up to t."""
     task, agent, members = trained
-    start = np.tile([1.0, 0, 0, 0], (2, 1))
+    start = begin(task, np.tile([1.0, 0, 0, 0], (2, 1)))
     targets, _ = follow(task, agent, members, 40, start, 20)
     assert np.isfinite(targets).all()
     for seed in range(5):
@@ -184,8 +184,9 @@ def test_no_agent_looks_ahead(trained):
 
 def test_weights_stay_on_the_simplex(trained):
     task, agent, members = trained
-    targets, held = follow(task, agent, members, 40, np.tile([1.0, 0, 0, 0], (2, 1)), 20)
-    for weights in (targets, held):
+    start = begin(task, np.tile([1.0, 0, 0, 0], (2, 1)))
+    targets, held = follow(task, agent, members, 40, start, 20)
+    for weights in (targets, np.asarray(held.weights)):
         np.testing.assert_allclose(weights.sum(-1), 1, atol=1e-5)
         assert weights.min() >= 0
 
@@ -199,9 +200,9 @@ def test_agents_do_not_depend_on_the_order_of_columns(trained):
     assets = tuple(own.assets[i] for i in order)
     shuffled = task.on(Prices(own.dates, assets, own.values[:, order]))
     start = np.tile([0.4, 0.3, 0.2, 0.1], (2, 1))
-    targets, _ = follow(task, agent, members, 40, start, 1)
+    targets, _ = follow(task, agent, members, 40, begin(task, start), 1)
     entries = np.append(0, 1 + order)
-    again, _ = follow(shuffled, agent, members, 40, start[:, entries], 1)
+    again, _ = follow(shuffled, agent, members, 40, begin(task, start[:, entries]), 1)
     np.testing.assert_allclose(again, targets[..., entries], atol=1e-5)
 
 
@@ -210,7 +211,7 @@ def test_limits():
     values[:30, 1] = np.nan
     task = portfolio(Prices(table().dates, ("a", "b", "c"), values), max_weight=0.4)
     np.testing.assert_allclose(task.limits, [0.4, 0, 0.4])
-    target = task.target(jnp.array(0), jnp.array([1.0, 0, 0, 0]), jnp.array([0.1, 0.5, 0.3, 0.1]))
+    target = task.target(jnp.array(0), task.hold(jnp.eye(4)[0]), jnp.array([0.1, 0.5, 0.3, 0.1]))
     np.testing.assert_allclose(target, [0.5, 0.4, 0, 0.1], atol=1e-6)
     assert task.part(30, 59).limits.min() == pytest.approx(0.4)
 
@@ -277,14 +278,14 @@ def test_a_menu_of_signals_draws_holdings_near_the_anchor():
 
 def test_a_view_shows_what_a_menu_of_signals_orders_within_the_cap():
     task, held = signalling(max_weight=0.35), jnp.array([0, 0.4, 0.3, 0.3])
-    view = task.view(jnp.array(100), held)
+    view = task.view(jnp.array(100), task.hold(held))
     assert view.choices is not None
     assert view.choices.shape == (5, 3)
     assert view.choices.max() <= 0.35 + 1e-6
     np.testing.assert_allclose(
-        view.choices[3], task.target(jnp.array(100), held, jnp.array(3))[1:], rtol=1e-6
+        view.choices[3], task.target(jnp.array(100), task.hold(held), jnp.array(3))[1:], rtol=1e-6
     )
-    assert portfolio(menu="tilts:0.1").view(jnp.array(100), held).choices is None
+    assert portfolio(menu="tilts:0.1").view(jnp.array(100), task.hold(held)).choices is None
 
 
 def test_the_reference_is_the_reward_of_holding_the_anchor():

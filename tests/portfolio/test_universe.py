@@ -188,7 +188,12 @@ def test_what_comes_and_goes_later_changes_nothing_before(seed: int) -> None:
         Portfolio.of(p, window=5, horizon=5, **SIGNALS).part(0, now) for p in (prices, other)
     )
     wanted = jnp.asarray(np.random.default_rng(seed).dirichlet(np.ones(7)), jnp.float32)
-    view = jax.jit(lambda task, row: (task.view(row, wanted), task.target(row, wanted, wanted)))
+    view = jax.jit(
+        lambda task, row: (
+            task.view(row, task.hold(wanted)),
+            task.target(row, task.hold(wanted), wanted),
+        )
+    )
     for row in range(6, now + 1):
         seen = [jax.tree.map(np.asarray, view(task, jnp.array(row))) for task in (one, two)]
         jax.tree.map(np.testing.assert_array_equal, *seen)

@@ -130,6 +130,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             )
         self._row, self._steps, self._wealth = int(start), 0, 1.0
         self._held = np.eye(len(self.prices.assets) + 1)[0]
+        self._plan = self.task.terms.begin(self._held)
         self._memory = _programs().memory(self.task)
         self._target, self._cost, self._turnover = self._held, 0.0, 0.0
         return self._observe(), self._info()
@@ -139,7 +140,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         if self._steps >= self.task.horizon:
             raise QfolioError("The episode is over; call reset() first.")
         row, lag = self._row, self.task.lag
-        self._target = _programs().target(self.task, row, self._held, self._checked(action))
+        given = (self.task, row, self._held, self._plan, self._checked(action))
+        self._target, self._plan = _programs().target(*given)
         values, costs = self.prices.values[row : row + lag + 2], self.task.costs
         known = self._conditions.part(row, row + lag + 2)
         traded = simulate(
@@ -218,16 +220,17 @@ class _Programs:
         import jax
 
         from qfolio.core import devices, simplex
-        from qfolio.core.mdp import Position
         from qfolio.portfolio.rewards import Outcome
 
         devices.configure()
 
         @jax.jit
-        def target(task: Any, row: Any, held: Any, action: Any) -> Any:
+        def target(task: Any, row: Any, held: Any, plan: Any, action: Any) -> Any:
             if not task.menu:
                 action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
-            return task.intent(Position(row, task.hold(held)), action)
+            holding = task.hold(held)._replace(plan=plan)
+            traded, plan = task.trade(row, holding, task.wanted(row, holding, action))
+            return traded, task.planned(row, plan)
 
         self._target = target
 
@@ -242,10 +245,13 @@ class _Programs:
         where = lambda task: (task.center, task.scale)  # noqa: E731
         self.scaled = lambda task, by: eqx.tree_at(where, task, where(by))
 
-    def target(self, task: Any, row: int, held: np.ndarray, action: np.ndarray) -> np.ndarray:
+    def target(
+        self, task: Any, row: int, held: np.ndarray, plan: Any, action: np.ndarray
+    ) -> tuple[np.ndarray, Any]:
         with self._double():
-            weights = np.asarray(self._target(task, np.int32(row), held, action), float)
-        return np.asarray(weights / weights.sum())
+            found, plan = self._target(task, np.int32(row), held, plan, action)
+            weights = np.asarray(found, float)
+        return np.asarray(weights / weights.sum()), plan
 
     def memory(self, task: Any) -> Any:
         """The reward's state at the start of an episode."""

@@ -1,7 +1,7 @@
 """Anchors: weights at each row of a table that a policy may depart from.
 
 An anchor is a baseline, followed on the whole table, or a column of the table with a benchmark's
-weights.
+weights. What tracking error is measured against may also be an asset.
 """
 
 import warnings
@@ -39,6 +39,8 @@ def path(name: str, prices: Prices) -> Weights:
     Raises QfolioError if there is no such baseline or column, if a baseline gives invalid weights,
     or if a column's weights are not at least 0, with a sum of at most 1.
     """
+    if name in prices.assets:
+        return np.where(np.isnan(prices.values), 0.0, np.array(prices.assets) == name)
     chosen = made(name)
     if chosen is None:
         return _column(name.removeprefix(COLUMN), prices)

@@ -42,6 +42,13 @@ def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bo
     )
 
 
+def elapsed(dates: NDArray[np.datetime64]) -> NDArray[np.float64]:
+    """The share of its calendar year that has passed at each row, of shape (row,)."""
+    begin = dates.astype("datetime64[Y]")
+    length = (begin + 1).astype("datetime64[D]") - begin.astype("datetime64[D]")
+    return np.asarray((dates - begin) / length)
+
+
 def band(calendar: str) -> float:
     """How far some weight, cash included, must be from its target before there is an order.
 

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
+from numpy.typing import ArrayLike
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Agent
+from qfolio.portfolio.market import Holding
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
@@ -30,11 +32,11 @@ def follow(
     agent: Agent,
     members: PyTree,
     first: int,
-    held: np.ndarray,
+    held: Holding,
     count: int,
     *,
     together: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, Holding]:
     """Greedy decisions from row ``first`` on: of each member by itself, or of all together.
 
     Together, they hold one portfolio and follow the mean of their targets. After the table's last
@@ -42,71 +44,82 @@ def follow(
 
     Args:
         members: The agents' weights, with a leading seed axis.
-        held: Weights at row ``first``, shape (seed, entry), or (1, entry) if together.
+        held: What is held at row ``first``, as of ``begin``, by each seed, or by one if together.
         count: Number of decisions.
 
     Returns:
-        Target weights, and the weights held one row after each decision, both of shape
-        (seed or 1, count, entry).
+        Target weights of shape (seed or 1, count, entry), and what is held one row after each
+        decision, with the same first axes.
 
     Raises:
         QfolioError: Targets are not numbers, or not feasible.
     """
     portfolios = jax.tree.map(lambda x: x[None] if together else x[:, None], members)
-    start = jnp.array(first, jnp.int32), jnp.asarray(held, jnp.float32)
-    results = paths(task, agent, portfolios, *start, count)
-    targets, after = (np.asarray(result) for result in results)
-    _require_feasible(task, agent, targets, first, ordered(task, targets, held, after))
+    found = paths(task, agent, portfolios, jnp.array(first, jnp.int32), held, count)
+    wanted, targets, after = jax.tree.map(np.asarray, found)
+    _require_feasible(task, agent, wanted, first)
     return targets, after
 
 
-def ordered(
-    task: Portfolio, targets: np.ndarray, held: np.ndarray, after: np.ndarray
-) -> np.ndarray:
+def begin(task: Portfolio, weights: ArrayLike, spent: float = 0.0) -> Holding:
+    """Holdings without orders before, of weights of shape (portfolio, entry).
+
+    spent: turnover since the calendar year began.
+    """
+    hold = partial(task.hold, spent=spent)
+    held: Holding = jax.vmap(hold)(jnp.asarray(weights, jnp.float32))
+    return held
+
+
+def ordered(task: Portfolio, targets: np.ndarray, held: ArrayLike, after: np.ndarray) -> np.ndarray:
     """Where targets are orders, of shape (seed, count); between, they are what is held.
 
-    held, after: as ``follow`` takes and returns them.
+    held, after: weights before the first decision and after each.
     """
     if not task.calendar:
         return np.ones(targets.shape[:2], bool)
-    before = np.concatenate([held[:, None].astype(after.dtype), after[:, :-1]], axis=1)
+    before = np.concatenate([np.asarray(held, after.dtype)[:, None], after[:, :-1]], axis=1)
     return np.asarray((targets != before).any(-1))
 
 
 @eqx.filter_jit(donate="none")
 def paths(
-    task: Portfolio, agent: Agent, members: PyTree, first: Array, held: Array, count: int
-) -> tuple[Float[Array, "portfolio time entry"], Float[Array, "portfolio time entry"]]:
-    """Targets, and weights held one row later, without the checks of ``follow``.
+    task: Portfolio, agent: Agent, members: PyTree, first: Array, held: Holding, count: int
+) -> tuple[
+    Float[Array, "portfolio time entry"], Float[Array, "portfolio time entry"], Holding
+]:  # fmt: skip
+    """What is wanted at each row, targets, and what is held one row later, without the checks of
+    ``follow``.
 
     members: with leading axes (portfolio, member); a portfolio follows the mean of its own.
     """
 
-    def step(members: PyTree, held: Array, row: Array) -> tuple[Array, tuple[Array, Array]]:
+    def step(
+        members: PyTree, held: Holding, row: Array
+    ) -> tuple[Holding, tuple[Array, Array, Holding]]:
         view = jax.tree.map(lambda x: x[None], task.view(row, held))
 
         def one(weights: PyTree) -> Array:
             return task.wanted(row, held, agent.policy(weights, view)[0])
 
-        target = task.obeying(row, held, jax.vmap(one)(members).mean(0))
-        after = task.drifted(row, target)
-        return after, (target, after)
+        wanted = task.of_mean(row, held, jax.vmap(one)(members).mean(0))
+        target, plan = task.trade(row, held, wanted)
+        after = Holding(task.drifted(row, target), held.reward, task.planned(row, plan))
+        return after, (wanted, target, after)
 
-    def path(members: PyTree, held: Array) -> tuple[Array, Array]:
-        return lax.scan(partial(step, members), held, first + jnp.arange(count))[1]
+    def path(members: PyTree, held: Holding) -> tuple[Array, Array, Holding]:
+        found: tuple[Array, Array, Holding] = lax.scan(
+            partial(step, members), held, first + jnp.arange(count)
+        )[1]
+        return found
 
     return jax.vmap(path)(members, held)
 
 
-def _require_feasible(
-    task: Portfolio, agent: Agent, targets: np.ndarray, first: int, given: np.ndarray
-) -> None:
-    """Raises QfolioError for infeasible orders; a replay would read NaN as no order.
-
-    given: where targets are orders; elsewhere, what is held may have drifted outside.
-    """
-    for said, amount in task.feasible.violations(targets).items():
-        wrong = ~(amount <= TOLERANCE) & (given | np.isnan(amount))
+def _require_feasible(task: Portfolio, agent: Agent, wanted: np.ndarray, first: int) -> None:
+    """Raises QfolioError for infeasible weights; a replay would read NaN as no order."""
+    for said, amount in task.feasible.violations(wanted).items():
+        wrong = ~(amount <= TOLERANCE)
         if wrong.any():
             seed, day = np.argwhere(wrong)[0]
             raise QfolioError(

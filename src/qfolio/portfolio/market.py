@@ -30,6 +30,7 @@ from qfolio.core.mdp import (
 )
 from qfolio.core.registry import Kind, build
 from qfolio.portfolio.costs import Context, CostModel, grown, traded
+from qfolio.portfolio.execution import Plan
 from qfolio.portfolio.mandate.feasible import CappedSimplex, Feasible
 from qfolio.portfolio.rewards import Outcome, Reward
 
@@ -43,10 +44,11 @@ RATE = 0.3
 
 
 class Holding(NamedTuple):
-    """The last target weights, drifted to now, and the state of the reward."""
+    """The last target weights, drifted to now, the state of the reward, and what is planned."""
 
     weights: Float[Array, " entry"]
     reward: PyTree
+    plan: Plan | None = None
 
 
 class Relatives(NamedTuple):
@@ -240,32 +242,47 @@ class Market(ExogenousTask):
     def path_dependent(self) -> bool:
         return self.reward_function.path_dependent
 
-    def target(
-        self, market: PyTree, held: Float[Array, " entry"], action: Array
-    ) -> Float[Array, " entry"]:
-        """The target weights of an action, projected onto the feasible set."""
+    def wanted(self, market: PyTree, holding: Holding, action: Array) -> Float[Array, " entry"]:
+        """The weights that an action orders, projected onto the feasible set."""
         weights = action
         if self.menu:
-            weights = self._menu.weights(held, action, self.signalled(market))
-        return self.feasible_at(market).project(weights, held)
+            weights = self._menu.weights(holding.weights, action, self.signalled(market))
+        return self.allow(market, holding, weights)
+
+    def allow(
+        self, market: PyTree, holding: Holding, weights: Float[Array, " entry"]
+    ) -> Float[Array, " entry"]:
+        """The weights that may be ordered and are nearest to the weights given."""
+        return self.feasible_at(market).project(weights, holding.weights)
+
+    def trade(
+        self, market: PyTree, holding: Holding, wanted: Float[Array, " entry"]
+    ) -> tuple[Float[Array, " entry"], Plan | None]:
+        """The target weights for an order at once, and what is planned: the order, and nothing."""
+        return wanted, holding.plan
+
+    def target(self, market: PyTree, holding: Holding, action: Array) -> Float[Array, " entry"]:
+        """The target weights of an action."""
+        return self.trade(market, holding, self.wanted(market, holding, action))[0]
 
     def intent(self, state: Position, action: Array) -> Float[Array, " entry"]:
-        return self.target(state.market, state.holding.weights, action)
+        return self.target(state.market, state.holding, action)
 
     def anchor_weights(self, market: PyTree) -> Float[Array, " asset"] | None:
         """The weights that a policy may depart from, if the market has any."""
         return None
 
-    def view(self, market: PyTree, weights: Float[Array, " entry"]) -> View:
-        """The observation of a market, from weights held."""
+    def view(self, market: PyTree, holding: Holding) -> View:
+        """The observation of a market from a holding."""
         choices = None
         if (menu := self._signal_menu) is not None:
             order = jax.vmap(self.target, (None, None, 0))
-            choices = order(market, weights, jnp.arange(menu.actions.n))[:, 1:]
-        return View(self.features(market), weights[1:], self.anchor_weights(market), choices)
+            choices = order(market, holding, jnp.arange(menu.actions.n))[:, 1:]
+        held = holding.weights[1:]
+        return View(self.features(market), held, self.anchor_weights(market), choices)
 
     def observe(self, state: Position) -> View:
-        return self.view(state.market, state.holding.weights)
+        return self.view(state.market, state.holding)
 
     def draw_holding(self, key: PRNGKeyArray) -> Holding:
         return self.hold(self.feasible.draw(key))
@@ -304,8 +321,9 @@ class Market(ExogenousTask):
     def settle(
         self, market: PyTree, next_market: PyTree, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
-        target = self.target(market, holding.weights, action)
-        return self._earn(market, next_market, holding, target)
+        wanted = self.wanted(market, holding, action)
+        target, plan = self.trade(market, holding, wanted)
+        return self._earn(market, next_market, holding._replace(plan=plan), target)
 
     def measure(self, step: Transition) -> Metrics:
         """Turnover and cost, cash, the effective number of assets, growth (a row, logarithmic),
@@ -350,7 +368,11 @@ class Market(ExogenousTask):
             drifted = jnp.where(lives, drifted, jnp.eye(drifted.shape[0])[0])
         outcome = Outcome(growth, sum(paid.values()), after)
         reward, state = self.reward_function(holding.reward, outcome)
-        return reward, Holding(drifted, state)
+        return reward, Holding(drifted, state, self.planned(market, holding.plan))
+
+    def planned(self, market: PyTree, plan: Plan | None) -> Plan | None:
+        """What is planned, drifted with prices after a decision."""
+        return plan
 
 
 def _part(market: Market, kind: Kind, text: str) -> Any:

@@ -25,7 +25,7 @@ from qfolio.experiments.fit import Listener, fit
 from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio import signals
 from qfolio.portfolio.costs import CostModel
-from qfolio.portfolio.following import follow, on_table
+from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
@@ -115,20 +115,24 @@ class Policy:
         self.assets, self.features = tuple(assets), tuple(features)
         self.learner, self.updates, self.learned = learner, updates, learned
 
-    def weights(self, prices: Any, holdings: Any = None, **options: Any) -> dict[str, float]:
+    def weights(
+        self, prices: Any, holdings: Any = None, *, spent: float = 0.0, **options: Any
+    ) -> dict[str, float]:
         """Target weights after the last row of a price table, by asset, with "cash" first.
 
         Args:
             prices: A price table with the assets that the policy was trained on, in any order, and
                 more rows than its window; anything that ``prices.load`` reads, with its options.
             holdings: Weights held now, by asset; the rest is cash (default: all cash).
+            spent: Turnover since the calendar year began, for a mandate that limits it.
 
         Raises:
             QfolioError: The assets are not those of the policy, or prices are missing in its
                 window.
         """
         table = self.table(prices, **options)
-        targets, _ = self.decide(table, len(table) - 1, self.holdings(holdings), 1)
+        held, last = self.holdings(holdings), len(table) - 1
+        targets, _ = self.decide(table, last, held, 1, spent=spent, whole=True)
         return dict(zip(("cash", *self.assets), targets[0].tolist(), strict=True))
 
     def update(
@@ -284,17 +288,28 @@ class Policy:
         return held / held.sum()
 
     def decide(
-        self, prices: Prices, first: int, held: np.ndarray, count: int
+        self,
+        prices: Prices,
+        first: int,
+        held: np.ndarray,
+        count: int,
+        *,
+        spent: float = 0.0,
+        whole: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Target weights at ``count`` rows from ``first`` on, and the weights held after each.
 
-        held: at row ``first``, shape (entry,). Both results are (count, entry); the second is
-        drifted to the row after each decision.
+        held: at row ``first``, shape (entry,). spent: as for ``weights``. whole: whether orders are
+        filled at once. Both results are (count, entry); the second is drifted to the row after each
+        decision.
         """
         task = on_table(self.task, prices)
-        results = follow(task, self.agent, self.members, first, held[None], count, together=True)
-        targets, after = (x[0].astype(float) for x in results)
-        return tuple(x / x.sum(-1, keepdims=True) for x in (targets, after))
+        task = task.filling(1) if whole else task
+        start = begin(task, held[None], spent)
+        found, after = follow(task, self.agent, self.members, first, start, count, together=True)
+        both = (np.asarray(x[0], float) for x in (found, after.weights))
+        targets, then = (x / x.sum(-1, keepdims=True) for x in both)
+        return targets, then
 
     def save(self, folder: Path | str) -> None:
         """Writes the policy into a new or empty folder."""

@@ -6,11 +6,13 @@ a choice from a menu. A decision sees prices up to row t, is executed at the clo
 and earns the move to the row after. No observation at t depends on a later price.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -20,12 +22,14 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Box, Position, Simplex
 from qfolio.portfolio import anchors, signals, universe
-from qfolio.portfolio.calendars import band, decision_rows
+from qfolio.portfolio.calendars import band, decision_rows, elapsed
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import cashed
+from qfolio.portfolio.execution import Plan, Terms
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Feasible, Mandated
-from qfolio.portfolio.mandate.mandate import feasible, largest_weight, settled
+from qfolio.portfolio.mandate.mandate import Mandate, feasible, largest_weight, parse, settled
+from qfolio.portfolio.mandate.risk import Risk
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
 
@@ -49,6 +53,9 @@ class Portfolio(Market):
     scale: Float[Array, " channel"]
     conditions: Conditions  # the columns that the cost model reads; empty if it reads none
     decides: Bool[Array, " decision"]  # whether a row is for decisions; no rows if all are
+    elapsed: Float[Array, " dated"]  # of each row's year, see Terms; no rows if it does not matter
+    benchmarks: Float[Array, "benchmarked asset"]  # weights for tracking error; no rows without
+    year: Float[Array, ""]  # rows in a year
     tradable: Bool[Array, "row asset"] | None  # at each row; None if all assets always are
     first_decision: Row
     last_decision: Row
@@ -93,6 +100,9 @@ class Portfolio(Market):
             scale=jnp.ones(1 + channels),
             conditions=Conditions(jnp.zeros(0), {}, {}),
             decides=jnp.zeros(0, bool),
+            elapsed=jnp.zeros(0),
+            benchmarks=jnp.zeros((0, assets)),
+            year=jnp.ones(()),
             tradable=None,
             first_decision=jnp.array(0, jnp.int32),
             last_decision=jnp.array(0, jnp.int32),
@@ -114,18 +124,26 @@ class Portfolio(Market):
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
         followed = anchors.path(self.anchor, prices) if self.anchor else logs[:0]
         then = Conditions.of(prices, self.costs.columns)
-        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (logs, extra, followed, then))
+        terms, risk = self.written.trading, self.written.risk
+        passed = elapsed(prices.dates) if terms.turnover_a_year else np.zeros(0)
+        compared = anchors.path(risk.benchmark, prices) if risk.benchmark else logs[:0]
+        year = np.array(prices.periods_per_year)
+        given = (logs, extra, followed, then, passed, compared, year)
+        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), given)
         decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)
         decides[-1:] = True  # tomorrow's weights may be asked for on any day
         tradable = None if prices.tradable is None else jnp.asarray(prices.tradable)
         if tradable is not None:
             universe.require_support(self.mandate, self.menu)
         return eqx.tree_at(
-            lambda t: (t.log_relatives, t.extra, t.anchors, t.conditions, t.decides, t.tradable),
+            lambda t: (
+                t.log_relatives, t.extra, t.anchors, t.conditions, t.elapsed, t.benchmarks, t.year,
+                t.decides, t.tradable,
+            ),
             self,
             (*arrays, jnp.asarray(decides), tradable),
             is_leaf=lambda x: x is None,
-        )
+        )  # fmt: skip
 
     def deciding_at(self, row: int) -> "Portfolio":
         """The same task with a decision at a row, whatever the calendar says."""
@@ -201,43 +219,70 @@ class Portfolio(Market):
         named = [*signals.parse(self.signals), *([] if anchor is None else [anchor])]
         return [self.costs, self.reward_function, *named]
 
-    def target(
-        self, market: Row, held: Float[Array, " entry"], action: Array
-    ) -> Float[Array, " entry"]:
-        """As in any market; what is held where the calendar has no decision."""
-        return self._when_deciding(market, held, self.wanted(market, held, action))
+    @property
+    def written(self) -> Mandate:
+        """The mandate, or one without limits."""
+        return parse(self.mandate)[1] if self.mandate else Mandate()
 
-    def wanted(
-        self, market: Row, held: Float[Array, " entry"], action: Array
-    ) -> Float[Array, " entry"]:
-        """The target if every row were for decisions.
+    @property
+    def terms(self) -> Terms:
+        """When orders are given, and how they are filled."""
+        trading, margin = self.written.trading, self.written.exposure.margin
+        return Terms(
+            self.decides,
+            self.elapsed,
+            band(self.calendar),
+            trading.fill,
+            trading.turnover_a_year or np.inf,
+            1 / margin if margin else np.inf,
+        )
 
-        Where debts are allowed, an action may also be the weights of the assets; cash is the rest.
-        """
+    def filling(self, rows: int) -> "Portfolio":
+        """The same task with orders that are filled over some rows."""
+        if self.terms.fill == rows:
+            return self
+        assets, mandate = parse(self.mandate)
+        trading = msgspec.structs.replace(mandate.trading, fill=rows)
+        text = msgspec.structs.replace(mandate, trading=trading).text(assets)
+        return dataclasses.replace(self, mandate=text)
+
+    def hold(self, weights: Float[Array, " entry"], spent: Any = 0.0) -> Holding:
+        """A holding without a history; spent: turnover since the calendar year began."""
+        return super().hold(weights)._replace(plan=self.terms.begin(weights, spent))
+
+    def wanted(self, market: Row, holding: Holding, action: Array) -> Float[Array, " entry"]:
+        """As in any market; where debts are allowed, an action may also be the weights of the
+        assets, and cash is the rest."""
         if action.shape == self.limits.shape:
             action = simplex.with_rest(action)
-        return super().target(market, held, action)
+        return super().wanted(market, holding, action)
 
-    def obeying(
-        self, market: Row, held: Float[Array, " entry"], wanted: Float[Array, " entry"]
+    def allow(
+        self, market: Row, holding: Holding, weights: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
-        """The order for a mean of ``wanted``, which may break rules on holdings and small trades.
+        feasible = self.feasible_at(market)
+        left = self.terms.unspent(holding.plan)
+        if left is not None and isinstance(feasible, Mandated):
+            feasible = feasible.spending(left)
+        return feasible.project(weights, holding.weights)
 
-        As held where the calendar has no decision.
-        """
-        if self.mandate:
-            wanted = self.feasible.project(wanted, held)
-        return self._when_deciding(market, held, wanted)
+    def trade(
+        self, market: Row, holding: Holding, wanted: Float[Array, " entry"]
+    ) -> tuple[Float[Array, " entry"], Plan | None]:
+        """As held where no decision is due; over several rows, if orders are filled so."""
+        terms, held = self.terms, holding.weights
+        return terms.trade(held, wanted, terms.ordered(market, held, wanted), holding.plan)
 
-    def _when_deciding(
-        self, market: Row, held: Float[Array, " entry"], wanted: Float[Array, " entry"]
+    def planned(self, market: Row, plan: Plan | None) -> Plan | None:
+        if plan is None:
+            return None
+        return self.terms.next_row(market, plan, self.drifted(market, plan.order))
+
+    def of_mean(
+        self, market: Row, holding: Holding, wanted: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
-        if not self.calendar:
-            return wanted
-        decides = lax.dynamic_index_in_dim(self.decides, market, keepdims=False)
-        if most := band(self.calendar):
-            decides &= abs(wanted - held).max() > most
-        return jnp.where(decides, wanted, held)
+        """The order for a mean of ``wanted``, which may break rules on holdings and trades."""
+        return self.allow(market, holding, wanted) if self.mandate else wanted
 
     @property
     def actions(self) -> Actions:
@@ -254,8 +299,18 @@ class Portfolio(Market):
         return super().feasible if self.allowed is None else self.allowed
 
     def feasible_at(self, market: Row) -> Feasible:
-        """Without the assets that cannot be traded at a row."""
-        return self.feasible if self.tradable is None else universe.Present(self._limits(market))
+        """Without the assets that cannot be traded at a row, and with the risk that it knows."""
+        if self.tradable is not None:
+            return universe.Present(self._limits(market))
+        allowed = self.allowed
+        if allowed is None or not allowed.limits_risk:
+            return self.feasible
+        return allowed.knowing(self.risk_at(market))
+
+    def risk_at(self, market: Row) -> Risk:
+        """What is known of risk at a row."""
+        past = self.written.risk.rows
+        return Risk.at(self.log_relatives, self.benchmarks, market, past, self.year)
 
     def _limits(self, market: Row) -> Float[Array, " asset"]:
         """The largest weights at a row."""
@@ -265,7 +320,12 @@ class Portfolio(Market):
         return jnp.where(there, self.limits, 0.0)
 
     def draw_reachable(self, market: Row, key: PRNGKeyArray) -> Holding:
+        """With some of the year's turnover spent, in proportion to what has passed of the year."""
         drawn = super().draw_reachable(market, key)
+        if drawn.plan is not None and self.elapsed.shape[0]:
+            pace = self.terms.turnover * self.elapsed[market]
+            spent = pace * jax.random.uniform(jax.random.fold_in(key, 1))
+            drawn = self.hold(drawn.weights, spent)
         if self.tradable is None:
             return drawn
         there = lax.dynamic_index_in_dim(self.tradable, market, keepdims=False)

@@ -19,7 +19,7 @@ from qfolio.portfolio.backtest.replay import Stretch, decide
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
-from qfolio.portfolio.following import follow
+from qfolio.portfolio.following import begin, follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices
 
 from listeners import Interrupt
@@ -128,7 +128,8 @@ def test_holdings_carry_over_from_fold_to_fold(finished, name, together):
     held = np.zeros((1 if together else 2, 4))
     held[:, 0] = 1
     agent, first = same.agents[name], fold.decisions.start
-    targets, _ = follow(task, agent, members, first, held, 160, together=together)
+    start = begin(task, held)
+    targets, _ = follow(task, agent, members, first, start, 160, together=together)
     stretches = [Stretch(task, members, each) for each in same.folds]
     decided = decide(agent, stretches, len(held), together=together)
     np.testing.assert_allclose(decided, targets, atol=1e-6)

@@ -1,7 +1,7 @@
 """A baseline's orders over the folds of a test, row by row without look-ahead."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -10,10 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, Bools, Floats, History
-from qfolio.portfolio.mandate.feasible import Feasible, exactly
+from qfolio.portfolio.execution import Terms
+from qfolio.portfolio.mandate.feasible import Feasible, Mandated, exactly
 
 TOLERANCE = 1e-6
 """How far weights may be off the simplex or above the cap."""
+
+AT_EVERY_ROW = Terms(np.zeros(0, bool), np.zeros(0))
 
 
 @runtime_checkable
@@ -47,10 +50,9 @@ def orders(
     *,
     tradable: ArrayLike | None = None,
     cap: float = 1.0,
-    feasible: Sequence[Feasible] | None = None,
+    feasible: Callable[[int, int], Feasible] | None = None,
     month: int = 21,
-    decides: Bools | None = None,
-    band: float = 0.0,
+    terms: Terms = AT_EVERY_ROW,
     universe: Bools | None = None,
 ) -> Orders:
     """Ask a baseline for its decisions on every row of the folds.
@@ -65,11 +67,12 @@ def orders(
         tradable: Which assets a fold may hold, of shape (folds, N) (default: those with prices in
             all of its training rows).
         cap: Largest weight of one asset when it is ordered.
-        feasible: The weights that a mandate allows in each fold. Targets are projected onto them at
-            every row at which there is one; a target of the calendar "fold" is one of every row.
+        feasible: The weights that a mandate allows, given the number of a fold and a row. Targets
+            are projected onto them at every row at which there is one; a target of the calendar
+            "fold" is one of every row.
         month: Rows in a month.
-        decides: Which rows are for decisions, of shape (rows,), instead of the baseline's calendar.
-        band: As ``calendars.band``; a target of the calendar "fold" is one of every row.
+        terms: When orders are given and how they are filled, in numpy; rows for decisions take the
+            place of the baseline's calendar.
         universe: Which assets may be bought at each row, of shape (rows, N), if they come and go.
             One that estimates may hold those of them with prices in all of the fold's training
             rows. A target of the calendar "fold" is asked for at every row.
@@ -85,38 +88,54 @@ def orders(
     prices = np.array(values, dtype=float)
     prices.flags.writeable = False  # shared by all baselines
     _check(folds)
-    ordered, row_ordered = np.eye(prices.shape[1] + 1)[0], folds[0].decisions.start
+    nothing = np.eye(prices.shape[1] + 1)[0]
+    last, row_last, plan = nothing, folds[0].decisions.start, terms.begin(nothing)
+    watched = plan is not None or terms.called < np.inf
     parts, notes = [], []
     for number, fold in enumerate(folds):
         chosen = None if tradable is None else np.asarray(tradable, dtype=bool)[number]
         may = ~np.isnan(prices[fold.train]).any(axis=0) if baseline.estimates else True
         allowed = _tradable(fold, prices, chosen) if universe is None else universe & may
         rows = range(len(prices))[fold.decisions]
+        decides = terms.decides if len(terms.decides) else None
         asked = set(_asked(baseline, rows, folds[0].decisions.start, month, decides))
         trading = np.ones(len(rows), bool) if decides is None else decides[fold.decisions]
-        mandated = None if feasible is None else feasible[number]
-        each = universe is not None and baseline.calendar == "fold"
+        stands = baseline.calendar == "fold"  # its target is one of every row
+        each = universe is not None and stands
         asked |= {row for row in rows if each and (decides is None or decides[row])}
-        again = (mandated is not None or band > 0) and baseline.calendar == "fold"
-        part = np.full((len(rows), len(ordered)), np.nan)
+        again = stands and (feasible is not None or terms.band > 0)
+        part = np.full((len(rows), len(last)), np.nan)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            for row in rows if again else sorted(asked):
-                held = drifted(ordered, prices[row_ordered], prices[row])
-                if row in asked:
+            for row in rows if again or watched else sorted(asked):
+                held = drifted(last, prices[row_last], prices[row])
+                called = terms.called < np.inf and abs(held[1:]).sum() > terms.called
+                if row in asked or (called and not stands):
                     known = slice(0, row + 1)
                     open_to = allowed if universe is None else allowed[row]
                     history = History(dates[known], prices[known], fold.train, open_to, cap, month)
-                    nothing = np.eye(len(ordered))[0]
                     wanted = baseline.decide(history, held) if open_to.any() else nothing
-                if wanted is not None and (trading[row - rows[0]] or not again):
-                    target = obeying(name, wanted, held, history, mandated)
-                    if beyond(band, target, held):
-                        ordered, row_ordered = target, row
-                        part[row - rows[0]] = ordered
-        if baseline.calendar == "fold" and not (again or each or np.isnan(part[0]).any()):
+                elif not stands:
+                    wanted = None
+                due = trading[row - rows[0]] or called or not (again or watched)
+                order, given = held, False
+                if wanted is not None and due:
+                    mandated = None if feasible is None else feasible(number, row)
+                    left = terms.unspent(plan)
+                    if left is not None and isinstance(mandated, Mandated):
+                        mandated = mandated.spending(left)
+                    order = obeying(name, wanted, held, history, mandated)
+                    given = beyond(terms.band, order, held)
+                target, plan = terms.trade(held, order, given, plan)
+                if given or (target != held).any():
+                    last, row_last = target, row
+                    part[row - rows[0]] = target
+                if plan is not None and row + 1 < len(prices):
+                    coming = drifted(plan.order, prices[row], prices[row + 1])
+                    plan = terms.next_row(row, plan, coming)
+        if stands and not (again or watched or each or np.isnan(part[0]).any()):
             part[:] = np.where(trading[:, None], part[0], np.nan)
-            row_ordered = rows[np.flatnonzero(trading)[-1]] if trading.any() else row_ordered
+            row_last = rows[np.flatnonzero(trading)[-1]] if trading.any() else row_last
         said = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
         notes += [f"{name}, fold {fold.name}: {note}" for note in said]
         parts.append(part)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
@@ -17,10 +19,10 @@ from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.own import Placed, kept
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
-from qfolio.portfolio.calendars import band
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel
-from qfolio.portfolio.following import follow, ordered
+from qfolio.portfolio.execution import Terms
+from qfolio.portfolio.following import begin, follow, ordered
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight
@@ -74,17 +76,17 @@ def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: 
     With ``together`` one portfolio follows the mean of all seeds, and ``seeds`` is 1. The agents
     see their portfolio in float32; the replay is in float64.
     """
-    held = np.zeros((seeds, 1 + len(stretches[0].task.limits)))
-    held[:, 0] = 1.0
+    cash = np.eye(1 + len(stretches[0].task.limits))[:1]
+    held = begin(stretches[0].task, np.repeat(cash, seeds, 0))
     days = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
     parts = []
     for (task, members, fold), count in zip(stretches, days, strict=True):
         # One length for all folds, so that one program serves all; the surplus is cut off.
         start = fold.decisions.start
         targets, after = follow(task, agent, members, start, held, max(days), together=together)
-        given = ordered(task, targets, held, after)
+        given = ordered(task, targets, held.weights, np.asarray(after.weights))
         parts.append(np.where(given[..., None], targets, np.nan)[:, :count])
-        held = after[:, count - 1]
+        held = jax.tree.map(lambda x, last=count - 1: x[:, last], after)
     return np.concatenate(parts, axis=1)
 
 
@@ -152,6 +154,16 @@ class Replay:
             if mandate
         ]
 
+    def _feasible(self, fold: int, row: int) -> Mandated:
+        """What the mandate allows at a row of a fold."""
+        made = self._relaxed[fold][0]
+        return made.knowing(self.task.risk_at(jnp.array(row))) if made.limits_risk else made
+
+    @property
+    def _terms(self) -> Terms:
+        terms = self.task.terms
+        return terms._replace(decides=np.asarray(terms.decides), elapsed=np.asarray(terms.elapsed))
+
     def wiped_out(self, entries: Mapping[str, Entry]) -> list[str]:
         """A note on each strategy that lost everything."""
         counts = {name: int(entry.simulation.ruined.sum()) for name, entry in entries.items()}
@@ -184,10 +196,9 @@ class Replay:
             table.values,
             universe=table.tradable,
             cap=min(self.cap, largest_weight(text)) if text else self.cap,
-            feasible=[made for made, _ in self._relaxed] if text else None,
+            feasible=self._feasible if text else None,
             month=table.month,
-            decides=np.asarray(self.task.decides) if self.task.calendar else None,
-            band=band(self.task.calendar),
+            terms=self._terms,
         )
         return self.entry(kind, given.decisions[None]), given.notes
 

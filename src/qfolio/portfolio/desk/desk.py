@@ -13,7 +13,6 @@ from qfolio.core.text import near, quote
 from qfolio.core.version import __version__
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.calendars import band
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
 from qfolio.portfolio.desk.rule import Rule
@@ -63,12 +62,10 @@ class Desk:
                 name,
                 self.run.baselines[name],
                 self.run.prices.assets,
-                task.costs,
+                task,
                 train=config.train,
                 expanding=config.expanding,
                 cap=config.cap,
-                mandate=task.mandate,
-                band=band(task.calendar),
             )
         known = near(name, (*self.run.agents, *self.run.baselines))
         raise QfolioError(f"The backtest has no agent or baseline {quote(name)}; {known}")

@@ -1,7 +1,9 @@
 """A baseline of a backtest, asked for tomorrow's weights as a learned policy is."""
 
+import dataclasses
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from qfolio.core.errors import QfolioError
@@ -12,6 +14,7 @@ from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight
 from qfolio.portfolio.prices.table import Prices, load
+from qfolio.portfolio.task import Portfolio
 
 
 class Rule:
@@ -25,17 +28,23 @@ class Rule:
         name: str,
         baseline: Baseline,
         assets: tuple[str, ...],
-        costs: CostModel,
+        task: Portfolio,
         *,
         train: str,
         expanding: bool,
         cap: float,
-        mandate: str = "",
-        band: float = 0.0,
     ) -> None:
-        self.name, self.baseline, self.assets, self.costs = name, baseline, assets, costs
-        self.train, self.expanding = train, expanding
-        self.cap, self.mandate, self.band = cap, mandate, band
+        self.name, self.baseline, self.assets = name, baseline, assets
+        self.train, self.expanding, self.cap = train, expanding, cap
+        self.task = dataclasses.replace(task, signals="", anchor="", menu="")
+
+    @property
+    def costs(self) -> CostModel:
+        return self.task.costs
+
+    @property
+    def mandate(self) -> str:
+        return self.task.mandate
 
     def table(self, prices: Any, **options: Any) -> Prices:
         """The prices with the assets of the backtest, in its order."""
@@ -49,8 +58,11 @@ class Rule:
             )
         return table.select(self.assets)
 
-    def weights(self, prices: Any, holdings: Any = None) -> dict[str, float]:
-        """Target weights by asset, with "cash" first; as held if the baseline gives no order."""
+    def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:
+        """Target weights by asset, with "cash" first; as held if the baseline gives no order.
+
+        spent: turnover since the calendar year began, for a mandate that limits it.
+        """
         table = self.table(prices)
         held = np.array([(holdings or {"cash": 1.0}).get(n, 0.0) for n in ("cash", *self.assets)])
         fold = latest("latest", table.dates, self.train, self.expanding).complete(table.values)
@@ -59,14 +71,19 @@ class Rule:
             raise QfolioError(
                 f"No asset has prices in all of the last {self.train}; give earlier prices."
             )
-        mandated, cap = None, self.cap
+        mandated, cap, terms = None, self.cap, self.task.terms
         if self.mandate:
             mandated, _ = checks.relaxed(feasible(self.mandate, tradable, cap))
             cap = min(cap, largest_weight(self.mandate))
+            if mandated.limits_risk:
+                last = jnp.array(len(table) - 1)
+                mandated = mandated.knowing(self.task.on(table).risk_at(last))
+            left = terms.unspent(terms.begin(held, spent))
+            mandated = mandated if left is None else mandated.spending(left)
         history = History(table.dates, table.values, fold.train, tradable, cap, table.month)
         wanted = self.baseline.decide(history, held)
         target = held
         if wanted is not None:
             target = obeying(self.name, wanted, held, history, mandated)
-            target = target if beyond(self.band, target, held) else held
+            target = target if beyond(terms.band, target, held) else held
         return dict(zip(("cash", *self.assets), target.tolist(), strict=True))

@@ -1,6 +1,7 @@
 """The weights that a mandate allows."""
 
 import abc
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -23,6 +24,7 @@ from qfolio.portfolio.mandate.projection import (
     search,
     solution,
 )
+from qfolio.portfolio.mandate.risk import TINY, Risk
 
 Multipliers = Float[Array, " condition"]
 
@@ -102,7 +104,9 @@ class Mandated(Feasible):
     An order is the point of the set that is nearest to the weights wanted, in the weights of the
     assets; cash is the rest. With a number of holdings, the largest weights of that point are kept,
     and the others are 0. Changes below the smallest trade are not made, unless a limit needs them.
-    If turnover clashes with other limits, as after a fall in prices, it gives way to them.
+    If turnover clashes with other limits, as after a fall in prices, it gives way to them. If that
+    point is too risky, the order goes from it towards the benchmark, or towards cash where tracking
+    error has no limit, as far as it must (see ``risk.py``).
     """
 
     limits: Limits
@@ -111,6 +115,23 @@ class Mandated(Feasible):
     smallest_trade: float = eqx.field(static=True, default=0.0)
     exposure: float = eqx.field(static=True, default=1.0)  # largest sum of absolute weights
     long: bool = eqx.field(static=True, default=True)
+    volatility: float = eqx.field(static=True, default=float("inf"))  # a year, at most
+    tracking_error: float = eqx.field(static=True, default=float("inf"))  # a year, at most
+    risk: Risk | None = None  # as known at a row, if there is such a limit
+
+    @property
+    def limits_risk(self) -> bool:
+        """Whether volatility or tracking error has a limit."""
+        return min(self.volatility, self.tracking_error) < float("inf")
+
+    def knowing(self, risk: Risk) -> "Mandated":
+        """The set at a row where so much is known of risk."""
+        return dataclasses.replace(self, risk=risk)
+
+    def spending(self, turnover: Any) -> "Mandated":
+        """The set of orders with at most some turnover."""
+        least = turnover.__array_namespace__().minimum(self.limits.turnover, turnover)
+        return dataclasses.replace(self, limits=self.limits._replace(turnover=least))
 
     @property
     def long_only(self) -> bool:
@@ -126,15 +147,44 @@ class Mandated(Feasible):
         aim, now, limits = wanted[1:], held[1:], self.limits
         if self.holdings and self.holdings < len(aim):
             limits = self._fewer(aim, now)
+        within = limits
         if self.smallest_trade:
             found, left = checkpoint_name(self._without_small(aim, now, limits), SEARCHED)
-            limits = _fixed(limits, left, now)
+            within = _fixed(limits, left, now)
         else:
             found = checkpoint_name(search(aim, now, limits), SEARCHED)
-        weights = solution(found, aim, now, limits)
+        weights = solution(found, aim, now, within)
+        if self.limits_risk and self.risk is not None:
+            weights = self._safer(weights, now, limits, self.risk)
         if self.long:  # rounding may leave no cash, and less
             weights /= jnp.maximum(weights.sum(), 1.0)
         return simplex.with_rest(weights)
+
+    def _safer(
+        self,
+        weights: Float[Array, " asset"],
+        held: Float[Array, " asset"],
+        limits: Limits,
+        risk: Risk,
+    ) -> Float[Array, " asset"]:
+        """The weights moved towards safe ones within the limits, as far as they are too risky.
+
+        The benchmark is the safe portfolio, with as much cash as its own volatility needs; where
+        tracking error has no limit, cash is.
+        """
+        aim = jnp.zeros_like(weights)
+        if self.tracking_error < float("inf"):
+            own = risk.of(risk.benchmark)
+            aim = risk.benchmark * jnp.minimum(1.0, self.volatility / jnp.maximum(own, TINY))
+        found = checkpoint_name(search(aim, held, limits), SEARCHED)
+        safe = solution(found, aim, held, limits)
+        change = weights - safe
+        shares = [jnp.ones(())]
+        if self.volatility < float("inf"):
+            shares.append(risk.share(safe, change, self.volatility))
+        if self.tracking_error < float("inf"):
+            shares.append(risk.share(safe - risk.benchmark, change, self.tracking_error))
+        return safe + jnp.stack(shares).min() * change
 
     def _fewer(self, wanted: Float[Array, " asset"], held: Float[Array, " asset"]) -> Limits:
         """Limits that keep all but the largest weights at 0.

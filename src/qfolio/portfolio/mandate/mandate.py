@@ -15,8 +15,14 @@
     [cash]
     max = 0.05
 
+    [risk]                    # a year
+    tracking_error = 0.04
+    volatility = 0.12
+
     [trading]                 # of one decision
     turnover = 0.3
+    turnover_a_year = 2.0
+    fill = 5
     smallest_trade = 0.005
     holdings = 10
     lot = 100
@@ -49,6 +55,7 @@ from qfolio.portfolio.mandate.projection import Limits
 Weight = Annotated[float, msgspec.Meta(ge=-3, le=3)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Lot = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+Turnover = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -81,21 +88,43 @@ class Cash(Section, frozen=True):
 class Trading(Section, frozen=True):
     """Limits of a decision. turnover: the sum of all changes of weights, bought and sold.
 
-    calendar: as ``calendars.decision_rows`` takes it. lot: shares that are traded together, a
-    number for all assets or for some; allocation alone knows shares, and rounds to them.
+    calendar: as ``calendars.decision_rows`` takes it. turnover_a_year: likewise, in a calendar
+    year. fill: rows over which an order is filled, in equal parts. lot: shares that are traded
+    together, a number for all assets or for some; allocation alone knows shares, and rounds to
+    them.
     """
 
     calendar: str = ""
-    turnover: Annotated[float, msgspec.Meta(gt=0, le=20)] | None = None
+    turnover: Turnover | None = None
+    turnover_a_year: Turnover | None = None
+    fill: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
     smallest_trade: Share = 0.0
     holdings: Annotated[int, msgspec.Meta(ge=1, le=100_000)] | None = None
     lot: Lot | dict[str, Lot] | None = None
 
 
 class Exposure(Section, frozen=True):
-    """gross: the largest sum of absolute weights."""
+    """gross: the largest sum of absolute weights.
+
+    margin: the least share of that sum which the account's own wealth must be. If prices bring it
+    below, a decision is due at that row, whatever the calendar says.
+    """
 
     gross: Annotated[float, msgspec.Meta(gt=0, le=20)] | None = None
+    margin: Annotated[float, msgspec.Meta(gt=0, le=1)] | None = None
+
+
+class Limited(Section, frozen=True):
+    """Limits on the risk of an order, a year, as the last ``rows`` returns show it.
+
+    benchmark: what tracking error is measured against: an asset, a baseline, or column:NAME with
+    its weights (default: the mandate's benchmark, or else equal weights).
+    """
+
+    volatility: Annotated[float, msgspec.Meta(gt=0, le=10)] | None = None
+    tracking_error: Annotated[float, msgspec.Meta(gt=0, le=10)] | None = None
+    benchmark: str | None = None
+    rows: Annotated[int, msgspec.Meta(ge=20, le=10_000)] = 252
 
 
 class Mandate(Section, frozen=True):
@@ -112,6 +141,7 @@ class Mandate(Section, frozen=True):
     cash: Cash = Cash()
     trading: Trading = Trading()
     exposure: Exposure = Exposure()
+    risk: Limited = Limited()
 
     @staticmethod
     def read(path: Path | str) -> "Mandate":
@@ -171,8 +201,11 @@ class Mandate(Section, frozen=True):
                     f"The mandate's group {column} {value} has none of the table's assets; name "
                     "them in groups.file, or in the group's assets."
                 )
-        trading = msgspec.structs.replace(self.trading, calendar="")
-        limits = msgspec.structs.replace(self, benchmark=None, costs={}, trading=trading)
+        trading, risk = msgspec.structs.replace(self.trading, calendar=""), self.risk
+        against = risk.benchmark or self.benchmark or "equal-weight"
+        tracked = risk.tracking_error is not None
+        risk = msgspec.structs.replace(risk, benchmark=against if tracked else None)
+        limits = msgspec.structs.replace(self, benchmark=None, costs={}, trading=trading, risk=risk)
         return msgspec.json.encode((list(assets), limits)).decode()
 
     @property
@@ -244,6 +277,8 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
         trading.smallest_trade,
         1.0 if long else min(exposure or most_gross, most_gross),
         long,
+        mandate.risk.volatility or np.inf,
+        mandate.risk.tracking_error or np.inf,
     )
 
 
@@ -297,7 +332,7 @@ def _fields(place: str) -> list[str]:
     """The keys of a section."""
     section = place.partition(".")[0].partition("[")[0]
     kinds: dict[str, Any] = {"": Mandate, "assets": Assets, "groups": Group, "cash": Cash}
-    kinds |= {"trading": Trading, "exposure": Exposure}
+    kinds |= {"trading": Trading, "exposure": Exposure, "risk": Limited}
     return list(kinds[section].__struct_fields__)
 
 

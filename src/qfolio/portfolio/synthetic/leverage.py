@@ -12,7 +12,7 @@ from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Box, Policy, Position
 from qfolio.portfolio.costs import Context
 from qfolio.portfolio.mandate.feasible import Feasible
-from qfolio.portfolio.market import Contexts, Relatives
+from qfolio.portfolio.market import Contexts, Holding, Relatives
 from qfolio.portfolio.synthetic.base import SyntheticMarket
 from qfolio.portfolio.synthetic.merton import lognormal_table
 from qfolio.solvers.merton import LeveragedOptimum, leveraged_optimal
@@ -82,9 +82,7 @@ class Leverage(SyntheticMarket):
     def actions(self) -> Box:
         return Box(len(self.drift))
 
-    def target(
-        self, market: Array, held: Float[Array, " entry"], action: Array
-    ) -> Float[Array, " entry"]:
+    def wanted(self, market: Array, holding: Holding, action: Array) -> Float[Array, " entry"]:
         return simplex.with_rest(action)
 
     def intent(self, state: Position, action: Array) -> Array:

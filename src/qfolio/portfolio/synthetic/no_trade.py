@@ -83,7 +83,7 @@ class NoTrade(OneAsset):
     def settle(
         self, market: Array, next_market: Array, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
-        target = self.target(market, holding.weights, action)
+        target = self.target(market, holding, action)
         at = self.contexts(market, next_market)
         remainder, _ = self.costs.trade(holding.weights, target, at.trade)
         nodes, chances = np.polynomial.hermite_e.hermegauss(self.NODES)

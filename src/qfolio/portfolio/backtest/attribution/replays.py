@@ -8,7 +8,7 @@ would be confused with that of trading less. All else is as it was: prices, hold
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,8 +20,8 @@ from jaxtyping import Array, Float, Int, PyTree
 from qfolio.core.mdp import Agent
 from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.replay import Stretch
-from qfolio.portfolio.following import paths
-from qfolio.portfolio.market import Signalled
+from qfolio.portfolio.following import begin, paths
+from qfolio.portfolio.market import Holding, Signalled
 from qfolio.portfolio.task import Portfolio
 
 AT_ONCE = 16
@@ -133,8 +133,8 @@ def _replay(
     raw = channels(stretches[0].task)
     masks, rows, assets = (jnp.asarray(np.array(x)) for x in zip(*wanted, strict=True))
     counts = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
-    held = np.zeros((len(wanted), raw.shape[1] + 1), np.float32)
-    held[:, 0] = 1.0
+    cash = np.eye(raw.shape[1] + 1)[:1]
+    held = begin(stretches[0].task, np.repeat(cash, len(wanted), 0))
     targets, before = [], []
     for (task, members, fold), count in zip(stretches, counts, strict=True):
         start, longest = fold.decisions.start, max(counts)
@@ -149,32 +149,35 @@ def _replay(
             agent,
             together,
             first,
-            jnp.asarray(held),
+            held,
             (*drawn, masks, rows, assets),
             longest,
         )
-        ordered, after = (np.asarray(x) for x in ends)
+        ordered, after = jax.tree.map(np.asarray, ends)
         targets.append(ordered[:, :count])
-        before.append(np.concatenate([held[:, None], after[:, : count - 1]], 1))
-        held = after[:, count - 1]
+        start_held = np.asarray(held.weights)[:, None]
+        before.append(np.concatenate([start_held, after.weights[:, : count - 1]], 1))
+        held = jax.tree.map(lambda x, last=count - 1: x[:, last], after)
     return Replays(np.concatenate(targets, 1), np.concatenate(before, 1))
 
 
 @eqx.filter_jit(donate="none")
 def _paths(
-    task: Portfolio, raw: Array, agent: Agent, members: PyTree, first: Array, held: Array,
+    task: Portfolio, raw: Array, agent: Agent, members: PyTree, first: Array, held: Holding,
     shuffled: tuple[Array, ...], count: int,
-) -> tuple[Float[Array, "replay time entry"], Float[Array, "replay time entry"]]:  # fmt: skip
+) -> tuple[Float[Array, "replay time entry"], Holding]:  # fmt: skip
     rows, assets, masks, *draws = shuffled
 
-    def one(given: tuple[Array, ...]) -> tuple[Array, Array]:
+    def one(given: tuple[Any, ...]) -> tuple[Array, Holding]:
         held, mask, row_draw, asset_draw = given
         seen = jnp.take_along_axis(raw[rows[row_draw]], assets[asset_draw][..., None], 1)
         mixed = jnp.where(mask > 0, seen, raw[rows[0]])
         observed = (mixed - task.center) / task.scale
         blind = Observed.given(task, observed, first - task.window + 1)
-        targets, after = paths(blind, agent, members, first, held[None], count)
-        return targets[0], after[0]
+        start = jax.tree.map(lambda x: x[None], held)
+        found = paths(blind, agent, members, first, start, count)
+        _, targets, after = jax.tree.map(lambda x: x[0], found)
+        return targets, after
 
-    found: tuple[Array, Array] = jax.vmap(one)((held, masks, *draws))
+    found: tuple[Array, Holding] = jax.vmap(one)((held, masks, *draws))
     return found

@@ -130,10 +130,11 @@ def answer(
     """The target weights at a row whose features are given, the mean of all members."""
     asked = eqx.tree_at(lambda t: t.decides, task, jnp.ones_like(task.decides))  # on any day
     seen = Observed.given(asked, jnp.swapaxes(features, 0, 1), row - task.window + 1)
-    view = jax.tree.map(lambda x: x[None], seen.view(row, held))
+    holding = seen.hold(held)
+    view = jax.tree.map(lambda x: x[None], seen.view(row, holding))
 
     def one(weights: PyTree) -> Array:
-        return seen.target(row, held, agent.policy(weights, view)[0])
+        return seen.target(row, holding, agent.policy(weights, view)[0])
 
     mean: Array = jax.vmap(one)(members).mean(0)
     return mean

@@ -1,0 +1,91 @@
+"""From an order to trades: when orders are given, and over how many rows they are filled.
+
+The functions take numpy and jax arrays alike, so that training, replay and baselines share them.
+"""
+
+from typing import Any, NamedTuple
+
+
+class Plan(NamedTuple):
+    """What an account remembers of its orders."""
+
+    spent: Any  # turnover since the calendar year began, ()
+    order: Any  # the last order, drifted to now, (entry,)
+    left: Any  # rows over which it is still to be filled, ()
+
+
+class Terms(NamedTuple):
+    """When orders are given, and how they are filled; arrays of numpy or jax.
+
+    decides: rows for decisions, shape (row,); no rows if all are. elapsed: share of the calendar
+    year that has passed at each row, shape (row,); no rows unless ``turnover`` is limited. band: an
+    order is given only if some weight, cash included, is to change by more. fill: rows over which
+    an order is filled, in equal parts. turnover: the most in a calendar year, bought and sold.
+    called: with a larger sum of absolute weights, a decision is due at any row (a margin call).
+    """
+
+    decides: Any
+    elapsed: Any
+    band: float = 0.0
+    fill: int = 1
+    turnover: float = float("inf")
+    called: float = float("inf")
+
+    @property
+    def remembers(self) -> bool:
+        """Whether an account needs a plan."""
+        return self.fill > 1 or self.turnover < float("inf")
+
+    def due(self, row: Any, held: Any) -> Any:
+        """Whether a decision is due at a row with some weights held; a bool, or an array ()."""
+        decides = self.decides[row] if len(self.decides) else True
+        if self.called < float("inf"):
+            decides |= abs(held[1:]).sum() > self.called
+        return decides
+
+    def ordered(self, row: Any, held: Any, wanted: Any) -> Any:
+        """Whether what is wanted is ordered; a bool, or an array ()."""
+        decides = self.due(row, held)
+        return decides & (abs(wanted - held).max() > self.band) if self.band else decides
+
+    def begin(self, held: Any, spent: Any = 0.0) -> Plan | None:
+        """The plan of an account without orders; None if it needs none."""
+        if not self.remembers:
+            return None
+        xp = held.__array_namespace__()
+        return Plan(xp.asarray(spent, dtype=held.dtype), held, xp.asarray(0, dtype=xp.int32))
+
+    def trade(
+        self, held: Any, order: Any, given: Any, plan: Plan | None
+    ) -> tuple[Any, Plan | None]:
+        """The weights after the trade of a row, and the plan from there on.
+
+        Each row buys and sells an equal part of what is left of the order, in shares. An order that
+        is ``given`` at this row takes the place of the rest.
+        """
+        if given is True and plan is None:
+            return order, None
+        xp = held.__array_namespace__()
+        if plan is None:
+            return xp.where(given, order, held), None
+        order = xp.where(given, order, plan.order)
+        left = xp.where(given, self.fill, plan.left)
+        part = xp.where(left > 1, held + (order - held) / xp.maximum(left, 1), order)
+        target = xp.where(left > 0, part, held)
+        spent = plan.spent + abs(target - held)[1:].sum()
+        return target, Plan(spent, order, xp.maximum(left - 1, 0))
+
+    def unspent(self, plan: Plan | None) -> Any:
+        """The turnover that is left this year; None if it has no limit."""
+        if plan is None or self.turnover == float("inf"):
+            return None
+        return plan.spent.__array_namespace__().maximum(self.turnover - plan.spent, 0.0)
+
+    def next_row(self, row: Any, plan: Plan, order: Any) -> Plan:
+        """The plan one row later; order: what it orders, drifted to there."""
+        spent = plan.spent
+        if len(self.elapsed):
+            xp = spent.__array_namespace__()
+            after = xp.minimum(row + 1, len(self.elapsed) - 1)
+            spent = xp.where(self.elapsed[after] < self.elapsed[row], 0.0, spent)
+        return Plan(spent, order, plan.left)
