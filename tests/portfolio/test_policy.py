@@ -77,9 +77,9 @@ def test_it_decides_by_the_mean_of_its_agents(policy):
     np.testing.assert_allclose(targets.sum(1), 1, atol=1e-12)
     start = begin(task, held[None])
     found, then = follow(task, policy.agent, policy.members, 70, start, 5, together=True)
-    for one, other in zip((found, then.weights), (targets, after), strict=True):
-        assert np.shape(one) == (1, 5, 4)
-        np.testing.assert_allclose(np.asarray(one)[0], other, atol=1e-6)
+    for one, other in ((found, targets), (np.asarray(then.weights), after)):
+        assert one.shape == (1, 5, 4)
+        np.testing.assert_allclose(one[0], other, atol=1e-6)
 
 
 def test_it_comes_back_from_disk(policy, tmp_path):

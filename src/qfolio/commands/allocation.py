@@ -129,7 +129,10 @@ def allocate(
         if not isinstance(followed, Policy):
             raise QfolioError(f"{name} is a baseline, which learns nothing; leave out --update.")
         followed = followed.update(table)
-    allocation = Allocation.of(followed, table, shares, cash, whole_shares=whole_shares)
+    spent = desk.spent(followed, table)
+    allocation = Allocation.of(
+        followed, table, shares, cash, whole_shares=whole_shares, spent=spent
+    )
     rows = None if orders is None else order_rows(allocation, layout, currency)
     said, number = "A dry run: nothing is recorded.", None
     if not dry_run:
@@ -147,7 +150,8 @@ def allocate(
     console.print_allocation(allocation, standing, trained)
     for reason in why:
         console.tell(f"Why {sentence(reason)}")
-    console.tell(said)
+    for line in (*desk.terms(followed, allocation, spent), said):
+        console.tell(line)
     return {
         "agent": name,
         "trained_until": trained,
@@ -155,6 +159,7 @@ def allocate(
         "worse": standing.worse,
         "record": number,
         **allocation.to_json(),
+        "spent": spent,
         "reasons": msgspec.to_builtins(why),
     }
 

@@ -109,6 +109,28 @@ def test_every_order_obeys_the_mandate(tmp_path):
 
 
 @pytest.mark.slow
+def test_agents_and_baselines_keep_risk_and_turnover_of_a_year_at_every_order(tmp_path):
+    mandate = {"risk": {"tracking_error": 0.04}, "trading": {"turnover_a_year": 1.5, "fill": 2}}
+    agents = {"pathwise": AGENTS["pathwise"]}
+    backtest = create(mandate, tmp_path / "run", agents=agents, baselines=["momentum"])
+    backtest.run()
+    backtest = Backtest.open(tmp_path / "run")
+    entries, notes = backtest.entries()
+    prices = backtest.prices
+    rows = backtest.folds[0].decisions.start + np.arange(backtest.folds[-1].decisions.stop)
+    for name in ("pathwise", "pathwise-together", "momentum"):
+        for weights in entries[name].simulation.weights:
+            held, traded = np.eye(6)[0], 0.0
+            for row, after in zip(rows, weights, strict=False):
+                traded += abs(after - held)[1:].sum()
+                moved = after[1:] * prices.values[row + 2] / prices.values[row + 1]
+                held = np.append(after[0], moved) / (after[0] + moved.sum())
+            assert 0.2 < traded <= 1.55, name  # all of it is in one year
+    said = [note for note in notes if "has a tracking error above 0.04 after" in note]
+    assert len(said) >= 3  # on the way from cash
+
+
+@pytest.mark.slow
 def test_orders_of_a_calendar_obey_although_holdings_drift_between_them():
     mandate = {"assets": {"cap": 0.25}, "trading": {"holdings": 4}}
     backtest = create(mandate, agents={"pathwise": AGENTS["pathwise"]}, calendar="weekly")

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jax import lax
+from jaxtyping import Array, Float, Int, PyTree
 
 from qfolio.core.mdp import Agent
 from qfolio.portfolio.backtest.assessment import Strategy
@@ -29,6 +31,9 @@ from qfolio.portfolio.mandate.mandate import feasible, largest_weight
 from qfolio.portfolio.prices.findings import listing
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
+
+BARELY = 1e-3
+"""Risk above a limit by a smaller share of it is rounding."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,20 @@ def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: 
         parts.append(np.where(given[..., None], targets, np.nan)[:, :count])
         held = jax.tree.map(lambda x, last=count - 1: x[:, last], after)
     return np.concatenate(parts, axis=1)
+
+
+@eqx.filter_jit
+def _risks(
+    task: Portfolio, rows: Int[Array, " trade"], weights: Float[Array, "trade asset"]
+) -> tuple[Float[Array, " trade"], Float[Array, " trade"]]:
+    """Annual volatility and tracking error of weights, as known at their rows."""
+
+    def each(row: Array, held: Array) -> tuple[Array, Array]:
+        risk = task.risk_at(row)
+        return risk.of(held), risk.of(held - risk.benchmark)
+
+    found: tuple[Array, Array] = lax.map(lambda given: each(*given), (rows, weights))
+    return found
 
 
 @dataclass(frozen=True)
@@ -163,6 +182,26 @@ class Replay:
     def _terms(self) -> Terms:
         terms = self.task.terms
         return terms._replace(decides=np.asarray(terms.decides), elapsed=np.asarray(terms.elapsed))
+
+    def too_risky(self, entries: Mapping[str, Entry]) -> list[str]:
+        """A note on each strategy whose trades exceed the mandate's limits on risk."""
+        allowed, notes = self.task.allowed, []
+        if allowed is None or not allowed.limits_risk:
+            return []
+        limits = {"volatility": allowed.volatility, "tracking error": allowed.tracking_error}
+        for name, entry in entries.items():
+            if not entry.weighted:
+                continue
+            traded = ~np.isnan(entry.decisions[..., 0])
+            rows = self.folds[0].decisions.start + np.nonzero(traded)[1]
+            found = _risks(self.task, jnp.asarray(rows), jnp.asarray(entry.decisions[traded, 1:]))
+            for (said, most), risk in zip(limits.items(), np.asarray(found), strict=True):
+                if over := int((risk > most * (1 + BARELY)).sum()):
+                    notes.append(
+                        f"{name} has a {said} above {most:.4g} after {over:,} of its "
+                        f"{len(rows):,} trades (up to {risk.max():.4g})."
+                    )
+        return notes
 
     def wiped_out(self, entries: Mapping[str, Entry]) -> list[str]:
         """A note on each strategy that lost everything."""

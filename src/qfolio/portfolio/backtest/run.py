@@ -409,7 +409,13 @@ class Backtest:
             entries |= replay.agent(name, agent, self.stretches(name), self.config.seeds)
         others, notes = replay.others(self.baselines, self._own, self.config.benchmark)
         entries |= others
-        return entries, [*replay.left_out(), *replay.mandated(), *notes, *replay.wiped_out(entries)]
+        return entries, [
+            *replay.left_out(),
+            *replay.mandated(),
+            *notes,
+            *replay.too_risky(entries),
+            *replay.wiped_out(entries),
+        ]
 
     @cached_property
     def replay(self) -> Replay:

@@ -60,6 +60,7 @@ class Allocation:
         cash: float,
         *,
         whole_shares: bool = False,
+        spent: float = 0.0,
     ) -> "Allocation":
         """The policy's target after the table's last row, and the trades from the current holding.
 
@@ -73,6 +74,7 @@ class Allocation:
             cash: Cash held now, in money.
             whole_shares: Whether to trade whole shares only, as near to the target as they come.
                 Where the mandate has lots, whole lots are traded in any case.
+            spent: Turnover since the calendar year began, for a mandate that limits it.
 
         Raises:
             QfolioError: There is nothing to allocate.
@@ -86,7 +88,8 @@ class Allocation:
             )
         held = np.append(cash, shares * known) / wealth
         names = ("cash", *prices.assets)
-        targets = policy.weights(prices, dict(zip(names, held.tolist(), strict=True)))
+        before: dict[str, Any] = {"spent": spent} if spent else {}  # few need to know
+        targets = policy.weights(prices, dict(zip(names, held.tolist(), strict=True)), **before)
         weights = _ordered(np.array([targets[name] for name in names]), held)
         trades = np.zeros(len(shares))
         context = context_of(policy.costs, prices, wealth)
@@ -126,6 +129,11 @@ class Allocation:
     def held(self) -> np.ndarray:
         """Weights now, cash first."""
         return np.append(self.cash, np.nan_to_num(self.shares * self.prices)) / self.wealth
+
+    @property
+    def turnover(self) -> float:
+        """The sum of all changes of weights, bought and sold."""
+        return float(abs(self.weights - self.held)[1:].sum())
 
     @cached_property
     def reached(self) -> np.ndarray:

@@ -74,6 +74,29 @@ class Desk:
         """The prices to decide on (default: those of the backtest)."""
         return self.run.prices if prices is None else followed.table(self.load(prices))
 
+    def spent(self, followed: Policy | Rule, table: Prices, before: int | None = None) -> float:
+        """The turnover of the ledger since the year of a table's last row began.
+
+        0 if the mandate does not limit it. before: as for ``Ledger.spent``.
+        """
+        limited = followed.task.written.trading.turnover_a_year is not None
+        return self.ledger.spent(table.dates[-1], before) if limited else 0.0
+
+    def terms(self, followed: Policy | Rule, allocation: Allocation, spent: float) -> list[str]:
+        """Sentences on how the mandate wants an allocation to be traded."""
+        trading, said = followed.task.written.trading, []
+        if trading.fill > 1:
+            said.append(
+                f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
+                "order at every one of them."
+            )
+        if (most := trading.turnover_a_year) is not None:
+            said.append(
+                f"Of this year's turnover of at most {most:.0%}, the ledger's orders took "
+                f"{spent:.1%}, and this one takes {allocation.turnover:.1%}."
+            )
+        return said
+
     def record(
         self, name: str, allocation: Allocation, prices: Prices, whole_shares: bool
     ) -> tuple[Record, str]:
@@ -138,7 +161,9 @@ class Desk:
                 f"{name} cannot be reproduced: {' and '.join(differing)} differ from those of the "
                 "ledger; restore them."
             )
-        again = Allocation.of(followed, table, shares, cash, whole_shares=record.whole_shares)
+        spent = self.spent(followed, table, record.number)
+        whole = record.whole_shares
+        again = Allocation.of(followed, table, shares, cash, whole_shares=whole, spent=spent)
         off = float(abs(again.weights - np.array(record.target)).max())
         if off > SAME:
             raise QfolioError(

@@ -85,6 +85,20 @@ class Ledger:
         last = {record.moment: record for record in self.records()}
         return [last[moment] for moment in sorted(last)]
 
+    def spent(self, moment: np.datetime64, before: int | None = None) -> float:
+        """The turnover ordered since the calendar year of a moment began, without its own.
+
+        before: number of a record; only those before it count (default: all).
+        """
+        known = [record for record in self.records() if before is None or record.number < before]
+        last = {record.moment: record for record in known}
+        year = moment.astype("datetime64[Y]")
+        return sum(
+            float(abs(np.subtract(record.target, record.weights_before))[1:].sum())
+            for record in last.values()
+            if record.moment < moment and record.moment.astype("datetime64[Y]") == year
+        )
+
     def on(self, date: str) -> Record:
         """The record that counts of a date, or of the last moment of a day."""
         found = [record for record in self.current() if record.date.startswith(date)]

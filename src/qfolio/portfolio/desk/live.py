@@ -28,7 +28,9 @@ class Live:
     short: int  # trades after which cash was negative: prices rose before they were filled
 
 
-def mark(records: Sequence[Record], prices: Prices, model: CostModel, lag: int) -> Live:
+def mark(
+    records: Sequence[Record], prices: Prices, model: CostModel, lag: int, fill: int = 1
+) -> Live:
     """Follows the allocations of a ledger along a price table.
 
     Trades of an allocation are filled ``lag`` rows after it, at the close, in the shares of the
@@ -42,6 +44,7 @@ def mark(records: Sequence[Record], prices: Prices, model: CostModel, lag: int) 
         prices: With a row for each of these dates; the assets are those of the records.
         model: Costs of trading and holding.
         lag: Rows from an allocation to its trades.
+        fill: Rows over which these are filled, in equal parts.
 
     Raises:
         QfolioError: The ledger is empty, or prices do not fit it.
@@ -93,7 +96,8 @@ def mark(records: Sequence[Record], prices: Prices, model: CostModel, lag: int) 
             flow = cash + float(units @ values[row]) - after
             if row == first:
                 total, flow = total + flow, 0.0
-            due = {row + lag: np.array(record.trades) * scale}
+            part = np.array(record.trades) * scale / fill
+            due = {row + lag + later: part for later in range(fill)}
             if lag == 0:
                 units, cash, more = _filled(due.pop(row), units, cash, prices, row, model)
                 paid, short = paid + more, short + (cash < -1e-9 * total)

@@ -172,6 +172,7 @@ class Mandated(Feasible):
         The benchmark is the safe portfolio, with as much cash as its own volatility needs; where
         tracking error has no limit, cash is.
         """
+        risk = jax.tree.map(lambda x: jnp.asarray(x, weights.dtype), risk)
         aim = jnp.zeros_like(weights)
         if self.tracking_error < float("inf"):
             own = risk.of(risk.benchmark)
@@ -179,7 +180,7 @@ class Mandated(Feasible):
         found = checkpoint_name(search(aim, held, limits), SEARCHED)
         safe = solution(found, aim, held, limits)
         change = weights - safe
-        shares = [jnp.ones(())]
+        shares = [jnp.ones((), weights.dtype)]
         if self.volatility < float("inf"):
             shares.append(risk.share(safe, change, self.volatility))
         if self.tracking_error < float("inf"):

@@ -48,6 +48,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.registry import BASELINES
 from qfolio.core.text import near, quote
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.projection import Limits
@@ -204,6 +205,12 @@ class Mandate(Section, frozen=True):
         trading, risk = msgspec.structs.replace(self.trading, calendar=""), self.risk
         against = risk.benchmark or self.benchmark or "equal-weight"
         tracked = risk.tracking_error is not None
+        if tracked and against not in {*assets, *BASELINES} and ":" not in against:
+            raise QfolioError(
+                f"The mandate's tracking error has the benchmark {quote(against)}, which is no "
+                "asset of the table and no baseline; set risk.benchmark to one, or to column:NAME "
+                "with its weights."
+            )
         risk = msgspec.structs.replace(risk, benchmark=against if tracked else None)
         limits = msgspec.structs.replace(self, benchmark=None, costs={}, trading=trading, risk=risk)
         return msgspec.json.encode((list(assets), limits)).decode()

@@ -1,0 +1,143 @@
+"""Limits on volatility and tracking error: what an order's risk is, and where it goes."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.mandate.feasible import Mandated, exactly
+from qfolio.portfolio.mandate.mandate import Mandate
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+
+ASSETS = ("A", "B", "C", "D", "E")
+
+ROWS = 400
+
+
+def table(seed: int = 0, rows: int = ROWS) -> Prices:
+    rng = np.random.default_rng(seed)
+    scale = rng.uniform(0.005, 0.03, 5) * np.exp(rng.normal(0, 0.3, (rows, 1)))
+    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 1, (rows, 5)) * scale, axis=0))
+    return Prices(np.datetime64("2020-01-01") + np.arange(rows), ASSETS, values)
+
+
+def portfolio(prices: Prices, risk: dict, **limits) -> Portfolio:
+    return Portfolio.of(prices, mandate={"risk": risk, **limits}, window=10, horizon=20)
+
+
+def volatility(prices: Prices, row: int, weights: np.ndarray, past: int = 252) -> float:
+    """Annual, from the last returns that are known."""
+    known = prices.values[max(0, row - past) : row + 1]
+    returns = known[1:] / known[:-1] - 1
+    return float(np.sqrt(prices.periods_per_year * ((returns @ weights) ** 2).mean()))
+
+
+@pytest.mark.parametrize("past", [20, 252])
+def test_an_order_is_as_risky_as_it_may_be(past):
+    prices, rng = table(), np.random.default_rng(1)
+    task = portfolio(prices, {"volatility": 0.12, "rows": past}, assets={"cap": 0.6})
+    order = jax.jit(lambda row, wanted: task.wanted(row, task.hold(wanted), wanted))
+    bound = 0
+    for row in rng.integers(20, ROWS, 60):
+        wanted = rng.dirichlet(np.full(6, 0.5))
+        capped = np.minimum(wanted[1:], 0.6)
+        found = np.asarray(order(jnp.array(row), jnp.asarray(wanted, jnp.float32)), float)
+        risk = volatility(prices, row, capped, past)
+        share = min(1.0, 0.12 / risk)
+        np.testing.assert_allclose(found[1:], share * capped, rtol=2e-5, atol=1e-6)
+        bound += share < 1
+    assert 20 < bound < 60
+
+
+def test_active_weights_shrink_to_the_tracking_error():
+    prices, rng = table(), np.random.default_rng(2)
+    task = portfolio(prices, {"tracking_error": 0.03}, assets={"cap": 0.6})
+    equal = np.full(5, 0.2)
+    for row in rng.integers(20, ROWS, 30):
+        wanted = rng.dirichlet(np.full(6, 0.5))
+        active = np.minimum(wanted[1:], 0.6) - equal
+        share = min(1.0, 0.03 / volatility(prices, row, active))
+        held = rng.dirichlet(np.ones(6))
+        allowed = task.feasible_at(jnp.array(row))
+        found = exactly(allowed, wanted, held)
+        np.testing.assert_allclose(found[1:], equal + share * active, rtol=1e-5, atol=1e-6)
+
+
+def test_other_limits_hold_and_both_risks_are_met_where_they_can_be():
+    prices, rng = table(), np.random.default_rng(3)
+    limits = {"assets": {"cap": 0.5, "floor": {"A": 0.05}}, "cash": {"min": 0.02},
+              "trading": {"turnover": 0.8}}  # fmt: skip
+    task = portfolio(prices, {"volatility": 0.15, "tracking_error": 0.06}, **limits)
+    equal, met = np.full(5, 0.2), 0
+    for row in rng.integers(20, ROWS, 60):
+        wanted, held = rng.dirichlet(np.full(6, 0.5), 2)
+        allowed = task.feasible_at(jnp.array(row))
+        assert isinstance(allowed, Mandated)
+        found = exactly(allowed, wanted, held)
+        outside = max(allowed.violations(held).values()) > 0
+        for said, amount in allowed.violations(found, held).items():
+            assert amount <= 1e-6 or (outside and said.startswith("turnover")), said
+
+        def over(weights, row=row):
+            tracked = volatility(prices, row, weights[1:] - equal) / 0.06
+            return max(tracked, volatility(prices, row, weights[1:]) / 0.15) - 1
+
+        safe = equal * min(1.0, 0.15 / volatility(prices, row, equal))
+        if over(exactly(allowed, np.append(1 - safe.sum(), safe), held)) <= 0:
+            assert over(found) <= 1e-5
+            further = found + 1e-3 * (exactly(_without_risk(allowed), wanted, held) - found)
+            assert abs(further - found).max() < 1e-6 or over(further) > 0
+            met += 1
+    assert 20 < met < 60
+
+
+def _without_risk(allowed: Mandated) -> Mandated:
+    return dataclasses.replace(allowed, risk=None)
+
+
+def test_risk_is_known_without_later_prices():
+    prices = table()
+    task, row = portfolio(prices, {"volatility": 0.1, "tracking_error": 0.05}), 100
+    other = prices.values.copy()
+    other[row + 1 :] *= np.exp(np.random.default_rng(0).normal(0, 0.5, other[row + 1 :].shape))
+    changed = portfolio(Prices(prices.dates, ASSETS, other), {"volatility": 0.1})
+    wanted = np.append(0.0, np.eye(5)[2])
+    for early in (5, 60, row):
+        mine, theirs = (t.risk_at(jnp.array(early)) for t in (task, changed))
+        np.testing.assert_array_equal(mine.returns, theirs.returns)
+        assert float(mine.rate) == float(theirs.rate)
+        risk = float(mine.of(jnp.asarray(wanted[1:], jnp.float32)))
+        np.testing.assert_allclose(risk, volatility(prices, early, wanted[1:]), rtol=1e-4)
+
+
+def test_its_derivative_is_that_of_finite_differences():
+    with jax.enable_x64(True):
+        task = portfolio(table(), {"volatility": 0.1, "tracking_error": 0.05})
+        allowed = jax.tree.map(jnp.asarray, task.feasible_at(jnp.array(300)))
+        rng, off = np.random.default_rng(4), []
+        for _ in range(20):
+            wanted, held, by = jnp.asarray(rng.dirichlet(np.ones(6), 3))
+            score = rng.normal(size=6)
+            worth = lambda w, held=held, score=score: (allowed.project(w, held) * score).sum()  # noqa: E731
+            change = jax.grad(worth)(wanted) @ (by - wanted)
+            step = 1e-6
+            ahead, back = (worth(wanted + s * (by - wanted)) for s in (step, -step))
+            off.append(float(abs(change - (ahead - back) / (2 * step))))
+        assert np.median(off) < 1e-6
+        assert np.mean(np.array(off) < 1e-4) >= 0.9  # but at kinks
+
+
+def test_what_it_is_measured_against_must_be_known():
+    with pytest.raises(
+        QfolioError, match="benchmark 'SPY', which is no asset of the table and no baseline"
+    ):
+        Mandate.of({"benchmark": "SPY", "risk": {"tracking_error": 0.05}}).text(ASSETS)
+    text = Mandate.of({"benchmark": "A", "risk": {"tracking_error": 0.05}}).text(ASSETS)
+    assert '"benchmark":"A"' in text
+    assert "benchmark" not in Mandate.of({"benchmark": "A", "risk": {"volatility": 0.1}}).text(
+        ASSETS
+    )

@@ -1,0 +1,171 @@
+"""Orders over several rows, a year's turnover, and margin calls, against ledgers of shares."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qfolio.portfolio.backtest.baselines import Baseline
+from qfolio.portfolio.backtest.folds import Fold
+from qfolio.portfolio.backtest.orders import AT_EVERY_ROW, orders
+from qfolio.portfolio.calendars import decision_rows, elapsed
+from qfolio.portfolio.following import begin
+from qfolio.portfolio.market import Holding
+from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
+
+ASSETS = ("a", "b", "c")
+FIRST, LAST = 40, 790
+
+
+def table(seed: int = 0, sigma: float = 0.02) -> Prices:
+    rng = np.random.default_rng(seed)
+    values = 30 * np.exp(np.cumsum(rng.normal(0, sigma, (800, 3)), axis=0))
+    dates = np.arange("2018-09-03", "2022-01-01", dtype="datetime64[D]")
+    return Prices(dates[dates.astype(int) % 7 != 4][:800], ASSETS, values)
+
+
+class Given(Baseline):
+    """Orders that were drawn before, one for each row."""
+
+    calendar = "row"
+    wanted: np.ndarray
+
+    def decide(self, history, held):
+        return self.wanted[len(history.prices) - 1]
+
+
+def drawn(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).dirichlet(np.ones(4), 800)
+
+
+def by_baseline(prices: Prices, task: Portfolio, wanted: np.ndarray) -> np.ndarray:
+    """Weights held after the trade of each row, from decisions that are NaN where nothing is."""
+    terms = task.terms
+    terms = terms._replace(decides=np.asarray(terms.decides), elapsed=np.asarray(terms.elapsed))
+    rule = type("Rule", (Given,), {"wanted": wanted})()
+    fold = Fold("only", slice(0, FIRST), slice(FIRST, LAST), slice(0, FIRST))
+    allowed = (lambda fold, row: task.feasible) if task.mandate else None
+    found = orders("rule", rule, [fold], prices.dates, prices.values, feasible=allowed, terms=terms)
+    held, after = np.eye(4)[0], []
+    for row, order in zip(range(FIRST, LAST), found.decisions, strict=True):
+        held = held if np.isnan(order[0]) else order
+        after.append(held)
+        worth = held * np.append(1, prices.values[row + 1] / prices.values[row])
+        held = worth / worth.sum()
+    return np.array(after)
+
+
+def by_task(task: Portfolio, wanted: np.ndarray) -> np.ndarray:
+    """The same by the task's functions, as training and following use them."""
+
+    def step(held, given):
+        row, action = given
+        target, plan = task.trade(row, held, task.wanted(row, held, action))
+        after = Holding(task.drifted(row, target), held.reward, task.planned(row, plan))
+        return after, target
+
+    start = jax.tree.map(lambda x: x[0], begin(task, np.eye(4)[:1]))
+    rows = jnp.arange(FIRST, LAST)
+    given = rows, jnp.asarray(wanted[FIRST:LAST], jnp.float32)
+    return np.asarray(jax.jit(lambda: jax.lax.scan(step, start, given)[1])())
+
+
+def made(prices: Prices, calendar: str = "", **mandate) -> Portfolio:
+    settings = {"window": 10, "horizon": 20, "calendar": calendar, "mandate": mandate}
+    task = Portfolio.of(prices, **settings)
+    return task.deciding_at(FIRST)
+
+
+@pytest.mark.parametrize("calendar", ["10", "weekly", "3", ""])
+def test_an_order_is_filled_in_equal_parts_of_shares(calendar):
+    prices, wanted, parts = table(1), drawn(1), 4
+    task = made(prices, calendar, trading={"fill": parts})
+    decides = decision_rows(calendar, prices.dates)
+    decides[FIRST] = True
+    shares, cash, expected = np.zeros(3), 1.0, []
+    goal, left = np.zeros(4), 0
+    for row in range(FIRST, LAST):
+        price = prices.values[row]
+        wealth = cash + shares @ price
+        if decides[row]:
+            goal, left = wanted[row] * wealth / np.append(1, price), parts  # cash, then shares
+        if left:
+            scale = wealth / (goal @ np.append(1, price))  # the order grows otherwise than wealth
+            bought = (scale * goal[1:] - shares) / left
+            cash, shares, left = cash - bought @ price, shares + bought, left - 1
+        expected.append(np.append(cash, shares * price) / wealth)
+    for found in (by_baseline(prices, task, wanted), by_task(task, wanted)):
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+def test_an_order_at_once_is_as_without_the_rule():
+    prices, wanted = table(2), drawn(2)
+    task, plain = (made(prices, "weekly", trading=t) for t in ({"fill": 1}, {}))
+    assert not task.terms.remembers
+    np.testing.assert_array_equal(by_task(task, wanted), by_task(plain, wanted))
+
+
+@pytest.mark.parametrize("fill", [1, 3])
+def test_a_year_trades_no_more_than_its_budget(fill):
+    prices, wanted = table(3), drawn(3)
+    budget = 3.0
+    task = made(prices, "weekly", trading={"turnover_a_year": budget, "fill": fill})
+    free = made(prices, "weekly", trading={"fill": fill})
+    years = prices.dates[FIRST:LAST].astype("datetime64[Y]").astype(int)
+
+    def turnover(weights):
+        moved = np.append(np.ones((LAST - FIRST, 1)), _relatives(prices), 1)
+        worth = weights * moved
+        held = np.concatenate([np.eye(4)[:1], (worth / worth.sum(1, keepdims=True))[:-1]])
+        traded = abs(weights - held)[:, 1:].sum(1)
+        return np.array([traded[years == year].sum() for year in np.unique(years)])
+
+    for follow in (lambda t: by_baseline(prices, t, wanted), lambda t: by_task(t, wanted)):
+        assert (turnover(follow(free)) > 1.5 * budget).all()
+        spent = turnover(follow(task))
+        # What prices do between the parts of an order adds a little.
+        assert (spent <= budget * (1 + (1e-4 if fill == 1 else 0.02))).all()
+        assert (spent > 0.99 * budget).all()
+    np.testing.assert_allclose(by_task(task, wanted), by_baseline(prices, task, wanted), atol=2e-4)
+
+
+def test_training_begins_with_some_of_the_budget_spent():
+    task = made(table(), "weekly", trading={"turnover_a_year": 2.0})
+    rows = jnp.arange(FIRST, LAST)
+    keys = jax.random.split(jax.random.key(0), len(rows))
+    plan = jax.vmap(task.draw_reachable)(rows, keys).plan
+    assert plan is not None
+    spent = np.asarray(plan.spent)
+    passed = elapsed(table().dates)[FIRST:LAST]
+    assert (spent <= 2.0 * passed + 1e-6).all()
+    np.testing.assert_allclose(spent.mean(), passed.mean(), rtol=0.1)
+
+
+def test_a_margin_call_is_a_decision_whatever_the_calendar_says():
+    prices = table(4, sigma=0.03)
+    debts = {"assets": {"cap": 2.0}, "cash": {"min": -1.0}}
+    exposure = {"gross": 1.8, "margin": 0.5}
+    task = made(prices, "quarterly", exposure=exposure, **debts)
+    plain = made(prices, "quarterly", exposure={"gross": 1.8}, **debts)
+    wanted = np.tile([-0.8, 0.6, 0.6, 0.6], (800, 1))
+    called, free = by_task(task, wanted), by_task(plain, wanted)
+    gross = abs(called[:, 1:]).sum(1)
+    assert gross.max() <= 2.0
+    assert abs(free[:, 1:]).sum(1).max() > 2.0
+    decides = decision_rows("quarterly", prices.dates)[FIRST:LAST]
+    ordered = abs(called - wanted[0]).max(1) < 1e-5
+    assert (ordered & ~decides).sum() > 2  # calls
+    before = np.flatnonzero(ordered & ~decides)[0]
+    np.testing.assert_array_equal(called[:before], free[:before])
+
+
+def test_terms_do_nothing_where_there_are_none():
+    held, wanted = np.full(4, 0.25), np.eye(4)[1]
+    target, plan = AT_EVERY_ROW.trade(held, wanted, AT_EVERY_ROW.ordered(5, held, wanted), None)
+    assert target is wanted
+    assert plan is AT_EVERY_ROW.begin(held) is AT_EVERY_ROW.unspent(None) is None
+
+
+def _relatives(prices: Prices) -> np.ndarray:
+    return prices.values[FIRST + 1 : LAST + 1] / prices.values[FIRST:LAST]
