@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from shell import qfolio
+from shell import TINY_BACKTEST, qfolio
 from tables import write_table
 
 AS_OF = ["--as-of", "2020-09-16"]
@@ -308,3 +308,29 @@ def test_nothing_to_trade_is_an_empty_file_of_orders(folder, monkeypatch, capsys
     of = ["--agent", "buy-and-hold", "--holdings", holdings, "--orders", path]
     allocation(folder, monkeypatch, capsys, *of)
     assert len(path.read_text().splitlines()) == 1
+
+
+def test_a_budget_of_the_year_is_that_of_the_ledger(tmp_path, monkeypatch, capsys):
+    prices, mandate = write_table(tmp_path / "prices.csv"), tmp_path / "mandate.toml"
+    mandate.write_text("[trading]\nturnover_a_year = 0.9\nfill = 3\n")
+    run = tmp_path / "run"
+    options = [*TINY_BACKTEST, "--mandate", mandate, "--out", run]
+    assert qfolio(monkeypatch, "backtest", prices, *options) == 0
+    follow = ["allocate", run, *AS_OF, "--agent", "equal-weight", "--json", "--anyway"]
+    capsys.readouterr()
+    assert qfolio(monkeypatch, *follow, "--capital", 1000) == 0
+    printed = capsys.readouterr()
+    first = json.loads(printed.out)
+    assert "fills orders over 3 rows" in printed.err
+    assert "at most 90%, the ledger's orders took 0.0%, and this one takes 90.0%" in printed.err
+    assert first["spent"] == 0
+    assert sum(row["weight"] for row in first["assets"]) == pytest.approx(0.9)  # the whole order
+    newer = write_table(tmp_path / "newer.csv", rows=270)
+    options = ["--prices", newer, "--as-of", "2020-09-26", "--capital", 1000]
+    assert qfolio(monkeypatch, *(each for each in follow if each not in AS_OF), *options) == 0
+    second = json.loads(capsys.readouterr().out)
+    assert second["spent"] == pytest.approx(0.9)
+    assert all(row["weight"] == 0 for row in second["assets"])
+    assert qfolio(monkeypatch, "allocate", run, "--reproduce", second["date"], "--json") == 0
+    assert json.loads(capsys.readouterr().out)["assets"] == second["assets"]
+    assert qfolio(monkeypatch, "follow", run, "--prices", newer) == 0

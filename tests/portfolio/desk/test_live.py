@@ -135,6 +135,21 @@ def test_a_trade_that_waits_a_row_by_hand():
     assert poor.short == 1
 
 
+def test_orders_filled_over_several_rows_equal_the_replay_of_their_parts():
+    prices, model = table(), Proportional(0.002)
+    target, fill = np.array([0.1, 0.3, 0.4, 0.2]), 4
+    plan = Allocation.of(Fixed(target, model), prices.between(None, 11), np.zeros(3), 1e4)
+    live = mark([record(plan, 1)], prices, model, 1, fill)
+    shares, cash, wealth = np.zeros(3), 1e4, []
+    for row in range(11, len(prices)):  # the first part is traded a row after the decision
+        wealth.append(cash + shares @ prices.values[row])
+        if row < 11 + fill:
+            value = plan.trades / fill * prices.values[row]
+            cash -= value.sum() / (1 - 0.002)  # what is bought costs a share of what is paid
+            shares = shares + plan.trades / fill
+    np.testing.assert_allclose(live.wealth, wealth[1:], rtol=1e-9)
+
+
 def test_a_split_and_a_deposit_earn_nothing():
     """The table is adjusted for a split of 2 after the first record; 500 are paid in later."""
     prices, one = by_hand([[5.0], [5.0], [6.0], [6.0]], 100.0, 0.0, 0.0)

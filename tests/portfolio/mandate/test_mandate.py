@@ -125,6 +125,8 @@ GROUP = {"assets": ["XLE", "XOM"]}
         ({"assets": {"cap": 0.3}, "trading": {"holdings": 2}, "cash": {"max": 0.1}},
          "2 holdings at their caps leave 40 % in cash"),
         ({"assets": {"floor": 0.1}, "trading": {"holdings": 3}}, "4 assets have a floor"),
+        ({"assets": {"cap": 2.0}, "cash": {"min": -1.0}, "exposure": {"gross": 2.0, "margin": 0.6}},
+         "exposure of 200 % would break a margin of 60 %, which allows 166.667 %"),
         ({"cash": {"max": 0.1}, "exposure": {"gross": 0.5}},
          "cash of at most 10 % and gross exposure of at most 50 % clash"),
     ],

@@ -32,7 +32,13 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
                 clash = rest
         both = " and ".join(said[i] for i in clash)
         raise QfolioError(f"The mandate cannot be met: {both} clash; change one of them.")
-    cash = parse(text)[1].cash
+    cash, margin = parse(text)[1].cash, parse(text)[1].exposure.margin
+    if margin and made.gross * margin > 1 + TINY:
+        raise QfolioError(
+            f"The mandate cannot be met: orders with a gross exposure of {_percent(made.gross)} "
+            f"would break a margin of {_percent(margin)}, which allows {_percent(1 / margin)}; set "
+            "exposure.gross below that, or lower the margin."
+        )
     left = 1 - _most_held(made)
     if left > cash.max + TINY:
         raise QfolioError(

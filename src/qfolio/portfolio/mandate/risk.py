@@ -17,9 +17,8 @@ TINY = 1e-12
 class Risk(NamedTuple):
     """What is known of risk at a row."""
 
-    returns: Float[Array, "past asset"]  # the last ones; 0 where there are none yet
+    covariance: Float[Array, "asset asset"]  # of returns, a year
     benchmark: Float[Array, " asset"]  # weights held by the benchmark
-    rate: Float[Array, ""]  # rows in a year over known returns: it annualizes sums of squares
 
     @staticmethod
     def at(
@@ -29,7 +28,7 @@ class Risk(NamedTuple):
         past: int,
         year: Float[Array, ""],
     ) -> "Risk":
-        """The risk as a row knows it, from ``past`` returns up to it.
+        """The risk as a row knows it, from ``past`` returns up to it, or as many as there are.
 
         log_relatives: those of the first row are not known. benchmarks: weights at each row; no
         rows without a benchmark. year: rows in a year.
@@ -44,11 +43,17 @@ class Risk(NamedTuple):
         weights = jnp.zeros(assets)
         if benchmarks.shape[0]:
             weights = lax.dynamic_index_in_dim(benchmarks, row, keepdims=False)
-        return Risk(returns, weights, year / jnp.maximum(known.sum(), 1))
+        return Risk(year / jnp.maximum(known.sum(), 1) * (returns.T @ returns), weights)
 
     def of(self, weights: Float[Array, " asset"]) -> Float[Array, ""]:
         """The annual volatility of weights."""
-        return jnp.sqrt(self.rate * ((self.returns @ weights) ** 2).sum())
+        return jnp.sqrt(jnp.maximum(self.between(weights, weights), 0.0))
+
+    def between(
+        self, one: Float[Array, " asset"], other: Float[Array, " asset"]
+    ) -> Float[Array, ""]:
+        """The annual covariance of weights."""
+        return one @ self.covariance @ other
 
     def share(
         self,
@@ -60,9 +65,8 @@ class Risk(NamedTuple):
 
         Where none has, the share of the least volatility.
         """
-        one, other = self.returns @ start, self.returns @ change
-        square, cross = jnp.maximum((other**2).sum(), TINY), (one * other).sum()
-        over = (one**2).sum() - most**2 / self.rate
+        square = jnp.maximum(self.between(change, change), TINY)
+        cross, over = self.between(start, change), self.between(start, start) - most**2
         inside = cross**2 - square * over
         root = jnp.sqrt(jnp.where(inside > 0, inside, 1.0))
         found = (jnp.where(inside > 0, root, 0.0) - cross) / square
