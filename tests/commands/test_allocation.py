@@ -310,6 +310,7 @@ def test_nothing_to_trade_is_an_empty_file_of_orders(folder, monkeypatch, capsys
     assert len(path.read_text().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_budget_of_the_year_is_that_of_the_ledger(tmp_path, monkeypatch, capsys):
     prices, mandate = write_table(tmp_path / "prices.csv"), tmp_path / "mandate.toml"
     mandate.write_text("[trading]\nturnover_a_year = 0.9\nfill = 3\n")

@@ -14,6 +14,7 @@ Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
 Folder = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
 File = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
 Names = Annotated[tuple[str, ...], arg(metavar="NAME …", help_behavior_hint="")]
+Limits = Annotated[tuple[str, ...], arg(metavar="KEY=VALUE …", help_behavior_hint="")]
 Modules = Annotated[tuple[str, ...], arg(metavar="MODULE …", help_behavior_hint="")]
 Trackers = Annotated[
     tuple[str, ...], arg(metavar="tensorboard|wandb|trackio …", help_behavior_hint="")

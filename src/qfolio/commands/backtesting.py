@@ -14,6 +14,7 @@ from qfolio.commands.arguments import (
     Count,
     File,
     Folder,
+    Limits,
     Modules,
     Name,
     Sources,
@@ -27,6 +28,7 @@ from qfolio.core.text import hint
 
 if TYPE_CHECKING:
     from qfolio.experiments.presets import Preset
+    from qfolio.portfolio.mandate.mandate import Mandate
 
 BASIS_POINT = 1e-4
 
@@ -46,6 +48,8 @@ class Options(Reading):
         rolling: Train on a window of fixed length instead of all rows so far.
         cap: Largest weight of one asset, from 0 to 1.
         mandate: File with the limits of all orders (TOML; see docs/guides/mandate.md).
+        limits: Keys of a mandate with their values, such as assets.cap=0.2 trading.turnover=0.3;
+            they take precedence over the file.
         cost_model: Cost of trading and holding: proportional, itemized or your own as module:Name;
             settings follow in brackets, as in "itemized(fixed=5, cash_rate=0.03)".
         calendar: When all strategies may trade: weekly, monthly, quarterly, yearly, a number of
@@ -85,6 +89,7 @@ class Options(Reading):
     rolling: bool = False
     cap: float = 1.0
     mandate: File = None
+    limits: Limits = ()
     cost_model: str = "proportional"
     calendar: str = ""
     signals: Name = None
@@ -124,6 +129,14 @@ class Options(Reading):
         observed = {} if self.signals is None else {"signals": self.signals}
         return _assign(chosen, observed | settings.parse(self.assignments))
 
+    def terms(self) -> "Mandate | None":
+        """The mandate of the file and of the limits that are given."""
+        from qfolio.portfolio.mandate.mandate import Mandate
+
+        if self.mandate is None and not self.limits:
+            return None
+        return (Mandate.read(self.mandate) if self.mandate else Mandate()).changed(self.limits)
+
     def settings(self) -> dict[str, Any]:
         """The other arguments of ``Backtest.create``, but lag, cost and folder."""
         seeds = (preset.seeds for preset in self.presets().values())
@@ -132,7 +145,7 @@ class Options(Reading):
             "test": self.test,
             "expanding": not self.rolling,
             "cap": self.cap,
-            "mandate": self.mandate,
+            "mandate": self.terms(),
             "cost_model": _known("cost", settings.called(self.cost_model)[0]) and self.cost_model,
             "calendar": self.calendar,
             "strategies": sources(self.strategy),

@@ -25,7 +25,7 @@ GROUPS = {
     "price": "prices missing late ended delisting_haircut members features columns returns date",
     "account": "holdings capital whole_shares as_of",
     "split": "train test rolling lag lags",
-    "cost and mandate": "cost_bps costs_bps cost_model cap mandate calendar",
+    "cost and mandate": "cost_bps costs_bps cost_model cap mandate limits calendar",
     "learning": "agents agent preset signals seeds seed episodes steps assignments batch search "
     "change rate renewal epsilon",
     "comparison": "baselines strategy benchmark trials after",

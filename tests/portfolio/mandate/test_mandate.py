@@ -51,6 +51,24 @@ def test_lots_are_for_all_assets_or_for_some():
         settled({"trading": {"lot": 0}}, ASSETS)
 
 
+def test_single_keys_take_precedence_over_a_file():
+    given = Mandate.of({"assets": {"cap": 0.4}, "trading": {"turnover": 0.3, "holdings": 4}})
+    made = given.changed(["trading.turnover=0.2", "trading.calendar = monthly",
+                          "assets.floor.A=0.1", 'assets.cap={A = 0.5, "B.C" = 0.2}'])  # fmt: skip
+    assert (made.trading.turnover, made.trading.holdings) == (0.2, 4)
+    assert made.trading.calendar == "monthly"
+    assert (made.assets.floor, made.assets.cap) == ({"A": 0.1}, {"A": 0.5, "B.C": 0.2})
+    assert Mandate().changed([]) == Mandate()
+    for wrong, message in {
+        "trading.turn=1": r"--limits: \[trading\] has no key 'turn'",
+        "trading.turnover": "--limits has 'trading.turnover'; it must be a key and a value",
+        "trading turnover=1": "it must be a key and a value",
+        "trading.turnover=much": "--limits: trading.turnover: expected float",
+    }.items():
+        with pytest.raises(QfolioError, match=message):
+            given.changed([wrong])
+
+
 def test_a_file_says_the_limits(tmp_path):
     made = feasible(settled(written(tmp_path), ASSETS), ALL)
     limits = made.limits

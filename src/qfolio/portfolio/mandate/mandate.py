@@ -36,6 +36,7 @@ docs/guides/mandate.md describes every key. ``checks.py`` says whether the limit
 """
 
 import csv
+import json
 import re
 import tomllib
 from collections.abc import Sequence
@@ -169,6 +170,30 @@ class Mandate(Section, frozen=True):
         if isinstance(given, Mandate):
             return given
         return _converted(given, "mandate") if isinstance(given, dict) else Mandate.read(given)
+
+    def changed(self, assignments: Sequence[str]) -> "Mandate":
+        """The mandate with other values of some keys, such as "trading.turnover=0.3".
+
+        Keys and values are those of the file; text needs no quotes. Raises QfolioError for a key
+        that does not exist, or a value that does not fit.
+        """
+        content = msgspec.to_builtins(self)
+        for assignment in assignments:
+            key, equals, value = assignment.partition("=")
+            try:
+                read = tomllib.loads(f"{key} = {value}")
+            except tomllib.TOMLDecodeError:
+                try:
+                    read = tomllib.loads(f"{key} = {json.dumps(value.strip())}")
+                except tomllib.TOMLDecodeError:
+                    equals = ""
+            if not equals:
+                raise QfolioError(
+                    f"--limits has {quote(assignment)}; it must be a key and a value of a mandate, "
+                    "such as trading.turnover=0.3."
+                )
+            _merge(content, read)
+        return _converted(content, "--limits")
 
     @property
     def cost_model(self) -> str:
@@ -333,6 +358,15 @@ def _converted(content: Any, source: str) -> Mandate:
             f"{source}: {where or 'the mandate'}: {text[:1].lower()}{text[1:]}; see "
             "docs/guides/mandate.md."
         ) from None
+
+
+def _merge(content: dict[str, Any], others: dict[str, Any]) -> None:
+    """Puts values into a dictionary of dictionaries, in place."""
+    for key, value in others.items():
+        if isinstance(value, dict) and isinstance(content.get(key), dict):
+            _merge(content[key], value)
+        else:
+            content[key] = value
 
 
 def _fields(place: str) -> list[str]:
