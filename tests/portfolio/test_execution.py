@@ -99,6 +99,36 @@ def test_an_order_is_filled_in_equal_parts_of_shares(calendar):
         np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
+@pytest.mark.slow
+def test_any_terms_are_those_of_a_ledger_of_shares():
+    for seed in range(500):
+        rng = np.random.default_rng(seed)
+        days = slice(30, 30 + int(rng.integers(2, 60)))
+        prices = table(seed, sigma=rng.uniform(0.001, 0.08))
+        decides = rng.random(800) < rng.uniform(0.05, 1)
+        band, fill = rng.choice([0.0, 0.02, 0.2]), int(rng.integers(1, 8))
+        terms = AT_EVERY_ROW._replace(decides=decides, band=float(band), fill=fill)
+        wanted = rng.dirichlet(np.full(4, rng.uniform(0.2, 3)), 800)
+        rule = type("Rule", (Given,), {"wanted": wanted})()
+        fold = Fold("only", slice(0, 30), days, slice(0, 30))
+        found = orders("rule", rule, [fold], prices.dates, prices.values, terms=terms).decisions
+        shares, cash, goal, left = np.zeros(3), 1.0, np.zeros(4), 0
+        for row, order in zip(range(days.start, days.stop), found, strict=True):
+            price = prices.values[row]
+            wealth = cash + shares @ price
+            held = np.append(cash, shares * price) / wealth
+            if decides[row] and (not band or abs(wanted[row] - held).max() > band):
+                goal, left = wanted[row] * wealth / np.append(1, price), fill
+            if left:
+                scale = wealth / (goal @ np.append(1, price))
+                bought = (scale * goal[1:] - shares) / left
+                cash, shares, left = cash - bought @ price, shares + bought, left - 1
+                after = np.append(cash, shares * price) / wealth
+                np.testing.assert_allclose(order, after, atol=1e-10)
+            else:
+                assert np.isnan(order).all()
+
+
 def test_an_order_at_once_is_as_without_the_rule():
     prices, wanted = table(2), drawn(2)
     task, plain = (made(prices, "weekly", trading=t) for t in ({"fill": 1}, {}))
