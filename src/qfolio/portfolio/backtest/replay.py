@@ -28,7 +28,7 @@ from qfolio.portfolio.following import begin, follow, ordered
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight
-from qfolio.portfolio.prices.findings import listing
+from qfolio.portfolio.prices.findings import first_of, listing
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
@@ -184,11 +184,12 @@ class Replay:
         return terms._replace(decides=np.asarray(terms.decides), elapsed=np.asarray(terms.elapsed))
 
     def too_risky(self, entries: Mapping[str, Entry]) -> list[str]:
-        """A note on each strategy whose trades exceed the mandate's limits on risk."""
-        allowed, notes = self.task.allowed, []
+        """A note on each limit of risk that trades exceed, with the strategies and how often."""
+        allowed = self.task.allowed
         if allowed is None or not allowed.limits_risk:
             return []
         limits = {"volatility": allowed.volatility, "tracking error": allowed.tracking_error}
+        over: dict[str, list[str]] = {said: [] for said in limits}
         for name, entry in entries.items():
             if not entry.weighted:
                 continue
@@ -196,12 +197,14 @@ class Replay:
             rows = self.folds[0].decisions.start + np.nonzero(traded)[1]
             found = _risks(self.task, jnp.asarray(rows), jnp.asarray(entry.decisions[traded, 1:]))
             for (said, most), risk in zip(limits.items(), np.asarray(found), strict=True):
-                if over := int((risk > most * (1 + BARELY)).sum()):
-                    notes.append(
-                        f"{name} has a {said} above {most:.4g} after {over:,} of its "
-                        f"{len(rows):,} trades (up to {risk.max():.4g})."
-                    )
-        return notes
+                if count := int((risk > most * (1 + BARELY)).sum()):
+                    most_of_all = f"{count:,} of {len(rows):,}, up to {risk.max():.3g}"
+                    over[said].append(f"{name} ({most_of_all})")
+        return [
+            f"Trades that leave a {said} above {limits[said]:.4g}: {first_of(names)}."
+            for said, names in over.items()
+            if names
+        ]
 
     def wiped_out(self, entries: Mapping[str, Entry]) -> list[str]:
         """A note on each strategy that lost everything."""

@@ -75,8 +75,13 @@ def day(moment: Any) -> str:
     return text.removesuffix("T00:00:00").replace("T", " ")
 
 
+def first_of(texts: Iterable[str]) -> str:
+    """The first few, and how many more there are."""
+    every = list(texts)
+    rest = len(every) - LISTED
+    return ", ".join(every[:LISTED]) + (f" and {rest:,} more" if rest > 0 else "")
+
+
 def listing(names: Iterable[str]) -> str:
     """The first few names in quotation marks, and how many more there are."""
-    quoted = [quote(name) for name in names]
-    rest = len(quoted) - LISTED
-    return ", ".join(quoted[:LISTED]) + (f" and {rest:,} more" if rest > 0 else "")
+    return first_of(map(quote, names))
