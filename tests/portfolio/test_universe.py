@@ -12,11 +12,13 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.presets import preset
+from qfolio.core.mdp import Discrete
+from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio.anchors import path
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import orders
+from qfolio.portfolio.backtest.replay import Replay
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
@@ -24,9 +26,19 @@ from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.prices.gaps import cash_outs
 from qfolio.portfolio.prices.table import Prices, check, load
 from qfolio.portfolio.task import Portfolio
-from qfolio.portfolio.universe import Present
+from qfolio.portfolio.universe import spread
 
 NAMES = tuple("ABCDEFGH")
+TINY = Preset(
+    "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (4,)}, episodes=8,
+    task={"window": 10, "horizon": 20},
+)  # fmt: skip
+MENU = Preset(
+    "dqn",
+    {"network": "mlp", "hidden": (4,), "num_envs": 4, "batch_size": 8, "learning_starts": 40,
+     "all_actions": True, "replay_capacity": 400, "episode_steps": 0},
+    episodes=8, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
+)  # fmt: skip
 SIGNALS = {"signals": "momentum:5,volatility:5", "anchor": "equal-weight"}
 
 
@@ -51,6 +63,12 @@ def moving(seed: int, rows: int, assets: int, haircut: float = 0.0) -> tuple[Pri
     member[:, 0] = True
     content: dict[str, Any] = {"values": values, **paid, "members": member}
     return Prices(dates.astype("datetime64[s]"), NAMES[:assets], **content), last
+
+
+def frame_of_weights(prices: Prices) -> pd.DataFrame:
+    """All in the first asset, from the first row on."""
+    weights = np.tile(np.eye(len(prices.assets))[0], (1, 1))
+    return pd.DataFrame(weights, pd.DatetimeIndex(prices.dates[:1], name="date"), prices.assets)
 
 
 class Ledger:
@@ -242,12 +260,13 @@ def test_signals_rank_those_that_are_there() -> None:
 
 
 def test_a_policy_over_all_assets_becomes_one_over_those_that_are_there() -> None:
-    feasible = Present(jnp.array([0.6, 0.0, 0.6]))
-    project = lambda *weights: feasible.project(jnp.array(weights), jnp.array(weights))  # noqa: E731
-    np.testing.assert_allclose(project(0.2, 0.2, 0.4, 0.2), [0.2, 0.4, 0, 0.4], atol=1e-6)
-    np.testing.assert_allclose(project(0.0, 0.3, 0.7, 0.0), [0.4, 0.6, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(project(0.5, 0.0, 0.5, 0.0), [1.0, 0, 0, 0], atol=1e-6)
-    np.testing.assert_array_equal(project(0.25, 0.5, 0, 0.25), [0.25, 0.5, 0, 0.25])
+    there = jnp.array([True, False, True])
+    put = lambda *weights, long_only=True: spread(jnp.array(weights), there, long_only)  # noqa: E731
+    np.testing.assert_allclose(put(0.2, 0.2, 0.4, 0.2), [0.2, 0.4, 0, 0.4], atol=1e-6)
+    np.testing.assert_allclose(put(0.5, 0.0, 0.5, 0.0), [1.0, 0, 0, 0], atol=1e-6)
+    np.testing.assert_array_equal(put(0.25, 0.5, 0, 0.25), [0.25, 0.5, 0, 0.25])
+    shorted = put(0.2, 1.0, 0.3, -0.5, long_only=False)
+    np.testing.assert_allclose(shorted, [0.5, 1.0, 0, -0.5], atol=1e-6)
 
 
 def test_a_complete_table_has_no_masks() -> None:
@@ -291,10 +310,90 @@ def test_a_backtest_keeps_its_universe(tmp_path: Path) -> None:
     again = Backtest.open(tmp_path / "run").prices
     assert again.digest == made.prices.digest
     np.testing.assert_array_equal(again.tradable, prices.tradable)
-    with pytest.raises(QfolioError, match="come and go, and a mandate"):
-        Portfolio.of(prices, mandate={"assets": {"cap": 0.5}})
-    with pytest.raises(QfolioError, match="menu=grid:10 needs all of them"):
-        Portfolio.of(prices, menu="grid:10")
+
+
+# Mandates and menus.
+
+LIMITS = {
+    "assets": {"cap": 0.5, "floor": {"B": 0.05}},
+    "groups": {"kind": {"x": {"assets": ["C", "D"], "cap": 0.6, "floor": 0.1}}},
+    "cash": {"max": 0.2},
+}
+
+
+def required(there: np.ndarray) -> dict[str, float]:
+    """The floors and the maximum of cash that can be met with the assets that are there."""
+    caps = 0.5 * there
+    group = min(0.6, caps[2:4].sum())
+    most = min(1.0, caps.sum() - caps[2:4].sum() + group)
+    return {"B": 0.05 * there[1], "group": min(0.1, group), "cash": max(0.2, 1 - most)}
+
+
+@pytest.mark.parametrize("cases", [range(10), pytest.param(range(10, 500), marks=pytest.mark.slow)])
+def test_every_order_obeys_the_mandate_of_its_row(cases: range) -> None:
+    """Random tables, by training's functions and by baselines."""
+    order = jax.jit(jax.vmap(lambda task, row, w: task.wanted(row, task.hold(w), w), (None, 0, 0)))
+    absent = 0
+    for case in cases:
+        prices, _ = moving(case, 40, 5)
+        assert prices.tradable is not None
+        task = Portfolio.of(prices, window=5, horizon=5, mandate=LIMITS)
+        rng = np.random.default_rng(case)
+        wanted = rng.dirichlet(np.full(6, 0.6), 40)
+        found = np.asarray(order(task, jnp.arange(40), jnp.asarray(wanted, jnp.float32)))
+        folds = [Fold("one", slice(0, 10), slice(10, 38), slice(0, 10))]
+        backtest = Replay(prices, folds, task, 1.0)
+        entry, _ = backtest.baseline("baseline", "equal-weight", baseline("equal-weight"))
+        for row, weights in [*enumerate(found), *enumerate(entry.decisions[0], 10)]:
+            there = prices.tradable[row]
+            assert (weights[1:][~there] == 0).all()
+            least = required(there)
+            assert weights[1:].max() <= 0.5 + 2e-6
+            assert weights[2] >= least["B"] - 2e-6
+            assert least["group"] - 2e-6 <= weights[3:5].sum() <= 0.6 + 2e-6
+            assert weights[0] <= least["cash"] + 2e-6
+            absent += int((~there).any())
+    assert absent > 10 * len(cases)
+
+
+@pytest.mark.slow
+def test_a_mandate_in_motion_is_said_and_checked_over_a_whole_backtest(tmp_path: Path) -> None:
+    prices, _ = moving(4, 160, 4, haircut=0.2)
+    backtest = Backtest.create(
+        prices, {"pathwise": TINY, "dqn": MENU}, train="100d", test="30d", seeds=1,
+        out=tmp_path / "run", baselines=["momentum"], mandate=LIMITS,
+        strategies={"mine": frame_of_weights(prices)},
+    )  # fmt: skip
+    backtest.run()
+    entries, notes = Backtest.open(tmp_path / "run").entries()
+    assert any(note.startswith("The mandate yields to the assets") for note in notes)
+    assert any(note.startswith("mine breaks the mandate in") for note in notes)
+    first = backtest.folds[0].decisions.start
+    for name in ("pathwise", "dqn", "momentum", "equal-weight"):
+        for row, order in enumerate(entries[name].decisions[0], first):
+            if not np.isnan(order).any():
+                there = prices.tradable[row]  # type: ignore[index]
+                assert (order[1:][~there] == 0).all(), name
+                assert order[0] <= required(np.append(there, False))["cash"] + 1e-5, name
+
+
+@pytest.mark.parametrize("menu", ["grid:4", "tilts:0.2", "overweight:0.2"])
+def test_menus_order_what_is_there(menu: str) -> None:
+    prices, _ = moving(2, 60, 5)
+    assert prices.tradable is not None
+    task = Portfolio.of(prices, window=5, horizon=5, menu=menu)
+    held = task.hold(jnp.asarray(np.append(0.4, 0.6 * np.eye(5)[0]), jnp.float32))
+    assert isinstance(task.actions, Discrete)
+    every = jnp.arange(task.actions.n)
+    orders_at = jax.jit(jax.vmap(task.wanted, (None, None, 0)))
+    for row in range(10, 60, 7):
+        found = np.asarray(orders_at(jnp.array(row), held, every))
+        there = prices.tradable[row]
+        assert (found[:, 1:][:, ~there] == 0).all()
+        np.testing.assert_allclose(found.sum(1), 1, atol=1e-6)
+        if menu != "grid:4":
+            equal = np.append(0, there / there.sum())
+            assert (abs(found - equal).max(1) < 1e-6).any()
 
 
 # Reading.

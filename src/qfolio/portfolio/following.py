@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Agent
+from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.market import Holding
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -118,7 +119,10 @@ def paths(
 
 def _require_feasible(task: Portfolio, agent: Agent, wanted: np.ndarray, first: int) -> None:
     """Raises QfolioError for infeasible weights; a replay would read NaN as no order."""
-    for said, amount in task.feasible.violations(wanted).items():
+    allowed = task.feasible
+    if isinstance(allowed, Mandated) and task.patterns is not None:
+        allowed = task.patterns.at(first + np.arange(wanted.shape[1]), allowed)
+    for said, amount in allowed.violations(wanted).items():
         wrong = ~(amount <= TOLERANCE)
         if wrong.any():
             seed, day = np.argwhere(wrong)[0]

@@ -27,11 +27,12 @@ from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import cashed
 from qfolio.portfolio.execution import Plan, Terms
 from qfolio.portfolio.mandate import checks
-from qfolio.portfolio.mandate.feasible import Feasible, Mandated
+from qfolio.portfolio.mandate.feasible import CappedSimplex, Feasible, Mandated
 from qfolio.portfolio.mandate.mandate import Mandate, feasible, largest_weight, parse, settled
 from qfolio.portfolio.mandate.risk import Risk
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.universe import Patterns
 
 Row = Int[Array, ""]
 
@@ -77,6 +78,7 @@ class Portfolio(Market):
     sharpe_rate: float = number(0.01)
     horizon: int = static(50)
     allowed: Mandated | None = None  # the weights that the mandate allows, if there is one
+    patterns: Patterns | None = None  # what it allows where assets come and go
 
     @staticmethod
     def of(prices: Prices, **settings: Any) -> "Portfolio":
@@ -132,16 +134,16 @@ class Portfolio(Market):
         arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), given)
         decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)
         decides[-1:] = True  # tomorrow's weights may be asked for on any day
-        tradable = None if prices.tradable is None else jnp.asarray(prices.tradable)
-        if tradable is not None:
-            universe.require_support(self.mandate, self.menu)
+        tradable, patterns = prices.tradable, None
+        if tradable is not None and self.mandate:
+            patterns = Patterns.of(self.mandate, tradable, self.max_weight)[0].in_float32()
         return eqx.tree_at(
             lambda t: (
                 t.log_relatives, t.extra, t.anchors, t.conditions, t.elapsed, t.benchmarks, t.year,
-                t.decides, t.tradable,
+                t.decides, t.tradable, t.patterns,
             ),
             self,
-            (*arrays, jnp.asarray(decides), tradable),
+            (*arrays, *jax.tree.map(jnp.asarray, (decides, tradable, patterns))),
             is_leaf=lambda x: x is None,
         )  # fmt: skip
 
@@ -261,6 +263,8 @@ class Portfolio(Market):
         self, market: Row, holding: Holding, weights: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
         feasible = self.feasible_at(market)
+        if self.tradable is not None:
+            weights = universe.spread(weights, self.tradable[market], self.feasible.long_only)
         left = self.terms.unspent(holding.plan)
         if left is not None and isinstance(feasible, Mandated):
             feasible = feasible.spending(left)
@@ -300,12 +304,12 @@ class Portfolio(Market):
 
     def feasible_at(self, market: Row) -> Feasible:
         """Without the assets that cannot be traded at a row, and with the risk that it knows."""
-        if self.tradable is not None:
-            return universe.Present(self._limits(market))
         allowed = self.allowed
-        if allowed is None or not allowed.limits_risk:
-            return self.feasible
-        return allowed.knowing(self.risk_at(market))
+        if allowed is None:
+            return CappedSimplex(self._limits(market))
+        if self.patterns is not None:
+            allowed = self.patterns.at(market, allowed)
+        return allowed.knowing(self.risk_at(market)) if allowed.limits_risk else allowed
 
     def risk_at(self, market: Row) -> Risk:
         """What is known of risk at a row."""

@@ -1,37 +1,86 @@
 """Orders in a universe in motion, whose assets are listed, delisted, and members for a time."""
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import dataclasses
+from functools import lru_cache
+from typing import Any, NamedTuple
 
-from qfolio.core.errors import QfolioError
-from qfolio.portfolio.mandate.feasible import CappedSimplex
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from qfolio.portfolio.mandate import checks
+from qfolio.portfolio.mandate.feasible import Mandated
+from qfolio.portfolio.mandate.mandate import feasible
 
 TINY = 1e-9
 
 
-def require_support(mandate: str, menu: str) -> None:
-    """Raises QfolioError for a setting of the task that needs all assets at every row."""
-    grid = menu and not menu.startswith("signals")
-    found = "a mandate" if mandate else f"menu={menu}" if grid else ""
-    if found:
-        raise QfolioError(
-            f"The assets of this table come and go, and {found} needs all of them at every row; "
-            "leave it out, or read the table without ended=cash-out and members."
-        )
+def spread(
+    wanted: Float[Array, " entry"], there: Bool[Array, " asset"], long_only: bool
+) -> Float[Array, " entry"]:
+    """What is wanted of the assets that are not there goes to the others, in proportion.
 
-
-class Present(CappedSimplex):
-    """Weights of the assets that are there, those with a limit above 0."""
-
-    def project(
-        self, wanted: Float[Array, " entry"], held: Float[Array, " entry"]
-    ) -> Float[Array, " entry"]:
-        """What is wanted of the others goes to those that are there, in proportion.
-
-        A policy over all assets so becomes one over those that are there; cash stays as it is.
-        """
-        assets = wanted[1:]
-        kept = jnp.where(self.limits > 0, assets, 0.0)
+    A policy over all assets so becomes one over those that are there; cash stays as it is. Where
+    weights may be negative, it goes to cash.
+    """
+    assets = wanted[1:]
+    kept = jnp.where(there, assets, 0.0)
+    if long_only:
         kept = kept * (assets.sum() / jnp.maximum(kept.sum(), TINY))
-        rest = wanted[:1] + (assets - kept).sum(keepdims=True)
-        return super().project(jnp.concatenate([rest, kept]), held)
+    rest = wanted[:1] + (assets - kept).sum(keepdims=True)
+    return jnp.concatenate([rest, kept])
+
+
+class Patterns(NamedTuple):
+    """What a mandate allows where assets come and go, for each set of assets that are there."""
+
+    low: Any  # (pattern, asset)
+    high: Any  # (pattern, asset)
+    most: Any  # (pattern, limit), of the rows of the limits
+    of_row: Int[Any, " row"]  # the pattern of each row
+
+    @staticmethod
+    def of(mandate: str, tradable: np.ndarray, most: float) -> "tuple[Patterns, list[str]]":
+        """The patterns of a table, in float64, and in words what gives way at how many rows.
+
+        Assets that are not there have weight 0. Floors, and the maximum of cash, that cannot be met
+        then give way by the least in sum.
+
+        Args:
+            mandate: Text of the mandate.
+            tradable: Which assets may be bought at each row, of shape (row, asset).
+            most: Largest weight of an asset, beside its cap.
+        """
+        return _patterns(mandate, tradable.tobytes(), tradable.shape, float(most))
+
+    def in_float32(self) -> "Patterns":
+        """The same limits in the precision of training."""
+        low, high, most = (np.asarray(x, np.float32) for x in self[:3])
+        return Patterns(low, high, most, self.of_row)
+
+    def at(self, row: Any, allowed: Mandated) -> Mandated:
+        """The weights allowed at a row, or at several."""
+        which = self.of_row[row]
+        limits = allowed.limits._replace(
+            low=self.low[which], high=self.high[which], most=self.most[which]
+        )
+        return dataclasses.replace(allowed, limits=limits)
+
+
+@lru_cache(8)
+def _patterns(
+    mandate: str, tradable: bytes, shape: tuple[int, int], most: float
+) -> tuple[Patterns, list[str]]:
+    every = np.frombuffer(tradable, bool).reshape(shape)
+    distinct, of_row = np.unique(every, axis=0, return_inverse=True)
+    of_row, found = of_row.reshape(-1), []
+    yields: dict[str, int] = {}
+    for i, there in enumerate(distinct):
+        made, lowered = checks.relaxed(feasible(mandate, there, most))
+        found.append((made.limits.low, made.limits.high, made.limits.most))
+        for said in lowered:
+            name = said.rpartition(" by ")[0]
+            yields[name] = yields.get(name, 0) + int((of_row == i).sum())
+    low, high, most_of_rows = (np.array(x) for x in zip(*found, strict=True))
+    counts = [f"{name} at {count:,} of {shape[0]:,} rows" for name, count in yields.items()]
+    return Patterns(low, high, most_of_rows, of_row.astype(np.int32)), counts

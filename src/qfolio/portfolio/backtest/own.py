@@ -162,9 +162,9 @@ def kept(
     orders = days = 0
     for some, allowed in mandates:
         given = ~np.isnan(decisions[some, 0])
-        found = allowed.violations(decisions[some][given])
-        found["turnover is too high by"] = turnover[some][given] - float(allowed.limits.turnover)
-        excess = np.array(list(found.values()))
+        found = allowed.violations(decisions[some])
+        found["turnover is too high by"] = turnover[some] - float(allowed.limits.turnover)
+        excess = np.array(list(found.values()))[:, given]
         orders, days = orders + int(given.sum()), days + int((excess > TOLERANCE).any(0).sum())
         for said, by in zip(found, excess, strict=True):
             broken.setdefault(said.removesuffix(" by"), []).extend(by[by > TOLERANCE].tolist())

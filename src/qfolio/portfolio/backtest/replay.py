@@ -31,6 +31,7 @@ from qfolio.portfolio.mandate.mandate import feasible, largest_weight
 from qfolio.portfolio.prices.findings import first_of, listing
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
+from qfolio.portfolio.universe import Patterns
 
 BARELY = 1e-3
 """Risk above a limit by a smaller share of it is rounding."""
@@ -140,7 +141,11 @@ class Replay:
         if not self.task.mandate:
             return []
         every = np.ones(len(self.prices.assets), bool)
-        return checks.require(self.task.mandate, every, self.cap) + [
+        notes = checks.require(self.task.mandate, every, self.cap)
+        if self._patterns is not None and (yields := self._patterns[1]):
+            said = ", ".join(yields)
+            notes.append(f"The mandate yields to the assets that can be traded: {said}.")
+        return notes + [
             f"In fold {fold.name} the mandate yields to the assets that can be traded: {said}."
             for fold, (_, lowered) in zip(self.folds, self._relaxed, strict=True)
             for said in lowered
@@ -167,15 +172,28 @@ class Replay:
     @cached_property
     def _relaxed(self) -> list[tuple[Mandated, list[str]]]:
         mandate, values = self.task.mandate, self.prices.values
+        every = np.ones(values.shape[1], bool) if self.prices.tradable is not None else None
         return [
-            checks.relaxed(feasible(mandate, fold.tradable(values), self.cap))
+            checks.relaxed(
+                feasible(mandate, fold.tradable(values) if every is None else every, self.cap)
+            )
             for fold in self.folds
             if mandate
         ]
 
+    @cached_property
+    def _patterns(self) -> tuple[Patterns, list[str]] | None:
+        """What the mandate allows where assets come and go, if they do."""
+        tradable, mandate = self.prices.tradable, self.task.mandate
+        return (
+            Patterns.of(mandate, tradable, self.cap) if mandate and tradable is not None else None
+        )
+
     def _feasible(self, fold: int, row: int) -> Mandated:
         """What the mandate allows at a row of a fold."""
         made = self._relaxed[fold][0]
+        if self._patterns is not None:
+            made = self._patterns[0].at(row, made)
         return made.knowing(self.task.risk_at(jnp.array(row))) if made.limits_risk else made
 
     @property
@@ -275,11 +293,11 @@ class Replay:
         """Says whether a strategy of the user's own keeps the mandate."""
         if not entry.weighted:
             return f"{name} has returns only, so whether it keeps the mandate is not known."
-        first = self.folds[0].decisions.start
-        allowed = [
-            (slice(fold.decisions.start - first, fold.decisions.stop - first), made)
-            for fold, (made, _) in zip(self.folds, self._relaxed, strict=True)
-        ]
+        first, allowed = self.folds[0].decisions.start, []
+        for fold, (made, _) in zip(self.folds, self._relaxed, strict=True):
+            rows = np.arange(fold.decisions.start, fold.decisions.stop)
+            here = made if self._patterns is None else self._patterns[0].at(rows, made)
+            allowed.append((slice(rows[0] - first, rows[-1] + 1 - first), here))
         return kept(name, entry.decisions[0], entry.simulation.turnover[0], allowed)
 
     def entry(self, kind: str, decisions: np.ndarray, costs: CostModel | None = None) -> Entry:
