@@ -174,3 +174,10 @@ def test_lockstep_members_learn_the_same(task, agent, monkeypatch):
     assert lockstep._programs is not one_by_one._programs  # or this would compare like with like
     expected, actual = (p.fetch().agent.online.mlp.weights for p in (one_by_one, lockstep))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), expected, actual)
+
+
+def test_small_loops_are_compiled_whole():
+    loop = jax.jit(lambda x: jax.lax.fori_loop(0, 50, lambda i, x: jnp.sin(x) * 2, x))
+    program = loop.lower(jnp.ones(1000)).compile().as_text()
+    assert "small_call" in program
+    assert " while(" not in program.split("ENTRY")[1]

@@ -29,8 +29,13 @@ LOCKSTEP = {"gpu", "tpu"}
 """Platforms that step their members in lockstep."""
 
 
+SMALL_LOOP = 10_000_000
+"""Bytes that a loop may touch for XLA to compile it into one function of the CPU. It starts every
+operation of a larger one by itself, which takes as long as the operation where arrays are small."""
+
+
 def configure() -> None:
-    """Makes each CPU core a device and keeps compiled programs on disk.
+    """Makes each CPU core a device, compiles small loops whole and keeps programs on disk.
 
     Takes effect if called before jax first computes; settings made by the user are kept.
     """
@@ -40,6 +45,7 @@ def configure() -> None:
     wanted = {
         "--xla_force_host_platform_device_count": str(count),
         "--xla_cpu_multi_thread_eigen": "false",
+        "--xla_backend_extra_options": f"xla_cpu_small_while_loop_byte_threshold={SMALL_LOOP}",
     }
     new = [f"{flag}={value}" for flag, value in wanted.items() if flag not in flags]
     os.environ["XLA_FLAGS"] = " ".join([flags, *new]).strip()
