@@ -260,7 +260,7 @@ class BacktestFolder:
 
     def write_returns(self, days: Sequence[str], columns: dict[str, np.ndarray]) -> None:
         """returns.csv, a column per strategy and seed."""
-        rows = zip(days, *columns.values(), strict=True)
+        rows = zip(days, *(column.tolist() for column in columns.values()), strict=True)
         write_csv(self.path / "returns.csv", ["date", *columns], rows)
 
     def read_returns(self) -> tuple[list[str], dict[str, np.ndarray]]:
@@ -291,9 +291,9 @@ class BacktestFolder:
         """
         rows = rows_written(dates, len(weights) * (1 + len(assets)))
         lines = (
-            (days[row], name, *table[row].round(6))
+            (days[row], name, *numbers)
             for name, table in weights.items()
-            for row in rows
+            for row, numbers in zip(rows, table[rows].round(6).tolist(), strict=True)
         )
         header = ["date", "strategy", "cash", *assets]
         write_csv(self.path / "weights.csv", header, lines)
