@@ -17,7 +17,6 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.registry import TASKS, find
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.costs import grown
 from qfolio.portfolio.market import RUIN
 from qfolio.portfolio.prices.table import load
 
@@ -42,7 +41,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
 
     **Observation**: "features", for each asset the window of scaled log returns (and any other
     features) up to today, of shape (assets, window, channels); and "holding", the weights of the
-    assets held now (the rest is cash).
+    assets held now (the rest is cash). Where assets come and go, "tradable" is 1 for each that may
+    be bought now; what is wanted of the others goes to those, in proportion.
 
     **Action**: N + 1 numbers, cash first. Target weights are the nearest point of the simplex
     (Euclidean projection, no asset above ``max_weight``), so valid weights are used unchanged.
@@ -84,7 +84,6 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             raise QfolioError(f"render_mode is {render_mode!r}; it must be 'ansi' or None.")
         self.render_mode = render_mode
         self.prices = load(prices)
-        self.prices.require_still("the environment of Gymnasium")
         chosen = settings.convert(Portfolio, task)
         self.task = Portfolio.of(self.prices, **chosen)
         self._conditions = Conditions.of(self.prices, self.task.costs.columns)
@@ -106,6 +105,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
                     -_LARGEST, _LARGEST, (assets, self.task.window, channels), np.float32
                 ),
                 "holding": spaces.Box(0.0, 1.0, (assets,), np.float32),
+                **({} if self.prices.tradable is None else {"tradable": spaces.MultiBinary(assets)}),
             }
         )
         self.action_space = (
@@ -156,7 +156,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         )
         reward, self._memory = _programs().reward(self.task, self._memory, traded)
         coming = np.nan_to_num(values[1] / values[0], nan=1.0)
-        self._held = grown(self._target, costs.growth(self._target, coming, known.holding(0, 1)))
+        self._held = costs.held(self._target, coming, known.holding(0, 1))
         self._wealth *= 1 + float(traded.returns[0])
         self._cost, self._turnover = float(traded.cost[0]), float(traded.turnover[0])
         self._row, self._steps = row + 1, self._steps + 1
@@ -189,10 +189,13 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         return scores
 
     def _observe(self) -> Observation:
-        return {
+        seen = {
             "features": _programs().features(self.task, self._row),
             "holding": np.clip(self._held[1:], 0, 1).astype(np.float32),
         }
+        if self.prices.tradable is not None:
+            seen["tradable"] = self.prices.tradable[self._row].astype(np.int8)
+        return seen
 
     def _info(self) -> dict[str, Any]:
         earned = self._row + self.task.lag if self._steps else self._row

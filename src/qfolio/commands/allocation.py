@@ -7,7 +7,7 @@ from tyro.conf import Positional, arg
 
 from qfolio.commands.arguments import File, Modules, Name, Names
 from qfolio.commands.parsing import Document
-from qfolio.commands.tables import Missing, Returns
+from qfolio.commands.tables import Ended, Missing, Returns
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
@@ -35,6 +35,9 @@ def allocate(
     reproduce: Date = None,
     trust: Modules = (),
     missing: Missing = "error",
+    ended: Ended | None = None,
+    delisting_haircut: float = 0.0,
+    members: File = None,
     features: Names = (),
     returns: Returns = None,
     date: Name = None,
@@ -74,6 +77,10 @@ def allocate(
             or, if they are given, from --prices and --holdings, and compare the two.
         trust: Modules of your own code that the folder may name (default: none).
         missing: How to treat missing prices.
+        ended: How to treat prices that end early: as missing ones, or as a delisting (default:
+            cash-out, if assets come and go in the backtest).
+        delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
+        members: Table of the assets that may be bought at each date (default: all).
         features: Columns that hold features (default: those of the backtest).
         returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
             shares and orders need prices (default: they are prices).
@@ -92,7 +99,7 @@ def allocate(
     from qfolio.portfolio.backtest.attribution.drivers import reasons, sentence
     from qfolio.portfolio.desk.allocation import Allocation, require_fresh
     from qfolio.portfolio.desk.desk import Desk
-    from qfolio.portfolio.desk.holdings import read_holdings
+    from qfolio.portfolio.desk.holdings import cashed_out, read_holdings
     from qfolio.portfolio.desk.orders_csv import order_rows
     from qfolio.portfolio.desk.standing import Standing
     from qfolio.portfolio.mandate.mandate import lots
@@ -104,7 +111,10 @@ def allocate(
             "--returns gives no prices of shares; leave out --holdings, --whole-shares and "
             "--orders, or bring prices."
         )
-    desk = Desk.open(folder, missing=missing, features=features, returns=returns, date=date)
+    universe = {"ended": ended, "delisting_haircut": delisting_haircut, "members": members}
+    desk = Desk.open(
+        folder, missing=missing, features=features, returns=returns, date=date, **universe
+    )
     if reproduce is not None:
         if agent is not None or update or orders is not None:
             raise QfolioError(
@@ -124,7 +134,8 @@ def allocate(
         )
     table = desk.table(followed, prices)
     require_fresh(table, as_of)
-    shares, cash = read_holdings(holdings, table.assets, capital, debts=desk.debts)
+    held = read_holdings(holdings, table.assets, capital, debts=desk.debts)
+    shares, cash, gone = cashed_out(*held, table)
     if update:
         if not isinstance(followed, Policy):
             raise QfolioError(f"{name} is a baseline, which learns nothing; leave out --update.")
@@ -150,7 +161,7 @@ def allocate(
     console.print_allocation(allocation, standing, trained)
     for reason in why:
         console.tell(f"Why {sentence(reason)}")
-    for line in (*desk.terms(followed, allocation, spent), said):
+    for line in (*gone, *desk.terms(followed, allocation, spent), said):
         console.tell(line)
     return {
         "agent": name,
@@ -172,6 +183,9 @@ def follow(
     out: File = None,
     trust: Modules = (),
     missing: Missing = "error",
+    ended: Ended | None = None,
+    delisting_haircut: float = 0.0,
+    members: File = None,
     features: Names = (),
     date: Name = None,
 ) -> Document:
@@ -193,6 +207,10 @@ def follow(
             page is written beside it, with the suffix html.
         trust: Modules of your own code that the folder may name (default: none).
         missing: How to treat missing prices.
+        ended: How to treat prices that end early: as missing ones, or as a delisting (default:
+            cash-out, if assets come and go in the backtest).
+        delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
+        members: Table of the assets that may be bought at each date (default: all).
         features: Columns that hold features (default: those of the backtest).
         date: Column of dates (default: found by its name).
     """
@@ -209,7 +227,8 @@ def follow(
     from qfolio.portfolio.desk.follow import follow as marked
     from qfolio.report.follow import LiveRows, render_following
 
-    desk = Desk.open(folder, missing=missing, features=features, date=date)
+    universe = {"ended": ended, "delisting_haircut": delisting_haircut, "members": members}
+    desk = Desk.open(folder, missing=missing, features=features, date=date, **universe)
     following = marked(desk, prices, benchmark)
     path = folder / "follow.csv" if out is None else out
     following.write(path)

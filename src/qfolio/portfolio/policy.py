@@ -24,7 +24,7 @@ from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Listener, fit
 from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio import signals
-from qfolio.portfolio.costs import CostModel
+from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
@@ -132,6 +132,7 @@ class Policy:
         """
         table = self.table(prices, **options)
         held, last = self.holdings(holdings), len(table) - 1
+        held = held if table.listed is None else cashed(held, table.listed[-1])
         targets, _ = self.decide(table, last, held, 1, spent=spent, whole=True)
         return dict(zip(("cash", *self.assets), targets[0].tolist(), strict=True))
 
@@ -252,8 +253,9 @@ class Policy:
                 f"The price table has {amount(len(table), 'row')}; the policy's signals "
                 f"look back on {looked}, so bring at least {looked + 1}."
             )
-        table.require_still("a policy for tomorrow")
         table = table.select(self.assets)
+        if table.tradable is not None:  # it may hold those that are there
+            return table
         # An asset that may be held needs prices in the whole window, the others at its end.
         tradable, last = np.asarray(self.task.limits) > 0, len(table) - 1
         begin = last - self.task.window
@@ -327,7 +329,7 @@ class Policy:
     def _moved(self, table: Prices) -> Portfolio:
         """The task on all rows of another table, with the scale of the old one."""
         task = on_table(self.task, table)
-        tradable = ~np.isnan(table.values[0])
+        tradable = ~np.isnan(table.values[0]) if table.tradable is None else None
         part = task.part(0, len(table) - 1, tradable)
         where = lambda t: (t.center, t.scale)  # noqa: E731
         return eqx.tree_at(where, part, where(self.task))

@@ -193,7 +193,7 @@ class Portfolio(Market):
         channels = np.concatenate(
             [np.asarray(self.log_relatives)[rows, :, None], np.asarray(self.extra)[rows]], axis=2
         )[:, usable]
-        if self.tradable is not None:
+        if self.tradable is not None and not self.tradable[rows].all():
             channels = channels[np.asarray(self.tradable)[rows][:, usable]][:, None]
         center, scale = channels.mean((0, 1)), channels.std((0, 1))
         center[0] = 0.0  # the sign of a return means something

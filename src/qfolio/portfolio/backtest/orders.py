@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, Bools, Floats, History
+from qfolio.portfolio.costs import cashed
 from qfolio.portfolio.execution import Terms
 from qfolio.portfolio.mandate.feasible import Feasible, Mandated, exactly
 
@@ -54,6 +55,7 @@ def orders(
     month: int = 21,
     terms: Terms = AT_EVERY_ROW,
     universe: Bools | None = None,
+    listed: Bools | None = None,
 ) -> Orders:
     """Ask a baseline for its decisions on every row of the folds.
 
@@ -76,6 +78,7 @@ def orders(
         universe: Which assets may be bought at each row, of shape (rows, N), if they come and go.
             One that estimates may hold those of them with prices in all of the fold's training
             rows. A target of the calendar "fold" is asked for at every row.
+        listed: Which assets have a price at each row, likewise; what is delisted is held as cash.
 
     Returns:
         Decisions for all rows of the folds, and notes that name the fold.
@@ -109,6 +112,7 @@ def orders(
             warnings.simplefilter("always")
             for row in rows if again or watched else sorted(asked):
                 held = drifted(last, prices[row_last], prices[row])
+                held = held if listed is None else cashed(held, listed[row])
                 called = terms.called < np.inf and abs(held[1:]).sum() > terms.called
                 if row in asked or (called and not stands):
                     known = slice(0, row + 1)
@@ -132,6 +136,7 @@ def orders(
                     part[row - rows[0]] = target
                 if plan is not None and row + 1 < len(prices):
                     coming = drifted(plan.order, prices[row], prices[row + 1])
+                    coming = coming if listed is None else cashed(coming, listed[row + 1])
                     plan = terms.next_row(row, plan, coming)
         if stands and not (again or watched or each or np.isnan(part[0]).any()):
             part[:] = np.where(trading[:, None], part[0], np.nan)

@@ -14,6 +14,7 @@ from qfolio.core.version import __version__
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
 from qfolio.portfolio.desk.rule import Rule
 from qfolio.portfolio.policy import Policy
@@ -40,6 +41,8 @@ class Desk:
         run = Backtest.open(folder)
         known = {**options, "features": options.get("features") or tuple(run.config.feature_names)}
         known.setdefault("columns", tuple(run.config.prices.get("columns", ())))
+        ends = "gap" if run.prices.tradable is None else "cash-out"
+        known["ended"] = options.get("ended") or ends
         # What is followed looks at the last rows only; assets may start at any row before.
         return Desk(run, Path(folder), lambda source: load(source, late="join", **known))
 
@@ -72,7 +75,15 @@ class Desk:
 
     def table(self, followed: Policy | Rule, prices: Path | None) -> Prices:
         """The prices to decide on (default: those of the backtest)."""
-        return self.run.prices if prices is None else followed.table(self.load(prices))
+        if prices is None:
+            return self.run.prices
+        table = self.load(prices)
+        if table.members is None and self.run.prices.members is not None:
+            raise QfolioError(
+                "The assets of the backtest are members for a time only; give the latest "
+                "memberships with --members."
+            )
+        return followed.table(table)
 
     def spent(self, followed: Policy | Rule, table: Prices, before: int | None = None) -> float:
         """The turnover of the ledger since the year of a table's last row began.
@@ -140,11 +151,11 @@ class Desk:
         if prices is None:
             table = self.ledger.prices(record, self.run.prices)
         else:
-            table = followed.table(self.load(prices))
+            table = self.table(followed, prices)
             table = table.between(None, int((table.dates <= record.moment).sum()))
         shares, cash = np.array(record.shares), record.cash
         if holdings is not None:
-            shares, cash = holdings
+            shares, cash, _ = cashed_out(*holdings, table)
         digests["prices"] = table.sha256
         digests["holdings"] = holdings_digest(self.run.prices.assets, shares, cash)
         said = {

@@ -173,7 +173,7 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
         )
     agent, lag = records[-1].agent, run.config.lag
     known = desk.followed(agent, records[-1].policy)
-    table = run.prices if prices is None else known.table(desk.load(prices))
+    table = desk.table(known, prices)
     live = mark(records, table, known.costs, lag, known.task.written.trading.fill)
     other, count = run.config.benchmark, len(live.returns)
     tested, before = (_tested(desk, name, records[0]) for name in (agent, other))

@@ -10,6 +10,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.cells import CURRENCIES, is_missing, label, not_a_number, numbers
 from qfolio.portfolio.prices.reading import read
+from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.prices.vocabulary import plain
 
 ASSET_NAMES = ("asset", "symbol", "ticker", "name", "instrument")
@@ -72,6 +73,25 @@ def read_holdings(
     for name, amount in held.items():
         shares[places[name]] = amount
     return shares, cash
+
+
+def cashed_out(
+    shares: np.ndarray, cash: float, prices: Prices
+) -> tuple[np.ndarray, float, list[str]]:
+    """Shares and cash after the cash-out of what a table's last row does not list any more.
+
+    Returns:
+        Shares of shape (assets,), cash, and a sentence for each asset that is taken as cash.
+    """
+    if prices.listed is None:
+        return shares, cash, []
+    gone = (shares != 0) & ~prices.listed[-1] & (prices.first_rows < len(prices))
+    paid = np.where(gone, shares * prices.values[-1], 0.0)
+    said = [
+        f"{prices.assets[j]} is delisted; {shares[j]:,g} shares count as {paid[j]:,.2f} in cash."
+        for j in np.flatnonzero(gone)
+    ]
+    return np.where(gone, 0.0, shares), cash + float(paid.sum()), said
 
 
 def _name_columns(names: tuple[str, ...]) -> set[int]:

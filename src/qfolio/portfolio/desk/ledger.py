@@ -174,6 +174,7 @@ class Ledger:
             table = Prices(
                 dates, assets, arrays["values"], arrays["features"], features,
                 market=arrays.get("market", np.empty(0)), market_names=known.market_names,
+                listed=arrays.get("listed"), members=arrays.get("members"),
             )  # fmt: skip
         except (KeyError, ValueError, QfolioError) as error:
             raise QfolioError(f"{path} is damaged ({error}); give the prices again.") from None
@@ -186,7 +187,7 @@ class Ledger:
         if not path.exists():
             seconds = prices.dates.astype("datetime64[s]").astype(np.int64)
             arrays = {"dates": seconds, "values": prices.values, "features": prices.features}
-            write_arrays(path, {**arrays, "market": prices.market})
+            write_arrays(path, {**arrays, "market": prices.market, **prices.masks})
 
     def _prices(self, digest: str) -> Path:
         return self.folder / "prices" / f"{digest[:16]}.safetensors"

@@ -79,6 +79,11 @@ def mark(
             growth = model.growth(before, relatives, known.holding(row - 1, row))
             # What holding earns besides the price is paid in cash.
             cash = cash * growth[0] + float(before[1:] @ (growth[1:] - relatives))
+            if known.listed is not None:  # what is delisted is cash, and its orders are void
+                gone = known.listed[row] == 0
+                cash += float(units[gone] @ values[row][gone])
+                units = np.where(gone, 0.0, units)
+                due = {then: np.where(gone, 0.0, part) for then, part in due.items()}
             total = cash + float(units @ values[row])
             if row > first + lag:
                 table.append((total / base - 1, total, cash, paid, flow))

@@ -10,7 +10,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.folds import latest
 from qfolio.portfolio.backtest.orders import beyond, obeying
-from qfolio.portfolio.costs import CostModel
+from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight
 from qfolio.portfolio.prices.table import Prices, load
@@ -49,7 +49,6 @@ class Rule:
     def table(self, prices: Any, **options: Any) -> Prices:
         """The prices with the assets of the backtest, in its order."""
         table = load(prices, **options)
-        table.require_still("a baseline's orders for tomorrow")
         if set(table.assets) != set(self.assets):
             off = sorted(set(table.assets) ^ set(self.assets))
             raise QfolioError(
@@ -66,14 +65,20 @@ class Rule:
         table = self.table(prices)
         held = np.array([(holdings or {"cash": 1.0}).get(n, 0.0) for n in ("cash", *self.assets)])
         fold = latest("latest", table.dates, self.train, self.expanding).complete(table.values)
-        tradable = fold.tradable(table.values)
+        there = tradable = fold.tradable(table.values)
+        if table.tradable is not None:
+            priced = ~np.isnan(table.values[fold.train]).any(0)
+            there = table.tradable[-1]
+            tradable = there & (priced | (not self.baseline.estimates))
+        if table.listed is not None:
+            held = cashed(held, table.listed[-1])
         if not tradable.any():
             raise QfolioError(
                 f"No asset has prices in all of the last {self.train}; give earlier prices."
             )
         mandated, cap, terms = None, self.cap, self.task.terms
         if self.mandate:
-            mandated, _ = checks.relaxed(feasible(self.mandate, tradable, cap))
+            mandated, _ = checks.relaxed(feasible(self.mandate, there, cap))
             cap = min(cap, largest_weight(self.mandate))
             if mandated.limits_risk:
                 last = jnp.array(len(table) - 1)

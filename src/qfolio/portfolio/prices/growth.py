@@ -31,7 +31,9 @@ def require_grown(before: Prices, after: Prices) -> None:
                 )
         if old != new:
             raise QfolioError(f"The new table has its {kind}s in another order; restore it.")
-    if before.masks.keys() != after.masks.keys():
+    # The first delisting may be new, unless assets started late, which then may be held earlier.
+    ends = before.listed is None and not np.isnan(before.values).any()
+    if before.masks.keys() != after.masks.keys() - ({"listed"} if ends else set()):
         raise QfolioError(
             "Assets come and go in one of the tables, the backtest's or the new one, and not in "
             "the other; give the same options as before, or start a new backtest."
@@ -58,8 +60,9 @@ def _require_same(before: Prices, after: Prices) -> None:
         label = [f"{name} of {asset}" for asset in names]
         blocks.append((label, before.features[..., i], after.features[..., i]))
     blocks.append((list(before.market_names), before.market, after.market))
-    for what, mask in before.masks.items():
-        blocks.append(([f"{what} of {name}" for name in names], mask, after.masks[what]))
+    for what in before.masks | after.masks:  # a table that lists all needs no mask
+        old, new = (table.masks.get(what, ~np.isnan(table.values)) for table in (before, after))
+        blocks.append(([f"{what} of {name}" for name in names], old, new))
     columns = [name for label, *_ in blocks for name in label]
     old = np.concatenate([block.astype(float) for _, block, _ in blocks], axis=1)
     new = np.concatenate([block.astype(float) for *_, block in blocks], axis=1)

@@ -110,6 +110,9 @@ class Prices:
             arrays[name] = np.array(mask, dtype=bool)
             if arrays[name].shape != shape:
                 raise QfolioError(f"{name} has the shape {mask.shape}; it must be {shape}.")
+        if "listed" in arrays and (arrays["listed"] >= started).all():  # as in the first rows
+            del arrays["listed"]
+            object.__setattr__(self, "listed", None)
         for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
@@ -144,14 +147,6 @@ class Prices:
     def known(self) -> np.ndarray:
         """The prices, with NaN after an asset's last row, too."""
         return self.values if self.listed is None else np.where(self.listed, self.values, np.nan)
-
-    def require_still(self, who: str) -> None:
-        """Raises QfolioError if assets end or have a membership."""
-        if self.tradable is not None:
-            raise QfolioError(
-                f"The assets of this table come and go, which {who} does not know yet; read it "
-                "without ended=cash-out and members."
-            )
 
     @property
     def relatives(self) -> np.ndarray:
