@@ -105,7 +105,9 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
                     -_LARGEST, _LARGEST, (assets, self.task.window, channels), np.float32
                 ),
                 "holding": spaces.Box(0.0, 1.0, (assets,), np.float32),
-                **({} if self.prices.tradable is None else {"tradable": spaces.MultiBinary(assets)}),
+                **(
+                    {} if self.prices.tradable is None else {"tradable": spaces.MultiBinary(assets)}
+                ),
             }
         )
         self.action_space = (
