@@ -51,9 +51,9 @@ class Film:
         self.frames.append(frame)
         self.milliseconds.append(milliseconds)
 
-    def save(self, name: str, colours: int) -> None:
-        """Write a GIF that repeats, in colours that all frames share."""
-        palette = self.frames[-1].quantize(colours, dither=Image.Dither.NONE)
+    def save(self, name: str, colors: int) -> None:
+        """Write a GIF that repeats, in colors that all frames share."""
+        palette = self.frames[-1].quantize(colors, dither=Image.Dither.NONE)
         first, *rest = (
             frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in self.frames
         )

@@ -41,7 +41,7 @@ NotebookClient.coalesce_streams = True
 # Notebooks type commands as readers do, and draw in the style of the reports.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 os.environ["MATPLOTLIBRC"] = str(Path(__file__).parent / "matplotlibrc")
-os.environ["TTY_COMPATIBLE"] = "0"  # no colours and no moving bars
+os.environ["TTY_COMPATIBLE"] = "0"  # no colors and no moving bars
 
 autodoc_member_order = "bysource"
 napoleon_use_ivar = True

@@ -83,7 +83,7 @@ def _call(words: list[str]) -> None:
     """Runs the command that the words name, or shows the commands."""
     import tyro
 
-    from qfolio.commands.parsing import description, summary
+    from qfolio.commands.parsing import chosen, summary
     from qfolio.core.errors import QfolioError
 
     if words == ["--version"]:
@@ -93,8 +93,7 @@ def _call(words: list[str]) -> None:
         return
     known, name = commands(), words[0] if words else ""
     if name in known:
-        about = description(known[name])
-        tyro.cli(known[name], prog=f"qfolio {name}", description=about, args=words[1:])
+        chosen(known[name], name, words[1:])()
         return
     if name and not name.startswith("-"):
         raise QfolioError(f"there is no command {name!r}; {near(name, known)}")

@@ -222,7 +222,7 @@ def test_rewards_by_name():
         env.reset(options={"start": 10})
         _, growth[reward], *_, info = env.step(target)
     moved = prices.values[11] / prices.values[10]
-    wealth = 0.99 * (moved[0] + moved[1]) / 2  # cash to assets at 1 %
+    wealth = 0.99 * (moved[0] + moved[1]) / 2  # cash to assets at 1%
     np.testing.assert_allclose(info["wealth"], wealth, rtol=1e-12)
     np.testing.assert_allclose(growth["log"], np.log(wealth), rtol=1e-9)
     np.testing.assert_allclose(growth["crra"], (1 - wealth**-2) / 2, rtol=1e-9)

@@ -53,7 +53,7 @@ def decided(monkeypatch):
 
 
 class Checked(PortfolioPolicy):
-    """With this tag, scikit-learn draws no negative returns, and so none below −100 %."""
+    """With this tag, scikit-learn draws no negative returns, and so none below −100%."""
 
     def __sklearn_tags__(self):
         tags = super().__sklearn_tags__()
@@ -62,7 +62,7 @@ class Checked(PortfolioPolicy):
 
 
 UNFIT = {
-    "check_positive_only_tag_during_fit": "returns may be negative, but not below −100 %",
+    "check_positive_only_tag_during_fit": "returns may be negative, but not below −100%",
     "check_fit_score_takes_y": "skfolio's fit_predict takes no y",
     "check_fit2d_1sample": "one row is refused by a sentence that names window and horizon",
     "check_methods_sample_order_invariance": "what is held depends on the order of days",

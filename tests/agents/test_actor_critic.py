@@ -100,7 +100,7 @@ def batch_of(n=6, actions=None):
 def test_a_deterministic_actor_finds_the_best_action_and_its_value(kind, rescale):
     noise = {"target_noise": 0.2, "target_noise_clip": 0.1} if kind is TD3 else {}
     end = learned(Aim(), kind(**SMALL, exploration_noise=0.2, value_rescaling=rescale, **noise))
-    np.testing.assert_allclose(end.actor(STATES), BEST, atol=0.08)  # 2 % of the range
+    np.testing.assert_allclose(end.actor(STATES), BEST, atol=0.08)  # 2% of the range
     values = end.critics(STATES, BEST).mean(0)
     # Noise on the target's actions takes its variance off each later step.
     lost = clipped_variance(0.2, 0.1) if kind is TD3 else 0.0
@@ -113,7 +113,7 @@ def test_returns_over_steps_lead_to_the_same_policy():
     """Rewards between now and the value that follows are those of actions with noise."""
     noise = 0.2
     end = learned(Aim(horizon=50), DDPG(**SMALL, exploration_noise=noise, n_steps=3))
-    np.testing.assert_allclose(end.actor(STATES), BEST, atol=0.16)  # 4 %: returns vary more
+    np.testing.assert_allclose(end.actor(STATES), BEST, atol=0.16)  # 4%: returns vary more
     later = sum(DISCOUNT**k * (1 - noise**2 * (k % 3 > 0)) for k in range(1, 100))
     np.testing.assert_allclose(end.critics(STATES, BEST)[0], [1 + later, 1], rtol=0.02)
 
@@ -590,8 +590,8 @@ def test_warm_up_explores_at_random_and_learning_by_the_actor():
     random = agent.act(state, observation, jax.random.key(1))
     np.testing.assert_allclose(random.std(), 2 / math.sqrt(3), rtol=0.1)
     state = eqx.tree_at(lambda s: s.steps, state, jnp.array(agent.warm_up(), jnp.int32))
-    learnt = agent.act(state, observation, jax.random.key(1))
-    np.testing.assert_array_equal(learnt, agent.policy(state.learned.actor, observation))
+    learned = agent.act(state, observation, jax.random.key(1))
+    np.testing.assert_array_equal(learned, agent.policy(state.learned.actor, observation))
 
 
 def test_each_kind_of_action_has_its_distribution():
@@ -659,7 +659,7 @@ def test_refuses_what_makes_no_sense(kind, settings):
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
 def test_fast_presets_swing_the_pendulum_up(agent):
-    """What docs/algorithms/actor_critic.md says of every seed; an idle agent loses 900 %."""
+    """What docs/algorithms/actor_critic.md says of every seed; an idle agent loses 900%."""
     fast = preset("fast", "pendulum", agent)
     task = Pendulum(**fast.task)
     run = train(task, fast.build(), episodes=fast.episodes, seeds=2, seed=100)

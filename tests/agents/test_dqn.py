@@ -549,7 +549,7 @@ def test_targets_are_without_noise(task, agent):
     assert (spread(loud, quiet) > 1e-3).all()
 
 
-def test_prioritised_updates_set_the_priorities_of_what_was_drawn(task):
+def test_prioritized_updates_set_the_priorities_of_what_was_drawn(task):
     """Written out: β = 0.4 at the first update, priorities (|error| + 10⁻⁶)^α afterwards."""
     agent = DQN(
         hidden=(8,),

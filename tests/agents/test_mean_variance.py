@@ -55,7 +55,7 @@ def test_learns_shorter_half_lives_where_volatility_changes():
     assert found["volatility_half_life"] < 30 < other["volatility_half_life"]
     assert state.policy.trading.described["rate"] > 2 * steady.policy.trading.described["rate"]
 
-    def realised(policy):
+    def realized(policy):
         rows = jnp.arange(500, 1900)
         views = jax.vmap(lambda row: market.view(row, market.hold(jnp.append(1.0, jnp.zeros(6)))))(
             rows
@@ -65,7 +65,7 @@ def test_learns_shorter_half_lives_where_volatility_changes():
         return float(earned.std())
 
     started = eqx.tree_at(lambda policy: policy.learned, state.policy, state.start)
-    assert realised(state.policy) < 0.95 * realised(started)
+    assert realized(state.policy) < 0.95 * realized(started)
 
 
 def test_expected_returns_are_learned_only_where_there_is_momentum():

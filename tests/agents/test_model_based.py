@@ -205,7 +205,7 @@ def test_each_seed_draws_counts_of_its_own():
 
 
 def test_a_share_of_a_batch_is_real():
-    """5 % of 64 steps, as in Janner et al.: three, before the imagined ones."""
+    """5% of 64 steps, as in Janner et al.: three, before the imagined ones."""
     step = jax.tree.map(lambda x: x[0], steps())
     real = Replay.empty(Remembered(step, jnp.ones(3)), 4, 4)
     real = jit(real.add)(Remembered(steps(), jnp.ones((4, 3))))
@@ -239,7 +239,7 @@ def test_learns_values_from_imagined_steps():
 
 @pytest.mark.slow
 def test_the_fast_preset_swings_the_pendulum_up_from_two_thousand_steps():
-    """A seed whose values once rose without end, to a regret of 773 %, in states never seen."""
+    """A seed whose values once rose without end, to a regret of 773%, in states never seen."""
     fast = preset("fast", "pendulum", "mbpo")
     run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=1, seed=302)
     assert run.population.steps <= 2000

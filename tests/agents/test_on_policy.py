@@ -492,14 +492,14 @@ def test_reinforce_wants_whole_episodes():
     [
         ("ppo", 100, 0.05),
         ("a2c", 100, 0.10),
-        # Lost, at a regret of 457 %, before means out of reach cost anything.
+        # Lost, at a regret of 457%, before means out of reach cost anything.
         ("a2c", 236, 0.10),
         ("a2c", 283, 0.10),
         ("reinforce", 100, 0.08),
     ],
 )
 def test_presets_learn_the_pendulum(name, seed, limit):
-    """All well within public figures: A2C's −163 is a regret of 19 %, PPO's −172 one of 26 %."""
+    """All well within public figures: A2C's −163 is a regret of 19%, PPO's −172 one of 26%."""
     fast = preset("fast", "pendulum", name)
     run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=2, seed=seed)
     regrets = run.grade()["regret_per_seed"]

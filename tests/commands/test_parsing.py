@@ -176,3 +176,21 @@ def test_a_narrow_terminal_folds_names_and_cuts_no_number(monkeypatch, capsys):
     assert "…" not in printed
     console.tell("A sentence with words that are longer than the terminal is wide, by far.")
     assert capsys.readouterr().out.split("\n")[0].endswith(" longer than the")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["backtest", "--seeds", "x"], "--seeds is 'x'; it must be a whole number."),
+        (["backtest", "--cost-bps", "ten"], "--cost-bps is 'ten'; it must be a number."),
+        (["backtest", "--late", "trimm"], "--late is 'trimm'; did you mean trim?"),
+        (["backtest", "--late", "x"], "--late is 'x'; choose from error, drop-asset, trim, join."),
+        (["backtest", "--sedes", "2"], "there is no option --sedes; did you mean --seeds?"),
+        (["backtest", "a.csv", "b.csv"], "there is no argument b.csv."),
+        (["train", "--seeds"], "--seeds needs a value."),
+        (["evaluate"], "PATH is missing: folder of a run."),
+    ],
+)
+def test_wrong_words_are_one_sentence_that_names_the_help(words, said, monkeypatch, capsys):
+    assert typed(monkeypatch, *words) == 2
+    assert capsys.readouterr().err == f"qfolio: {said} See qfolio {words[0]} --help.\n"

@@ -35,7 +35,7 @@ def test_a_backtest_shows_itself_in_a_notebook(folder):
     assert "Backtest of pathwise" in shown
     measures = json.loads((folder / "summary.json").read_text())["strategies"]
     growth = measures["equal-weight"]["measures"]["growth"]["mean"]
-    assert f"<td>equal-weight</td><td>{100 * growth:.1f} %</td>" in shown
+    assert f"<td>equal-weight</td><td>{100 * growth:.1f}%</td>" in shown
     assert "equal-weight at" not in shown  # the other speeds of rebalancing
 
 
@@ -146,7 +146,7 @@ def test_backtest_obeys_a_mandate(monkeypatch, capsys, tmp_path):
                "rollout_length=10"]  # fmt: skip
     mandate.write_text("[assets]\ncap = 0.1\n[cash]\nmax = 0.5\n")
     assert qfolio(monkeypatch, "backtest", *options, "--out", "run") == 2
-    assert "caps of assets (10 %) and cash of at most 50 % clash" in capsys.readouterr().err
+    assert "caps of assets (10%) and cash of at most 50% clash" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
     mandate.write_text(
         '[assets]\ncap = 0.6\n[groups]\nfile = "groups.csv"\n[groups.sector.Metals]\ncap = 0.3\n'

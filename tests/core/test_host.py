@@ -107,7 +107,7 @@ class Faulty(Tiny):
     def reset(self, *, seed=None, options=None):
         seen, info = super().reset(seed=seed)
         if self.fault == "fails to start":
-            raise RuntimeError("no licence")
+            raise RuntimeError("no license")
         if self.fault == "starts with NaN":
             seen = np.array([np.nan, 0], np.float32)
         return seen, info
@@ -310,7 +310,7 @@ def test_it_says_what_is_wrong(make, message):
         ("number", r"step 2 .* has the shape \(\) and its observation space \(2,\)"),
         ("raises", r"step 2 of an episode: KeyError: 'missing' \(test_host.py, line \d+\)"),
         ("old interface", r"step 2 of an episode: ValueError: not enough values"),
-        ("fails to start", r"the start of an episode: RuntimeError: no licence"),
+        ("fails to start", r"the start of an episode: RuntimeError: no license"),
     ],
 )  # fmt: skip
 def test_a_fault_of_an_environment_is_told_as_its_own(fault, says):

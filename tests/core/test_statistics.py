@@ -126,7 +126,7 @@ def test_the_interval_of_one_stratum_is_that_of_the_bootstrap() -> None:
 
 
 def test_intervals_cover_what_they_should() -> None:
-    # Of ten values, an interval that claims 95 % holds the truth some 93 times in 100, and a
+    # Of ten values, an interval that claims 95% holds the truth some 93 times in 100, and a
     # difference between groups that are alike contains zero as often.
     rng = np.random.default_rng(5)
     held = np.zeros(3)

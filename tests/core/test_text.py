@@ -29,6 +29,7 @@ def test_quotes_are_short():
 def test_a_wrong_name_gets_advice():
     known = ["dqn", "PPO", "", *(f"number-{i}" for i in range(30))]
     assert near("dqm", known) == "did you mean dqn?"
+    assert closest("dnq", ["dyna-q", "dqn"]) == "dqn", "of the same length"
     assert near("ppo", known) == "did you mean PPO?"
     assert closest("xyz", known) is None
     assert near("xyz", known[:2]) == "choose from dqn, PPO."

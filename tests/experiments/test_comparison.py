@@ -31,7 +31,6 @@ from qfolio.portfolio.synthetic.kelly import Kelly
 from qfolio.portfolio.synthetic.regime import Regime
 from qfolio.report.comparison import comparison_data, render_comparison, tidy
 from qfolio.report.figures.style import percent_tick
-from qfolio.report.rendering import THIN_SPACE
 from qfolio.tasks.pendulum import Pendulum
 
 from jobs import Elsewhere
@@ -76,7 +75,7 @@ def short_chunks():
 
 @pytest.fixture
 def one_core(monkeypatch):
-    """The programs of these tests are hardly optimised, and round differently on two."""
+    """The programs of these tests are hardly optimized, and round differently on two."""
     monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
 
 
@@ -115,12 +114,12 @@ def test_ranking_by_regret():
     assert ranking["order"] == ["good", "bad"]
     assert ranking["common_steps"] == 500
     good = ranking["agents"]["good"]
-    # The middle half of 2 % to 1.125 % below −100.
+    # The middle half of 2% to 1.125% below −100.
     assert good["final"]["iqm"] == pytest.approx(0.015625)
     assert good["final"]["worst"] == pytest.approx(0.02)
     low, high = good["final"]["interval"]
     assert 0.0125 < low < 0.015625 < high < 0.02
-    # Regrets of the curve: 200 % and 100 % and 1 %, at 0, 250 and 500 steps.
+    # Regrets of the curve: 200% and 100% and 1%, at 0, 250 and 500 steps.
     assert good["area"]["iqm"] == pytest.approx((1.5 + 0.505) / 2)
     near = {entry["threshold"]: entry for entry in good["within"]}
     assert (near[0.1]["steps"], near[0.1]["seconds"], near[0.1]["reached"]) == (500, 4.0, 8)
@@ -148,7 +147,7 @@ def test_ranking_by_return_where_no_optimum_is_known():
     assert (ranking["measure"], ranking["goal"]) == ("return", 500.0)
     assert ranking["order"] == ["best", "worse"]
     assert ranking["agents"]["best"]["final"]["worst"] == 480
-    assert ranking["agents"]["best"]["within"][2]["steps"] == 500  # 460 is within 10 % of 500
+    assert ranking["agents"]["best"]["within"][2]["steps"] == 500  # 460 is within 10% of 500
     assert ranking["agents"]["worse"]["within"][2]["steps"] is None
     first, second, last = conclusion(ranking)
     assert first == "best ends with the highest return: 495.0 (4 seeds, 480.0 to 500.0)."
@@ -156,15 +155,15 @@ def test_ranking_by_return_where_no_optimum_is_known():
     assert ranking["pairs"][0]["probability_interval"] is None
     assert second == "With 4 seeds each it can be told apart from worse (115.0)."
     assert (
-        last == "Only best settles within 10 % of the best return, after 500 steps and 1 s a seed."
+        last == "Only best settles within 10% of the best return, after 500 steps and 1 s a seed."
     )
 
 
 def test_agents_that_cannot_be_told_apart_are_said_so():
     said = conclusion(rank({"a": result(GOOD), "b": result(ALIKE), "c": result(BAD)}))
-    assert said[0].startswith("a ends nearest to the exact optimum: its regret is 1.6 % (95 %")
+    assert said[0].startswith("a ends nearest to the exact optimum: its regret is 1.6% (95%")
     assert said[1] == (
-        "With 8 seeds each it cannot be told apart from b (1.6 %); c (36 %) does worse."
+        "With 8 seeds each it cannot be told apart from b (1.6%); c (36%) does worse."
     )
     assert len(said) == 3
 
@@ -176,7 +175,7 @@ def test_a_best_return_of_zero_has_no_shares():
 
 
 def test_few_seeds_tell_nothing_apart():
-    # Of three against three, two of twenty ways to choose are as extreme: 10 %.
+    # Of three against three, two of twenty ways to choose are as extreme: 10%.
     assert [fewest_seeds(pairs) for pairs in (1, 3, 45)] == [4, 5, 7]
     said = conclusion(rank({"a": result(GOOD[:3]), "b": result(BAD[:3])}))
     assert said[1] == (
@@ -196,8 +195,8 @@ def test_one_seed_has_no_intervals():
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.0, "0 %"), (2e-7, "0 %"), (-2e-7, "0 %"), (0.000193, "0.019 %"), (0.0134, "1.3 %"),
-     (0.134, "13 %"), (10.36, "1,036 %"), (-0.004, "−0.40 %"), (0.00005, "0.005 %")],
+    [(0.0, "0%"), (2e-7, "0%"), (-2e-7, "0%"), (0.000193, "0.019%"), (0.0134, "1.3%"),
+     (0.134, "13%"), (10.36, "1,036%"), (-0.004, "−0.40%"), (0.00005, "0.005%")],
 )  # fmt: skip
 def test_shares_show_the_digits_that_matter(value, text):
     assert share(value) == text
@@ -490,12 +489,12 @@ def test_the_report():
     text = page({"a": result(GOOD), "b": result(ALIKE, steps=90_000), "c": result(BAD)})
     assert "Three agents on the pendulum" in text
     assert "Mind &lt;b&gt;." in text
-    assert "cannot be told apart from b (1.6\N{NARROW NO-BREAK SPACE}%)" in text
+    assert "cannot be told apart from b (1.6%)" in text
     # c is told apart from both, a and b are not: of six pairs, four are bold.
     table = text[text.index('class="grid"') : text.index("Computational cost")]
     assert len(re.findall(r"<b>(?:100|0)</b>", table)) == 4
     assert len(re.findall(r"<td class=\"(?:win|loss)\d\">\d", table)) + 4 >= 5
-    # Offline, without scripts, and in the colours of the page.
+    # Offline, without scripts, and in the colors of the page.
     assert not re.search(r"<script|https?://(?!www\.w3\.org)|url\((?!#)", text)
     assert text.count("<svg viewBox") == 4
     assert "var(--agent-3)" in text
@@ -509,7 +508,7 @@ def test_reports_of_hard_cases():
     text = page({"exact": exact, "above": above})
     assert re.search(r"<td class=\"lead\">\N{MINUS SIGN}0.50", text)
     assert not re.search(r"\bnan\b|\binf\b", text)
-    # More agents than colours, with budgets from ten steps to ten million.
+    # More agents than colors, with budgets from ten steps to ten million.
     many = {f"agent{i}": result(GOOD[:2] - i, steps=10**i) for i in range(1, 8)}
     text = page(many)
     assert text.count('stroke-dasharray="7 3"') == 4  # the seventh, in each table and list
@@ -525,8 +524,8 @@ def test_reports_of_hard_cases():
 
 
 def test_tidy_leaves_names_alone():
-    text = tidy("double-q-2 is at −0.40 % after 51,200 steps, q-learning 3,4")
-    assert text.startswith("double-q-2 is at \N{MINUS SIGN}0.40\N{NARROW NO-BREAK SPACE}% after 51")
+    text = tidy("double-q-2 is at −0.40% after 51,200 steps, q-learning 3,4")
+    assert text.startswith("double-q-2 is at \N{MINUS SIGN}0.40% after 51")
     assert text.endswith("q-learning 3,4")
 
 
@@ -535,4 +534,4 @@ def test_tidy_leaves_names_alone():
     [(0.001, "0.1"), (0.024, "2.4"), (0.05, "5"), (0.00025, "0.025"), (5.0, "500")],
 )
 def test_ticks_have_the_digits_that_tell_them_apart(tick, label):
-    assert percent_tick(tick) == f"{label}{THIN_SPACE}%"
+    assert percent_tick(tick) == f"{label}%"

@@ -20,7 +20,7 @@ EPISODES, SEEDS = 12, 3
 
 @pytest.fixture(autouse=True)
 def one_core(monkeypatch):
-    """Programs that are hardly optimised, as those of the quick tests, round differently on two."""
+    """Programs that are hardly optimized, as those of the quick tests, round differently on two."""
     monkeypatch.setattr(jax, "devices", lambda every=jax.devices: every()[:1])
 
 

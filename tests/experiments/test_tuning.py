@@ -81,7 +81,7 @@ def test_the_tail_is_that_of_the_longest_discount(task, agent):
     far = settings.build(DQN, settings.describe(agent) | {"discount": 0.9})
     near = settings.build(DQN, settings.describe(agent) | {"discount": 0.5})
     for agents in ([near, far], [far, near]):
-        assert Population(task, agents, [0, 0])._tail == 44  # 0.9^44 < 1 % < 0.9^43
+        assert Population(task, agents, [0, 0])._tail == 44  # 0.9^44 < 1% < 0.9^43
 
 
 def test_agents_of_other_programs_are_refused(task, agent):

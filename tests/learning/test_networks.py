@@ -38,7 +38,7 @@ def normal(*shape):
 
 def test_an_image_is_convolved_as_xla_does_it():
     x, cnn = normal(5, 6, 7, 2), CNN((6, 7, 2), 24, KEY)
-    # Our neighbourhoods run by column, then row, then channel.
+    # Our neighborhoods run by column, then row, then channel.
     kernel = cnn.first.weights[0].reshape(3, 3, 2, 3).transpose(1, 0, 2, 3)
     found = lax.conv_general_dilated(
         x, kernel, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")

@@ -47,7 +47,7 @@ def test_adam_by_hand():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_optimiser_remembers_the_same_arrays(kind):
+def test_every_optimizer_remembers_the_same_arrays(kind):
     """So that checkpoints of all kinds have one form."""
     state = optimizer.begin(jnp.zeros(3), DQN(optimizer=kind)._optimizer)
     assert (state.count.shape, state.mu.shape, state.nu.shape) == ((), (3,), (3,))

@@ -85,7 +85,7 @@ def test_whole_wealth_moves(before: list[float], after: list[float], expected: f
 
 
 def test_hand_computed_trade() -> None:
-    # 100 in A, 100 in cash, to 30 % A, 50 % B, 20 % cash at 10 %: of a wealth of 200·mu is
+    # 100 in A, 100 in cash, to 30% A, 50% B, 20% cash at 10%: of a wealth of 200·mu is
     # 60·mu in A, so 100 − 60·mu is sold; 100·mu is bought for 100·mu/.9; cash is left 40·mu:
     # 100 + .9(100 − 60·mu) − 100·mu/.9 = 40·mu, so mu = 190/(40 + 54 + 111.11…).
     remainder = remainder_factor(np.array([0.5, 0.5, 0.0]), np.array([0.2, 0.3, 0.5]), 0.1)
@@ -217,7 +217,7 @@ def test_drift() -> None:
 
 @dataclass(frozen=True)
 class WithInterest(CostModel):
-    """A user's own: cash earns 1 % a row, and each trade costs a fee whatever its size."""
+    """A user's own: cash earns 1% a row, and each trade costs a fee whatever its size."""
 
     cost: float = 0.0
     fee: float = 0.001

@@ -16,7 +16,7 @@ def test_every_table_has_a_row_and_an_interval(count):
     shown = page(count)
     bars = [at for _, at in shown.tags if (at.get("class") or "").startswith("bar ")]
     assert len(bars) == 2 * (count + 1)  # two agents, each with a pooled row
-    assert all("95 % interval" in (at["aria-label"] or "") for at in bars)
+    assert all("95% interval" in (at["aria-label"] or "") for at in bars)
     styles = [at["style"] or "" for _, at in shown.tags if "left:" in (at.get("style") or "")]
     places = [float(style.split("left:")[1].split("%")[0].split(";")[0]) for style in styles]
     assert all(0 <= place <= 100 for place in places)

@@ -217,11 +217,11 @@ def test_ar1_policy_in_simulation(signal_market: Ar1Optimum) -> None:
         buy = np.log((0.998 + 0.002 * weight) / (0.998 + 0.002 * after))
         paid = np.minimum(sell, buy)  # the other one would be a gain
         mean = 0.0002 + 0.004 * x
-        realised = mean + 0.01 * rng.normal(size=paths)
+        realized = mean + 0.01 * rng.normal(size=paths)
         # The expected log instead of the drawn one: the same mean, a fraction of the noise.
         growth = after * mean - after**2 * (0.01**2 + mean**2) / 2
         total += float((paid + growth).mean()) * (step >= 50)
-        weight = after * (1 + realised) / (1 + after * realised)
+        weight = after * (1 + realized) / (1 + after * realized)
         x = 0.95 * x + 0.3122 * rng.normal(size=paths)
     assert 252 * total / steps == pytest.approx(signal_market.growth, abs=0.003)
 

@@ -11,7 +11,7 @@ from qfolio.tasks.pendulum import Pendulum
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "seeds", "worst"), [("fast", 4, 0.05), ("categorical", 1, 0.08)])
 def test_presets_come_near_the_optimum(name, seeds, worst):
-    """Of 40 seeds of categorical, one was beyond 5 %, by less than 2 points."""
+    """Of 40 seeds of categorical, one was beyond 5%, by less than 2 points."""
     chosen = preset(name)
     run = train(Pendulum(), chosen.build(), episodes=chosen.episodes, seeds=seeds, seed=100)
     regrets = run.grade()["regret_per_seed"]

@@ -195,7 +195,7 @@ class ActorCritic(Agent, Generic[L]):
 
     @abc.abstractmethod
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> L:
-        """The networks and optimisers before training; ``observation`` is an example."""
+        """The networks and optimizers before training; ``observation`` is an example."""
 
     @abc.abstractmethod
     def explore(self, state: ActorCriticState[L], observation: PyTree, key: PRNGKeyArray) -> Array:

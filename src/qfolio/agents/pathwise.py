@@ -157,8 +157,8 @@ class Paths(NamedTuple):
         """The paths and, beside them, their mirror images, if the market has any.
 
         These are antithetic paths (Hammersley & Morton 1956). A band adapts to the mean return of
-        the paths that it is learned from. Over 10,000 years at a volatility of 20 % this differs
-        from the true one by 0.2 % a year, and edges by .01; paths and images have the true one.
+        the paths that it is learned from. Over 10,000 years at a volatility of 20% this differs
+        from the true one by 0.2% a year, and edges by .01; paths and images have the true one.
         """
         market, next_market = (jax.vmap(jax.vmap(task.mirror))(x) for x in self[:2])
         if market is None:

@@ -187,7 +187,7 @@ def _print_ranking(content: dict[str, Any]) -> None:
     ranking = content["ranking"]
     write = conclusion.share if ranking["measure"] == "regret" else conclusion.amount
     near = f"steps to {HEADLINE:.0%}"
-    spread = "95 % interval" if ranking["seeds"] >= FEWEST_SEEDS else "range of seeds"
+    spread = "95% interval" if ranking["seeds"] >= FEWEST_SEEDS else "range of seeds"
     heads = ("agent", ranking["measure"], spread, "worst", near, "s a seed", "parameters")
     rows = []
     for name in ranking["order"]:
@@ -198,13 +198,13 @@ def _print_ranking(content: dict[str, Any]) -> None:
         within = next(x for x in measures["within"] if x["threshold"] == HEADLINE)
         cells = (
             write(final["iqm"]),
-            f"{low.removesuffix(' %')} … {high}",
+            f"{low.removesuffix('%')} … {high}",
             write(final["worst"]),
             figure(within["steps"], ",.0f"),
             conclusion.span(result["seconds_per_seed"]).removesuffix(" s"),
             f"{result['parameters']:,}",
         )
-        rows.append((name, *(cell.replace(" %", "%") for cell in cells)))
+        rows.append((name, *cells))
     console.print_table(heads, rows)
     for sentence in [*content["conclusion"], *content["notes"]]:
         console.tell(sentence)

@@ -122,7 +122,7 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
     print_table(heads, [*rows, ("mean", *_cells(optimum, *means))], width=9)
     if result["return_ci95"]:
         low, high = result["return_ci95"]
-        say(f"95 % interval of the mean return over seeds: {number(low)} to {number(high)}")
+        say(f"95% interval of the mean return over seeds: {number(low)} to {number(high)}")
     else:
         say(
             f"An interval over seeds needs {FEWEST_SEEDS} seeds or more (--seeds); "
@@ -309,7 +309,7 @@ def print_study(result: "Result") -> None:
             pooled, rest = entry.agents[agent].to_reference, entry.agents[agent].to_rebalanced
             cells = (*_growth(pooled), "", decimal(pooled.z), decimal(rest.z), "")
             rows.append((_pooled(entry.variant), *cells))
-        heads = (agent, "a year", "95 % interval", "IR", "t", "rebal.", "Sharpe")
+        heads = (agent, "a year", "95% interval", "IR", "t", "rebal.", "Sharpe")
         print_table(heads, rows, bold=[_pooled(main.variant)])
     say(
         "Growth is what exceeds the benchmark's, t against it (pooled: Stouffer's z), rebal. the t "

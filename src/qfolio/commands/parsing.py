@@ -2,9 +2,12 @@
 
 import contextlib
 import dataclasses
+import functools
 import inspect
+import io
 import json
 import math
+import re
 import shutil
 import sys
 import textwrap
@@ -14,7 +17,11 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import docstring_parser
+import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg, configure
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.text import near
 
 PAGE = "report.html"
 
@@ -109,6 +116,50 @@ def grouped(command: Callable[..., Any]) -> Callable[..., None]:
     call.__signature__ = inspect.Signature(parameters)
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return typing.cast(Callable[..., None], call)
+
+
+def chosen(command: Callable[..., Any], name: str, words: list[str]) -> Callable[[], Any]:
+    """The command with the options that the words choose, ready to run.
+
+    Raises QfolioError where tyro would show a box.
+    """
+
+    @functools.wraps(command)
+    def bound(*args: Any, **options: Any) -> Callable[[], Any]:
+        return functools.partial(command, *args, **options)
+
+    program, shown = f"qfolio {name}", io.StringIO()
+    try:
+        with contextlib.redirect_stderr(shown):
+            return tyro.cli(bound, prog=program, description=description(command), args=words)
+    except SystemExit as error:
+        if error.code in (None, 0):  # --help
+            raise
+    raise QfolioError(f"{refusal(shown.getvalue())} See {program} --help.")
+
+
+def refusal(box: str) -> str:
+    """What tyro says in a box, as one sentence."""
+    text = " ".join(re.sub("[╭╮╰╯│]", " ", box).split())
+    parts = [part.strip() for part in re.split("─+|-{3,}", text) if part.strip()]
+    said = parts[min(1, len(parts) - 1)]  # after the title
+    if found := re.match(r"Unrecognized options?: ([^\s,]+)", said):
+        meant = re.search(r"Perhaps you meant:[\s─-]*(--[\w-]+)", text)
+        unknown = "option" if found[1].startswith("-") else "argument"
+        return f"there is no {unknown} {found[1]}{f'; did you mean {meant[1]}?' if meant else '.'}"
+    if found := re.match(r"Missing from .*?: (\S+)\s+(.*?)\.? \(required\)", said):
+        return f"{found[1]} is missing: {found[2][:1].lower()}{found[2][1:]}."
+    if found := re.match(r"Missing value for argument '([^']+)'", said):
+        return f"{found[1]} needs a value."
+    if found := re.match(r"invalid choice '(.*)' for argument '([^']+)'\. .*\((.*)\)", said):
+        known = [choice.strip(" '") for choice in found[3].split(",")]
+        return f"{found[2]} is {found[1]!r}; {near(found[1], known)}"
+    found = re.match(r"Error parsing (\S+): ", said)
+    values = re.findall(r"'([^']*)'", said)
+    if found and values and (kind := re.search(r"\b(int|float)\b", said)):
+        number = "a whole number" if kind[1] == "int" else "a number"
+        return f"{found[1]} is {values[-1]!r}; it must be {number}."
+    return f"{said.rstrip('.')}."
 
 
 def summary(command: Callable[..., Any]) -> str:

@@ -30,7 +30,7 @@ class Greedy(NamedTuple):
 
 
 def tail_steps(discount: float | None) -> int:
-    """Steps after which a reward counts for less than 1 % (at most 2,000)."""
+    """Steps after which a reward counts for less than 1% (at most 2,000)."""
     if discount is None:
         return 0
     return min(2000, math.ceil(math.log(0.01) / math.log(min(max(discount, 1e-9), 1 - 1e-9))))

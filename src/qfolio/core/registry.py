@@ -73,9 +73,9 @@ BASELINES = {
     "minimum-variance-ledoit-wolf": f"{_CLASSICS}.minimum_variance:MinimumVarianceLedoitWolf",
     "minimum-variance-nonlinear": f"{_CLASSICS}.minimum_variance:MinimumVarianceNonlinear",
     "minimum-variance-ewma": f"{_CLASSICS}.minimum_variance:MinimumVarianceEwma",
-    "maximum-ratio": f"{_CLASSICS}.optimisers:MaximumRatio",
-    "risk-budgeting": f"{_CLASSICS}.optimisers:RiskBudgeting",
-    "hierarchical-risk-parity": f"{_CLASSICS}.optimisers:HierarchicalRiskParity",
+    "maximum-ratio": f"{_CLASSICS}.optimizers:MaximumRatio",
+    "risk-budgeting": f"{_CLASSICS}.optimizers:RiskBudgeting",
+    "hierarchical-risk-parity": f"{_CLASSICS}.optimizers:HierarchicalRiskParity",
     "pamr": f"{_CLASSICS}.online:Pamr",
     "olmar": f"{_CLASSICS}.online:Olmar",
 }

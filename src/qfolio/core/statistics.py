@@ -95,7 +95,7 @@ def bootstrap_interval(
 def band(values: ArrayLike) -> tuple[Floats, Floats]:
     """Return the lower and upper ends of the band around the interquartile mean over seeds.
 
-    The band is the 95 % bootstrap interval, or the seeds' range if there are fewer than
+    The band is the 95% bootstrap interval, or the seeds' range if there are fewer than
     FEWEST_SEEDS.
 
     Args:
@@ -132,8 +132,8 @@ def stratified_interval(
 ) -> tuple[float, float]:
     """Return a percentile bootstrap interval of a statistic of groups, each resampled separately.
 
-    It is too narrow with few values: of three normal ones, a 95 % interval of the interquartile
-    mean holds the truth in about 75 % of all cases, of five in 90 % and of ten in 93 %.
+    It is too narrow with few values: of three normal ones, a 95% interval of the interquartile
+    mean holds the truth in about 75% of all cases, of five in 90% and of ten in 93%.
 
     Args:
         strata: Groups of numbers, of shape (n,) each and n of its own: the seeds of an agent.

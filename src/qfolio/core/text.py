@@ -58,8 +58,13 @@ def listed(names: Sequence[str], word: str = "and") -> str:
 def closest(name: str, known: Iterable[str]) -> str | None:
     """The known name that a wrong one resembles, whatever its case; None if none does."""
     names = {other.casefold(): other for other in known if other}
-    close = difflib.get_close_matches(name.casefold(), names, n=1)
-    return names[close[0]] if close else None
+    given = name.casefold()
+
+    def unlike(other: str) -> tuple[float, int]:  # dnq is as similar to dyna-q as to dqn
+        return -difflib.SequenceMatcher(None, other, given).ratio(), abs(len(other) - len(given))
+
+    close = difflib.get_close_matches(given, names)
+    return names[min(close, key=unlike)] if close else None
 
 
 def hint(name: str, known: Iterable[str]) -> str:

@@ -142,7 +142,7 @@ def project(
 ) -> Float[Array, "batch atom"]:
     """Probabilities of outcomes, projected onto an increasing support (Bellemare 2017, eq. 7).
 
-    Each outcome's probability is split linearly between its two neighbours, which preserves the
+    Each outcome's probability is split linearly between its two neighbors, which preserves the
     mean; outcomes beyond the support go to its ends.
     """
     gaps = jnp.diff(support)[:, None]

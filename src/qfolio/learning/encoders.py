@@ -72,7 +72,7 @@ class CNN(eqx.Module):
 
     Filters cover three rows of a window (time, channel), or 3 × 3 pixels of an image (height,
     width, channel); there are ``width`` / 8 (16 for 128, as in MinAtar, Young & Tian 2019). On a
-    CPU, small convolutions are faster as one matrix product over copied neighbourhoods than XLA's
+    CPU, small convolutions are faster as one matrix product over copied neighborhoods than XLA's
     own (docs/concepts/networks.md).
     """
 
@@ -96,9 +96,9 @@ class CNN(eqx.Module):
         self.dimensions = len(space)
         first, second = jax.random.split(key)
         narrow = max(2, width // 8)
-        neighbours = self.SIZE**self.dimensions
-        gains = jnp.tile(jnp.broadcast_to(gain, (channels,)), neighbours)
-        self.first = MLP((neighbours * channels, narrow), first, gains)
+        neighbors = self.SIZE**self.dimensions
+        gains = jnp.tile(jnp.broadcast_to(gain, (channels,)), neighbors)
+        self.first = MLP((neighbors * channels, narrow), first, gains)
         places = math.prod(n - self.SIZE + 1 for n in space)
         self.second = MLP((places * narrow, width), second)
 

@@ -20,7 +20,7 @@ from qfolio.learning.targets import Scalar
 Weights = TypeVar("Weights", bound=PyTree)
 
 KINDS = ("adam", "rmsprop", "rmsprop-centered", "sgd")
-"""Optimisers by name: RMSProp as in Mnih et al. (2016), or centered as in Mnih et al. (2015)."""
+"""Optimizers by name: RMSProp as in Mnih et al. (2016), or centered as in Mnih et al. (2015)."""
 
 
 class OptimizerConfig(NamedTuple):

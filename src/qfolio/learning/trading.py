@@ -18,7 +18,7 @@ class Trading(eqx.Module):
 
     @staticmethod
     def start(rate: float) -> "Trading":
-        """A share of the way at each step, outside a band of 5 % of an equal weight."""
+        """A share of the way at each step, outside a band of 5% of an equal weight."""
         return Trading(jnp.array(math.log(rate / (1 - rate))), jnp.array(math.log(0.05)))
 
     @property

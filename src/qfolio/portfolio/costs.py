@@ -178,7 +178,7 @@ def newton_steps(assets: int, cost: float, dtype: Any, gross: float = 1.0) -> in
     by q·mⱼ or less, with q = 1/(1−c)² − 1. No asset switches twice, so the mⱼ sum to at most 1, and
     K steps leave at most (1 − (1−c)²)·(q/K)ᴷ. Nor can all N assets switch, because selling
     everything gains cash; so N steps leave nothing. At 10 bp that is 2 steps for 4-byte floats and
-    5 for 8-byte ones, at 20 % it is 7 and 12. Both bounds grow with the gross weight of the assets.
+    5 for 8-byte ones, at 20% it is 7 and 12. Both bounds grow with the gross weight of the assets.
     """
     kept = (1 - cost) ** 2
     first, later = gross * (1 - kept), gross * (1 / kept - 1)

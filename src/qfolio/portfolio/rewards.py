@@ -102,7 +102,7 @@ class DifferentialSharpe(Reward):
 
     where the variance B − A² is bounded below (``LEAST_VARIANCE``, ``LEAST_SHARE``): it vanishes
     for a portfolio that stays in cash or grows at a constant rate. State: (A, B); the first B of
-    1e-4 stands for a volatility of 1 % a step.
+    1e-4 stands for a volatility of 1% a step.
     """
 
     sharpe_rate: Number = 0.01  # η, the reciprocal of the memory in steps

@@ -52,7 +52,7 @@ def pendulum_gif(
     step = round(1000 * dt)
     durations = [step] * (len(frames) - 1) + [HOLD_MILLISECONDS] + [step] * FADE_FRAMES
     frames += _fade(frames[-1], frames[0])
-    table = _colour_table()
+    table = _color_table()
     indexed = [frame.quantize(palette=table, dither=Image.Dither.NONE) for frame in frames]
     indexed[0].save(
         path,
@@ -119,14 +119,14 @@ def _draw_torque(pen: ImageDraw.ImageDraw, angle: float, torque: float) -> None:
     """Draw a curved arrow from the rod in the direction of the torque."""
     if abs(torque) < 0.02:
         return
-    colour = palette.ACCENT if torque > 0 else palette.SECOND
+    color = palette.ACCENT if torque > 0 else palette.SECOND
     radius, side = 0.5 * _ROD, 1 if torque > 0 else -1
     end = angle + torque * 0.6
     head = side * min(0.2, 0.6 * abs(torque))
-    _arc(pen, radius, angle, end - 0.7 * head, colour, 3.4)
+    _arc(pen, radius, angle, end - 0.7 * head, color, 3.4)
     tip, base = _at(radius, end), end - head
     wings = [_at(radius + w, base) for w in (-6.5, 6.5)]
-    pen.polygon(_pixels([tip, *wings]), fill=colour)
+    pen.polygon(_pixels([tip, *wings]), fill=color)
 
 
 def _draw_pendulum(pen: ImageDraw.ImageDraw, angle: float) -> None:
@@ -172,9 +172,9 @@ def _text(
     y: float,
     text: str,
     anchor: str,
-    colour: str = palette.MUTED,
+    color: str = palette.MUTED,
 ) -> None:
-    pen.text((x * _SCALE, y * _SCALE), text, fill=colour, font=font, anchor=anchor)
+    pen.text((x * _SCALE, y * _SCALE), text, fill=color, font=font, anchor=anchor)
 
 
 def _at(radius: float, angle: float) -> tuple[float, float]:
@@ -183,18 +183,18 @@ def _at(radius: float, angle: float) -> tuple[float, float]:
 
 
 def _arc(
-    pen: ImageDraw.ImageDraw, radius: float, a: float, b: float, colour: str | _RGB, width: float
+    pen: ImageDraw.ImageDraw, radius: float, a: float, b: float, color: str | _RGB, width: float
 ) -> None:
     # Pillow measures clockwise from three o'clock.
     start, end = sorted(degrees(-angle - pi / 2) for angle in (a, b))
     box = _box(*_CENTRE, radius + width / 2)
-    pen.arc(box, start, end, fill=colour, width=round(width * _SCALE))
+    pen.arc(box, start, end, fill=color, width=round(width * _SCALE))
 
 
 def _line(
-    pen: ImageDraw.ImageDraw, points: Sequence[tuple[float, float]], colour: str, width: float
+    pen: ImageDraw.ImageDraw, points: Sequence[tuple[float, float]], color: str, width: float
 ) -> None:
-    pen.line(_pixels(points), fill=colour, width=round(width * _SCALE))
+    pen.line(_pixels(points), fill=color, width=round(width * _SCALE))
 
 
 def _pixels(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -206,7 +206,7 @@ def _box(x: float, y: float, radius: float) -> tuple[float, float, float, float]
 
 
 def _mix(first: str, second: str, share: float) -> _RGB:
-    a, b = (np.array(ImageColor.getrgb(colour)[:3]) for colour in (first, second))
+    a, b = (np.array(ImageColor.getrgb(color)[:3]) for color in (first, second))
     red, green, blue = np.round(a + share * (b - a)).astype(int).tolist()
     return red, green, blue
 
@@ -216,14 +216,14 @@ def _fade(last: Image.Image, first: Image.Image) -> list[Image.Image]:
     return [Image.blend(last, first, float(share)) for share in shares]
 
 
-def _colour_table() -> Image.Image:
-    """Return an image whose palette runs from paper to each colour in even steps."""
+def _color_table() -> Image.Image:
+    """Return an image whose palette runs from paper to each color in even steps."""
     # Shades too close to paper would replace it, and the background must stay pure.
     steps = {palette.INK: 20, palette.MUTED: 12, palette.HAIRLINE: 3}
     steps |= {palette.ACCENT: 20, palette.SECOND: 16}
     shades = [
-        _mix(palette.PAPER, colour, step / count)
-        for colour, count in steps.items()
+        _mix(palette.PAPER, color, step / count)
+        for color, count in steps.items()
         for step in range(count + 1)
     ]
     table = Image.new("P", (1, 1))

@@ -57,7 +57,7 @@ UNLIKE = 5.0
 class Look:
     """The line style of an agent, the same in every figure."""
 
-    colour: str  # a key of palette.LIGHT and palette.DARK
+    color: str  # a key of palette.LIGHT and palette.DARK
     dash: str  # lengths as in SVG; '' is solid
     symbol: int  # place among the markers
 
@@ -209,18 +209,16 @@ def draw_finals(data: ComparisonData, width: float) -> Figure:
     log = _logarithmic(data)
     for row, name in enumerate(names):
         final = data.ranking["agents"][name]["final"]
-        colour = palette.LIGHT[data.looks[name].colour]
+        color = palette.LIGHT[data.looks[name].color]
         limit = (lambda x: np.maximum(x, FLOOR)) if log else np.asarray
         seeds = limit(final["per_seed"])
-        axes.plot(
-            seeds, np.full(len(seeds), row + 0.2), "|", color=colour, markersize=7, alpha=0.75
-        )
+        axes.plot(seeds, np.full(len(seeds), row + 0.2), "|", color=color, markersize=7, alpha=0.75)
         if final["interval"] is not None:
             axes.plot(
-                limit(final["interval"]), [row - 0.1] * 2, color=colour, linewidth=4, alpha=0.4
+                limit(final["interval"]), [row - 0.1] * 2, color=color, linewidth=4, alpha=0.4
             )
         symbol = palette.MARKERS[data.looks[name].symbol]
-        axes.plot(limit([final["iqm"]]), [row - 0.1], symbol, color=colour, markersize=7)
+        axes.plot(limit([final["iqm"]]), [row - 0.1], symbol, color=color, markersize=7)
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(axis="y", labelcolor=palette.INK)
     axes.set_ylim(len(names) - 0.5, -0.6)
@@ -242,12 +240,12 @@ def _draw_curve(axes: Axes, data: ComparisonData, name: str, pace: float, log: b
     x = np.array(result.curve_steps) * pace
     if log:  # which has no zero
         values, x = values[x > 0], x[x > 0]
-    colour = palette.LIGHT[look.colour]
+    color = palette.LIGHT[look.color]
     low, high, middle = (
         np.maximum(line, _floor(data)) if _logarithmic(data) else line
         for line in (*band(values), interquartile_mean(values))
     )
-    axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
+    axes.fill_between(x, low, high, color=color, alpha=0.16, linewidth=0)
     style: dict[str, Any] = {
         "linestyle": (0, tuple(float(part) / 1.8 for part in look.dash.split()))
         if look.dash
@@ -257,7 +255,7 @@ def _draw_curve(axes: Axes, data: ComparisonData, name: str, pace: float, log: b
         "markersize": 5,
         "clip_on": False,
     }
-    axes.plot(x, middle, color=colour, linewidth=1.8, label=name, **style)
+    axes.plot(x, middle, color=color, linewidth=1.8, label=name, **style)
 
 
 def _goal_line(axes: Axes, data: ComparisonData) -> None:
@@ -295,10 +293,9 @@ def _middles(data: ComparisonData) -> Floats:
 
 
 def tidy(text: str) -> str:
-    """A sentence with true minus signs and thin spaces, as in the page's numbers."""
-    text = re.sub(r"(?<=\d),(?=\d{3})", THIN_SPACE, text.replace("'", "’"))
-    text = re.sub(r"(?<![\w.])-(?=\d)", "\N{MINUS SIGN}", text)
-    return re.sub(r"(?<=\d) (?=%|s\b)", THIN_SPACE, text)
+    """A sentence with true minus signs and apostrophes, as in the page's numbers."""
+    text = re.sub(r"(?<![\w.])-(?=\d)", "\N{MINUS SIGN}", text.replace("'", "’"))
+    return re.sub(r"(?<=\d) (?=s\b)", THIN_SPACE, text)
 
 
 def _facts(data: ComparisonData) -> list[tuple[str, str, str]]:

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 Content = dict[str, Any]
 """The content of continual.json."""
 
-COLOURS = dict(zip(WAYS, ("muted", "agent-3", "agent-1", "agent-2"), strict=True))
-"""The colour of each way, as keys of palette.LIGHT and palette.DARK."""
+COLORS = dict(zip(WAYS, ("muted", "agent-3", "agent-1", "agent-2"), strict=True))
+"""The color of each way, as keys of palette.LIGHT and palette.DARK."""
 
 FLOOR = 1e-3
 """The smallest regret drawn on the logarithmic scale."""
@@ -57,7 +57,7 @@ def render_page(content: Content) -> str:
         change=change(content),
         verdict=verdict(content),
         facts=_facts(content),
-        rows=[(way, WAYS[way], COLOURS[way], _row(content, way)) for way in WAYS],
+        rows=[(way, WAYS[way], COLORS[way], _row(content, way)) for way in WAYS],
         within=percent(content["within"], 0),
         rate=percent(content["rate"], 0),
         renewal=percent(content["renewal"], 0),
@@ -156,9 +156,9 @@ def _draw_course(axes: Axes, content: Content, way: str, last: int) -> None:
     steps, curve = np.array(course["steps"]), np.array(course["curve"])
     if len(steps) == 1:
         steps, curve = np.array([0, last]), np.repeat(curve, 2, axis=0)
-    colour = palette.MUTED if COLOURS[way] == "muted" else palette.LIGHT[COLOURS[way]]
+    color = palette.MUTED if COLORS[way] == "muted" else palette.LIGHT[COLORS[way]]
     low, high, middle = (
         np.maximum(line, FLOOR) for line in (*band(curve), interquartile_mean(curve))
     )
-    axes.fill_between(steps, low, high, color=colour, alpha=0.16, linewidth=0)
-    axes.plot(steps, middle, color=colour, linewidth=1.8, label=way, clip_on=False)
+    axes.fill_between(steps, low, high, color=color, alpha=0.16, linewidth=0)
+    axes.plot(steps, middle, color=color, linewidth=1.8, label=way, clip_on=False)

@@ -22,7 +22,7 @@ WIDTH = 8.6
 class LiveRows:
     """What the page draws; an entry for each row, growth over the start.
 
-    band: 2.5 %, 50 % and 97.5 %, of shape (3, rows). alarm: the evidence that raises it.
+    band: 2.5%, 50% and 97.5%, of shape (3, rows). alarm: the evidence that raises it.
     """
 
     dates: np.ndarray
@@ -87,6 +87,6 @@ def draw_following(rows: LiveRows, width: float) -> Figure:
     ticks = AutoDateLocator(minticks=2, maxticks=4 if few else 8)
     below.xaxis.set_major_locator(ticks)
     below.xaxis.set_major_formatter(ConciseDateFormatter(ticks, show_offset=False))
-    marks = {"live": live, rows.benchmark_name: other, "backtest, median": median, "95 %": shade}
+    marks = {"live": live, rows.benchmark_name: other, "backtest, median": median, "95%": shade}
     legend_above(figure, marks, few=few)
     return figure

@@ -1,7 +1,7 @@
-"""The colours and marks shared by figures, animation and page.
+"""The colors and marks shared by figures, animation and page.
 
-Blue and orange are distinct for every common form of colour blindness. The page replaces these
-colours with its own variables, so that figures follow its light or dark scheme.
+Blue and orange are distinct for every common form of color blindness. The page replaces these
+colors with its own variables, so that figures follow its light or dark scheme.
 """
 
 PAPER = "#ffffff"
@@ -58,10 +58,10 @@ CSS_VARIABLES = {
     SECOND: "--second",
     **{LIGHT[f"agent-{n}"]: f"--agent-{n}" for n in (3, 4, 5, 6)},
 }
-"""The page's variable for each colour of a figure."""
+"""The page's variable for each color of a figure."""
 
 AGENTS = 6
-"""Number of colours for agents; further agents reuse them with dashed lines."""
+"""Number of colors for agents; further agents reuse them with dashed lines."""
 
 MARKERS = ("o", "s", "D", "^", "v", "p")
 """Markers of agents, in matplotlib's notation."""

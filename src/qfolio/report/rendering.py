@@ -40,7 +40,7 @@ def render(template: str, **context: Any) -> str:
 
 
 def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
-    """Return a number with a true minus sign and thin spaces between thousands."""
+    """Return a number with a true minus sign and commas between thousands."""
     if math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -48,14 +48,14 @@ def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
     text = f"{value:{'+' if sign else ''},.{digits}f}"
     if not text.strip("+-0.,"):
         text = text.lstrip("+-")
-    return text.replace(",", THIN_SPACE).replace("-", "\N{MINUS SIGN}")
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def percent(fraction: float, digits: int = 1, *, sign: bool = False) -> str:
     """Return a fraction as a percentage."""
     if math.isnan(fraction):
         return "–"
-    return f"{number(100 * fraction, digits, sign=sign)}{THIN_SPACE}%"
+    return f"{number(100 * fraction, digits, sign=sign)}%"
 
 
 def over_seeds(
@@ -63,19 +63,19 @@ def over_seeds(
     interval: Sequence[float] | None,
     write: Callable[[float], str],
 ) -> str:
-    """Return the spread of results over seeds: their 95 % interval, or the range of a few."""
+    """Return the spread of results over seeds: their 95% interval, or the range of a few."""
     if len(values) == 1:
         return "one seed"
     if interval is None:
         return f"{len(values)} seeds, {write(min(values))} to {write(max(values))}"
-    return f"95{THIN_SPACE}% interval {write(interval[0])} to {write(interval[1])}"
+    return f"95% interval {write(interval[0])} to {write(interval[1])}"
 
 
 def bands(seeds: int) -> str:
     """Return a description of the bands of learning curves; see ``core.statistics.band``."""
     if seeds < FEWEST_SEEDS:
         return "from the worst to the best seed"
-    return f"95{THIN_SPACE}% bootstrap intervals over seeds"
+    return "95% bootstrap intervals over seeds"
 
 
 def amount(count: float) -> str:

@@ -246,7 +246,7 @@ def _interval(low: float | None, high: float | None) -> str:
 
 
 def _label(growth: float | None, low: float | None, high: float | None) -> str:
-    return f"{percent(growth)}, 95 % interval {_interval(low, high)}"
+    return f"{percent(growth)}, 95% interval {_interval(low, high)}"
 
 
 def _chance(p: float | None) -> str:

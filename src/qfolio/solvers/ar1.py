@@ -82,7 +82,7 @@ def ar1(
         steps_per_year: Turns growth per step into growth a year.
 
     Raises:
-        QfolioError: A parameter is out of range, or returns below −100 % are too likely.
+        QfolioError: A parameter is out of range, or returns below −100% are too likely.
     """
     b = np.asarray(levels, dtype=float)
     numbers = np.array([rho, noise, drift, slope, volatility, cost, discount])
@@ -103,7 +103,7 @@ def ar1(
     returns = (drift + slope * x)[:, None, None] + volatility * nodes  # (s, 1, q)
     require(
         float(returns.min()) > -1,
-        "returns below −100 % are too likely; lower slope, noise or volatility",
+        "returns below −100% are too likely; lower slope, noise or volatility",
     )
     grown = 1 + b[:, None] * returns  # (s, a, q)
     reward = np.log(grown) @ chances

@@ -22,7 +22,7 @@ from qfolio.tasks.pendulum import Pendulum, PendulumState
 class GridPendulum(Pendulum):
     """The pendulum, observed as the number of its cell among ``angles`` × ``speeds``.
 
-    Cells are equally large; with odd numbers, the upright pendulum at rest is at the centre of a
+    Cells are equally large; with odd numbers, the upright pendulum at rest is at the center of a
     cell. Speeds at the limit have half a cell.
     """
 

@@ -34,7 +34,7 @@ def walk(rows: int, train: int, test: int, count: int | None = None) -> list[Fol
 
 
 def prices(rows: int = 90, assets: int = 4) -> np.ndarray:
-    """Assets of volatility 1 %, 2 %, …, all of which rise."""
+    """Assets of volatility 1%, 2%, …, all of which rise."""
     generator = np.random.default_rng(0)
     scales = 0.01 * np.arange(1, assets + 1)
     return np.exp((generator.normal(size=(rows, assets)) * scales + scales / 5).cumsum(0))

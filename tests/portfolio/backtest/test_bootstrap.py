@@ -35,12 +35,12 @@ def test_block_length_of_an_autoregression(coefficient: float) -> None:
 
 
 def test_block_length_by_hand() -> None:
-    # Neighbours alone are related, so the window is 2 wide, with the weights 1 at lag 1 and 0 at
+    # Neighbors alone are related, so the window is 2 wide, with the weights 1 at lag 1 and 0 at
     # lag 2: G = 2 R(1) and g(0) = R(0) + 2 R(1).
     noise = np.random.default_rng(1).standard_normal(501)
     series = noise[1:] + 0.8 * noise[:-1]
-    centred = series - series.mean()
-    none, one = centred @ centred, centred[1:] @ centred[:-1]
+    centerd = series - series.mean()
+    none, one = centerd @ centerd, centerd[1:] @ centerd[:-1]
     expected = ((2 * one / (none + 2 * one)) ** 2 * 500) ** (1 / 3)
     assert block_length(series) == pytest.approx(expected)
     assert block_length(1000 - 3 * series) == pytest.approx(expected)
@@ -101,7 +101,7 @@ def test_percentile_interval_by_hand() -> None:
     assert percentile_interval(samples).tolist() == [
         1,
         39,
-    ]  # the (39 + 1) · 2.5 % = first from either end
+    ]  # the (39 + 1) · 2.5% = first from either end
     assert percentile_interval(samples, 0.5).tolist() == [10, 30]
     samples[samples < 5] = -math.inf
     assert percentile_interval(samples).tolist() == [-math.inf, 39]
@@ -109,7 +109,7 @@ def test_percentile_interval_by_hand() -> None:
 
 def test_blocks_cover_where_independent_days_do_not() -> None:
     # Log returns with φ = 0.5: the mean of n days varies (1 + φ) / (1 − φ) = 3 times as much as
-    # independent days would tell, so their 95 % intervals cover 2 Φ(1.96 / √3) − 1 = 74 %.
+    # independent days would tell, so their 95% intervals cover 2 Φ(1.96 / √3) − 1 = 74%.
     rng = np.random.default_rng(7)
     series = np.expm1(0.01 * autoregressive(rng, 150, 300, 0.5))
     zeros = np.zeros((1, 300))
@@ -169,7 +169,7 @@ def test_intervals_are_those_of_arch() -> None:
     for name, column in zip(names, theirs.T, strict=True):
         spread = column.std()
         assert drawn[name].std() == pytest.approx(spread, rel=0.06), name
-        # A quantile of 2.5 % has a standard error of √(.025 · .975 / 4000) / .058 = .043 spreads.
+        # A quantile of 2.5% has a standard error of √(.025 · .975 / 4000) / .058 = .043 spreads.
         for end, other in zip(
             percentile_interval(drawn[name][:, 0]), percentile_interval(column), strict=True
         ):

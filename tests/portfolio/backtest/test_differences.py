@@ -151,7 +151,7 @@ def test_a_strategy_does_not_differ_from_itself() -> None:
 
 
 def test_differences_are_paired() -> None:
-    # The agent is equal weight and 0.01 % more every day: the days cannot blur that.
+    # The agent is equal weight and 0.01% more every day: the days cannot blur that.
     rng = np.random.default_rng(12)
     base = strategy(rng, "baseline", 1)
     returns = np.asarray(base.returns)

@@ -128,7 +128,7 @@ def test_the_luckiest_of_several() -> None:
 @pytest.mark.parametrize("clustered", [False, True])
 @pytest.mark.parametrize("count", [120, 500, 2000])
 def test_p_values_are_right_as_often_as_they_say(count: int, clustered: bool) -> None:
-    """Two strategies without a difference: 5 % of the p-values are at most 5 %, 1 % at most 1 %."""
+    """Two strategies without a difference: 5% of the p-values are at most 5%, 1% at most 1%."""
     rng = np.random.default_rng(6)
     worlds = 1500
     p_values = np.empty((worlds, len(MEASURED)))

@@ -160,7 +160,7 @@ def test_floors_yield_to_assets_that_start_late():
 
 
 def test_a_mandate_that_cannot_be_met_is_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(QfolioError, match=r"caps of assets \(10 %\) and cash of at most 5 % clash"):
+    with pytest.raises(QfolioError, match=r"caps of assets \(10%\) and cash of at most 5% clash"):
         create({"assets": {"cap": 0.1}, "cash": {"max": 0.05}}, tmp_path / "run")
     with pytest.raises(QfolioError, match="names 'Z'"):
         create({"assets": {"forbidden": ["Z"]}}, tmp_path / "run")

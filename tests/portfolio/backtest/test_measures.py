@@ -81,7 +81,7 @@ def test_a_single_period() -> None:
 
 
 def test_doubled_cost_doubles_the_logarithm_of_the_drag() -> None:
-    # The same gross path +10 % a year, a trade of 1 % or 1.99 % = 1 − 0.99² of wealth each year.
+    # The same gross path +10% a year, a trade of 1% or 1.99% = 1 − 0.99² of wealth each year.
     once = measures(np.full(3, 1.1 * 0.99 - 1), np.ones(3), np.full(3, 0.01), 1)
     twice = measures(np.full(3, 1.1 * 0.99**2 - 1), np.ones(3), np.full(3, 0.0199), 1)
     assert once["cost_drag"] == pytest.approx(1.1 * 0.01)
@@ -127,7 +127,7 @@ def test_monthly_refuses_dates(dates: list[str]) -> None:
 
 
 def test_ratios_leave_out_what_cash_earns() -> None:
-    # Over cash: 3 % and −1 %, of mean 1 % and standard deviation √8 %; the downside is √(1/2) %.
+    # Over cash: 3% and −1%, of mean 1% and standard deviation √8%; the downside is √(1/2) %.
     table = measures([0.04, 0.01], [0, 0], [0, 0], 4, risk_free=[0.01, 0.02])
     assert table["sharpe"] == pytest.approx(2 / math.sqrt(8))
     assert table["sortino"] == pytest.approx(2 * math.sqrt(2))

@@ -16,7 +16,7 @@ OTHER = np.array([0.02, -0.01, 0.02, -0.01])
 
 
 def test_measures_by_hand() -> None:
-    """Differences of 1, −1, −1 and 1 %; deviations of 2.5, −2.5, 0.5, −0.5 and 1.5, −1.5, …."""
+    """Differences of 1, −1, −1 and 1%; deviations of 2.5, −2.5, 0.5, −0.5 and 1.5, −1.5, …."""
     found = relative(RETURNS, OTHER, 4)
     assert found["active_return"] == pytest.approx(0, abs=1e-15)
     assert found["tracking_error"] == pytest.approx(2 * 0.01 * math.sqrt(4 / 3))

@@ -165,10 +165,10 @@ def test_order_of_assets_does_not_matter(**case: Any) -> None:
 
 
 def test_two_days_by_hand() -> None:
-    # Prices of A: 10, 10, 20, 20; of B: 10, 20, 20, 10. All cash, 10 % cost, lag 1.
+    # Prices of A: 10, 10, 20, 20; of B: 10, 20, 20, 10. All cash, 10% cost, lag 1.
     values = np.array([[10.0, 10.0], [10.0, 20.0], [20.0, 20.0], [20.0, 10.0]])
     # Row 0 decides for half A, half B: as many shares of both. At row 1 B costs twice as much,
-    # so a third of the wealth goes to A: bought for 90 % of the cash, .3 A and .6 B per unit.
+    # so a third of the wealth goes to A: bought for 90% of the cash, .3 A and .6 B per unit.
     # By row 2, A doubles: .6 + .6 = 1.2 for each unit of wealth.
     # Row 1 decides for all A; at row 2 that sells .6 of B for .54, which buys .486 of A:
     # 1.086 of 1.2 remains, and stays so, as A does not move into row 3.

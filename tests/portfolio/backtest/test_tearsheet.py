@@ -34,7 +34,7 @@ def test_drawdowns_from_peak_to_recovery() -> None:
 
 
 def test_value_at_risk_is_a_loss() -> None:
-    returns = np.arange(-10, 11) / 100  # the 5 % quantile of 21 values is the second
+    returns = np.arange(-10, 11) / 100  # the 5% quantile of 21 values is the second
     var, cvar = value_at_risk(returns)
     assert var == pytest.approx(0.09)
     assert cvar == pytest.approx(0.095)

@@ -38,7 +38,7 @@ def plan(weights, shares, cash, cost=0.01, **options):
 
 
 def test_from_cash_by_hand():
-    """100 spent at 1 % buys 99; half of it each."""
+    """100 spent at 1% buys 99; half of it each."""
     allocation = plan([0, 0.5, 0.5], [0, 0], 100)
     np.testing.assert_allclose(allocation.trades, [49.5 / 20, 49.5 / 40])
     assert allocation.cost == pytest.approx(1)
@@ -93,7 +93,7 @@ def test_noise_of_float32_is_no_order(noise, whole):
 
 
 def test_one_order_leaves_the_noise_of_the_others_alone():
-    """Half of A's 40 % is sold without cost; B's target is off by a hundred-millionth."""
+    """Half of A's 40% is sold without cost; B's target is off by a hundred-millionth."""
     shares = np.array([200_000.0, 100_000.0])  # 4 million each
     noisy = [0.4, 0.2, 0.4 - 1e-8]
     for whole in (False, True):
@@ -162,7 +162,7 @@ def test_nothing_to_allocate():
 
 
 def test_costs_by_kind():
-    """Two orders of 1 money each, and a spread of 2 % of which half is paid."""
+    """Two orders of 1 money each, and a spread of 2% of which half is paid."""
     policy = Fixed([0.2, 0.4, 0.4], 0.0)
     model = "itemized(fixed=1,spread=0.02)"
     policy.task = dataclasses.replace(policy.task, cost_model=model)

@@ -9,7 +9,7 @@ SHARPE = 1.0 / np.sqrt(252)
 
 
 def clustered(rng, count, mean):
-    """Daily returns of deviation 1 % or so, whose volatility clusters, with fat tails."""
+    """Daily returns of deviation 1% or so, whose volatility clusters, with fat tails."""
     variance, out = 1.0, np.empty(count)
     for t in range(count):
         shock = np.sqrt(variance) * rng.standard_t(5) * np.sqrt(3 / 5)

@@ -121,7 +121,7 @@ def by_hand(values, shares, cash, trades):
 
 
 def test_a_trade_that_waits_a_row_by_hand():
-    """10 shares are bought at 20 instead of 10, at 1 %: the cost is in the row after."""
+    """10 shares are bought at 20 instead of 10, at 1%: the cost is in the row after."""
     prices, one = by_hand([[10.0], [20.0], [30.0], [30.0]], 0.0, 1000.0, 10.0)
     found = mark([one], prices, Proportional(0.01), lag=1)
     cost = 200 / 0.99 - 200

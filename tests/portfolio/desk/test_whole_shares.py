@@ -92,7 +92,7 @@ def test_lots_of_a_mandate_are_traded_whole_and_single_shares_of_a_split_are_the
 
 
 def test_the_rounding_is_nearly_the_best_of_all():
-    """In 9 of 10 accounts it is the best; the distance to the target is 2 % longer at most."""
+    """In 9 of 10 accounts it is the best; the distance to the target is 2% longer at most."""
     found = []
     for seed in range(80):
         ideal, whole, distance, cost = case(seed)

@@ -110,7 +110,7 @@ def test_its_text_is_whole_and_is_for_any_order_of_assets(tmp_path):
         ("[assets]\ncap = 'much'", "assets.cap"),
         ("[assets]\ncap = 20", "assets.cap: expected .* <= 3"),
         ("[trading]\nholdings = 2.5", "trading.holdings: expected .*int"),
-        ("[cash", "is no TOML"),
+        ("[cash", "is not valid TOML"),
         ("[assets]\nforbidden = ['SPX']", "'SPX', which is no asset of.* mean SPY"),
         ("[assets.cap]\nQQQ = 0.1", "assets.cap of the mandate names 'QQQ'.*choose from SPY"),
         ("[groups.sector.Energy]\ncap = 0.1", "sector Energy has none of the table's assets"),
@@ -131,22 +131,22 @@ GROUP = {"assets": ["XLE", "XOM"]}
     ("mandate", "message"),
     [
         ({"assets": {"cap": 0.1}, "cash": {"max": 0.05}},
-         r"the caps of assets \(10 %\) and cash of at most 5 % clash"),
+         r"the caps of assets \(10%\) and cash of at most 5% clash"),
         ({"groups": {"sector": {"E": {**GROUP, "cap": 0.1}}}, "assets": {"floor": 0.06}},
-         r"the floors of assets \(6 %\) and sector E of at most 10 % clash"),
+         r"the floors of assets \(6%\) and sector E of at most 10% clash"),
         ({"groups": {"a": {"E": {**GROUP, "cap": 0.1}}, "b": {"F": {**GROUP, "floor": 0.2}}}},
-         "a E of at most 10 % and b F of at least 20 % clash"),
+         "a E of at most 10% and b F of at least 20% clash"),
         ({"assets": {"floor": 0.3}, "cash": {"min": 0.1}},
-         r"the floors of assets \(30 %\) and cash of at least 10 % clash"),
-        ({"assets": {"floor": {"SPY": 0.3}, "cap": 0.2}}, "floor of SPY, 30 %, is above its cap"),
-        ({"cash": {"min": 0.3, "max": 0.2}}, "minimum of cash, 30 %, is above its maximum, 20 %"),
+         r"the floors of assets \(30%\) and cash of at least 10% clash"),
+        ({"assets": {"floor": {"SPY": 0.3}, "cap": 0.2}}, "floor of SPY, 30%, is above its cap"),
+        ({"cash": {"min": 0.3, "max": 0.2}}, "minimum of cash, 30%, is above its maximum, 20%"),
         ({"assets": {"cap": 0.3}, "trading": {"holdings": 2}, "cash": {"max": 0.1}},
-         "2 holdings at their caps leave 40 % in cash"),
+         "2 holdings at their caps leave 40% in cash"),
         ({"assets": {"floor": 0.1}, "trading": {"holdings": 3}}, "4 assets have a floor"),
         ({"assets": {"cap": 2.0}, "cash": {"min": -1.0}, "exposure": {"gross": 2.0, "margin": 0.6}},
-         "exposure of 200 % would break a margin of 60 %, which allows 166.667 %"),
+         "exposure of 200% would break a margin of 60%, which allows 166.667%"),
         ({"cash": {"max": 0.1}, "exposure": {"gross": 0.5}},
-         "cash of at most 10 % and gross exposure of at most 50 % clash"),
+         "cash of at most 10% and gross exposure of at most 50% clash"),
     ],
 )  # fmt: skip
 def test_limits_that_clash_are_refused_with_their_names(mandate, message):
@@ -157,10 +157,10 @@ def test_limits_that_clash_are_refused_with_their_names(mandate, message):
 def test_what_is_unusual_is_said():
     many = [f"A{i}" for i in range(15)]
     [note] = checks.require(settled({"assets": {"cap": 0.05}}, many), np.ones(15, bool))
-    assert note == "The mandate forces at least 25 % cash: caps allow no more."
+    assert note == "The mandate forces at least 25% cash: caps allow no more."
     bound = {"assets": {"cap": 0.1}, "groups": {"s": {"E": {**GROUP, "floor": 0.2}}}}
     notes = checks.require(settled(bound, ASSETS), ALL)
-    assert "no choice for s E: its floor, 20 %" in notes[1]
+    assert "no choice for s E: its floor, 20%" in notes[1]
     assert checks.require(settled({"cash": {"max": 0.1}}, ASSETS), ALL) == []
 
 

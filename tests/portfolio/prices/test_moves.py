@@ -15,7 +15,7 @@ SPLIT = "perhaps a split that was not adjusted"
 
 
 def market(assets: int = 4, seed: int = 3) -> np.ndarray:
-    """Prices that move by 1 % a day; the second asset does not move into row AT."""
+    """Prices that move by 1% a day; the second asset does not move into row AT."""
     moves = np.random.default_rng(seed).normal(0, 0.01, (ROWS, assets))
     moves[AT, 1] = 0
     return 50 * np.exp(np.cumsum(moves, axis=0))

@@ -487,7 +487,7 @@ def test_features_must_be_finite():
 
 
 def test_wild_assets_have_no_splits():
-    """A move of −50 % is nothing special where every move is as large."""
+    """A move of −50% is nothing special where every move is as large."""
     values = np.where(np.arange(300) % 2, 1.0, 2.0)[:, None]
     table = pd.DataFrame(values, index=pd.bdate_range("2020-01-01", periods=300), columns=["A"])
     assert [f.message for f in warnings(table)] == ["there is only one asset, 'A'"]

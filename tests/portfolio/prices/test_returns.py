@@ -76,9 +76,9 @@ def test_late_assets_and_gaps():
 @pytest.mark.parametrize(
     ("cell", "unit", "message"),
     [
-        (-1.0, "fraction", "row 7 (2020-01-10), column 'B': the return is −100 % or less"),
-        (-1.5, "fraction", "column 'B': the return is −100 % or less. Check the unit"),
-        (-100.0, "percent", "column 'B': the return is −100 % or less"),
+        (-1.0, "fraction", "row 7 (2020-01-10), column 'B': the return is −100% or less"),
+        (-1.5, "fraction", "column 'B': the return is −100% or less. Check the unit"),
+        (-100.0, "percent", "column 'B': the return is −100% or less"),
         (np.inf, "fraction", "column 'B': the return is infinite"),
         (1e7, "fraction", "the price goes from"),
     ],
@@ -99,7 +99,7 @@ def test_a_unit_that_is_unlikely():
     assert (warning.message[:19], warning.advice) == (
         "the usual return is", "Check the unit: perhaps it is fraction."
     )  # fmt: skip
-    with pytest.raises(QfolioError, match="−100 % or less"):
+    with pytest.raises(QfolioError, match="−100% or less"):
         load(100 * rates, returns="fraction")
     with pytest.raises(QfolioError, match="returns is 'log'; choose from percent, fraction"):
         load(rates, returns="log")

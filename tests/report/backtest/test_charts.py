@@ -31,7 +31,7 @@ def test_numbers_of_the_charts(data: BacktestData, page: Page) -> None:
     assert dqn["turnover"][0] == pytest.approx(traded, rel=1e-3)
     assert min(equal["drawdown"]) < 0 == max(equal["drawdown"])
     assert equal["band"] is None
-    # Told apart without colours, too.
+    # Told apart without colors, too.
     looks = [(s["symbol"], s["dash"]) for s in chart["strategies"]]
     assert len(set(looks)) == len(looks)
     assert dqn["width"] == pathwise["width"] > max(s["width"] for s in chart["strategies"][3:])
@@ -108,9 +108,9 @@ def test_only_what_matters_is_bright_at_first() -> None:
     ]
     assert pressed[: len(names)] == [str(name in bright).lower() for name in names]
     looks = {name: page.data["strategies"][names.index(name)] for name in names}
-    assert looks["equal weight"]["colour"] == looks["other 0"]["colour"] == "ink"
+    assert looks["equal weight"]["color"] == looks["other 0"]["color"] == "ink"
     assert looks["equal weight"]["dash"] != looks["other 0"]["dash"]
-    assert looks["other 1"]["colour"] == "faint"
+    assert looks["other 1"]["color"] == "faint"
     assert "3 other baselines" in page.text
     assert f"{len(names) - 3} more" in page.text
 

@@ -38,7 +38,7 @@ def test_leads_with_the_verdicts_and_says_no_more(data: BacktestData, page: Page
 
 def test_says_what_the_test_is(page: Page) -> None:
     for sentence in (
-        "made up: 4 assets, 1 234 rows from 1999-01-04",
+        "made up: 4 assets, 1,234 rows from 1999-01-04",
         "The test covers 300 days, from 2001-01-02 to",
         "These assets are survivors.",
         "25 bp of the value of every purchase and every sale",
@@ -46,7 +46,7 @@ def test_says_what_the_test_is(page: Page) -> None:
         "1, walk-forward: training on a rolling window of 2y, then a test of 6m",
         "12: 2 agents × 3 seeds, 1 ensemble, and 5 earlier trials on these prices.",
         "after Holm’s correction for 21 comparisons",
-        "no order gives an asset more than 30.0 %",
+        "no order gives an asset more than 30.0%",
         "Market impact",
         "Taxes.",
         "cash earns nothing",
@@ -80,7 +80,7 @@ def test_table_has_every_figure_with_its_intervals(data: BacktestData) -> None:
     ]  # fmt: skip
     sharpe = data.assessment.strategies["DQN"].measures["sharpe"]
     assert sharpe.over_seeds is None  # of three
-    cell = rows[0][2].split("<td>")[3].replace("\N{MINUS SIGN}", "-").replace("\u202f", "")
+    cell = rows[0][2].split("<td>")[3].replace("\N{MINUS SIGN}", "-")
     low, high = sharpe.over_time
     left, right = min(sharpe.per_seed), max(sharpe.per_seed)
     assert cell.startswith(f"{sharpe.mean:.2f}<span")  # a bar of the interval over time
@@ -116,7 +116,7 @@ def test_only_the_corrected_verdict_is_marked() -> None:
         return table.split("<td", 2)[1]
 
     assert first_cell(near).startswith(' class="better">▲ +1.0')
-    assert "+0.004\u202f% … +2.0\u202f%" in first_cell(near)
+    assert "+0.004% … +2.0%" in first_cell(near)
     assert first_cell(none).startswith(' class="">+1.0')
 
 

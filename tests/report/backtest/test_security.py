@@ -53,6 +53,6 @@ def test_identifiers_are_unique_and_found() -> None:
     assert len(identifiers) == len(set(identifiers))
     script = "".join(map(source, SCRIPTS))
     assert set(re.findall(r'byId\("([\w-]+)"\)', script)) <= set(identifiers)
-    labelled = {attributes["for"] for tag, attributes in page.tags if tag == "label"}
-    assert labelled == {a["id"] for tag, a in page.tags if tag in ("select", "input")}
+    labeled = {attributes["for"] for tag, attributes in page.tags if tag == "label"}
+    assert labeled == {a["id"] for tag, a in page.tags if tag in ("select", "input")}
     assert all("aria-label" in a for _, a in page.tags if a.get("role") in ("img", "region"))

@@ -23,7 +23,7 @@ def test_figures_are_means_over_seeds() -> None:
     assert rows["Growth a year (CAGR)"][0] == percent(
         data.assessment.strategies["DQN"].measures["growth"].mean
     )
-    assert rows["Value at risk, 95\u202f%, daily"][1] == percent(
+    assert rows["Value at risk, 95%, daily"][1] == percent(
         -float(np.quantile(data.strategies["equal weight"].returns, 0.05)), 2
     )
     assert len(rows) == 27
@@ -36,8 +36,8 @@ def test_drawdowns_have_dates() -> None:
     data = make_data({"equal weight": series}, days, ("A",))
     (only,) = tear_sheet(["equal weight"], data)["each"]
     assert only["drawdowns"] == [
-        ["2020-01-02", "2020-01-03", "not yet", "50.0\u202f%", "2 days"],
-        ["2019-12-31", "2020-01-01", "2020-01-02", "10.0\u202f%", "2 days"],
+        ["2020-01-02", "2020-01-03", "not yet", "50.0%", "2 days"],
+        ["2019-12-31", "2020-01-01", "2020-01-02", "10.0%", "2 days"],
     ]
     assert only["assets"] == []  # nothing is known of the assets' returns
 
@@ -48,7 +48,7 @@ def test_histogram_counts_every_return() -> None:
     heights = np.array([height for _, height in histogram["bars"]])
     assert len(heights) == BINS
     assert heights.max() <= 100
-    shares = heights * float(histogram["highest"].split("\u202f")[0]) / heights.max()
+    shares = heights * float(histogram["highest"].split("%")[0]) / heights.max()
     assert 80 < shares.sum() < 120  # the highest is rounded
 
 

@@ -120,8 +120,8 @@ def test_runs_are_compared(board: Board, browser: Browser, tmp_path: Path) -> No
     browser.click("#runs li:not(.chosen) .pick")
     browser.wait("document.querySelectorAll('#charts .chart:first-child .line').length === 2")
     lines = "[...document.querySelectorAll('#charts .chart:first-child .line')]"
-    colours = browser.evaluate(f"{lines}.map((line) => getComputedStyle(line).stroke)")
-    assert len(set(colours)) == 2
+    colors = browser.evaluate(f"{lines}.map((line) => getComputedStyle(line).stroke)")
+    assert len(set(colors)) == 2
     names = browser.evaluate("document.getElementById('legend').innerText")
     assert "first" in names
     assert "second" in names

@@ -41,13 +41,13 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
 def result_of(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
     """An agent's final regret or return as text.
 
-    ``interval`` adds its 95 % interval, or the seeds' range if there are too few for one.
+    ``interval`` adds its 95% interval, or the seeds' range if there are too few for one.
     """
     write = share if ranking["measure"] == "regret" else amount
     final = ranking["agents"][name]["final"]
     text, values = write(final["iqm"]), final["per_seed"]
     if interval and final["interval"] is not None:
-        text += f" (95 % interval {' to '.join(map(write, final['interval']))})"
+        text += f" (95% interval {' to '.join(map(write, final['interval']))})"
     elif interval and len(values) > 1:
         text += f" ({len(values)} seeds, {write(min(values))} to {write(max(values))})"
     return text
@@ -57,9 +57,9 @@ def share(fraction: float) -> str:
     """A fraction in percent, with two significant digits, down to a thousandth of a percent."""
     size = abs(100 * fraction)
     if size < 5e-4:
-        return "0 %"
+        return "0%"
     digits = min(3, max(0, 1 - math.floor(math.log10(size))))
-    return f"{figure(100 * fraction, f',.{digits}f')} %"
+    return f"{figure(100 * fraction, f',.{digits}f')}%"
 
 
 def amount(value: float) -> str:
@@ -77,7 +77,7 @@ def span(seconds: float) -> str:
 def _quickest(ranking: dict[str, Any]) -> str:
     """The agents that come near the optimum, or the best return, in fewest steps and least time."""
     goal = "the optimum" if ranking["measure"] == "regret" else "the best return"
-    near = f"within {HEADLINE:.0%} of {goal}".replace("%", " %")
+    near = f"within {HEADLINE:.0%} of {goal}"
     arrived = {
         name: entry
         for name in ranking["order"]

@@ -61,7 +61,7 @@ class Outcome:
         """The loss that a robust value may incur, in words."""
         share = f"{100 * TOLERANCE:.0f}"
         if self.optimum is None:
-            return f"{share}\N{NARROW NO-BREAK SPACE}% of the best return"
+            return f"{share}% of the best return"
         return f"{share} points of regret"
 
     def height(self, returns: ArrayLike) -> Floats:
@@ -258,7 +258,7 @@ def verdicts(found: Sensitivity | None, trials: Sequence[Trial]) -> list[str]:
 
 
 def percent(share: float) -> str:
-    return f"{100 * share:.0f}\N{NARROW NO-BREAK SPACE}%"
+    return f"{100 * share:.0f}%"
 
 
 def short(value: float) -> str:

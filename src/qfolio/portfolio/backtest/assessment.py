@@ -69,7 +69,7 @@ class SharpeTest:
     skewness: float
     kurtosis: float  # 3 for a normal distribution
     probabilistic: float  # probability that the true Sharpe ratio exceeds zero
-    minimum_years: float  # track record needed until that probability reaches 95 %; may be inf
+    minimum_years: float  # track record needed until that probability reaches 95%; may be inf
     threshold: float  # annual Sharpe ratio expected of the best trial if none has any skill
     deflated: float  # probability that the true Sharpe ratio exceeds the threshold
     trials: int  # that the threshold counts; 1 for a baseline

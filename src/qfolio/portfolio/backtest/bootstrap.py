@@ -131,9 +131,9 @@ def bootstrap_measures(
     """
     track = checked_track(returns, turnover, cost)
     series, periods = track[0].shape
-    centre = track[0].mean(axis=-1)
+    center = track[0].mean(axis=-1)
     free = checked_risk_free(risk_free, periods)
-    features = per_period(track, centre, free).reshape(-1, periods).T
+    features = per_period(track, center, free).reshape(-1, periods).T
     steps = np.ascontiguousarray(log_growth(track[0]).T)
     parts = []
     for days, counts in histories(periods, block, resamples, rng):
@@ -142,7 +142,7 @@ def bootstrap_measures(
             from_moments(
                 moments.swapaxes(0, 1),
                 deepest_drawdown(steps, days),
-                centre,
+                center,
                 free,
                 periods,
                 periods_per_year,

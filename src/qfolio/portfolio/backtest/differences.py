@@ -38,7 +38,7 @@ Finding = Literal["better", "worse", "none"]
 class Contrast:
     """A difference in one measure; without p-values if it is not tested.
 
-    The interval is of this difference alone, with a level of 95 %, over days and seeds.
+    The interval is of this difference alone, with a level of 95%, over days and seeds.
     """
 
     value: float

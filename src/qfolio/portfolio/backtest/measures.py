@@ -55,9 +55,9 @@ def measures(
     track = checked_track(returns, turnover, cost)
     free = checked_risk_free(risk_free, track[0].shape[-1])
     deepest = drawdown(track[0]).max(axis=-1)
-    centre = track[0].mean(axis=-1)
-    moments = per_period(track, centre, free).mean(axis=-1)
-    return from_moments(moments, deepest, centre, free, track[0].shape[-1], periods_per_year)
+    center = track[0].mean(axis=-1)
+    moments = per_period(track, center, free).mean(axis=-1)
+    return from_moments(moments, deepest, center, free, track[0].shape[-1], periods_per_year)
 
 
 def drawdown(returns: ArrayLike) -> Floats:
@@ -102,13 +102,13 @@ def monthly(returns: ArrayLike, dates: ArrayLike) -> tuple[list[int], Floats]:
     return list(years), table.reshape(*values.shape[:-1], len(years), 12)
 
 
-def per_period(track: Floats, centre: Floats, free: Floats | None) -> Floats:
+def per_period(track: Floats, center: Floats, free: Floats | None) -> Floats:
     """Quantities whose means over time give all measures but the drawdown: (7, ..., periods).
 
     With returns of cash there are 9; the downside is that of returns over them.
     """
     returns, turnover, cost = track
-    deviation = returns - centre[..., None]  # centered, or the variance would lose precision
+    deviation = returns - center[..., None]  # centered, or the variance would lose precision
     ruined = returns == -1
     log_net = np.log1p(np.where(ruined, 0, returns))
     log_free = log_net - np.log1p(-cost)
@@ -123,20 +123,20 @@ def per_period(track: Floats, centre: Floats, free: Floats | None) -> Floats:
 def from_moments(
     moments: Floats,
     deepest: Floats,
-    centre: Floats,
+    center: Floats,
     free: Floats | None,
     periods: int,
     periods_per_year: float,
 ) -> dict[str, Floats]:
     deviation, square, downside, log_net, log_free, ruined, turnover, *of_excess = moments
     bessel = periods / (periods - 1) if periods > 1 else math.nan
-    spread = np.sqrt(bessel * _variance(square, deviation, centre))
-    excess, excess_spread = centre + deviation, spread
+    spread = np.sqrt(bessel * _variance(square, deviation, center))
+    excess, excess_spread = center + deviation, spread
     if free is not None:
         over, over_square = of_excess
-        excess = centre - free.mean() + over
-        excess = np.where(np.abs(excess) > 1e-12 * np.abs(centre), excess, 0)  # cash itself
-        excess_spread = np.sqrt(bessel * _variance(over_square, over, centre))
+        excess = center - free.mean() + over
+        excess = np.where(np.abs(excess) > 1e-12 * np.abs(center), excess, 0)  # cash itself
+        excess_spread = np.sqrt(bessel * _variance(over_square, over, center))
     with np.errstate(over="ignore", invalid="ignore"):
         growth, free = (
             np.where(ruined > 0, -1, np.expm1(periods_per_year * log))
@@ -156,10 +156,10 @@ def from_moments(
     }
 
 
-def _variance(square: Floats, deviation: Floats, centre: Floats) -> Floats:
+def _variance(square: Floats, deviation: Floats, center: Floats) -> Floats:
     """The mean of squared deviations, exactly 0 where only rounding is left of equal returns."""
     variance = square - deviation**2
-    rounding = 1e-14 * square + 1e-24 * (centre + deviation) ** 2
+    rounding = 1e-14 * square + 1e-24 * (center + deviation) ** 2
     return np.where(variance > rounding, variance, 0)
 
 

@@ -97,7 +97,7 @@ def place(name: str, own: Own, prices: Prices, days: slice, task: Portfolio, cap
         worst = int(np.argmin(np.where(np.isfinite(returns), returns, -np.inf)))
         raise QfolioError(
             f"{name} returns {returns[worst]:g} on {_day(prices, earned.start + worst)}; returns "
-            "are fractions, at least −1 (0.012 for 1.2 %)."
+            "are fractions, at least −1 (0.012 for 1.2%)."
         )
     return Placed(none, returns, ())
 

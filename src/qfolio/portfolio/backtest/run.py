@@ -285,8 +285,8 @@ class Backtest:
         folder = self._kept.folder
         for name, measures in (folder.read_measures() if folder else {}).items():
             growth, drawdown = (100 * measures[key] for key in ("growth", "drawdown"))
-            cells = (f"{growth:.1f} %", f"{measures['sharpe']:.2f}", f"{measures['turnover']:.1f}")
-            rows.append((name, *cells, f"{drawdown:.1f} %"))
+            cells = (f"{growth:.1f}%", f"{measures['sharpe']:.2f}", f"{measures['turnover']:.1f}")
+            rows.append((name, *cells, f"{drawdown:.1f}%"))
         return card(f"Backtest of {' and '.join(self.agents)}", facts, header, rows)
 
     @property

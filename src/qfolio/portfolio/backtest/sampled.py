@@ -13,7 +13,7 @@ from qfolio.portfolio.backtest.measures import MEASURES, Floats, Range
 
 @dataclass(frozen=True)
 class Measure:
-    """One measure of one strategy, with both of its 95 % intervals."""
+    """One measure of one strategy, with both of its 95% intervals."""
 
     mean: float  # over seeds
     per_seed: tuple[float, ...]

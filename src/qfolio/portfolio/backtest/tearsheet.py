@@ -138,7 +138,7 @@ def figures(returns: ArrayLike, dates: ArrayLike, periods_per_year: float) -> di
 
     ``growth`` is the compound annual rate (CAGR), ``kurtosis`` is 3 for a normal distribution,
     ``longest`` is the longest drawdown in years, ``time_below`` the share of the time below a peak,
-    ``tail_ratio`` the 95 % quantile over the size of the 5 % quantile, ``omega`` the sum of gains
+    ``tail_ratio`` the 95% quantile over the size of the 5% quantile, ``omega`` the sum of gains
     over that of losses, ``payoff`` the mean gain over the mean loss, ``hit_rate`` the share of
     periods with a gain among those that moved, ``ulcer`` the root mean square of drawdowns.
 
@@ -202,12 +202,12 @@ def figures(returns: ArrayLike, dates: ArrayLike, periods_per_year: float) -> di
 
 def _rolling(values: Floats, other: Floats | None, window: int) -> tuple[NDArray, Floats]:
     """Mean and variance of each window, stacked, and the covariance with another series."""
-    centre = values.mean(axis=-1, keepdims=True)  # or differences of sums would lose precision
-    moved = values - centre
+    center = values.mean(axis=-1, keepdims=True)  # or differences of sums would lose precision
+    moved = values - center
     mean = _means(moved, window)
     variance = np.maximum(_means(moved**2, window) - mean**2, 0)
     variance = np.where(variance > 1e-18, variance, 0)
-    both = np.stack([mean + centre, variance])
+    both = np.stack([mean + center, variance])
     if other is None:
         return both, variance
     beside = other - other.mean()

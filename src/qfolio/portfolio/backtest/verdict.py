@@ -9,8 +9,6 @@ from qfolio.portfolio.backtest.bootstrap import LEVEL
 from qfolio.portfolio.backtest.differences import Contrast, Difference, Finding
 from qfolio.portfolio.backtest.estimates import Measured
 
-_THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
-
 _MEASURES: dict[Measured, str] = {
     "growth": "growth",
     "sharpe": "Sharpe ratio",
@@ -124,14 +122,14 @@ def shown(key: Measured, contrast: Contrast) -> tuple[float, float, float]:
 
 def _numbers(key: Measured, contrast: Contrast, p: str) -> str:
     """A difference with its interval and p-value in words."""
-    percent, unit = key != "sharpe", f"{_THIN_SPACE}%" if key != "sharpe" else ""
+    percent, unit = key != "sharpe", "%" if key != "sharpe" else ""
     least = 1 if percent else 2
     scaled = [100 * value if percent else value for value in shown(key, contrast)]
     # Enough digits to tell an end from zero.
     ends = [abs(end) for end in scaled[1:] if end and math.isfinite(end)]
     digits = next((d for d in range(least, 7) if all(round(end, d) for end in ends)), 7)
     middle, left, right = (f"{_number(value, digits, sign=True)}{unit}" for value in scaled)
-    text = f"{middle} (95{_THIN_SPACE}% interval {left} to {right}"
+    text = f"{middle} (95% interval {left} to {right}"
     return text + (")" if contrast.p_holm is None else f"; {p} {p_value(contrast.p_holm)})")
 
 
@@ -157,10 +155,10 @@ def luck(name: str, strategy: StrategyAssessment) -> str:
     chance = float(np.floor(1000 * test.deflated) / 10)
     claim, shortfall = "is more than luck is likely to explain", ""
     if not test.deflated >= LEVEL:
-        claim, shortfall = "may be luck", f", less than the usual 95{_THIN_SPACE}%"
+        claim, shortfall = "may be luck", ", less than the usual 95%"
     return (
         f"The annual Sharpe ratio of {name}, {_number(sharpe, 2)}, {claim}: the probability that "
-        f"the true one exceeds {bar} is {_number(chance, 1)}{_THIN_SPACE}%{shortfall}."
+        f"the true one exceeds {bar} is {_number(chance, 1)}%{shortfall}."
     )
 
 
@@ -168,7 +166,7 @@ def bound_sentence(assessment: Assessment) -> str:
     """What no constant weights could have exceeded; empty if it is not known."""
     if assessment.bound is None:
         return ""
-    growth = f"{_number(100 * assessment.bound, 1)}{_THIN_SPACE}%"
+    growth = f"{_number(100 * assessment.bound, 1)}%"
     return (
         f"A bound: even without costs, no constant weights grew by more than {growth} a year. "
         "They are known only in hindsight, so nobody could have followed them."

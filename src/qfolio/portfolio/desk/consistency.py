@@ -76,7 +76,7 @@ def band(tested: ArrayLike, rows: int, rng: np.random.Generator) -> Floats:
     """Growth of wealth over the rows to come, if they are as the backtest's.
 
     Returns:
-        Of shape (3, rows): 2.5 %, 50 % and 97.5 % of the histories that the stationary bootstrap
+        Of shape (3, rows): 2.5%, 50% and 97.5% of the histories that the stationary bootstrap
         draws.
     """
     returns = np.asarray(tested, dtype=float)

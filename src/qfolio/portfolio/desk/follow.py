@@ -75,7 +75,7 @@ class Following:
             f"{since}, {amount(len(live.returns), 'row')} up to {day(live.dates[-1])}: "
             f"{figure(earned - 1, '+.1%')} after costs, and {self.benchmark} "
             f"{figure(other - 1, '+.1%')}.",
-            f"Of histories like the backtest's, 95 % end between {low} and {high}, half of them "
+            f"Of histories like the backtest's, 95% end between {low} and {high}, half of them "
             f"above {middle}.{place}",
         ]
         level = f"evidence against it {self.evidence[-1]:.2g}, alarm at {consistency.ALARM:.0f}"

@@ -191,4 +191,4 @@ def _unusual(made: Mandated, left: float, least: float) -> list[str]:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * round(share, 9):.6g} %"
+    return f"{100 * round(share, 9):.6g}%"

@@ -154,7 +154,9 @@ class Mandate(Section, frozen=True):
         except OSError as error:
             raise QfolioError(f"The mandate {path} cannot be read: {error.strerror}.") from None
         except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise QfolioError(f"{path} is no TOML: {error}; see docs/guides/mandate.md.") from None
+            raise QfolioError(
+                f"{path} is not valid TOML: {error}; see docs/guides/mandate.md."
+            ) from None
         groups = content.get("groups")
         file = groups.pop("file", None) if isinstance(groups, dict) else None
         mandate = _converted(content, str(path))

@@ -177,13 +177,13 @@ def approximate(
     v = wanted − rows'·λ.
     """
     *_, gross, turnover = multipliers
-    centre = wanted - (multipliers[:-2, None] * limits.rows).sum(0)
+    center = wanted - (multipliers[:-2, None] * limits.rows).sum(0)
     short = held < 0
     first, second = jnp.where(short, held, 0.0), jnp.where(short, 0.0, held)
     at_first = jnp.where(short, turnover, gross)
     at_second = gross + turnover - at_first
-    below, above = centre + (gross + turnover), centre - (gross + turnover)
-    between = jnp.clip(centre - at_first + at_second, first, second)
+    below, above = center + (gross + turnover), center - (gross + turnover)
+    between = jnp.clip(center - at_first + at_second, first, second)
     found = jnp.where(below < first, below, jnp.where(above > second, above, between))
     return jnp.clip(found, limits.low, limits.high)
 

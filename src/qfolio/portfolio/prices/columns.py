@@ -129,7 +129,10 @@ def _check_names(
         )  # fmt: skip
     for name in dict.fromkeys((*features, *([] if date is None else [date]))):
         if name not in places and not columns_of_kind(table, name):
-            findings.error(f"there is no column {quote(name)}{hint(name, names)}")
+            findings.error(
+                f"there is no column {quote(name)}{hint(name, names)}",
+                advice=f"The columns are {listing(names)}.",
+            )
     if len(set(features)) < len(features) or date in features:
         findings.error("a column is named twice among the features and the dates")
     return columns

@@ -28,7 +28,7 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
         known = np.isfinite(rates)
         report_cells(grid, block, np.isinf(rates), "is infinite", "Correct the cell.", findings)
         report_cells(
-            grid, block, known & (rates <= -1), "is −100 % or less",
+            grid, block, known & (rates <= -1), "is −100% or less",
             "Check the unit, returns='percent' or 'fraction' (--returns); an asset that lost "
             "everything must be dropped.",
             findings,

@@ -56,7 +56,7 @@ class Active(msgspec.Struct, frozen=True, kw_only=True):
 
     reference: str
     growth: float | None  # of log wealth
-    low: float | None  # 95 % interval of the growth
+    low: float | None  # 95% interval of the growth
     high: float | None
     tracking_error: float | None  # standard deviation of the differences in log return
     information_ratio: float | None  # growth over tracking error
@@ -82,7 +82,7 @@ class Pooled(msgspec.Struct, frozen=True, kw_only=True):
     """What all tables say about one agent against one reference."""
 
     growth: float | None  # mean over tables of the active growth a year
-    low: float | None  # 95 % interval by the hierarchical bootstrap
+    low: float | None  # 95% interval by the hierarchical bootstrap
     high: float | None
     z: float | None  # Stouffer's
     p: float | None  # two-sided; against rebalancings only the claim "better" is tested

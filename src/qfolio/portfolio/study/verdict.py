@@ -8,8 +8,6 @@ from qfolio.portfolio.backtest.verdict import p_value
 from qfolio.portfolio.study.folder import Result
 from qfolio.portfolio.study.pooling import Pooled, Pools
 
-_SPACE = "\N{NARROW NO-BREAK SPACE}"
-
 
 def verdicts(agents: Mapping[str, Pools]) -> dict[str, list[str]]:
     """Sentences on each agent: against the reference, its best rebalancing, and by table.
@@ -50,7 +48,7 @@ def _reference(pools: Pools) -> str:
 
 
 def _numbers(pooled: Pooled) -> str:
-    interval = f"95{_SPACE}% interval {percent(pooled.low)} to {percent(pooled.high)}"
+    interval = f"95% interval {percent(pooled.low)} to {percent(pooled.high)}"
     chance = "" if pooled.p_holm is None else f", corrected p {p_value(pooled.p_holm)}"
     return (
         f"the mean difference in annual growth is {percent(pooled.growth)} ({interval}); "
@@ -84,7 +82,7 @@ def percent(value: float | None) -> str:
     if value is None:
         return "undefined"
     digits = 1 if abs(value) >= 0.0995 else 2
-    return f"{_signed(100 * value, digits)}{_SPACE}%"
+    return f"{_signed(100 * value, digits)}%"
 
 
 def decimal(value: float | None) -> str:

@@ -44,7 +44,7 @@ class Ar1(OneAsset):
         worst = abs(self.drift) + 5 * abs(self.slope) * self.spread + 5 * self.volatility
         if worst >= 1:
             raise QfolioError(
-                "Returns below −100 % are too likely; lower slope, noise, rho or volatility."
+                "Returns below −100% are too likely; lower slope, noise, rho or volatility."
             )
 
     @property

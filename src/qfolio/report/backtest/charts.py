@@ -42,7 +42,7 @@ def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> 
         "months": texts(months.astype("datetime64[D]")),
         "strategies": [
             {
-                "colour": looks[name].colour,
+                "color": looks[name].color,
                 "width": looks[name].width,
                 "dash": looks[name].dash,
                 "symbol": None if (place := looks[name].symbol) is None else SYMBOLS[place],

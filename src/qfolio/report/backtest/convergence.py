@@ -11,7 +11,7 @@ import numpy as np
 from qfolio.core.statistics import Floats
 from qfolio.report import palette
 from qfolio.report.data import Numbers
-from qfolio.report.figures.style import NARROW, colours, new_figure
+from qfolio.report.figures.style import NARROW, colors, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,7 +71,7 @@ def draw_convergence(training: Mapping[str, Sequence[FoldTraining]], width: floa
     figure = new_figure(width, 2.1 * rows + 0.3)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True)
     share = 100 * (np.arange(POINTS) + 0.5) / POINTS
-    shades = colours("folds", [palette.HAIRLINE, palette.ACCENT])
+    shades = colors("folds", [palette.HAIRLINE, palette.ACCENT])
     for axes, (name, folds) in zip(panels.flat, training.items(), strict=False):
         for i, fold in enumerate(folds):
             shade = shades((i + 1) / len(folds))

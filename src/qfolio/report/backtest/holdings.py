@@ -29,12 +29,12 @@ def holdings(names: list[str], data: BacktestData) -> dict[str, Any]:
     """
     days = len(data.dates)
     blocks = np.arange(0, days, math.ceil(days / BLOCKS))
-    centres = (blocks + np.append(blocks[1:], days) - 1) // 2
+    centers = (blocks + np.append(blocks[1:], days) - 1) // 2
     name = data.assessment.reference
     reference, known = data.strategies[name].weights, data.strategies[name].weighted
     base = _averages(reference, blocks)
     return {
-        "dates": texts(data.dates[centres]),
+        "dates": texts(data.dates[centers]),
         "reference": names.index(name) if known else None,
         "effective": compact(_averages(effective_number(reference), blocks), 3) if known else None,
         "series": [

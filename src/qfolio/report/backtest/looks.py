@@ -15,9 +15,9 @@ SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "penta
 
 @dataclass(frozen=True)
 class Look:
-    """The line style of a strategy: agents and ensembles coloured, most baselines thin and grey."""
+    """The line style of a strategy: agents and ensembles colored, most baselines thin and gray."""
 
-    colour: str  # a key of palette.LIGHT and palette.DARK
+    color: str  # a key of palette.LIGHT and palette.DARK
     width: float
     dash: str  # lengths as in SVG; '' is solid
     symbol: int | None  # place in SYMBOLS; none for baselines
@@ -29,8 +29,8 @@ def looks_of(names: list[str], data: BacktestData) -> dict[str, Look]:
     for name in names:
         if data.strategies[name].kind in JUDGED:
             dash = "" if agents < palette.AGENTS else "8 3"
-            colour = f"agent-{agents % palette.AGENTS + 1}"
-            looks[name] = Look(colour, 2.2, dash, agents % len(SYMBOLS))
+            color = f"agent-{agents % palette.AGENTS + 1}"
+            looks[name] = Look(color, 2.2, dash, agents % len(SYMBOLS))
             agents += 1
         elif name == data.assessment.reference:
             looks[name] = Look("ink", 1.6, "", None)

@@ -190,7 +190,7 @@ def _column(key: Measured, names: list[str], data: BacktestData) -> dict[str, An
                 "span": (place(left), round(place(right) - place(left), 2), place(contrast.value))
                 if known
                 else None,
-                "label": f"{written(contrast.value)}, 95 % interval "
+                "label": f"{written(contrast.value)}, 95% interval "
                 f"{written(left)} to {written(right)}",
             }
         )

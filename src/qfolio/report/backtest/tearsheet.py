@@ -91,10 +91,10 @@ def _groups(found: list[dict[str, float]], unit: str) -> list[tuple[str, list[An
                 row("Longest drawdown, years", "longest", "1"),
                 row("Time below a peak", "time_below", "%"),
                 row("Ulcer index", "ulcer", "%"),
-                row(f"Value at risk, 95\u202f%, {every}", "var", "%2"),
-                row(f"CVaR, 95\u202f%, {every}", "cvar", "%2"),
-                row("Value at risk, 95\u202f%, monthly", "var_month", "%"),
-                row("CVaR, 95\u202f%, monthly", "cvar_month", "%"),
+                row(f"Value at risk, 95%, {every}", "var", "%2"),
+                row(f"CVaR, 95%, {every}", "cvar", "%2"),
+                row("Value at risk, 95%, monthly", "var_month", "%"),
+                row("CVaR, 95%, monthly", "cvar_month", "%"),
                 row("Skewness", "skewness", "2"),
                 row("Kurtosis (normal: 3)", "kurtosis", "1"),
             ],
@@ -180,7 +180,7 @@ def _histogram(returns: Floats, reference: Floats, edges: Floats) -> dict[str, A
         "reach": percent(reach),
         "highest": percent(highest / 100, 0),
         "marks": [(place(-cvar), "CVaR"), (place(-var), "VaR")],
-        "label": f"95 % of the returns are above {percent(-var, 2)}; "
+        "label": f"95% of the returns are above {percent(-var, 2)}; "
         f"the mean of the others is {percent(-cvar, 2)}",
     }
 

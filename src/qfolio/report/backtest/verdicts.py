@@ -40,7 +40,7 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
             "finding": claim,
             "numbers": f"{evidence(each, test)}.",
             "span": (left, round(right - left, 2), place(growth)) if known else None,
-            "label": f"{percent(growth, sign=True)}, 95 % interval "
+            "label": f"{percent(growth, sign=True)}, 95% interval "
             + " to ".join(percent(end, sign=True) for end in interval),
         }
 

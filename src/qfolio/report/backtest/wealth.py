@@ -30,10 +30,10 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
     handles = []
     for name in reversed(names):
         look, series = looks[name], data.strategies[name]
-        colour = palette.LIGHT[look.colour]
+        color = palette.LIGHT[look.color]
         middle, low, high = across_seeds(wealth_paths(series))
         style: dict[str, Any] = {
-            "color": colour,
+            "color": color,
             "linewidth": 0.75 * look.width,
             # Lengths are in units of the line's width.
             "linestyle": (0, tuple(float(part) / look.width for part in look.dash.split()))
@@ -49,7 +49,7 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
                 "markevery": (round(start * len(days)), max(1, len(days) // 7)),
             }
             if len(series.returns) > 1:
-                axes[0].fill_between(days, low, high, color=colour, alpha=0.15, linewidth=0)
+                axes[0].fill_between(days, low, high, color=color, alpha=0.15, linewidth=0)
         else:
             marker = {}
         handles += axes[0].plot(days, middle, **style, **marker, label=name)

@@ -23,7 +23,7 @@ LISTED = 20
 """Assets, beside cash, whose parts of the return are listed; the others are added up."""
 
 SIGNIFICANT = 1.96
-"""The t-statistic beyond which a figure is in bold: 5 % of those without any meaning."""
+"""The t-statistic beyond which a figure is in bold: 5% of those without any meaning."""
 
 
 def why_sections(data: BacktestData) -> list[dict[str, Any]]:

@@ -68,8 +68,8 @@ def draw_learning_curve(data: ReportData, width: float) -> Figure:
     kind = None if data.market else "greedy"
     whole = axes.flat[0]
     _line_axes(whole, name.capitalize(), data)
-    for curve, colour in curves:
-        _draw_runs(whole, curve.done, curve.returns, colour, kind, curve.label)
+    for curve, color in curves:
+        _draw_runs(whole, curve.done, curve.returns, color, kind, curve.label)
     _draw_training(whole, data)
     whole.set_xlim(left=0)
     _draw_optimum(whole, data)
@@ -87,8 +87,8 @@ def draw_overestimation(data: ReportData, width: float) -> Figure:
     axes = figure.subplots()
     _line_axes(axes, "", data)
     curves = [data.curve] if data.comparison is None else [data.curve, data.comparison]
-    for curve, colour in zip(curves, (palette.ACCENT, palette.SECOND), strict=False):
-        _draw_runs(axes, curve.done, curve.overestimation, colour, None, curve.label)
+    for curve, color in zip(curves, (palette.ACCENT, palette.SECOND), strict=False):
+        _draw_runs(axes, curve.done, curve.overestimation, color, None, curve.label)
     axes.axhline(0, color=palette.INK, linewidth=0.9, dashes=(4, 3))
     _line_label(axes, 0, "unbiased", below=True)
     low, high, clipped = _settled_range(curves)
@@ -125,7 +125,7 @@ def _draw_runs(
     axes: Axes,
     done: Numbers,
     runs: Floats,
-    colour: str,
+    color: str,
     kind: str | None = None,
     label: str | None = None,
     least: float = -np.inf,
@@ -143,13 +143,13 @@ def _draw_runs(
     if seeds > 1:
         alpha = max(0.1, min(0.35, 4 / seeds))
         thin = np.maximum(runs, least)
-        axes.plot(done, thin, color=colour, linewidth=0.7, alpha=alpha, marker=marker)
+        axes.plot(done, thin, color=color, linewidth=0.7, alpha=alpha, marker=marker)
         low, high = (np.maximum(end, least) for end in band(runs))
-        axes.fill_between(done, low, high, color=colour, alpha=0.2, linewidth=0)
+        axes.fill_between(done, low, high, color=color, alpha=0.2, linewidth=0)
     middle = np.maximum(interquartile_mean(runs), least)
     # A single point must not vanish behind the edge or the legend.
     order, clip = (2, True) if points > 1 else (6, False)
-    (line,) = axes.plot(done, middle, color=colour, linewidth=2, marker=marker, label=label)
+    (line,) = axes.plot(done, middle, color=color, linewidth=2, marker=marker, label=label)
     line.set(zorder=order, clip_on=clip)
 
 
@@ -160,10 +160,10 @@ def _draw_training(axes: Axes, data: ReportData) -> None:
     edges = np.linspace(data.training_done.min(), data.training_done.max() + 1, 61)
     bins = np.digitize(data.training_done, edges)
     used = np.unique(bins)
-    centres = [data.training_done[bins == number].mean() for number in used]
+    centers = [data.training_done[bins == number].mean() for number in used]
     medians = [np.median(data.training_returns[bins == number]) for number in used]
     axes.plot(
-        centres,
+        centers,
         medians,
         color=palette.MUTED,
         linewidth=1,
@@ -208,8 +208,8 @@ def _draw_regret(axes: Axes, data: ReportData, curves: list[tuple[Curve, str]]) 
     """Draw the share of the optimum that is missed, on a logarithmic scale."""
     _line_axes(axes, "Regret, on a logarithmic scale", data)
     regrets = [regret(curve.returns, data.optimum) for curve, _ in curves]
-    for (curve, colour), missed in zip(curves, regrets, strict=True):
-        _draw_runs(axes, curve.done, missed, colour, least=LEAST_REGRET)
+    for (curve, color), missed in zip(curves, regrets, strict=True):
+        _draw_runs(axes, curve.done, missed, color, least=LEAST_REGRET)
     least = max(min(interquartile_mean(missed).min() for missed in regrets), LEAST_REGRET)
     worst = max(missed.max() for missed in regrets)
     top = min(max(worst, 10 * least), 10**DECADES * least)

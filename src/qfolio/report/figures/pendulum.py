@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-from qfolio.report.figures.style import NARROW, WIDE, Panels, Target, colours, new_figure, save_png
+from qfolio.report.figures.style import NARROW, WIDE, Panels, Target, colors, new_figure, save_png
 
 
 def value(target: Target, data: ReportData) -> None:
@@ -44,11 +44,11 @@ def draw_value(data: ReportData, width: float) -> Figure:
     if maps.value is not None:
         _draw_values(axes[0], maps, maps.value)
         names = ["Learned value", "Exact value", *names]
-    torques = colours("torque", palette.TORQUE_MAP)
+    torques = colors("torque", palette.TORQUE_MAP)
     limit = max(2.0, np.abs(maps.policy).max(), np.abs(maps.exact_policy).max())
     for panel, table in zip(axes[-1], (maps.policy, maps.exact_policy), strict=True):
         image = _draw_map(panel, maps, table, torques, -limit, limit, "nearest")
-    _colour_bar(figure, image, axes[-1], "torque (N m)")
+    _color_bar(figure, image, axes[-1], "torque (N m)")
     for panel, name in zip(axes.flat, names, strict=True):
         panel.set_title(name, pad=6)
     _map_ticks(axes, few=width <= NARROW)
@@ -60,7 +60,7 @@ def draw_value(data: ReportData, width: float) -> Figure:
 def _draw_values(axes: Panels, maps: Maps, learned: Floats) -> None:
     both = np.stack([learned, maps.exact_value])
     low, high = float(both.min()), float(both.max())
-    values = colours("value", palette.VALUE_MAP)
+    values = colors("value", palette.VALUE_MAP)
     for panel, table in zip(axes, (learned, maps.exact_value), strict=True):
         image = _draw_map(panel, maps, table, values, low, high, "bilinear")
         levels = np.linspace(low, high, 9)[1:-1]
@@ -74,14 +74,14 @@ def _draw_values(axes: Panels, maps: Maps, learned: Floats) -> None:
             alpha=0.35,
             linestyles="solid",
         )
-    _colour_bar(axes[0].figure, image, axes, "value")
+    _color_bar(axes[0].figure, image, axes, "value")
 
 
 def _draw_map(
     axes: Axes,
     maps: Maps,
     table: Floats,
-    colours: Colormap,
+    colors: Colormap,
     low: float,
     high: float,
     interpolation: str,
@@ -95,7 +95,7 @@ def _draw_map(
         origin="lower",
         extent=(extent[0], extent[1], extent[2], extent[3]),
         aspect="auto",
-        cmap=colours,
+        cmap=colors,
         vmin=low,
         vmax=high,
         interpolation=interpolation,
@@ -116,7 +116,7 @@ def _map_ticks(axes: Panels, *, few: bool) -> None:
         panel.set_ylabel("speed (rad/s)" if few else "angular speed (rad/s)")
 
 
-def _colour_bar(figure: Figure, image: AxesImage, axes: Panels, label: str) -> None:
+def _color_bar(figure: Figure, image: AxesImage, axes: Panels, label: str) -> None:
     from matplotlib.ticker import MaxNLocator
 
     bar = figure.colorbar(

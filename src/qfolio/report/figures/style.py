@@ -80,7 +80,7 @@ _style_lock = threading.Lock()
 def inline_svg(draw: Callable[[T, float], Figure], data: T, width: float) -> str:
     """Return a figure as an SVG element for a page.
 
-    Texts stay texts in the font of the page, colours refer to the variables of the page
+    Texts stay texts in the font of the page, colors refer to the variables of the page
     (see palette.CSS_VARIABLES), and the element has no fixed size.
 
     Args:
@@ -100,8 +100,8 @@ def inline_svg(draw: Callable[[T, float], Figure], data: T, width: float) -> str
     name = f"{draw.__name__.removeprefix('draw_')}-{round(width * 100)}-"
     body = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}", body)
     body = re.sub(r"font: ([^;\"]*?)([\d.]+px)[^;\"]*", r"font-size: \2", body)
-    for colour, variable in palette.CSS_VARIABLES.items():
-        body = body.replace(colour, f"var({variable})")
+    for color, variable in palette.CSS_VARIABLES.items():
+        body = body.replace(color, f"var({variable})")
     return f'<svg {box.group()} aria-hidden="true">{body}'
 
 
@@ -167,10 +167,10 @@ def end_label(axes: Axes, x: float, y: float, text: str) -> None:
     )
 
 
-def colours(name: str, colours: list[str]) -> Colormap:
+def colors(name: str, colors: list[str]) -> Colormap:
     from matplotlib.colors import LinearSegmentedColormap
 
-    return LinearSegmentedColormap.from_list(name, colours)
+    return LinearSegmentedColormap.from_list(name, colors)
 
 
 def percent_axis(axis: Any) -> None:
@@ -185,7 +185,7 @@ def percent_axis(axis: Any) -> None:
 
 
 def percent_tick(tick: float) -> str:
-    """A fraction as the label of a tick, with as many digits as needed: 0.1 %, 2.5 %, 5 %."""
+    """A fraction as the label of a tick, with as many digits as needed: 0.1%, 2.5%, 5%."""
     return percent(tick, next(n for n in range(16) if math.isclose(round(tick, 2 + n), tick)))
 
 

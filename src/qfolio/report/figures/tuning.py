@@ -28,7 +28,7 @@ SHADES = 5
 
 
 def _mix(share: float) -> str:
-    """A colour between the two ends of the shades."""
+    """A color between the two ends of the shades."""
     ends = [[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in (palette.HAIRLINE, palette.ACCENT)]
     mixed = [round(a + share * (b - a)) for a, b in zip(*ends, strict=True)]
     return "#" + "".join(f"{part:02x}" for part in mixed)
@@ -167,8 +167,8 @@ def _draw_effect(
     for name, shade in (("first trials", _SHADES[0]), ("last trials", _SHADES[-1])):
         (marks[name],) = axes.plot([], [], "o", markersize=5, color=shade, markeredgewidth=0)
     kept = np.flatnonzero(~failed)
-    colours = [shades[i] for i in kept]
-    axes.scatter(x[kept], heights[kept], s=24, c=colours, linewidths=0, clip_on=False, zorder=3)
+    colors = [shades[i] for i in kept]
+    axes.scatter(x[kept], heights[kept], s=24, c=colors, linewidths=0, clip_on=False, zorder=3)
     if failed.any():
         cross = axes.plot(x[failed], heights[failed], "x", color=palette.MUTED, clip_on=False)
         cross[0].set_markersize(5)
@@ -267,7 +267,7 @@ def shaded_svgs(
 
 
 def _shaded(svg: str) -> str:
-    """Makes the shades follow the page's light or dark scheme, as its other colours do."""
+    """Makes the shades follow the page's light or dark scheme, as its other colors do."""
     ends: Sequence[str] = ("var(--accent)", "var(--hairline)")
     for share, shade in list(zip(_SHARES, _SHADES, strict=True))[:-1]:
         svg = svg.replace(shade, f"color-mix(in srgb, {ends[0]} {100 * share:.0f}%, {ends[1]})")

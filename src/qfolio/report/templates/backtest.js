@@ -1,7 +1,7 @@
 /* The lines of all strategies: wealth, drawdown, costs, rolling ratios; their legends and choices. */
 "use strict";
 (() => {
-  const { data, dark, narrow, coarse, state, byId, last, colour, translucent, dashes, percent,
+  const { data, dark, narrow, coarse, state, byId, last, color, translucent, dashes, percent,
     times, ratio, layout, options, logTicks, tidy, inView, extent, room, label } = tools;
   const hidden = new Set(data.hidden);
   const names = [...document.querySelectorAll("table[data-legend=wealth] button")]
@@ -17,7 +17,7 @@
     const order = data.strategies.map((_, i) => i).reverse();
     return order.flatMap((index) => {
       const strategy = data.strategies[index];
-      const ink = colour(strategy.colour);
+      const ink = color(strategy.color);
       const base = {
         x: dates, yaxis: axis, type: "scatter", mode: "lines", meta: index,
         visible: !hidden.has(index), hoverinfo: "skip",
@@ -32,14 +32,14 @@
       result.push({ ...base, y: strategy[key], hoverinfo: "none",
         line: { color: ink, width: (main ? 1 : 0.65) * strategy.width, dash: dashes(strategy.dash) || "solid" } });
       if (main && strategy.symbol) {
-        // Shapes tell agents apart where colours do not; each begins at another place.
+        // Shapes tell agents apart where colors do not; each begins at another place.
         const count = narrow.matches ? 4 : 7;
         const places = Array.from({ length: count }, (_, k) =>
           Math.round((dates.length - 1) * (k + 0.35 + 0.3 * (index % 3)) / count));
         result.push({ ...base, mode: "markers", x: places.map((i) => dates[i]),
           y: places.map((i) => strategy[key][i]),
           marker: { symbol: strategy.symbol, size: 8, color: ink,
-            line: { width: 1.5, color: colour("paper") } } });
+            line: { width: 1.5, color: color("paper") } } });
       }
       return result;
     });
@@ -71,7 +71,7 @@
   /** Names the lines of a chart where they leave the view; share: a value's height on the axis. */
   function nameEnds(id, axis, key, [, to], share) {
     const entries = data.strategies.map((strategy, index) => ({
-      name: names[index], colour: strategy.colour, value: strategy[key][to - 1], index,
+      name: names[index], color: strategy.color, value: strategy[key][to - 1], index,
     })).filter((entry) => !hidden.has(entry.index) && entry.value !== null);
     label(`${id}-labels`, byId(id), axis,
       entries.map((entry) => ({ ...entry, at: 1 - Math.min(Math.max(share(entry.value), 0), 1) })));

@@ -3,7 +3,7 @@
 "use strict";
 
 const EVERY = 700; // milliseconds between two questions
-const COLOURS = 6; // then they come again, dashed
+const COLORS = 6; // then they come again, dashed
 const STATES = ["running", "done", "stopped", "failed"];
 const NAMES = { // what curves show, the most telling first
   "return": "Return in training", "greedy return": "Greedy return", "greedy regret": "Greedy regret",
@@ -50,7 +50,7 @@ function number(x) {
   const size = Math.abs(x);
   let text;
   if (size >= 1e6) text = x.toExponential(2);
-  else if (size >= 1000) text = Math.round(x).toString().replace(/\B(?=(\d{3})+$)/g, THIN);
+  else if (size >= 1000) text = Math.round(x).toString().replace(/\B(?=(\d{3})+$)/g, ",");
   else if (size >= 100) text = x.toFixed(1);
   else if (size >= 1 || size === 0) text = x.toFixed(2);
   else text = size < 1e-3 ? x.toExponential(1) : x.toPrecision(3);
@@ -74,7 +74,7 @@ function span(seconds) {
 }
 
 const ago = (time) => `${span(Date.now() / 1000 - time)} ago`;
-const percent = (x) => `${Math.floor(100 * x)}${THIN}%`;
+const percent = (x) => `${Math.floor(100 * x)}%`;
 const plural = (count, noun) => `${number(count).replace(/[.].*/, "")} ${noun}${count === 1 ? "" : "s"}`;
 const tail = (name) => name.split(":").pop();
 
@@ -124,12 +124,12 @@ function list() {
   const sorted = [...runs.values()].sort((a, b) =>
     (b.state === "running") - (a.state === "running") || b.begun - a.begun || (a.name < b.name ? -1 : 1));
   sorted.forEach((run, i) => {
-    const place = items.get(run.key), colour = chosen.indexOf(run.key);
+    const place = items.get(run.key), color = chosen.indexOf(run.key);
     const text = `${run.name} ${what(run)} ${run.state}`.toLowerCase();
     place.hidden = !wanted.every((word) => text.includes(word));
-    place.className = `${run.state}${colour < 0 ? "" : " chosen"}`;
-    place.style.setProperty("--line", colour < 0 ? "" : `var(--agent-${colour % COLOURS + 1})`);
-    place.querySelector(".pick").setAttribute("aria-pressed", colour >= 0);
+    place.className = `${run.state}${color < 0 ? "" : " chosen"}`;
+    place.style.setProperty("--line", color < 0 ? "" : `var(--agent-${color % COLORS + 1})`);
+    place.querySelector(".pick").setAttribute("aria-pressed", color >= 0);
     say(place.querySelector(".when"), run.state === "running" ? percent(run.share)
       : run.state === "done" ? ago(run.last) : run.state);
     if (find("runs").children[i] !== place) find("runs").insertBefore(place, find("runs").children[i] || null);
@@ -181,8 +181,8 @@ function groups() {
     }
   }
   found.forEach((group, i) => {
-    group.colour = `var(--agent-${i % COLOURS + 1})`;
-    group.dash = ["", "5 3", "1.5 2.5"][Math.floor(i / COLOURS) % 3];
+    group.color = `var(--agent-${i % COLORS + 1})`;
+    group.dash = ["", "5 3", "1.5 2.5"][Math.floor(i / COLORS) % 3];
   });
   return found;
 }
@@ -271,13 +271,13 @@ function matrix(single, found) {
 }
 
 function stroke(node, group) {
-  node.style.stroke = group.colour;
+  node.style.stroke = group.color;
   node.style.strokeDasharray = group.dash;
   return node;
 }
 
 function legend(found) {
-  const text = found.map((group) => group.label + group.colour).join("\n");
+  const text = found.map((group) => group.label + group.color).join("\n");
   const place = find("legend");
   place.hidden = found.length < 2 && chosen.length < 2;
   if (place.dataset.said === text) return;
@@ -380,7 +380,7 @@ function plot(chart, name, found) {
     const at = (k) => one.points.map((p) => `${x(p[0]).toFixed(1)},${y(p[k]).toFixed(1)}`);
     if (one.alone && one.job.members > 1 && one.points.length > 1) {
       const band = drawn("path", { class: "band", d: `M${at(3).join("L")}L${at(2).reverse().join("L")}Z` });
-      band.style.fill = one.group.colour;
+      band.style.fill = one.group.color;
       parts.push(band);
     }
   }
@@ -408,7 +408,7 @@ function tip(chart, name, lines, steps, width, parts, x) {
   place.replaceChildren(element("div", {}, element("span", { textContent: `step ${number(Math.round(step))}` })),
     ...near.slice(0, 8).map(({ one, point }) => {
       const row = element("div", {}, element("span", { textContent: label(one) }), element("span", { textContent: number(point[1]) }));
-      row.style.color = one.group.colour;
+      row.style.color = one.group.color;
       return row;
     }), ...(near.length > 8 ? [element("div", { textContent: `and ${near.length - 8} more` })] : []));
 }

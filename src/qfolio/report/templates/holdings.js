@@ -1,8 +1,8 @@
-/* The picture of holdings: a row for each asset, its weight against the reference's in colour, and
+/* The picture of holdings: a row for each asset, its weight against the reference's in color, and
    the effective number of assets below. Names and weights stand beside the rows. */
 "use strict";
 (() => {
-  const { data, dark, narrow, coarse, state, byId, last, colour, percent, number, layout,
+  const { data, dark, narrow, coarse, state, byId, last, color, percent, number, layout,
     options } = tools;
   const { dates, series: all, reference, effective } = data.weights;
   const tall = () => (state.printing ? [13, 72] : [23, 130]); // of a row, and of the panel below
@@ -13,7 +13,7 @@
   const rows = (series) => [...series.names.keys()].slice(1).concat(0);
   const margin = () => (narrow.matches ? { l: 92, r: 58 } : { l: 150, r: 66 });
 
-  /** Half of the width of the colours: most values are within it. */
+  /** Half of the width of the colors: most values are within it. */
   function reach(series) {
     const sizes = series.active.flat().map(Math.abs).sort((a, b) => a - b);
     return Math.max(sizes[Math.floor(0.99 * (sizes.length - 1))], 0.005);
@@ -27,13 +27,13 @@
     const map = {
       type: "heatmap", x: dates, y: order.map((_, place) => place),
       z: order.map((place) => series.active[place]), zmin: alone ? 0 : -edge, zmax: edge,
-      colorscale: alone ? [[0, colour("paper")], [1, colour("accent")]]
-        : [[0, colour("second")], [0.5, colour("paper")], [1, colour("accent")]],
+      colorscale: alone ? [[0, color("paper")], [1, color("accent")]]
+        : [[0, color("second")], [0.5, color("paper")], [1, color("accent")]],
       showscale: false, hoverinfo: "none", ygap: 2,
     };
     const line = (y, ink, width) => ({
       x: dates, y, yaxis: "y2", type: "scatter", mode: "lines", hoverinfo: "none",
-      line: { color: colour(ink), width },
+      line: { color: color(ink), width },
     });
     const below = panel / inner;
     const traces = [map, ...(alone ? [] : [line(effective, "ink", 1)]),
@@ -49,7 +49,7 @@
     }), { ...options("holdings"), displayModeBar: false }).then(() => list(order));
   }
 
-  /** Says what the colours mean. */
+  /** Says what the colors mean. */
   function say(alone, edge) {
     byId("weights-what").textContent = alone ? "Weights after each trade"
       : "Weights after each trade, less those of the reference: blue is more, orange is less";

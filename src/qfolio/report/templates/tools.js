@@ -1,4 +1,4 @@
-/* What the charts of a backtest's report share: numbers, colours, axes, and names beside them.
+/* What the charts of a backtest's report share: numbers, colors, axes, and names beside them.
    Names that users give never reach plotly, which would read markup in them: the charts carry
    numbers only, and names stand in the page beside them. */
 "use strict";
@@ -11,31 +11,31 @@ const tools = (() => {
 
   const MARGIN = 44; // left of an axis, for its numbers
   const PRINTED = 380; // the most height of a chart on paper
-  const SPACE = "\u202f", MINUS = "\u2212";
+  const MINUS = "\u2212";
   const SANS = getComputedStyle(document.documentElement).getPropertyValue("--sans").trim();
   const byId = (id) => document.getElementById(id);
   const last = (values) => values[values.length - 1];
-  const colour = (name) => (state.printing && name === "paper") ? "#ffffff" : data.themes[dark.matches && !state.printing ? "dark" : "light"][name] || name;
+  const color = (name) => (state.printing && name === "paper") ? "#ffffff" : data.themes[dark.matches && !state.printing ? "dark" : "light"][name] || name;
   const translucent = (hex, alpha) => hex + Math.round(255 * alpha).toString(16).padStart(2, "0");
   const dashes = (pattern) => pattern && pattern.split(" ").map((part) => part + "px").join(",");
 
   function number(value, digits) {
     if (value === null || value === undefined) return "–";
-    const text = Math.abs(value).toFixed(digits).replace(/\B(?=(\d{3})+(?!\d))/g, SPACE);
+    const text = Math.abs(value).toFixed(digits).replace(/\B(?=(\d{3})+(?!\d))/g, ",");
     return (value < 0 && /[1-9]/.test(text) ? MINUS : "") + text;
   }
   const percent = (value, digits = 1) =>
-    value === null || value === undefined ? "–" : number(100 * value, digits) + SPACE + "%";
+    value === null || value === undefined ? "–" : number(100 * value, digits) + "%";
   const times = (value) => number(value, value >= 100 ? 0 : value >= 10 ? 1 : 2);
   const ratio = (value) => number(value, 2);
 
   // Axes ------------------------------------------------------------------------------------
 
   function layout(height, more) {
-    const text = colour("muted");
+    const text = color("muted");
     return {
       height: state.printing ? Math.min(height, PRINTED) : height, width: state.printing ? 660 : undefined,
-      paper_bgcolor: colour("paper"), plot_bgcolor: colour("paper"),
+      paper_bgcolor: color("paper"), plot_bgcolor: color("paper"),
       font: { family: SANS, size: 12, color: text },
       margin: { l: MARGIN, r: 10, t: 26, b: 40, ...more.margin },
       showlegend: false, hovermode: "x", hoverdistance: -1, spikedistance: -1,
@@ -44,10 +44,10 @@ const tools = (() => {
         type: "date", showgrid: false, linecolor: text, ticks: "outside", tickcolor: text,
         ticklen: 4, nticks: narrow.matches ? 5 : 9,
         showspikes: true, spikemode: "across", spikesnap: "hovered data", spikedash: "solid",
-        spikethickness: 1, spikecolor: colour("faint"), fixedrange: coarse.matches, ...more.xaxis,
+        spikethickness: 1, spikecolor: color("faint"), fixedrange: coarse.matches, ...more.xaxis,
       },
       ...Object.fromEntries(["yaxis", "yaxis2"].filter((name) => more[name]).map((name) => [name, {
-        gridcolor: colour("hairline"), zeroline: false, fixedrange: true, ...more[name],
+        gridcolor: color("hairline"), zeroline: false, fixedrange: true, ...more[name],
       }])),
       shapes: (more.shapes || []).map((shape) => ({
         type: "line", xref: "paper", x0: 0, x1: 1, layer: "below",
@@ -55,7 +55,7 @@ const tools = (() => {
       })),
       annotations: (more.titles || []).map(([title, y]) => ({
         text: title, x: 0, y, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom",
-        yshift: 5, xshift: -(more.margin?.l ?? MARGIN), showarrow: false, font: { size: 12.5, color: colour("ink") },
+        yshift: 5, xshift: -(more.margin?.l ?? MARGIN), showarrow: false, font: { size: 12.5, color: color("ink") },
       })),
     };
   }
@@ -133,11 +133,11 @@ const tools = (() => {
       span.textContent = mark.name;
       span.style.top = `${mark.at}px`;
       span.style.width = `${room() - 8}px`;
-      span.style.color = colour(mark.colour);
+      span.style.color = color(mark.color);
       place.append(span);
     }
   }
 
-  return { data, dark, narrow, coarse, state, MARGIN, byId, last, colour, translucent, dashes,
+  return { data, dark, narrow, coarse, state, MARGIN, byId, last, color, translucent, dashes,
     number, percent, times, ratio, layout, options, logTicks, tidy, inView, extent, room, label };
 })();

@@ -7,7 +7,7 @@ import skfolio.optimization
 from qfolio.portfolio.backtest.baselines import Baseline, History, baseline
 from qfolio.portfolio.backtest.baselines.base import nearest
 from qfolio.portfolio.backtest.baselines.online import Olmar, Pamr
-from qfolio.portfolio.backtest.baselines.optimisers import HierarchicalRiskParity
+from qfolio.portfolio.backtest.baselines.optimizers import HierarchicalRiskParity
 
 
 def history(prices: np.ndarray, month: int = 21, cap: float = 1.0) -> History:

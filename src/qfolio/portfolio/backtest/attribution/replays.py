@@ -25,7 +25,7 @@ from qfolio.portfolio.market import Holding, Signalled
 from qfolio.portfolio.task import Portfolio
 
 AT_ONCE = 16
-"""Most replays in one vectorised loop; their inputs and weights are in memory together."""
+"""Most replays in one vectorized loop; their inputs and weights are in memory together."""
 
 
 class Observed(Portfolio):

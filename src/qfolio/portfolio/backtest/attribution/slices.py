@@ -35,7 +35,7 @@ SHOWN = 8
 """Most folds whose policies are drawn, evenly spread."""
 
 DECISIONS = 24
-"""Decisions in a row until a policy rests; one that trades a tenth of the way has come 92 %."""
+"""Decisions in a row until a policy rests; one that trades a tenth of the way has come 92%."""
 
 TAIL = 0.01
 """Share of the signal's values that lies beyond each end of a slice."""

@@ -31,7 +31,7 @@ class HierarchicalRiskParity(Fitted):
     M. López de Prado, "Building Diversified Portfolios that Outperform Out of Sample" (2016): a
     tree of their correlations orders the assets, and the order is halved again and again; the two
     halves of each cluster share its weight in inverse proportion to their variances, with weights
-    ∝ 1/σ² inside. The tree is Ward's and neighbours are as near as it allows, as in skfolio. Beyond
+    ∝ 1/σ² inside. The tree is Ward's and neighbors are as near as it allows, as in skfolio. Beyond
     ``ORDERED`` assets the order is the tree's own, as in the paper.
     """
 
