@@ -63,7 +63,7 @@ class WeightsAndBiases(Tracker):
 
 
 class Trackio(WeightsAndBiases):
-    """Trackio, which has the same three functions and keeps its data on this machine."""
+    """Trackio, which has the same functions as wandb and keeps its data on this machine."""
 
     name = "trackio"
 

@@ -67,7 +67,7 @@ class Efficient(eqx.Module):
 
     @property
     def trading(self) -> Trading:
-        """Between that towards the least variance and the members', by the share."""
+        """How to trade: as for the least variance, moved by the share towards the members' mean."""
         least, members = self.learned.trading, self.learned.members
         if members is None:
             return least

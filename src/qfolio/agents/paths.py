@@ -29,8 +29,8 @@ Rewards = tuple[Float[Array, "time path"], ...]
 Targets = Callable[[View, PyTree], tuple[Float[Array, "path entry"], ...]]
 
 AT_ONCE = 2**21
-"""Most numbers in the features of a rollout from which all targets are computed at once. Those of
-more leave the processor's cache, and each step's targets are computed when it is taken."""
+"""Most numbers in the features of a rollout whose targets are computed all at once. A larger
+rollout would not fit the processor's cache; its targets are computed step by step."""
 
 
 class OnPaths(Agent):
@@ -136,7 +136,7 @@ class Onlooker(OnPaths):
     def act(
         self, state: State, observation: View, key: PRNGKeyArray
     ) -> Float[Array, "batch entry"]:
-        """The order that changes nothing."""
+        """The order that keeps the holding as it is."""
         return simplex.with_rest(observation.holding)
 
     def measure(self, task: Task, step: Transition) -> Metrics:

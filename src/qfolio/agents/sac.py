@@ -77,7 +77,8 @@ def expectations(
 ) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
     """E[min Q(s, a)] and the entropy of the policy, for each observation.
 
-    Exact for numbered actions, and from one draw otherwise; gradients flow through the draw.
+    They are exact for numbered actions, and estimated from one draw otherwise, through which
+    gradients flow.
     """
     policy = actor(observation)
     if isinstance(policy, Categorical):

@@ -1,4 +1,4 @@
-"""The command that shows in a browser what is trained."""
+"""The command that shows trainings in a browser."""
 
 from pathlib import Path
 from typing import Annotated

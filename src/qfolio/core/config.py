@@ -23,7 +23,7 @@ class Config(msgspec.Struct, kw_only=True, frozen=True):
     """Name of this kind of folder in messages, such as "backtest"."""
 
     format: ClassVar[int]
-    """Raised whenever an older folder can no longer be read."""
+    """Number of the format; a change that makes older folders unreadable raises it by one."""
 
     version: str = __version__
     """Version of qfolio that wrote the file."""
@@ -39,7 +39,7 @@ def write_config(path: Path, config: Config) -> None:
 
 
 def read_config(path: Path, kind: type[C]) -> C:
-    """The settings in a file.
+    """Reads the settings in a file.
 
     Raises QfolioError if the file is missing, belongs to a folder of another kind, was written in
     another format, or holds invalid values.

@@ -10,7 +10,7 @@ from qfolio.core.errors import QfolioError
 
 
 def static(default: Any) -> Any:
-    """A setting that shapes the program."""
+    """A setting that is fixed when the program is compiled: members may not differ in it."""
     return eqx.field(static=True, default=default)
 
 
@@ -20,17 +20,17 @@ def number(default: float) -> Any:
 
 
 def constant(default: float) -> Any:
-    """A number that shapes the program."""
+    """A number that is fixed when the program is compiled."""
     return eqx.field(static=True, converter=float, default=default)
 
 
 def sizes(*default: int) -> Any:
-    """Layer sizes."""
+    """Sizes of layers, fixed when the program is compiled."""
     return eqx.field(static=True, converter=tuple, default=default)
 
 
 def numbers(*default: float) -> Any:
-    """Several numbers that shape the program; one number alone is a tuple of one."""
+    """Several numbers, fixed when the program is compiled; one alone becomes a tuple of one."""
     return eqx.field(static=True, converter=_floats, default=default)
 
 

@@ -125,7 +125,7 @@ def write_csv(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]]) 
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Raises QfolioError if the file is missing or holds no JSON object."""
+    """Reads a JSON object; raises QfolioError if the file is missing or holds anything else."""
     try:
         content = json.loads(path.read_text())
     except OSError as error:
@@ -147,7 +147,10 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Raises QfolioError if the file is missing, truncated, changed or not safetensors."""
+    """Reads named arrays.
+
+    Raises QfolioError if the file is missing, truncated, changed or not safetensors.
+    """
     try:
         content = path.read_bytes()
         arrays = load(content)

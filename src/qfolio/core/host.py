@@ -83,8 +83,8 @@ class Outcome(NamedTuple):
 class Environments:
     """Environments of one task, stepped one after another.
 
-    limit: steps after which their episodes are truncated. observation: the current ones. Raises
-    QfolioError, which names environment and step, if an environment fails or violates its
+    limit: steps after which an episode is truncated. observation: the current observations. Raises
+    a QfolioError that names environment and step if an environment fails or violates its
     observation space.
     """
 

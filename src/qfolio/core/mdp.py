@@ -94,7 +94,7 @@ class Optimum(Protocol):
 
 
 Policy = Callable[[PyTree], Array]
-"""From a task's state to the intended action."""
+"""A function from a task's state to the intended action."""
 
 
 class Task(eqx.Module):
@@ -134,7 +134,7 @@ class Task(eqx.Module):
 
     @property
     def observation_scale(self) -> tuple[float, ...] | float:
-        """The range ± of each component of an observation."""
+        """Half the range of each component of an observation, which lies in ± this number."""
         return 1.0
 
     @abc.abstractmethod
@@ -199,7 +199,7 @@ class ExogenousTask(Task):
         return math.inf
 
     def place(self, market: PyTree) -> Float[Array, ""]:
-        """The place of a state's move in the data, from 0 on; 0 if moves are drawn anew."""
+        """The position of a state's move in the data, counted from 0; 0 if moves are drawn anew."""
         return jnp.array(0.0)
 
     @abc.abstractmethod
@@ -207,7 +207,7 @@ class ExogenousTask(Task):
         """A random holding, so that an agent learns to act from any."""
 
     def draw_reachable(self, market: PyTree, key: PRNGKeyArray) -> PyTree:
-        """A random holding of the kind that actions lead to in a market; else any."""
+        """A random holding that actions may lead to in a market (default: any holding)."""
         return self.draw_holding(key)
 
     def reference(self, market: PyTree, next_market: PyTree) -> Float[Array, ""] | None:
@@ -288,7 +288,7 @@ class Agent(eqx.Module):
         """Actions for a batch of observations, with exploration."""
 
     def measure(self, task: Task, step: Transition) -> Metrics:
-        """What the log says of a step of training: what the task measures of it (default)."""
+        """What the log records of a training step (default: what the task measures of it)."""
         return task.measure(step)
 
     @abc.abstractmethod

@@ -30,7 +30,7 @@ def quote(value: object, limit: int = 60) -> str:
 
 
 def amount(count: int, noun: str) -> str:
-    """1 row, 2 rows."""
+    """A count with its noun: 1 row, 2 rows, 1,000 rows."""
     return f"{count:,} {plural(noun, count)}"
 
 

@@ -33,7 +33,7 @@ class Tally(NamedTuple):
 
 
 class TrainingState(eqx.Module):
-    """One member's complete training state: saved and loaded, training continues bit for bit."""
+    """One member's complete training state: training continues from a saved one bit for bit."""
 
     agent: PyTree
     task: PyTree  # (environment, ...)

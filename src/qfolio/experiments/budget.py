@@ -26,7 +26,7 @@ class Budget:
 
     @property
     def unit(self) -> str:
-        """The unit: "episodes" or "steps"."""
+        """What the budget counts: "episodes" or "steps"."""
         return "episodes" if self.steps is None else "steps"
 
     @property

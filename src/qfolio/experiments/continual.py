@@ -44,7 +44,7 @@ POINTS = 24
 """Approximate number of points on a learning curve after the change, also of the renewed agent."""
 
 WITHIN = 0.1
-"""A seed has recovered when its regret in the changed world stays below."""
+"""A seed has recovered when its regret in the changed world stays below this."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Course(msgspec.Struct):
 
     steps: since the change, of all environments of a seed. curve: regrets (point, seed) on the
     first start states. final: regrets (seed,) on all of them; other: the same in the other world
-    (after the change, the old one). seconds: of learning, all seeds.
+    (after the change, the old one). seconds: time of learning, all seeds together.
     """
 
     steps: list[int]

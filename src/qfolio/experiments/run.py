@@ -183,12 +183,12 @@ class Run:
 
         Args:
             budget: The budget of each seed, including earlier training.
-            listeners: Hear of the training.
+            listeners: Called at the start, after each chunk and at the end; see ``Listener``.
             executor: Where groups of seeds train (default: all side by side in this process); see
                 ``qfolio.on``.
             listen: Called before each group, with the finished share of all groups and the share of
                 this one; returns its listeners (default: ``listeners``).
-            log: Of the experiment that the run is a part of (default: the folder's own).
+            log: Log of the experiment that the run is a part of (default: the folder's own).
         """
         budget, executor = budget or self.budget, executor or Here()
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
@@ -405,7 +405,7 @@ def train(
         seeds: Number of agents.
         seed: The first seed; the others follow it.
         out: New folder for the run (default: nothing is written).
-        listeners: Hear of the training.
+        listeners: Called at the start, after each chunk and at the end; see ``Listener``.
         executor: Where groups of seeds train (default: all in this process); see ``qfolio.on``.
 
     Returns:

@@ -29,7 +29,9 @@ class Evidence(NamedTuple):
         unseen: Bool[Array, "member time path"],
         memory: Array | float,
     ) -> "Evidence":
-        """With a rollout's steps, by the member that has not learned from them; older ones fade."""
+        """The evidence with a rollout's steps added.
+
+        A step counts for the members that have not learned from it; older steps fade."""
         counted, earned = 1.0 * unseen.any(0), (unseen * active).sum(0)
         new = (counted, earned, earned**2)
         where = block.ravel()

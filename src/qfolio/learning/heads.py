@@ -18,7 +18,7 @@ from qfolio.learning.targets import Scalar
 class NoisyMLP(MLP):
     """Layers whose weights have noise of a learned scale (Fortunato et al. 2018, section 3).
 
-    The noise is factorised: a weight's noise is the product of one number for its input and one for
+    The noise is factorized: a weight's noise is the product of one number for its input and one for
     its output. The module itself uses the mean weights; ``draw`` returns it with noise.
     """
 

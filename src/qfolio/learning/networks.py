@@ -141,7 +141,7 @@ class Shared(eqx.Module):
         return self.answer(self.read(view.features), view.holding)
 
     def read(self, features: Float[Array, "*batch asset time channel"]) -> Reading:
-        """Everything that does not depend on the holding, computed once for many holdings."""
+        """What does not depend on the holding, computed once for many holdings."""
         found = jax.nn.relu(self.encoder(features))
         width = found.shape[-1]
         of_window, of_market = self.join[:width], self.join[width : 2 * width]

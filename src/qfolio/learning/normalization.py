@@ -78,7 +78,7 @@ class Normalizer(eqx.Module):
     rewards: RewardScale | None
 
     def update(self, rollout: Transition, discount: Scalar) -> "Normalizer":
-        """With the steps of a rollout, whose leading axes are time and environment."""
+        """The statistics after a rollout, whose leading axes are (time, environment)."""
         observations, rewards = self.observations, self.rewards
         if observations is not None:
             seen = rollout.observation
@@ -97,7 +97,7 @@ class Normalizer(eqx.Module):
         return jnp.clip(reward / self.unit, -LIMIT, LIMIT)
 
     def attached(self, weights: Weights) -> Weights:
-        """Weights whose field ``observations`` holds the statistics that they read by."""
+        """The weights, with these statistics in their field ``observations``."""
         if self.observations is None:
             return weights
         where: Any = lambda weights: weights.observations  # noqa: E731
@@ -131,7 +131,9 @@ class NormalizationConfig(NamedTuple):
             )
 
     def begin(self, task: Task, observation: PyTree, num_envs: int) -> Normalizer:
-        """No statistics yet. Raises QfolioError if observations are not one array of numbers.
+        """Statistics before the first step.
+
+        Raises QfolioError if observations are not one array of numbers.
 
         observation: an example.
         """

@@ -26,7 +26,7 @@ class Priorities(eqx.Module):
 
     @staticmethod
     def empty(capacity: int) -> "Priorities":
-        """All zero: no row can be drawn yet."""
+        """Priorities of 0, with which no row can be drawn yet."""
         levels: list[Array] = []
         nodes = capacity
         while not levels or nodes > 1:
@@ -42,7 +42,7 @@ class Priorities(eqx.Module):
         return self.levels[-1][index // FAN, index % FAN]
 
     def set(self, index: Int[Array, " n"], values: Float[Array, " n"]) -> "Priorities":
-        """Rows set to ``values``; a row that occurs twice must have equal values."""
+        """Sets rows to ``values``; a row that is given twice must have equal values."""
         highest = jnp.maximum(self.highest, values.max())
         levels = []
         for level in reversed(self.levels):
@@ -75,7 +75,7 @@ class Priorities(eqx.Module):
     def update(
         self, index: Int[Array, " n"], off: Float[Array, " n"], exponent: Scalar
     ) -> "Priorities":
-        """Rows set to their values' errors ``off``, to the power of ``exponent`` (α)."""
+        """Sets rows to their absolute errors ``off`` to the power of α (``exponent``)."""
         return self.set(index, (off + 1e-6) ** exponent)  # above 0, so that any is drawn again
 
     def importance(self, index: Int[Array, " n"], exponent: Scalar) -> Float[Array, " n"]:

@@ -34,10 +34,11 @@ def bootstrap(
 
 
 def smallest(values: Float[Array, "critic *batch"]) -> Float[Array, "*batch"]:
-    """The smallest of several estimates, and its gradient.
+    """The smallest of several estimates, with its gradient.
 
-    By selection: the gradient of ``min`` asks which estimate equals it. None does, and the gradient
-    is 0/0, if a compiler computes the estimates twice and rounds them differently.
+    It is selected by comparisons, because the gradient of ``min`` asks which estimate equals the
+    minimum. If a compiler computes the estimates twice and rounds them differently, none does, and
+    that gradient is 0/0.
     """
     return reduce(lambda least, other: jnp.where(other < least, other, least), values)
 

@@ -45,7 +45,7 @@ class Conditions(NamedTuple):
         return Conditions(years, values, sums, listed)
 
     def part(self, start: int, stop: int) -> "Conditions":
-        """Those of some rows, for tables that begin with the first of them."""
+        """The conditions of some rows, as a table has them that begins with the first of these."""
         values, sums = ({k: x[start:stop] for k, x in d.items()} for d in (self.values, self.sums))
         listed = None if self.listed is None else self.listed[start:stop]
         return Conditions(self.years[start:stop], values, sums, listed)
@@ -88,7 +88,7 @@ def _sums(values: Floats, years: Floats) -> Floats:
 
 
 def _volatility(values: Floats) -> Floats:
-    """Of the log returns up to each row, ``MEMORY`` of them, or as many as there are."""
+    """The volatility of the last ``MEMORY`` log returns at each row, or of as many as there are."""
     logs = np.zeros(values.shape)
     logs[1:] = np.nan_to_num(np.diff(np.log(values), axis=0))
     sums, squares = (np.cumsum(x, 0) for x in (logs, logs**2))

@@ -90,7 +90,7 @@ class CostModel(abc.ABC):
         """
 
     def owe(self, relatives: Any, context: Context) -> Any | None:
-        """Growth factors of a loan and of assets sold short; None (default): as ``carry``'s."""
+        """Growth factors of a loan and of assets sold short (default: None, those of ``carry``)."""
         return None
 
     def growth(self, weights: Any, relatives: Any, context: Context) -> Any:
@@ -226,7 +226,7 @@ def delisted(growth: Any, relatives: Any, listed: Any) -> Any:
     """Growth factors, in which assets without a price earn their cash-out and then what cash does.
 
     Args:
-        growth: Of cash and of each asset, of shape (..., N + 1).
+        growth: Growth factors of cash and of each asset, of shape (..., N + 1).
         relatives: New price over old price of each asset, of shape (..., N).
         listed: Whether an asset has a price at the end, likewise; None if all have.
     """

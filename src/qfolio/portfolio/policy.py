@@ -201,12 +201,12 @@ class Policy:
 
     @property
     def costs(self) -> CostModel:
-        """Of the market that it was trained on."""
+        """The cost model of the market that the policy was trained on."""
         return self.task.costs
 
     @property
     def mandate(self) -> str:
-        """Text of the mandate that it was trained under."""
+        """Text of the mandate that the policy was trained under."""
         return self.task.mandate
 
     @property
@@ -216,7 +216,7 @@ class Policy:
 
     @property
     def rows(self) -> int:
-        """Number of rows that it was trained on."""
+        """Number of rows that the policy was trained on."""
         return (
             int(self.task.last_decision - self.task.first_decision)
             + self.task.window

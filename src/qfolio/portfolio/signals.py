@@ -343,7 +343,7 @@ def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
 
 
 def _before(values: Floats, rows: int) -> Floats:
-    """The values that many rows before."""
+    """The values of a given number of rows before."""
     return np.concatenate([np.full((min(rows, len(values)), *values.shape[1:]), np.nan),
                            values[: max(0, len(values) - rows)]])  # fmt: skip
 

@@ -14,7 +14,7 @@ def kelly(up: float, down: float, probability: float) -> tuple[float, float]:
     Args:
         up: Relative with the given probability, above 1.
         down: Relative otherwise, at least 0 and below 1.
-        probability: Of ``up``.
+        probability: Probability of ``up``.
 
     Returns:
         The fraction and the growth per bet.

@@ -16,7 +16,9 @@ from qfolio.experiments.run import Run
 
 
 def measure(run: Run, devices: int) -> Result:
-    """Grades a run and measures its cost; devices: that trained its seeds side by side."""
+    """Grades a run and measures its cost.
+
+    devices: number of devices that trained its seeds side by side."""
     summary = run.summary()
     seeds = len(run.population.seeds)
     solution, curve_optimum = run.task.optimum(), None

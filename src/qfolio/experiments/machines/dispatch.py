@@ -49,7 +49,7 @@ class Workers(Protocol):
         ...
 
     def receive(self, seconds: float) -> list[tuple[int, Message]]:
-        """What workers have said, each message with its worker; waits at most so long."""
+        """What workers have said, each message with its worker; waits at most ``seconds``."""
         ...
 
 

@@ -15,7 +15,7 @@ SIGNALS = (
 
 
 SHORT_SIGNALS = "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,moving-average:10"
-"""Those that pay off within days: values of single moves are too noisy for slower ones."""
+"""Signals that pay off within days: values of single moves are too noisy for slower ones."""
 
 
 _ON_ANCHOR = {"window": 1, "horizon": 84, "signals": SIGNALS, "anchor": "equal-weight"}

@@ -92,7 +92,7 @@ class Journal:
         return found
 
     def in_hand(self) -> int:
-        """Number of trials in training, in all processes."""
+        """Number of trials that are being trained, in all processes."""
         return len(self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
 
     @contextlib.contextmanager

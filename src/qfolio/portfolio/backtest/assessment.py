@@ -140,7 +140,7 @@ def assess(
     Equal arguments give equal results, and the order of a strategy's seeds does not matter.
 
     Args:
-        strategies: By name, at least one baseline among them; all on the same days.
+        strategies: The strategies by name, with at least one baseline; all on the same days.
         dates: Days on which the returns were earned, shape (periods,), strictly increasing.
         periods_per_year: For example 252 for days of trading.
         reference: The name of the baseline chosen in advance for comparison.
@@ -303,7 +303,7 @@ def _relative(
 def _sharpe_test(
     returns: Floats, sharpe: float, trials: int, variance: float, periods_per_year: float
 ) -> SharpeTest:
-    """For returns of shape (seeds, periods) and their mean annual Sharpe ratio."""
+    """The tests of a Sharpe ratio, given returns of shape (seeds, periods) and its annual mean."""
     year = math.sqrt(periods_per_year)
     periods = returns.shape[1]
     moments = skewness_and_kurtosis(returns)

@@ -92,7 +92,9 @@ def stationary_bootstrap_indices(
 def histories(
     periods: int, block: float, resamples: int, rng: np.random.Generator
 ) -> Iterator[tuple[NDArray[np.int32], Floats]]:
-    """Draw resampled histories some at a time; the arguments are those above.
+    """Draw resampled histories, some at a time.
+
+    The arguments are those of ``stationary_bootstrap_indices``.
 
     Yields:
         Their days, and how often each day was drawn, both of shape (some, periods). Averages over a

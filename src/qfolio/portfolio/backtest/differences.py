@@ -94,7 +94,7 @@ def compare(
 
     Args:
         returns: Simple returns of shape (seeds, periods), by strategy.
-        rivals: By role.
+        rivals: The rivals, by their role.
         judged: Which strategies are tested.
         periods_per_year: For example 252 for days of trading.
         seed: Seed of the draws.

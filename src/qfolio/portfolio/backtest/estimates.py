@@ -89,7 +89,7 @@ class Estimate(NamedTuple):
         return Tails(*(float(stdtr(self.freedom, side)) for side in (-ratio, ratio)))
 
     def negated(self) -> "Estimate":
-        """The difference the other way round."""
+        """The same difference with the opposite sign."""
         return self._replace(value=-self.value, loads=-self.loads)
 
 

@@ -96,7 +96,7 @@ def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) ->
 
 
 def overdue(learned: np.datetime64, test: str, dates: np.ndarray) -> bool:
-    """Whether a table goes on for the length of a test, or longer, after the last row learned."""
+    """Whether a table has rows for a whole test, or longer, after the last row learned."""
     count, unit = parse_length(test)
     if unit == "d":
         return int((dates > learned).sum()) >= count
@@ -109,7 +109,7 @@ def spell(date: np.datetime64, dates: np.ndarray) -> str:
 
 
 def spell_all(some: np.ndarray, dates: np.ndarray) -> list[str]:
-    """Some dates of a table as text, likewise."""
+    """Some dates of a table as text, with times if rows are less than a day apart."""
     days = dates.astype("datetime64[D]")
     if (days[1:] > days[:-1]).all():
         return list(map(str, some.astype("datetime64[D]")))

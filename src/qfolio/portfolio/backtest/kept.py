@@ -57,7 +57,7 @@ class Kept:
         return self.folder.read_policy(agent, fold, template)
 
     def records(self, agent: str, fold: str) -> list[Row]:
-        """Every training episode, all seeds, in order of time; empty if there are none."""
+        """Every training episode of all seeds, in order of time; empty if there are none."""
         if self.folder is None:
             return self._records.get((agent, fold), [])
         return self.folder.read_records(agent, fold)

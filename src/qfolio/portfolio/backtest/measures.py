@@ -196,7 +196,7 @@ def deepest_drawdown(steps: Floats, days: NDArray[np.int32]) -> Floats:
 
     Args:
         steps: Log returns of shape (periods, series).
-        days: Of shape (resamples, periods).
+        days: Drawn days, of shape (resamples, periods).
     """
     depth = np.zeros((len(days), steps.shape[1]))
     deepest, step = np.zeros_like(depth), np.empty_like(depth)
@@ -214,7 +214,9 @@ def deepest_drawdown(steps: Floats, days: NDArray[np.int32]) -> Floats:
 def checked_track(
     returns: ArrayLike, turnover: ArrayLike, cost: ArrayLike, who: str = "the track record"
 ) -> Floats:
-    """Returns, turnover and cost stacked: (3, ..., periods), or a QfolioError."""
+    """Returns, turnover and cost, stacked to shape (3, ..., periods).
+
+    Raises QfolioError if the shapes differ, or a number is missing or out of range."""
     series = {"returns": returns, "turnover": turnover, "cost": cost}
     arrays = [_checked_series(name, values, who) for name, values in series.items()]
     if len({array.shape for array in arrays}) > 1:

@@ -41,10 +41,10 @@ def total(
     """The bytes, from the sizes of everything.
 
     Args:
-        rows: Of the price table.
-        days: Of the test.
-        assets: In the table.
-        channels: That each agent observes of an asset, by agent.
+        rows: Rows of the price table.
+        days: Days of the test.
+        assets: Assets in the table.
+        channels: Channels that each agent observes of an asset, an entry for each agent.
         seeds: Agents of each kind.
         others: Strategies that are not trained.
     """

@@ -68,16 +68,16 @@ def buy_and_hold(asset: str, prices: Prices) -> Own:
 def place(name: str, own: Own, prices: Prices, days: slice, task: Portfolio, cap: float) -> Placed:
     """Put a strategy on the days of a test.
 
-    A date that is no row of the prices counts at the next row, so that nothing is known too early.
+    A date without a row of prices counts at the next row, so that nothing is known too early.
     Before its first order a strategy holds cash. If that order is older than the test, the test
     begins with an order of what it has drifted to.
 
     Args:
-        name: Of the strategy, for messages.
+        name: Name of the strategy, for messages.
         own: The strategy.
         prices: The table of the backtest.
         days: Rows of the test's decisions.
-        task: Of any agent; all have the same lag, and are long-only or not.
+        task: The task of any agent: all have the same lag, and all or none are long-only.
         cap: Largest weight of one asset that agents may order; a note says where it is exceeded.
 
     Raises:
@@ -153,9 +153,9 @@ def kept(
     """Says where a strategy's orders break the mandate; they are carried out all the same.
 
     Args:
-        name: Of the strategy.
-        decisions: Its orders, of shape (D, N + 1), cash first, NaN for no order.
-        turnover: Of each, of shape (D,).
+        name: Name of the strategy.
+        decisions: The orders of the strategy, of shape (D, N + 1), cash first, NaN for no order.
+        turnover: Turnover of each order, of shape (D,).
         mandates: What is allowed on some of the D days.
     """
     broken: dict[str, list[float]] = {}

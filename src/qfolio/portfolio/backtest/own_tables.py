@@ -38,7 +38,7 @@ def read_own(name: str, source: Any, prices: Prices) -> Own:
     """Read a strategy for a backtest on a table of prices.
 
     Args:
-        name: Of the strategy, for messages.
+        name: Name of the strategy, for messages.
         source: Path of a CSV or Parquet file; a data frame that narwhals knows; or an array with a
             row for each row of the prices: weights of shape (rows, N + 1), cash first, or (rows,
             N), NaN for no order, or returns of shape (rows,).

@@ -28,7 +28,7 @@ def relative(
 
     Args:
         returns: Simple returns of shape (..., periods).
-        benchmark: Those of the benchmark, of shape (periods,).
+        benchmark: Simple returns of the benchmark, of shape (periods,).
         periods_per_year: For example 252 for days of trading.
         share: The active share by period, of the shape of the returns; NaN where it is not known
             (default: nowhere).
@@ -65,7 +65,7 @@ def bootstrap_relative(
         returns, benchmark, periods_per_year, share: As in ``relative``; returns of shape
             (series, periods).
         block, resamples: As in ``bootstrap.stationary_bootstrap_indices``.
-        seed: Of the drawing; equal ones give the same histories.
+        seed: Seed of the draws; equal seeds give the same histories.
 
     Returns:
         One array of shape (resamples, series) for each name in ``RELATIVE``.

@@ -37,7 +37,7 @@ class Sampled(NamedTuple):
         }
 
     def measure(self, key: str) -> Measure:
-        """One of them, by its name."""
+        """One of the measures, by its name."""
         values = self.observed[key]
         low, high = percentile_interval(self.drawn[key].mean(axis=1))
         return Measure(

@@ -84,7 +84,7 @@ def rolling_beta(returns: ArrayLike, reference: ArrayLike, window: int) -> Float
 
     Args:
         returns: Simple returns of shape (..., periods).
-        reference: Those of the reference, shape (periods,).
+        reference: Simple returns of the reference, shape (periods,).
         window: At least 2.
     """
     other = np.asarray(reference, dtype=float)
@@ -100,7 +100,7 @@ def effective_number(weights: ArrayLike) -> Floats:
     Shares are those of the assets in what is invested; 0 if all is cash.
 
     Args:
-        weights: Of shape (..., assets + 1), cash first.
+        weights: Weights of shape (..., assets + 1), cash first.
     """
     risky = np.asarray(weights, dtype=float)[..., 1:]
     invested = np.abs(risky).sum(axis=-1)
@@ -143,7 +143,7 @@ def figures(returns: ArrayLike, dates: ArrayLike, periods_per_year: float) -> di
     periods with a gain among those that moved, ``ulcer`` the root mean square of drawdowns.
 
     Args:
-        returns: Of shape (periods,).
+        returns: Simple net returns, of shape (periods,).
         dates: Days on which the returns were earned, shape (periods,), strictly increasing.
         periods_per_year: For example 252 for days of trading.
     """

@@ -24,7 +24,7 @@ ENDED = ("gap", "cash-out")
 
 @dataclass(frozen=True)
 class Choices:
-    """How a table is read; cf. ``table.load``."""
+    """How a table is read; see ``table.load``."""
 
     missing: str = "error"
     late: str = "error"

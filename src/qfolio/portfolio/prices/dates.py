@@ -172,7 +172,7 @@ def _seconds(count: float, unit: Unit) -> int:
 
 
 def _of_calendar(cells: np.ndarray) -> list[datetime | str]:
-    """Dates without zones, or complaints."""
+    """Dates without time zones, or complaints."""
     ends = [match for match in map(_year_last, cells) if match]
     day_first, month_first = (any(int(match[k]) > 12 for match in ends) for k in (1, 2))
     order = None if day_first == month_first else "day" if day_first else "month"

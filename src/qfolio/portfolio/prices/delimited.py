@@ -26,10 +26,10 @@ _TWO_READINGS = re.compile(rf"{_BEFORE}([1-9]\d{{0,2}}\.\d{{3}}){_AFTER}", re.A)
 
 
 def from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set[int]]) -> Table:
-    """The table in the bytes of a file of this name; texts: cf. ``reading.read``.
+    """The table in the bytes of a file of this name; texts: see ``reading.read``.
 
     Raises:
-        QfolioError: The file is no text, or its rows and columns cannot be told.
+        QfolioError: The file is not text, or its rows and columns cannot be told.
     """
     try:
         wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")

@@ -22,8 +22,8 @@ def every_day(dates: np.ndarray) -> bool:
 def periods_per_year(dates: np.ndarray) -> float:
     """Rows per year: 252 for business days, 365 for all days, 52, 12, 4 or 1 for longer periods.
 
-    Intraday: the median number of bars per day times the days per year; any other spacing: its
-    mean.
+    For intraday rows it is the median number of bars per day times the days per year, and for any
+    other spacing the mean number of rows per year.
     """
     if len(dates) < 2:
         return TRADING_DAYS

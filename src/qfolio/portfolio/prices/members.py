@@ -22,8 +22,8 @@ def membership(source: Any, dates: np.ndarray, assets: tuple[str, ...]) -> np.nd
         source: A file or a data frame, with a column of dates and one of 0 or 1 for each asset
             (a row stands until the next one), or with the columns asset, from and to (both are days
             of membership; an empty one is open).
-        dates: Of the price table, ascending, of shape (rows,).
-        assets: Of the price table.
+        dates: Dates of the price table, ascending, of shape (rows,).
+        assets: Assets of the price table.
 
     Raises:
         QfolioError: The source cannot be read, or does not say of each asset when it is a member.

@@ -145,14 +145,14 @@ class Prices:
 
     @property
     def known(self) -> np.ndarray:
-        """The prices, with NaN after an asset's last row, too."""
+        """The prices, with NaN before an asset's first row and after its last."""
         return self.values if self.listed is None else np.where(self.listed, self.values, np.nan)
 
     @property
     def relatives(self) -> np.ndarray:
         """Price relatives price[k] / price[k-1], k = 1 … rows-1, of shape (rows-1, assets).
 
-        NaN up to and including an asset's first row; cf. ``first_rows``.
+        NaN up to and including an asset's first row; see ``first_rows``.
         """
         return np.asarray(self.values[1:] / self.values[:-1])
 
@@ -164,7 +164,7 @@ class Prices:
 
     @property
     def periods_per_year(self) -> float:
-        """Rows per year, from the dates; cf. ``frequency.periods_per_year``."""
+        """Rows per year, from the dates; see ``frequency.periods_per_year``."""
         return periods_per_year(self.dates)
 
     @property
@@ -202,7 +202,7 @@ class Prices:
         return self._part(slice(None), columns)
 
     def between(self, start: int | None, stop: int | None) -> "Prices":
-        """Rows start … stop-1, counted as Python does."""
+        """The rows from ``start`` to ``stop`` − 1, as in a slice of Python."""
         return self._part(slice(start, stop), slice(None))
 
     def to_frame(self) -> Any:
@@ -297,7 +297,7 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
     The arguments are ``load``'s. At most five cells of one kind are named, the others are counted.
 
     Returns:
-        The prices, which are None exactly if a finding is an error, and the findings.
+        The prices (None if a finding is an error), and the findings.
 
     Raises:
         QfolioError: There is no table to check: no such file, not text, rows of unequal length.

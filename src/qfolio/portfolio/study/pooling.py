@@ -143,7 +143,7 @@ def pool(
     """Pool the evidence of tables on each agent, without Holm's correction.
 
     Args:
-        tables: By name, at least one.
+        tables: The tables by name, at least one.
         agents: Names of agents that all tables have.
         seed: Seed of the bootstrap; all agents share the tables and days that are drawn.
     """
@@ -237,7 +237,7 @@ def correlations(days: Sequence[Sequence[str]], active: Sequence[Floats]) -> Flo
     ones count as 0, so that the pooled z is never larger than that of independent tables.
 
     Args:
-        days: Of each table.
+        days: Days of each table.
         active: Daily differences of each table, of shape (days,).
     """
     shared = np.eye(len(days))

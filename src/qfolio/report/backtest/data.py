@@ -54,7 +54,7 @@ class BacktestData:
         assessment: The statistics of these strategies on these days.
         dates: Days on which the returns were earned, shape (D,), strictly increasing.
         assets: Names of the N assets, in the order of the weights.
-        strategies: By the same names as in the assessment.
+        strategies: The strategies, by the same names as in the assessment.
         prices: The origin of the prices: source, rows, assets, first and last (dates), note (a
             caveat to show with every result on them, such as survivorship; may be empty) and
             digest.

@@ -69,8 +69,8 @@ def decompose(
     Args:
         net: Net returns, shape (D,).
         weights: After each day's trade, cash first, shape (D, N + 1).
-        returns: Of cash and assets while these weights were held, likewise.
-        folds: The days of each, by name.
+        returns: Returns of cash and assets while these weights were held, same shape.
+        folds: The days of each fold, by its name.
         assets: Names of the N assets.
         periods_per_year: For example 252 for days of trading.
         known: Whether an asset had a price on a day, shape (D, N) (default: all had).

@@ -22,8 +22,8 @@ def diagnose(
     """Sentences about a strategy that does nothing with what it observes; usually none.
 
     Args:
-        name: Of the strategy.
-        entry: Its decisions and their replay.
+        name: Name of the strategy.
+        entry: The strategy's decisions and their replay.
         folds: The days of each fold.
         assets: Names of the assets.
         ignored: Whether its targets stay the same when all that it observes is shuffled.

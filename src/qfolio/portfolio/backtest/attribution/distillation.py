@@ -49,13 +49,15 @@ def distil(
         targets: Target weights of the assets, shape (D, N).
         anchor: The weights that they are active against, likewise.
         signals: Each asset's latest signals, shape (D, N, C).
-        names: Of the signals.
+        names: Names of the signals.
         tradable: 1 for assets that may be held on a day, else 0, shape (D, N).
         fitted: Whether a row fits the rule (else it tests it), shape (D,).
     """
 
     def triangle(days: np.ndarray) -> Floats:
-        """R of the QR factorisation of [signals, weights]: as good as all rows, and small."""
+        """The factor R of the QR factorization of [signals, weights].
+
+        Least squares on R gives the same as on all rows, and R is small."""
         found = np.zeros((0, len(names) + 1))
         for some in np.array_split(days, max(1, days.size * signals[:1].size // BLOCK)):
             open_to = tradable[some, :, None]

@@ -48,7 +48,7 @@ def exposures(
 
     Args:
         active: Net returns less those of the reference, shape (D,).
-        factors: By name, of the same days.
+        factors: Returns of each factor on the same days, by its name.
         periods_per_year: For example 252 for days of trading.
     """
     chosen: dict[str, Floats] = {}
@@ -78,12 +78,12 @@ def factor_returns(
 
     Args:
         values: Prices of shape (rows, N), NaN before an asset's first.
-        folds: In order, without gaps.
+        folds: The folds, in order and without gaps.
         lag: Rows from a decision to its execution.
         periods_per_year: It sets the factors' lengths: a year, a month, a week.
 
     Returns:
-        By name, series of shape (D,).
+        Series of shape (D,), by the name of the factor.
     """
     moves = np.zeros(values.shape)
     moves[1:] = np.nan_to_num(values[1:] / values[:-1] - 1)

@@ -52,7 +52,7 @@ def integrated_gradients(
 
     Args:
         stretches: The folds with its policies.
-        names: Of the channels that it observes.
+        names: Names of the channels that the agent observes.
         held: Weights held when deciding, shape (D, entry).
     """
     if isinstance(stretches[0].task.actions, Discrete):

@@ -71,7 +71,7 @@ def importance(
 
     Args:
         stretches: The folds with its policies.
-        names: Of the channels that it observes.
+        names: Names of the channels that the agent observes.
         values: Prices, shape (rows, N).
         periods_per_year: It sets the length of blocks, a quarter of a year.
 

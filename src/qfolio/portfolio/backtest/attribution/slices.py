@@ -72,8 +72,8 @@ def slices(
 
     Args:
         stretches: The folds with its policies.
-        names: Of the channels that it observes.
-        assets: Their names.
+        names: Names of the channels that the agent observes.
+        assets: Names of the assets.
         held: Weights held when deciding, shape (D, entry).
         shared: Whether a channel is the same for all assets.
     """
