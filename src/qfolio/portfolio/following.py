@@ -89,8 +89,9 @@ def paths(
 ) -> tuple[
     Float[Array, "portfolio time entry"], Float[Array, "portfolio time entry"], Holding
 ]:  # fmt: skip
-    """What is wanted at each row, targets, and what is held one row later, without the checks of
-    ``follow``.
+    """The weights wanted at each row, the targets, and what is held one row later.
+
+    As ``follow``, without its checks.
 
     members: with leading axes (portfolio, member); a portfolio follows the mean of its own.
     """

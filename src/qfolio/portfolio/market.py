@@ -3,7 +3,7 @@
 Weights have an entry for cash, then one for each asset. A decision sets target weights at today's
 prices: an order in shares, scaled to the wealth when it is executed, and free of cost if it equals
 the holding. Costs are in ``costs.py``, the same for training and backtest; feasible weights in
-``feasible.py``; rewards in ``rewards.py``.
+``mandate/feasible.py``; rewards in ``rewards.py``.
 """
 
 import abc
@@ -288,7 +288,7 @@ class Market(ExogenousTask):
         return self.hold(self.feasible.draw(key))
 
     def draw_reachable(self, market: PyTree, key: PRNGKeyArray) -> Holding:
-        """With a menu of signals the anchor, tilted at random by all of them.
+        """With a menu of signals, the anchor tilted at random by all signals.
 
         It is as near to the anchor as what is held, and its returns have as little noise.
         """
@@ -302,7 +302,7 @@ class Market(ExogenousTask):
         return self.hold(self.feasible_at(market).project(weights, weights))
 
     def reference(self, market: PyTree, next_market: PyTree) -> Float[Array, ""] | None:
-        """That of holding the anchor, if there is one."""
+        """The reward of holding the anchor, if there is one."""
         anchor = self.anchor_weights(market)
         if anchor is None:
             return None

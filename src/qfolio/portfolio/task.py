@@ -253,8 +253,10 @@ class Portfolio(Market):
         return super().hold(weights)._replace(plan=self.terms.begin(weights, spent))
 
     def wanted(self, market: Row, holding: Holding, action: Array) -> Float[Array, " entry"]:
-        """As in any market; where debts are allowed, an action may also be the weights of the
-        assets, and cash is the rest."""
+        """The weights ordered, as in any market.
+
+        Where debts are allowed, an action may also be the assets' weights; cash is the rest.
+        """
         if action.shape == self.limits.shape:
             action = simplex.with_rest(action)
         return super().wanted(market, holding, action)

@@ -47,7 +47,7 @@ class Promise:
 
     @staticmethod
     def of(tested: ArrayLike, rng: np.random.Generator, resamples: int = RESAMPLES) -> "Promise":
-        """From the net returns of a backtest, shape (T,); the limit is by stationary bootstrap."""
+        """The promise of a backtest's net returns, shape (T,); its limit is bootstrapped."""
         returns = np.asarray(tested, dtype=float)
         low, high = np.quantile(returns, (TAIL, 1 - TAIL))
         cut = np.clip(returns, low, high)
@@ -76,8 +76,8 @@ def band(tested: ArrayLike, rows: int, rng: np.random.Generator) -> Floats:
     """Growth of wealth over the rows to come, if they are as the backtest's.
 
     Returns:
-        Of shape (3, rows): 2.5%, 50% and 97.5% of the histories that the stationary bootstrap
-        draws.
+        Numbers of shape (3, rows): the 2.5%, 50% and 97.5% quantiles of the histories that the
+        stationary bootstrap draws.
     """
     returns = np.asarray(tested, dtype=float)
     block = block_length(returns)

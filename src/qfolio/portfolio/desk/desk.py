@@ -138,8 +138,8 @@ class Desk:
 
         Args:
             date: As the ledger has it.
-            prices: To be compared with those of the ledger; later rows are left out.
-            holdings: Shares and cash, likewise.
+            prices: Prices to compare with those of the ledger; later rows are left out.
+            holdings: Shares and cash to compare with those of the ledger.
 
         Raises:
             QfolioError: An input or the result differs; the error says which.

@@ -21,7 +21,7 @@ from qfolio.portfolio.desk.reference import reference
 from qfolio.portfolio.prices.findings import day
 
 SEED = 0
-"""Of the bootstrap: the same ledger gives the same evidence whenever one looks."""
+"""Seed of the bootstrap: the same ledger gives the same evidence whenever one looks."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +51,17 @@ class Following:
 
     @cached_property
     def growth(self) -> np.ndarray:
-        """Wealth over that before the first trade."""
+        """Wealth, as a multiple of that before the first trade."""
         return np.asarray(np.cumprod(1 + self.live.returns))
 
     @property
     def alarm(self) -> np.datetime64 | None:
-        """The date from which on the backtest is refuted."""
+        """The date of the first alarm, from which on the backtest is refuted; None without one."""
         over = np.flatnonzero(self.evidence >= consistency.ALARM)
         return self.live.dates[over[0]] if over.size else None
 
     def sentences(self) -> list[str]:
-        """What is to be said of it."""
+        """What the ledger shows, in sentences."""
         live, count = self.live, len(self.records)
         agents = ", ".join(dict.fromkeys(record.agent for record in self.records))
         since = f"{amount(count, 'allocation')} of {agents} since {self.records[0].date}"
@@ -121,7 +121,7 @@ class Following:
         }
 
     def write(self, path: Path) -> None:
-        """A CSV file with a row for each live row."""
+        """Writes a CSV file with a row for each live row."""
         live = self.live
         header = [
             "date", "return", "wealth", "cash", "cost", "flow", "growth", "benchmark",

@@ -119,7 +119,7 @@ class Ledger:
             allocation: The allocation.
             prices: The table that it used.
             keep_prices: Whether to store the table; without it, reproducing needs it again.
-            facts: The other fields of the record, but number, date and what it supersedes.
+            facts: The other fields of the record, except number, date and what it supersedes.
 
         Returns:
             The record, and a sentence that says what was done.

@@ -40,8 +40,8 @@ def mark(
     split or a dividend, the value at the allocation is the same.
 
     Args:
-        records: One for each date, by date.
-        prices: With a row for each of these dates; the assets are those of the records.
+        records: One record for each date, in order of date.
+        prices: A table with a row for each of these dates and the assets of the records.
         model: Costs of trading and holding.
         lag: Rows from an allocation to its trades.
         fill: Rows over which these are filled, in equal parts.

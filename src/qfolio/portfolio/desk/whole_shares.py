@@ -27,7 +27,7 @@ def whole_shares(
     Args:
         ideal: Shares to buy, negative to sell, of shape (assets,).
         shares: Shares held now, likewise.
-        prices: Of the assets.
+        prices: Prices of the assets, same shape.
         cash: What the ideal trades leave.
         cash_after: The cash that trades leave, after costs; at the result it is not negative, or
             no larger a loan than that of the ideal trades.

@@ -251,7 +251,7 @@ class Mandated(Feasible):
         return Mandated(from_anywhere, self.names, self.holdings).project(drawn, drawn)
 
     def violations(self, weights: Any, held: Any = None) -> dict[str, Any]:
-        """As in the base; with the weights held, also of turnover and of the smallest trade."""
+        """As in ``Feasible``; given the weights held, also for turnover and the smallest trade."""
         xp = weights.__array_namespace__()
         low, high, rows, most, gross, turnover = (xp.asarray(x) for x in self.limits)
         assets = weights[..., 1:]

@@ -249,7 +249,10 @@ class Mandate(Section, frozen=True):
 
 
 def settled(given: Any, assets: Sequence[str]) -> str:
-    """The text of a mandate; given: what ``Mandate.of`` takes, such a text, or nothing."""
+    """The text of a mandate.
+
+    given: what ``Mandate.of`` takes, such a text, or nothing.
+    """
     if not given:
         return ""
     if isinstance(given, str) and given.startswith("["):
@@ -260,7 +263,7 @@ def settled(given: Any, assets: Sequence[str]) -> str:
 
 @lru_cache(64)
 def parse(text: str) -> tuple[list[str], Mandate]:
-    """The assets and the mandate of a text. Raises QfolioError if it is none."""
+    """The assets and the mandate of a text. Raises QfolioError if the text is none."""
     try:
         return msgspec.json.decode(text, type=tuple[list[str], Mandate])
     except msgspec.MsgspecError as error:

@@ -63,7 +63,7 @@ class Risk(NamedTuple):
     ) -> Float[Array, ""]:
         """The largest share of a change whose sum with the start has at most some volatility.
 
-        Where none has, the share of the least volatility.
+        If no sum has so little, it is the share with the least volatility.
         """
         square = jnp.maximum(self.between(change, change), TINY)
         cross, over = self.between(start, change), self.between(start, start) - most**2

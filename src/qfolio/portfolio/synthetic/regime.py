@@ -41,12 +41,12 @@ class Regime(OneAsset):
 
     @property
     def stays(self) -> tuple[float, float]:
-        """Of bad and good times."""
+        """Probabilities that bad and good times last another step."""
         return self.stay[0], self.stay[-1]
 
     @property
     def means(self) -> tuple[float, float]:
-        """Of bad and good times."""
+        """Mean returns of a step in bad and in good times."""
         return (
             (-self.mean[0], self.mean[0]) if len(self.mean) == 1 else (self.mean[0], self.mean[1])
         )
