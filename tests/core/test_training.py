@@ -179,5 +179,6 @@ def test_lockstep_members_learn_the_same(task, agent, monkeypatch):
 def test_small_loops_are_compiled_whole():
     loop = jax.jit(lambda x: jax.lax.fori_loop(0, 50, lambda i, x: jnp.sin(x) * 2, x))
     program = loop.lower(jnp.ones(1000)).compile().as_text()
+    assert program is not None
     assert "small_call" in program
     assert " while(" not in program.split("ENTRY")[1]
