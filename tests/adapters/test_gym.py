@@ -11,10 +11,12 @@ from gymnasium.utils.env_checker import check_env
 from qfolio.adapters import gym
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.prices.table import Prices
 
 ROWS, WINDOW, HORIZON = 60, 5, 12
 CASH = [1.0, -1, -1, -1]
+CAPPED = {"assets": {"cap": 0.5}, "cash": {"max": 0.2}}
 
 
 def table(seed=0, rows=ROWS, features=0):
@@ -138,6 +140,39 @@ def test_its_wealth_is_that_of_the_replay(lag, task):
         assert infos[-1]["date"] == str(prices.dates[start + HORIZON])[:10]
         assert infos[-1]["return_date"] == str(prices.dates[start + HORIZON + lag])[:10]
     assert env.unwrapped.last + HORIZON + lag == ROWS - 1
+
+
+def coming_and_going():
+    """b joins, c is delisted with a haircut, and a is no member for a time."""
+    prices = table()
+    values, listed = prices.values.copy(), np.ones((ROWS, 3), bool)
+    members = listed.copy()
+    values[:30, 1], listed[:30, 1] = np.nan, False
+    values[45:, 2], listed[45:, 2] = 0.6 * values[44, 2], False
+    members[35:42, 0] = False
+    return Prices(prices.dates, prices.assets, values, listed=listed, members=members)
+
+
+@pytest.mark.parametrize("task", [{}, {"menu": "tilts:0.3", "lag": 0}, {"mandate": CAPPED}])
+def test_assets_that_come_and_go_are_held_while_they_are_there(task):
+    prices = coming_and_going()
+    env, lag = environment(prices, **task), task.get("lag", 1)
+    check_env(env.unwrapped)
+    known, lost = Conditions.of(prices, ()), 0
+    for start in range(env.unwrapped.first, env.unwrapped.last, 2):
+        record = play(env, options={"start": start})
+        decisions = np.array([info["target"] for _, _, info in record[1:]])
+        replay = simulate(
+            prices.values, decisions, first=start, cost=0.01, lag=lag, conditions=known
+        )
+        np.testing.assert_allclose(record[-1][2]["wealth"], replay.wealth[-1], rtol=1e-12)
+        for row, (seen, *_) in enumerate(record, start):
+            np.testing.assert_array_equal(seen["tradable"], prices.tradable[row])
+            assert (seen["holding"][~prices.listed[row]] == 0).all()
+        rows = slice(start, start + HORIZON)
+        assert (decisions[:, 1:][~prices.tradable[rows]] == 0).all()
+        lost += replay.returns.min() < -0.06
+    assert lost
 
 
 def test_the_last_row_is_reached_but_not_passed():

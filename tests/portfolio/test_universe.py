@@ -23,10 +23,12 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.itemized import Itemized
+from qfolio.portfolio.mandate.feasible import exactly
+from qfolio.portfolio.mandate.mandate import feasible, settled
 from qfolio.portfolio.prices.gaps import cash_outs
 from qfolio.portfolio.prices.table import Prices, check, load
 from qfolio.portfolio.task import Portfolio
-from qfolio.portfolio.universe import spread
+from qfolio.portfolio.universe import Patterns, spread
 
 NAMES = tuple("ABCDEFGH")
 TINY = Preset(
@@ -354,6 +356,32 @@ def test_every_order_obeys_the_mandate_of_its_row(cases: range) -> None:
             assert weights[0] <= least["cash"] + 2e-6
             absent += int((~there).any())
     assert absent > 10 * len(cases)
+
+
+def test_limits_of_every_set_of_assets_can_be_met() -> None:
+    """Also where those that are there are fewer than floors need, and where only others go short.
+
+    With three holdings at a cap of 0.3, A and B alone cannot invest 0.8.
+    """
+    there = np.array([[(i >> j) & 1 for j in range(4)] for i in range(16)], bool)
+    few = {"assets": {"cap": {"A": 0.1, "B": 0.3, "C": 0.3, "D": 0.3}}, "cash": {"max": 0.2},
+           "trading": {"holdings": 3}}  # fmt: skip
+    short = {"assets": {"cap": 0.6, "floor": {"A": -0.2}}, "cash": {"min": 0.0, "max": 1.0},
+             "groups": {"kind": {"x": {"assets": ["C"], "floor": 0.3}}}}  # fmt: skip
+    for mandate in (few, short):
+        text = settled(mandate, NAMES[:4])
+        patterns, _ = Patterns.of(text, there, 1.0)
+        every = feasible(text, np.ones(4, bool))
+        for row, present in enumerate(there):
+            made = patterns.at(row, every)
+            weights = exactly(made, np.array([0, 0.25, 0.25, 0.25, 0.25]), np.eye(5)[0])
+            assert max(made.violations(weights).values()) < 1e-6, (mandate, present)
+            assert (weights[1:][~present] == 0).all()
+    patterns, said = Patterns.of(settled(few, NAMES[:4]), there, 1.0)
+    cash = 1 + patterns.most[patterns.of_row, 1]
+    assert cash[there.all(1)] == pytest.approx(0.2)
+    np.testing.assert_allclose(cash[there.sum(1) == 3], [0.3, 0.3, 0.3, 0.2], atol=1e-6)
+    assert said == ["cash at 14 of 16 rows"]
 
 
 @pytest.mark.slow

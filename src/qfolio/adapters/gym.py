@@ -78,12 +78,15 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         **task: Any,
     ) -> None:
         from qfolio.core.mdp import Discrete
+        from qfolio.portfolio.mandate.mandate import settled
         from qfolio.portfolio.task import Portfolio
 
         if render_mode not in (None, "ansi"):
             raise QfolioError(f"render_mode is {render_mode!r}; it must be 'ansi' or None.")
         self.render_mode = render_mode
         self.prices = load(prices)
+        if "mandate" in task:
+            task["mandate"] = settled(task["mandate"], self.prices.assets)
         chosen = settings.convert(Portfolio, task)
         self.task = Portfolio.of(self.prices, **chosen)
         self._conditions = Conditions.of(self.prices, self.task.costs.columns)

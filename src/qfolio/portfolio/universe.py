@@ -75,8 +75,11 @@ def _patterns(
     distinct, of_row = np.unique(every, axis=0, return_inverse=True)
     of_row, found = of_row.reshape(-1), []
     yields: dict[str, int] = {}
+    full = feasible(mandate, np.ones(shape[1], bool), most)  # all patterns have its rows
     for i, there in enumerate(distinct):
-        made, lowered = checks.relaxed(feasible(mandate, there, most))
+        low, high = (np.where(there, bound, 0.0) for bound in full.limits[:2])
+        limits = full.limits._replace(low=low, high=high)
+        made, lowered = checks.relaxed(dataclasses.replace(full, limits=limits))
         found.append((made.limits.low, made.limits.high, made.limits.most))
         for said in lowered:
             name = said.rpartition(" by ")[0]

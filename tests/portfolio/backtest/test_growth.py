@@ -11,6 +11,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.prices.growth import require_grown
 from qfolio.portfolio.prices.table import Prices
 
 ROWS, FIRST = 160, 130  # folds of 30 rows begin at 60, 90, 120 and 150; the third has 10 at first
@@ -85,6 +86,37 @@ def test_going_on_equals_one_run_and_keeps_what_was_there(first, tmp_path):
     assert now.weights(table()) == whole.policy().weights(table())
     assert on.config.prices["rows"] == ROWS
     assert on.config.prices["source"] == "made up"
+
+
+def first_delisting(late=0):
+    """B is delisted in the new rows; it may have started late."""
+    values, listed = table().values.copy(), np.ones((ROWS, 3), bool)
+    values[FIRST + 4 :, 1] = 0.7 * values[FIRST + 3, 1]
+    listed[FIRST + 4 :, 1] = False
+    values[:late, 1], listed[:late, 1] = np.nan, False
+    return changed(values=values, listed=listed)
+
+
+def test_the_first_delisting_may_be_new(first, tmp_path):
+    shutil.copytree(first.folder, tmp_path / "run")
+    before, longer = returns(first), first_delisting()
+    assert longer.between(0, FIRST).digest == table(FIRST).digest
+    Backtest.open(tmp_path / "run").extended(longer).run()
+    on = Backtest.open(tmp_path / "run")
+    np.testing.assert_array_equal(on.prices.listed, longer.listed)
+    after = returns(on)
+    for name, series in before.items():
+        np.testing.assert_allclose(after[name][:, : series.shape[1]], series, rtol=0, atol=1e-14)
+    orders = on.entries()[0]["pathwise"].decisions[0]
+    row = np.arange(on.folds[0].decisions.start, on.folds[-1].decisions.stop)
+    assert (orders[row >= FIRST + 4, 2] == 0).all()
+
+
+def test_a_first_delisting_is_refused_where_assets_started_late():
+    with pytest.raises(QfolioError, match="Assets come and go in one of the tables"):
+        require_grown(
+            changed(values=first_delisting(9).values).between(0, FIRST), first_delisting(9)
+        )
 
 
 def test_the_same_table_trains_nothing(first):

@@ -57,21 +57,27 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
 def relaxed(made: Mandated) -> tuple[Mandated, list[str]]:
     """The same set with lower floors where they cannot be met, and what was lowered, in words.
 
-    For folds in which some assets cannot be traded. What is taken off the floors (and added to the
-    maximum of cash) is the least in sum.
+    For folds and rows in which some assets cannot be traded. What is taken off the floors (and
+    added to the maximum of cash) is the least in sum.
     """
     limits, count = made.limits, made.limits.low.size
-    if _found(limits) is not None:
+    falls, short = limits.rows.min(1) < 0, np.zeros(len(limits.most))
+    if made.holdings:  # so few may not reach a floor
+        reached = np.sort(limits.rows * limits.high)[:, : made.holdings].sum(1)
+        short = np.where(falls, np.maximum(reached - limits.most, 0.0), 0.0)
+        limits = limits._replace(most=limits.most + short)
+    if _found(limits) is not None and not (short > TINY).any():
         return made, []
-    found = _found(limits, slack=limits.rows.min(1) < 0)
+    found = _found(limits, slack=falls)
     if found is None:
         raise QfolioError(
             "The mandate cannot be met with the assets that can be traded; relax its caps, or drop "
             "the assets that start late."
         )
-    extra = np.where(found[2 * count :] > TINY, found[2 * count :] + TINY, 0.0)
+    extra = short + found[2 * count :]
+    extra = np.where(extra > TINY, extra + TINY, 0.0)
     names = [name for name, more in zip(made.names, extra, strict=True) if more > 0]
-    eased = limits._replace(most=limits.most + extra)
+    eased = made.limits._replace(most=made.limits.most + extra)
     lowered = [f"{name.partition(' is ')[0]} by {_percent(more)}"
                for name, more in zip(names, extra[extra > 0], strict=True)]  # fmt: skip
     return dataclasses.replace(made, limits=eased), lowered

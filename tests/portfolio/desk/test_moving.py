@@ -1,0 +1,114 @@
+"""From a backtest on assets that come and go to orders, their ledger and what they earn."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.desk import Desk
+from qfolio.portfolio.desk.holdings import cashed_out
+from qfolio.portfolio.desk.live import mark
+from qfolio.portfolio.prices.table import Prices
+
+ASSETS = ("A", "B", "C", "D", "E")
+ROWS, FIRST, NOW, LEAVES = 170, 140, 150, 156
+AGENT = Preset(
+    "pathwise", {"rollout_length": 10, "num_envs": 2, "hidden": (4,)}, episodes=4,
+    task={"window": 5, "horizon": 10},
+)  # fmt: skip
+MANDATE = {
+    "assets": {"cap": 0.4},
+    "groups": {"kind": {"x": {"assets": ["B", "C"], "cap": 0.5, "floor": 0.2}}},
+    "cash": {"max": 0.3},
+}
+
+
+def table(rows: int) -> Prices:
+    """E joins, C is no member around row NOW, D is delisted before it, and B at LEAVES."""
+    rng = np.random.default_rng(1)
+    values = 50 * np.exp(np.cumsum(0.02 * rng.normal(size=(ROWS, 5)), 0))
+    listed, members = np.ones((ROWS, 5), bool), np.ones((ROWS, 5), bool)
+    values[:60, 4], listed[:60, 4] = np.nan, False
+    for asset, row, paid in ((3, NOW - 5, 0.5), (1, LEAVES, 0.8)):
+        values[row:, asset] = values[row - 1, asset] * paid
+        listed[row:, asset] = False
+    members[NOW - 3 : NOW + 3, 2] = False
+    dates = np.datetime64("2024-01-01", "s") + np.arange(ROWS) * np.timedelta64(1, "D")
+    return Prices(dates, ASSETS, values, listed=listed, members=members).between(0, rows)
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """Its backtest ends before anything is delisted; then there are more rows."""
+    folder = tmp_path_factory.mktemp("moving") / "run"
+    Backtest.create(
+        table(FIRST), {"pathwise": AGENT}, out=folder, train="100d", test="30d", seeds=1,
+        baselines=["inverse-volatility"], mandate=MANDATE,
+    ).run()  # fmt: skip
+    opened = Desk.open(folder)
+    opened.load = lambda path: table(int(str(path)))
+    return opened
+
+
+@pytest.mark.parametrize("name", ["pathwise", "equal-weight", "inverse-volatility"])
+def test_orders_hold_what_is_there_and_are_reproduced(desk, name):
+    followed = desk.followed(name)
+    prices = desk.table(followed, Path(str(NOW + 1)))
+    held = np.array([1.0, 2, 3, 4, 0])
+    shares, cash, said = cashed_out(held, 100.0, prices)
+    assert cash == pytest.approx(100 + 4 * prices.values[-1, 3])
+    assert len(said) == 1
+    assert said[0].startswith("D is delisted; 4 shares count as")
+    made = Allocation.of(followed, prices, shares, cash)
+    assert made.trades[2] == -3  # no member
+    assert made.trades[3] == 0
+    assert made.weights[2] >= 0.2 - 1e-5  # B has the group's floor alone
+    assert made.weights[1:].max() <= 0.4 + 1e-5
+    assert made.weights[0] <= 0.3 + 1e-5
+    record, _ = desk.record(name, made, prices, whole_shares=False)
+    date = record.date
+    for given in (
+        (None, None),
+        (Path(str(ROWS)), (held, 100.0)),
+    ):  # a longer table has more delistings
+        again, _ = desk.reproduce(date, *given)
+        assert again.number == record.number
+    weights = followed.weights(prices, {"D": 0.5, "cash": 0.5})
+    assert weights["D"] == weights["C"] == 0
+
+
+def test_a_table_without_its_members_is_refused(desk):
+    desk = Desk(desk.run, desk.folder, lambda path: _without_members(int(str(path))))
+    with pytest.raises(QfolioError, match="--members"):
+        desk.table(desk.followed("equal-weight"), Path(str(NOW)))
+
+
+def _without_members(rows: int) -> Prices:
+    prices = table(rows)
+    return Prices(prices.dates, prices.assets, prices.values, listed=prices.listed)
+
+
+def test_a_delisting_is_marked_as_the_replay_does(desk):
+    prices, followed, first = table(ROWS), desk.followed("equal-weight"), LEAVES - 1
+    made = Allocation.of(followed, prices.between(0, first + 1), np.zeros(5), 1000.0)
+    record, _ = desk.record("equal-weight", made, prices.between(0, first + 1), False)
+    assert made.weights[2] > 0.2
+    decisions = np.full((ROWS - 1 - first, 6), np.nan)
+    decisions[0] = made.weights
+    replay = simulate(
+        prices.values, decisions, first=first, cost=followed.costs, lag=0,
+        conditions=Conditions.of(prices, followed.costs.columns),
+    )  # fmt: skip
+    found = mark([record], prices, followed.costs, 0)
+    np.testing.assert_allclose(found.returns, replay.returns, atol=1e-12)
+    assert found.returns[0] < -0.02  # a haircut of a fifth
+    # With a lag of a row, the order comes too late, and its money stays in cash.
+    late = mark([record], prices, followed.costs, 1)
+    money = made.trades[1] * prices.values[first, 1]
+    assert late.cash[0] - made.cash_after == pytest.approx(money, abs=0.2 * money)
