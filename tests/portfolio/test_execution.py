@@ -192,7 +192,8 @@ def test_a_margin_call_is_a_decision_whatever_the_calendar_says():
 
 def test_terms_do_nothing_where_there_are_none():
     held, wanted = np.full(4, 0.25), np.eye(4)[1]
-    target, plan = AT_EVERY_ROW.trade(held, wanted, AT_EVERY_ROW.ordered(5, held, wanted), None)
+    given = AT_EVERY_ROW.due(5, held) & AT_EVERY_ROW.beyond(held, wanted)
+    target, plan = AT_EVERY_ROW.trade(held, wanted, given, None)
     assert target is wanted
     assert plan is AT_EVERY_ROW.begin(held) is AT_EVERY_ROW.unspent(None) is None
 

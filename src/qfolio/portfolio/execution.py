@@ -43,10 +43,9 @@ class Terms(NamedTuple):
             decides |= abs(held[1:]).sum() > self.called
         return decides
 
-    def ordered(self, row: Any, held: Any, wanted: Any) -> Any:
-        """Whether what is wanted is ordered; a bool, or an array ()."""
-        decides = self.due(row, held)
-        return decides & (abs(wanted - held).max() > self.band) if self.band else decides
+    def beyond(self, held: Any, wanted: Any) -> Any:
+        """Whether what is held is so far from what is wanted that this is ordered."""
+        return abs(wanted - held).max() > self.band if self.band else True
 
     def begin(self, held: Any, spent: Any = 0.0) -> Plan | None:
         """The plan of an account without orders; None if it needs none."""

@@ -277,7 +277,8 @@ class Portfolio(Market):
     ) -> tuple[Float[Array, " entry"], Plan | None]:
         """As held where no decision is due; over several rows, if orders are filled so."""
         terms, held = self.terms, holding.weights
-        return terms.trade(held, wanted, terms.ordered(market, held, wanted), holding.plan)
+        given = terms.due(market, held) & terms.beyond(held, wanted)
+        return terms.trade(held, wanted, given, holding.plan)
 
     def planned(self, market: Row, plan: Plan | None) -> Plan | None:
         if plan is None:

@@ -129,7 +129,7 @@ def orders(
                     if left is not None and isinstance(mandated, Mandated):
                         mandated = mandated.spending(left)
                     order = obeying(name, wanted, held, history, mandated)
-                    given = beyond(terms.band, order, held)
+                    given = terms.beyond(held, order)
                 target, plan = terms.trade(held, order, given, plan)
                 if given or (target != held).any():
                     last, row_last = target, row
@@ -175,11 +175,6 @@ def drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
     bought = weights[1:] != 0  # others may have no price yet
     worth[1:][bought] *= now[bought] / then[bought]
     return np.asarray(worth / worth.sum())
-
-
-def beyond(band: float, target: Floats, held: Floats) -> bool:
-    """Whether a target is ordered; band: as ``calendars.band``."""
-    return not band or bool(abs(target - held).max() > band)
 
 
 def obeying(

@@ -9,7 +9,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.folds import latest
-from qfolio.portfolio.backtest.orders import beyond, obeying
+from qfolio.portfolio.backtest.orders import obeying
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight
@@ -90,5 +90,5 @@ class Rule:
         target = held
         if wanted is not None:
             target = obeying(self.name, wanted, held, history, mandated)
-            target = target if beyond(terms.band, target, held) else held
+            target = target if terms.beyond(held, target) else held
         return dict(zip(("cash", *self.assets), target.tolist(), strict=True))
