@@ -17,7 +17,7 @@ from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio.anchors import path
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.folds import Fold
-from qfolio.portfolio.backtest.orders import orders
+from qfolio.portfolio.backtest.orders import AT_EVERY_ROW, orders
 from qfolio.portfolio.backtest.replay import Replay
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
@@ -25,6 +25,7 @@ from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.feasible import exactly
 from qfolio.portfolio.mandate.mandate import feasible, settled
+from qfolio.portfolio.market import Holding
 from qfolio.portfolio.prices.gaps import cash_outs
 from qfolio.portfolio.prices.table import Prices, check, load
 from qfolio.portfolio.task import Portfolio
@@ -193,8 +194,9 @@ def test_training_earns_what_the_replay_earns(lag: int) -> None:
     assert result.returns.min() < -0.05  # a haircut
 
 
+@pytest.mark.parametrize("mandate", [None, {"cash": {"max": 0.2}, "trading": {"turnover": 0.5}}])
 @pytest.mark.parametrize("seed", range(3))
-def test_what_comes_and_goes_later_changes_nothing_before(seed: int) -> None:
+def test_what_comes_and_goes_later_changes_nothing_before(seed: int, mandate: Any) -> None:
     prices, _ = moving(seed, 60, 6, haircut=0.4)
     now = 30 + 5 * seed
     gone = np.array(prices.listed)
@@ -205,7 +207,8 @@ def test_what_comes_and_goes_later_changes_nothing_before(seed: int) -> None:
     values[now + 1 :] *= np.linspace(0.5, 2, 6)
     other = replace(prices, values=values, listed=gone, members=members)
     one, two = (
-        Portfolio.of(p, window=5, horizon=5, **SIGNALS).part(0, now) for p in (prices, other)
+        Portfolio.of(p, window=5, horizon=5, mandate=mandate, **SIGNALS).part(0, now)
+        for p in (prices, other)
     )
     wanted = jnp.asarray(np.random.default_rng(seed).dirichlet(np.ones(7)), jnp.float32)
     view = jax.jit(
@@ -403,6 +406,43 @@ def test_a_mandate_in_motion_is_said_and_checked_over_a_whole_backtest(tmp_path:
                 there = prices.tradable[row]  # type: ignore[index]
                 assert (order[1:][~there] == 0).all(), name
                 assert order[0] <= required(np.append(there, False))["cash"] + 1e-5, name
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_order_over_several_rows_buys_nothing_that_has_left(seed: int) -> None:
+    prices, _ = moving(seed, 60, 5)
+    assert prices.tradable is not None
+    limits = {"trading": {"fill": 6}}
+    task = Portfolio.of(prices, window=5, horizon=5, calendar="8", mandate=limits)
+    wanted = np.random.default_rng(seed).dirichlet(np.ones(6), 60)
+
+    def step(held: Holding, given: tuple) -> tuple[Holding, tuple]:
+        row, action = given
+        target, plan = task.trade(row, held, task.wanted(row, held, action))
+        after = Holding(task.drifted(row, target), held.reward, task.planned(row, plan))
+        return after, (held.weights, target)
+
+    start = task.hold(jnp.eye(6)[0])
+    rows = jnp.arange(5, 59)
+    given = rows, jnp.asarray(wanted[5:59], jnp.float32)
+    held, after = (np.asarray(x) for x in jax.jit(lambda: jax.lax.scan(step, start, given)[1])())
+    gone = ~prices.tradable[5:59]
+    assert (after[:, 1:] <= held[:, 1:] + 1e-6)[gone].all()
+    assert (after[:, 1:] > held[:, 1:] + 1e-3).sum() > 50
+    folds = [Fold("one", slice(0, 20), slice(20, 58), slice(0, 20))]
+    terms = AT_EVERY_ROW._replace(decides=np.arange(60) % 8 == 0, fill=6)
+    found = orders(
+        "equal-weight", baseline("equal-weight"), folds, prices.dates, prices.values,
+        universe=prices.tradable, listed=prices.listed, terms=terms,
+    )  # fmt: skip
+    relatives = np.nan_to_num(prices.values[1:] / prices.values[:-1], nan=1.0)
+    holding = np.eye(6)[0]
+    for row, order in zip(range(20, 58), found.decisions, strict=True):
+        if not np.isnan(order).any():
+            assert (order[1:] <= holding[1:] + 1e-9)[~prices.tradable[row]].all()
+            holding = order
+        holding = holding * np.append(1, relatives[row])
+        holding /= holding.sum()
 
 
 @pytest.mark.parametrize("menu", ["grid:4", "tilts:0.2", "overweight:0.2"])

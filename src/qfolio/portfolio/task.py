@@ -283,7 +283,10 @@ class Portfolio(Market):
     def planned(self, market: Row, plan: Plan | None) -> Plan | None:
         if plan is None:
             return None
-        return self.terms.next_row(market, plan, self.drifted(market, plan.order))
+        order = self.drifted(market, plan.order)
+        if self.tradable is not None:  # what may not be bought any more is not
+            order = cashed(order, self.tradable[market + 1])
+        return self.terms.next_row(market, plan, order)
 
     def of_mean(
         self, market: Row, holding: Holding, wanted: Float[Array, " entry"]

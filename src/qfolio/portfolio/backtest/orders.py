@@ -136,7 +136,7 @@ def orders(
                     part[row - rows[0]] = target
                 if plan is not None and row + 1 < len(prices):
                     coming = drifted(plan.order, prices[row], prices[row + 1])
-                    coming = coming if listed is None else cashed(coming, listed[row + 1])
+                    coming = coming if universe is None else cashed(coming, universe[row + 1])
                     plan = terms.next_row(row, plan, coming)
         if stands and not (again or watched or each or np.isnan(part[0]).any()):
             part[:] = np.where(trading[:, None], part[0], np.nan)
