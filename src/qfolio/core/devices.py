@@ -30,14 +30,14 @@ LOCKSTEP = {"gpu", "tpu"}
 
 
 SMALL_LOOP = 10_000_000
-"""Bytes that a loop may touch for XLA to compile it into one function of the CPU. It starts every
-operation of a larger one by itself, which takes as long as the operation where arrays are small."""
+"""Most bytes that a loop may touch for XLA to compile it into one CPU function. It launches each
+operation of a larger loop separately; if arrays are small, that takes as long as the operation."""
 
 
 def configure() -> None:
     """Makes each CPU core a device, compiles small loops whole and keeps programs on disk.
 
-    Takes effect if called before jax first computes; settings made by the user are kept.
+    Has an effect only before jax first computes; settings that the user has made are kept.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     known = hasattr(os, "sched_getaffinity")
@@ -56,6 +56,7 @@ def configure() -> None:
 
 
 def describe() -> str:
+    """The number, kind and platform of the devices."""
     device = jax.devices()[0]
     return f"{len(jax.devices())} × {device.device_kind} ({device.platform})"
 
@@ -63,7 +64,7 @@ def describe() -> str:
 def circumstances(*programs: str) -> dict[str, Any]:
     """Device, versions and start time of a run, for its record on disk.
 
-    programs: libraries, or "python", whose versions are included.
+    programs: names of libraries, or "python", whose versions are included.
     """
     versions = {name: python_version() if name == "python" else version(name) for name in programs}
     return {
@@ -81,7 +82,7 @@ def host_memory() -> int | None:
 
 
 def require_memory(tree: Any, count: int) -> None:
-    """Raises QfolioError if ``count`` members shaped like ``tree`` exceed the memory."""
+    """Raises QfolioError if ``count`` members shaped like ``tree`` exceed the devices' memory."""
     needed = count * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
     stats = jax.devices()[0].memory_stats()
     there = stats["bytes_limit"] * len(jax.devices()) if stats else host_memory()
@@ -95,9 +96,9 @@ def require_memory(tree: Any, count: int) -> None:
 class Members:
     """``count`` members spread over the devices, each in a slot of its device.
 
-    room: members that there are slots for, if more than ``count``.
+    room: number of members to provide slots for, if more than ``count``.
     one_by_one: whether a device runs its members in turn instead of in lockstep.
-    form: all that programs depend on.
+    form: everything that compiled programs depend on.
 
     Outside, leaves have a leading axis of length ``count``; on the devices, an axis of slots.
     ``place`` and ``fetch`` convert between the two.
@@ -121,12 +122,12 @@ class Members:
         self._taken = jax.device_put(taken, self._sharding)
 
     def place(self, tree: Any) -> Any:
-        """Moves each member to a device."""
+        """Moves leaves with a leading member axis to the devices."""
         slots = jax.tree.map(lambda x: np.asarray(x)[self._filling], tree)
         return jax.device_put(slots, self._sharding)
 
     def fetch(self, tree: Any) -> Any:
-        """The members as numpy arrays."""
+        """Leaves on the devices, as numpy arrays with a leading member axis."""
         return jax.tree.map(lambda x: np.asarray(x)[self._slots], tree)
 
     def compile(
@@ -135,7 +136,7 @@ class Members:
         """Compiles ``function(*members, *shared)`` for all members.
 
         example: arguments of the shapes to compile for; the first ``split`` of them have an axis of
-        slots, the others are the same for all members. donate: reuse the first one's memory.
+        slots, the others are the same for all members. donate: reuses the first one's memory.
         """
 
         def on_device(taken: Array, *args: Any) -> Any:

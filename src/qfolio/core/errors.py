@@ -12,7 +12,7 @@ class QfolioError(Exception):
 
 
 def one_line(error: BaseException) -> str:
-    """An exception of a user's code on one line: its type, message and location."""
+    """An exception from a user's code, on one line: its type, message and location."""
     message = " ".join(str(error).split()).rstrip(".")
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith("<")]

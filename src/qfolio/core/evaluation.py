@@ -11,10 +11,10 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 from qfolio.core.mdp import Agent, Policy, Task
 
 STARTS = 1024
-"""Start states of a final evaluation; those of the learning curve are the first of them."""
+"""Number of start states of a final evaluation; the learning curve uses the first of them."""
 
 CURVE_STARTS = 64
-"""Start states of the evaluations along the learning curve."""
+"""Number of start states of each evaluation along the learning curve."""
 
 
 def start_keys(n: int = STARTS) -> Key[Array, " start"]:
@@ -23,14 +23,14 @@ def start_keys(n: int = STARTS) -> Key[Array, " start"]:
 
 
 class Greedy(NamedTuple):
-    """Greedy episodes from some starts."""
+    """Results of greedy episodes from several start states."""
 
     returns: Float[Array, " start"]  # undiscounted, over the task's horizon
-    overestimation: Float[Array, ""]  # NaN without action values, or if the tail is unknown
+    overestimation: Float[Array, ""]  # NaN without action values or complete tails
 
 
 def tail_steps(discount: float | None) -> int:
-    """Steps after which a reward counts for less than 1% (at most 2,000)."""
+    """Steps after which a reward is discounted to 1%: at most 2,000, and 0 without a discount."""
     if discount is None:
         return 0
     return min(2000, math.ceil(math.log(0.01) / math.log(min(max(discount, 1e-9), 1 - 1e-9))))
@@ -42,9 +42,9 @@ def evaluate(
     """Follows the greedy policy from each key's start state over the horizon and ``tail`` steps.
 
     The return covers the horizon. The overestimation is the mean, over the states visited within
-    it, of max_a Q(s, a) minus the realized discounted return (van Hasselt et al. 2016, section 3);
-    the tail keeps that return from being cut off. Starts from which the task itself ends within
-    the tail, such as the last rows of a price table, are left out of it.
+    the horizon, of max_a Q(s, a) minus the realized discounted return (van Hasselt et al. 2016,
+    section 3); the tail keeps that return from being cut off. The overestimation leaves out starts
+    from which the task's data end within the tail, such as the last rows of a price table.
     """
     starts = jax.vmap(task.reset)(keys)
     known = jax.vmap(task.steps_left)(starts) >= task.horizon + tail
@@ -78,7 +78,7 @@ def evaluate(
 
 
 def greedy(task: Task, agent: Agent, weights: PyTree) -> Policy:
-    """An agent's greedy policy: from a state to the intended action."""
+    """An agent's greedy policy, as a function from a state to the intended action."""
 
     def policy(state: PyTree) -> Array:
         view = jax.tree.map(lambda x: x[None], task.observe(state))
@@ -96,7 +96,7 @@ class Episode(NamedTuple):
 
 
 def play(task: Task, agent: Agent, weights: PyTree, key: PRNGKeyArray) -> Episode:
-    """One greedy episode of the task's horizon from the start state of ``key``."""
+    """One greedy episode from the start state of ``key``, over the whole horizon of the task."""
 
     def step(state: PyTree, time: Array) -> tuple[PyTree, tuple]:
         action = agent.policy(weights, task.observe(state)[None])[0]

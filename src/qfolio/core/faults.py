@@ -12,7 +12,7 @@ from qfolio.core.training import episode_steps
 def find(task: Task, agent: Agent, seed: int) -> str | None:
     """A sentence on the first observation or reward that is not finite; None if all are.
 
-    One episode of each environment under the untrained agent is looked at.
+    Checks one episode of each environment under the untrained agent.
     """
     observed, paid = jax.jit(lambda key: _finite(task, agent, key))(jax.random.key(seed))
     for time, (seen, reward) in enumerate(zip(observed.tolist(), paid.tolist(), strict=True)):
@@ -33,7 +33,7 @@ def find(task: Task, agent: Agent, seed: int) -> str | None:
 def _finite(
     task: Task, agent: Agent, key: PRNGKeyArray
 ) -> tuple[Bool[Array, " time"], Bool[Array, " time"]]:
-    """Whether all observations and all rewards are finite, by steps of an episode."""
+    """Whether all observations and all rewards are finite, for each step of an episode."""
     agent_key, reset_key, key = jax.random.split(key, 3)
     state, count = agent.init(task, agent_key), agent.num_envs
 

@@ -10,12 +10,12 @@ from qfolio.core.errors import QfolioError
 
 
 def static(default: Any) -> Any:
-    """A setting that is fixed when the program is compiled: members may not differ in it."""
+    """A setting that is fixed when the program is compiled: members of a population share it."""
     return eqx.field(static=True, default=default)
 
 
 def number(default: float) -> Any:
-    """A setting that is an input of the program: members may differ in it."""
+    """A number that is an input of the program: members of a population may differ in it."""
     return eqx.field(converter=float, default=default)
 
 
@@ -25,12 +25,12 @@ def constant(default: float) -> Any:
 
 
 def sizes(*default: int) -> Any:
-    """Sizes of layers, fixed when the program is compiled."""
+    """Layer sizes, fixed when the program is compiled."""
     return eqx.field(static=True, converter=tuple, default=default)
 
 
 def numbers(*default: float) -> Any:
-    """Several numbers, fixed when the program is compiled; one alone becomes a tuple of one."""
+    """Several numbers, fixed when the program is compiled; a single number becomes a tuple."""
     return eqx.field(static=True, converter=_floats, default=default)
 
 
@@ -39,7 +39,10 @@ def _floats(values: float | Iterable[float]) -> tuple[float, ...]:
 
 
 def require(instance: Any, names: str, holds: Callable[[Any], bool], wanted: str) -> None:
-    """Raises QfolioError for the first of the settings that does not hold."""
+    """Raises QfolioError for the first setting for which ``holds`` is false.
+
+    names: of the settings, separated by spaces. wanted: what the value must be, for the message.
+    """
     for name in names.split():
         value = getattr(instance, name)
         if isinstance(value, str | int | float | tuple) and not holds(value):  # not while traced
@@ -47,9 +50,9 @@ def require(instance: Any, names: str, holds: Callable[[Any], bool], wanted: str
 
 
 def require_static(instance: Any) -> None:
-    """Raises QfolioError if a whole number is declared as an input of the program.
+    """Raises QfolioError if an integer setting is not declared as ``static``.
 
-    Whole numbers are counts, and counts shape the program.
+    Integers are counts, and counts shape the compiled program.
     """
     for field in dataclasses.fields(instance):
         if field.type in (int, "int") and not field.metadata.get("static"):
@@ -60,5 +63,6 @@ def require_static(instance: Any) -> None:
 
 
 def require_sizes(instance: Any, name: str = "hidden") -> None:
+    """Raises QfolioError unless a setting holds one or more layer sizes of at least 1."""
     holds = lambda x: len(x) > 0 and min(x) >= 1 and max(x) < 2**31  # noqa: E731
     require(instance, name, holds, "one or more layer sizes")

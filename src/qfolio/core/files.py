@@ -28,7 +28,10 @@ UNFINISHED = ".part"
 
 
 def cache_directory() -> Path:
-    """Where compiled programs and solved optima are kept; safe to delete at any time."""
+    """The folder of compiled programs and solved optima; safe to delete at any time.
+
+    ``QFOLIO_CACHE`` names it (default: the user's cache folder).
+    """
     if path := os.environ.get("QFOLIO_CACHE"):
         return Path(path)
     return platformdirs.user_cache_path("qfolio", appauthor=False)
@@ -61,7 +64,10 @@ def require_new(folder: Path) -> None:
 
 @contextlib.contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that is renamed to ``folder`` at the end: it is complete or absent."""
+    """A temporary folder that is renamed to ``folder`` at the end: it is complete or absent.
+
+    Raises QfolioError if ``folder`` is not empty.
+    """
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -114,10 +120,12 @@ def _holder(path: Path) -> str:
 
 
 def write_json(path: Path, content: Any) -> None:
+    """Writes JSON; raises ValueError for NaN and infinity."""
     write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
 def write_csv(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Writes a header and rows as CSV that is safe to open in a spreadsheet (``csv_cell``)."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerows([csv_cell(cell) for cell in row] for row in (header, *rows))
@@ -185,7 +193,10 @@ def write_tree(path: Path, tree: Any) -> None:
 
 
 def read_tree(path: Path, template: Any) -> Any:
-    """``template`` with its arrays from a file; QfolioError if names, shapes or types differ."""
+    """``template`` with its arrays read from a file.
+
+    Raises QfolioError if the file cannot be read, or names, shapes or types differ.
+    """
     import jax
 
     arrays, wanted = read_arrays(path), _named(template)

@@ -2,7 +2,7 @@
 
 The agents are the same. One compiled program takes the finished rollout, learns from it and returns
 the next actions; Python steps the environments of Gymnasium in between. Members take turns: while
-their programs run on all cores, the environments of another member are stepped.
+the programs of some compute, Python steps the environments of another.
 """
 
 import abc
@@ -68,7 +68,7 @@ class HostTask(Task):
 
     @abc.abstractmethod
     def make(self, **options: Any) -> Any:
-        """A new environment, without a time limit."""
+        """A new environment without a time limit; ``options`` are arguments of its constructor."""
 
 
 class Outcome(NamedTuple):
@@ -83,9 +83,10 @@ class Outcome(NamedTuple):
 class Environments:
     """Environments of one task, stepped one after another.
 
-    limit: steps after which an episode is truncated. observation: the current observations. Raises
-    a QfolioError that names environment and step if an environment fails or violates its
-    observation space.
+    limit: steps after which an episode is truncated. observation: the current observations.
+
+    All methods raise a QfolioError, which names the task and the step, if an environment fails or
+    returns an observation of the wrong shape or a number that is not finite.
     """
 
     def __init__(self, task: HostTask, limit: int, count: int) -> None:
@@ -108,7 +109,7 @@ class Environments:
             raise self._failure(index, "its observation is not finite")
 
     def step(self, actions: np.ndarray, which: Iterable[int] | None = None) -> Outcome:
-        """Steps all environments, or those in ``which``; resets none."""
+        """Steps all environments, or only those in ``which``; resets none."""
         count = len(self._steppers)
         reward = np.zeros(count, np.float32)
         terminated, truncated = np.zeros(count, bool), np.zeros(count, bool)
@@ -206,7 +207,8 @@ class HostPopulation(Population):
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
         """Greedy returns (member, start) from environments seeded by the keys.
 
-        The overestimation is NaN: rewards after a time limit are not observed.
+        The overestimation is NaN, because rewards after a time limit are not observed; ``tail`` has
+        no effect.
         """
         if not self._judges:
             limit = self.task.horizon

@@ -8,22 +8,19 @@ from jaxtyping import Array, Float
 from qfolio.core.mdp import Discrete
 
 SEARCHED = "searched"
-"""Name of what a market finds by a search that has no derivative, such as the limits that bind.
+"""Name of results that a market finds by a search without a derivative, such as which limits bind.
 
-``jax.checkpoint`` can keep it, so that the backward pass need not search again.
+``jax.checkpoint`` can keep them, so that the backward pass need not search again.
 """
 
 
 class View(NamedTuple):
-    """An observation of a market: the features of each asset and the weights held.
-
-    choices: the weights that each action of a menu of signals orders.
-    """
+    """An observation of a market: the features of each asset and the weights held."""
 
     features: Float[Array, "*batch asset time channel"]
     holding: Float[Array, "*batch asset"]  # weights, without cash
     anchor: Float[Array, "*batch asset"] | None = None  # weights to depart from, if any
-    choices: Float[Array, "*batch action asset"] | None = None
+    choices: Float[Array, "*batch action asset"] | None = None  # weights that each action orders
 
 
 class MenuActions(Discrete):

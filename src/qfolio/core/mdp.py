@@ -38,7 +38,7 @@ class Simplex(eqx.Module):
 
     @property
     def caps(self) -> np.ndarray:
-        """The largest weight of each entry."""
+        """The largest weight of each entry, cash first."""
         return np.append(1.0, np.full(self.assets, self.cap))
 
 
@@ -98,7 +98,11 @@ Policy = Callable[[PyTree], Array]
 
 
 class Task(eqx.Module):
-    """A Markov decision process with a time limit; no method resets the task by itself."""
+    """A Markov decision process with a time limit; no method resets the task by itself.
+
+    A task has a ``horizon``, the steps after which an episode is truncated, and ``actions``, which
+    are Discrete, Simplex or Box.
+    """
 
     if TYPE_CHECKING:  # each task has them; for type checkers, Task takes no arguments
 
@@ -129,12 +133,12 @@ class Task(eqx.Module):
 
     @property
     def states(self) -> int | None:
-        """The number of observations if they are integers from 0; else None."""
+        """The number of observations if they are integers from 0; else None (default)."""
         return None
 
     @property
     def observation_scale(self) -> tuple[float, ...] | float:
-        """Half the range of each component of an observation, which lies in ± this number."""
+        """The largest absolute value of each component of an observation (default: 1)."""
         return 1.0
 
     @abc.abstractmethod
@@ -142,11 +146,11 @@ class Task(eqx.Module):
         """The consequence of one action."""
 
     def optimum(self) -> Optimum | None:
-        """The exact solution, where one is known."""
+        """The exact solution if one is known; else None (default)."""
         return None
 
     def steps_left(self, state: PyTree) -> Int[Array, ""]:
-        """How many steps can follow a state, regardless of the time limit."""
+        """How many steps can follow a state, regardless of the time limit (default: any number)."""
         return jnp.array(jnp.iinfo(jnp.int32).max)
 
     def intent(self, state: PyTree, action: Array) -> Array:
@@ -154,13 +158,13 @@ class Task(eqx.Module):
         return action
 
     def measure(self, step: "Transition") -> "Metrics":
-        """Named scalars of one step, of which records of training hold the means over episodes."""
+        """Named scalars of one step, whose means over each episode are recorded (default: none)."""
         return {}
 
     def rule(self, policy: Policy) -> Mapping[str, float | None]:
-        """The few numbers that describe a policy, in tasks that define some.
+        """A few numbers that describe a policy (default: none).
 
-        None if a policy has no such number, such as an edge that it never trades to.
+        A number is None if the policy does not have it, such as an edge that it never trades to.
         """
         return {}
 
@@ -175,8 +179,8 @@ class Position(NamedTuple):
 class ExogenousTask(Task):
     """A task whose randomness does not depend on actions, such as prices for a price taker.
 
-    One observed move of the market then gives the outcome of every action from every holding, by
-    ``settle`` (hindsight learning for exogenous inputs, Sinclair et al. 2023). Agents may use it on
+    From one observed move of the market, ``settle`` computes the outcome of every action from every
+    holding (hindsight learning for exogenous inputs, Sinclair et al. 2023). Agents may call it for
     moves that they have seen; only the training loop calls ``reset_market`` and ``next_market``.
     """
 
@@ -211,13 +215,14 @@ class ExogenousTask(Task):
         return self.draw_holding(key)
 
     def reference(self, market: PyTree, next_market: PyTree) -> Float[Array, ""] | None:
-        """The reward to compare a move's others with, if the task has one."""
+        """The reward of a move to compare others with, such as the anchor's; None by default."""
         return None
 
     def mirror(self, market: PyTree) -> PyTree | None:
-        """The state on the mirror image of a path, if each path is as likely as its mirror image.
+        """The corresponding state on the mirror image of a path; None by default.
 
-        Applied to every state of a path of the market.
+        For markets in which each path is as likely as its mirror image. Applied to all states of a
+        path, it gives the image.
         """
         return None
 
@@ -299,10 +304,10 @@ class Agent(eqx.Module):
     def learn(
         self, task: Task, state: Any, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[Any, Metrics]:
-        """Stores experience and learns from it; only exogenous tasks may be queried."""
+        """Stores experience and learns from it; may query ``task`` only if it is exogenous."""
 
     def monitor(self, state: Any) -> Metrics:
-        """Named scalars that describe the state at any time, also before learning."""
+        """Named scalars that describe the state, also before any learning (default: none)."""
         return {}
 
     @abc.abstractmethod
@@ -310,9 +315,10 @@ class Agent(eqx.Module):
         """The part of the state that the learned policy needs."""
 
     def carry_over(self, state: Any, fresh: Any) -> Any:
-        """The state to continue learning on other data: learned weights, but no stored experience.
+        """The state with which learning continues on other data (default: ``state``).
 
-        fresh: a state before any experience, with the same settings.
+        It keeps the learned weights and drops stored experience. fresh: a state before any
+        experience, with the same settings.
         """
         return state
 
@@ -321,5 +327,5 @@ class Agent(eqx.Module):
         """Actions for a batch of observations, without exploration."""
 
     def action_values(self, weights: PyTree, observation: PyTree) -> Array | None:
-        """Q(s, ·) for a batch of observations, where the agent estimates it."""
+        """Q(s, ·) for a batch of observations; None if the agent does not estimate it (default)."""
         return None

@@ -1,4 +1,4 @@
-"""Members trained side by side: one seed of one agent on one task each, in one compiled program."""
+"""Members trained side by side in one compiled program, each one seed of one agent on one task."""
 
 from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache, partial
@@ -18,17 +18,20 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import Episodes, TrainingState, advance, begin, chunk_steps, episode_steps
 
 LARGE = 1000
-"""Numbers of an array that members share. Smaller ones are each member's own even if they are all
-the same, so that the program is that of other members, too."""
+"""Least size of an array that members share. Each member has its own copy of smaller arrays even if
+they are equal, so that the program also serves members whose arrays differ."""
 
 
 class Population:
     """Members trained side by side, and the programs that do it.
 
     tasks, agents: one for all members, or one for each, differing in numbers and arrays only.
-    room: members of the largest population that shares these programs, if there are larger ones.
+    seeds: one for each member.
+    room: size of the largest population that shares these programs (default: this one's).
     state: the members' TrainingState, with a leading member axis.
     starts, curve_starts: how many starts a final evaluation and the learning curve use.
+
+    Raises QfolioError if the agents' settings need different programs, or memory is too small.
     """
 
     starts, curve_starts = STARTS, CURVE_STARTS
@@ -56,7 +59,7 @@ class Population:
         self._begin(own, form)
 
     def _require_memory(self) -> None:
-        """Raises QfolioError if there is too little for a new form; others had enough before."""
+        """Raises QfolioError if memory is too small for a form that has not been run before."""
         if not self._programs:
             seed = jnp.array(0, jnp.uint32)
             first = jax.eval_shape(lambda: begin(self.task, self.agent, seed))
@@ -96,9 +99,10 @@ class Population:
         return self._fetch(lambda state: state.healthy).tolist()
 
     def steps_left(self, episodes: int | None = None, *, steps: int | None = None) -> int:
-        """Steps of each environment until each member has used its budget; 0 if it has.
+        """Steps of each environment until every member has used its budget; 0 if all have.
 
-        episodes: per member, if none ends early. steps: per member, over all its environments.
+        episodes: budget per member; the result assumes that no episode ends early. steps: budget
+        per member, over all its environments.
         """
         if steps is not None:
             return max(0, -(-steps // self.agent.num_envs) - self.steps)
@@ -112,8 +116,9 @@ class Population:
     def advance(self, steps: int, *, strict: bool = True) -> Episodes:
         """Advances at most one chunk; returns records as numpy arrays (member, time, environment).
 
-        Raises QfolioError, and leaves ``state`` undefined, if a loss is not finite; unless
-        ``strict``, the others continue, and ``healthy`` shows which failed.
+        steps: of each environment, rounded up to whole rollouts. strict: raises QfolioError if a
+        loss is not finite; ``state`` is of no use then. Without it, the other members continue, and
+        ``healthy`` shows which failed.
         """
         steps, learning = self._plan(steps, chunk_steps(self.task, self.agent))
 
@@ -153,13 +158,14 @@ class Population:
             )
 
     def _task_fault(self) -> str | None:
-        """Why the task and not the learning may be at fault."""
+        """What is wrong with the task, if the fault is not in the learning."""
         return faults.find(self.task, self.agent, self.seeds[0])
 
     def evaluate(self, keys: Key[Array, " start"], tail: int | None = None) -> Greedy:
         """Greedy returns (member, start) and overestimation (member,) of the current policies.
 
-        tail: steps beyond the horizon for the overestimation (default: ``tail_steps``).
+        tail: steps beyond the horizon for the overestimation (default: ``tail_steps`` of the
+        largest discount).
         """
         tail = self._tail if tail is None else tail
 
@@ -238,9 +244,9 @@ def _split(
 ) -> tuple[list[np.ndarray], list[Any], Callable[[Any, Any], PyTree], Hashable]:
     """Splits the members' numbers and arrays into own and shared ones.
 
-    Numbers are own, so that one program serves all members; an array is shared if it is large and
-    the same object in all. Returns the own ones with a leading member axis, the shared ones, a
-    function that rebuilds one member, and a key of everything that a program for them depends on.
+    Each member has its own numbers, so that one program serves all members; an array is shared if
+    it is large and the same object in all. Returns the own leaves with a leading member axis, the
+    shared ones, a function that rebuilds one member, and a key of all that a program depends on.
     """
     columns = list(zip(*(jax.tree.leaves(member) for member in members), strict=True))
     structure = jax.tree.structure(members[0])

@@ -10,11 +10,11 @@ ITERATIONS = 8
 CLOSE = 1e-5
 """Mean product of weights and multipliers at which the method stops."""
 EXCHANGES = 3
-"""Corrections of which weights lie between their bounds."""
+"""How often the guess of which weights lie between their bounds is corrected."""
 FROM_NEAR = 5
-"""The same, if that is guessed from the solution of another problem."""
+"""The same, if the first guess comes from the solution of a similar problem."""
 SLOPE = 1e-6
-"""Slopes up to this do not free a weight at its bound."""
+"""A slope up to this does not free a weight at its bound."""
 
 
 def best(
@@ -24,15 +24,15 @@ def best(
     cap: Float[Array, ""] | float = 1.0,
     near: Float[Array, "*batch asset"] | None = None,
 ) -> Float[Array, "*batch asset"]:
-    """The weights w that maximize gain·w − w'Σw/2 with Σw = 1, 0 ≤ w ≤ cap, and 0 if not open.
+    """The weights w that maximize gain·w − w'Σw/2 with 1'w = 1, 0 ≤ w ≤ cap, and 0 if not open.
 
     An interior-point method, as in ``solvers.minimum_variance``, finds which weights lie strictly
     between their bounds. Given that, they follow from one linear system, which is what is
     differentiated. A covariance should be in units of its mean variance, and positive definite.
-    Caps below 1.01 equal weights are raised to that.
+    A cap below 1.01 times the equal weight is raised to it.
 
-    near: weights that solve a similar problem, from which to start without an interior point. That
-    takes half the time, and rarely misses the solution.
+    near: weights that solve a similar problem, from which to start instead of from the interior.
+    This takes half the time and rarely misses the solution.
     """
     both = open_to[..., :, None] & open_to[..., None, :]
     sigma = jnp.where(both, covariance, 0.0) + (~open_to)[..., None] * jnp.eye(covariance.shape[-1])
@@ -87,7 +87,7 @@ def _between(
     open_to: Bool[Array, "*batch asset"],
     roof: Float[Array, "*batch 1"],
 ) -> tuple[Bool[Array, "*batch asset"], Bool[Array, "*batch asset"]]:
-    """Which weights of the solution lie between their bounds, and which at the upper one.
+    """Which weights of the solution lie between their bounds, and which lie at the upper bound.
 
     Wright (1997, Primal-dual interior-point methods, chapter 5), from equal weights, with
     multipliers z of w ≥ 0 and v of w ≤ roof.

@@ -120,7 +120,7 @@ class Entries(NamedTuple):
     base: str  # what each class inherits from
 
     def where(self, kind: Kind) -> dict[str, str]:
-        """Where each name is defined, those of installed packages included."""
+        """Where each name is defined, including those of installed packages."""
         installed = entry_points(group=f"qfolio.{kind}s")
         return {point.name: f"{point.module}:{point.attr}" for point in installed} | self.table
 
@@ -142,7 +142,7 @@ _GYMNASIUM = "qfolio.tasks.gymnasium:GymnasiumTask"
 
 
 def is_known(kind: Kind, name: str) -> bool:
-    """Whether qfolio or an installed package has something under this name."""
+    """Whether qfolio or an installed package defines this name."""
     return _where(kind, name) is not None
 
 
@@ -181,7 +181,10 @@ def imported(kind: Kind, name: str) -> type[Any]:
 
 
 def build(kind: Kind, name: str, chosen: Mapping[str, Any]) -> Any:
-    """The object that a folder names, with its settings; refuses what ``imported`` refuses."""
+    """The object that a folder names, with its settings.
+
+    Raises QfolioError as ``imported`` does, and if the settings do not suffice to make the object.
+    """
     found = imported(kind, name)
     if _where(kind, name) == _GYMNASIUM:
         _require_imported(kind, name, str(chosen.get("id", "")).rpartition(":")[0])
@@ -195,7 +198,7 @@ def build(kind: Kind, name: str, chosen: Mapping[str, Any]) -> Any:
 
 
 def name_of(instance: object) -> str:
-    """The name that ``find`` and ``build`` know an object's class by."""
+    """The name by which ``find`` and ``build`` know an object's class."""
     path = f"{type(instance).__module__}:{type(instance).__qualname__}"
     if path == _GYMNASIUM:
         return GYM + instance.id  # type: ignore[attr-defined]
@@ -209,7 +212,7 @@ def short(name: str) -> str:
 
 
 def own_modules(*instances: object) -> list[str]:
-    """The modules that must be trusted for ``build`` to make these again."""
+    """The modules that must be trusted before ``build`` can make these objects again."""
     names = [name_of(instance).removeprefix(GYM) for instance in instances]
     modules = [name.rpartition(":")[0] for name in names]
     return sorted({name for name in modules if name and not name.startswith("qfolio.")})
@@ -222,7 +225,7 @@ def trust(modules: Iterable[str]) -> None:
 
 
 def trusted() -> list[str]:
-    """The modules of a user's own that this process has imported by name."""
+    """The user's own modules that this process has imported by name."""
     return sorted(name for name in _trusted if not name.startswith("qfolio."))
 
 
@@ -230,7 +233,10 @@ _trusted: set[str] = set()
 
 
 def import_own(module: str) -> ModuleType:
-    """Imports a module that a user has named, also from the current directory."""
+    """Imports a module that a user has named, also from the current directory.
+
+    Raises QfolioError if there is no such module, or importing it fails.
+    """
     if not _exists(module):
         raise QfolioError(
             f"{module} cannot be imported: it is neither installed nor in this folder."

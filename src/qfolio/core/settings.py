@@ -51,7 +51,10 @@ def convert(kind: type, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def parse(assignments: Iterable[str]) -> dict[str, str]:
-    """``["name=value", …]`` as a dictionary."""
+    """``["name=value", …]`` as a dictionary; hyphens in names become underscores.
+
+    Raises QfolioError for anything else.
+    """
     pairs = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
@@ -64,7 +67,10 @@ def parse(assignments: Iterable[str]) -> dict[str, str]:
 
 
 def divide(chosen: Mapping[str, T], *kinds: type) -> list[dict[str, T]]:
-    """Settings by the class that has them, the first of several; raises QfolioError if none has."""
+    """Splits settings by class; each goes to the first of ``kinds`` that has it.
+
+    Raises QfolioError if none has.
+    """
     parts: list[dict[str, T]] = [{} for _ in kinds]
     for name, value in chosen.items():
         owner = next((i for i, kind in enumerate(kinds) if name in names(kind)), None)
@@ -77,7 +83,10 @@ def divide(chosen: Mapping[str, T], *kinds: type) -> list[dict[str, T]]:
 
 
 def called(text: str) -> tuple[str, dict[str, str]]:
-    """The name and the settings of a part that is written as ``name(setting=value, …)``."""
+    """The name and the settings of a part that is written as ``name(setting=value, …)``.
+
+    Raises QfolioError if it is written differently.
+    """
     name, bracket, rest = text.strip().partition("(")
     if not bracket:
         return name, {}

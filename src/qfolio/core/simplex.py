@@ -16,9 +16,8 @@ def project(
     They are clip(scores − τ, 0, cap) for the one τ that makes the sum 1 (Duchi et al. 2008; with a
     cap: Wang & Lu 2015). Scores on the simplex are returned as they are; small ones become exactly
     zero. The sum falls piecewise linearly in τ, and its kinks are at the scores and at the scores
-    less their caps; between the two kinks around τ it is known which entries lie strictly between
-    their bounds, and the value and its gradient follow from these. The caps must add up to 1 or
-    more.
+    less their caps; the two kinks around τ tell which entries lie strictly between their bounds,
+    and these determine the value and its gradient. The caps must add up to 1 or more.
     """
     scores = jnp.asarray(scores)
     cap = jnp.broadcast_to(jnp.asarray(cap, scores.dtype), scores.shape)
@@ -39,7 +38,7 @@ def project(
 
 
 def with_rest(assets: Float[Array, "*batch asset"]) -> Float[Array, "*batch entry"]:
-    """Weights of assets, with cash before them, which is the rest of 1."""
+    """Weights with cash first, which is 1 minus the sum of the assets' weights."""
     return jnp.concatenate([1 - assets.sum(-1, keepdims=True), assets], -1)
 
 

@@ -22,7 +22,7 @@ factor is 12.7 for two seeds and 4.3 for three, and a bootstrap of so few is far
 
 
 def regret(returns: ArrayLike, optimum: float) -> Floats:
-    """The share of the optimum's return that is missed; not finite if the optimum is zero."""
+    """The share of the optimum's return that each return misses; not finite if the optimum is 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((optimum - np.asarray(returns, dtype=float)) / np.abs(optimum))
 
@@ -112,7 +112,7 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> tuple[float, float]
 
     Args:
         values: Numbers of shape (n,), one per seed.
-        level: Coverage where the values are normal, between 0 and 1.
+        level: Coverage if the values are normal, between 0 and 1.
     """
     from scipy.special import stdtrit
 
@@ -132,13 +132,13 @@ def stratified_interval(
 ) -> tuple[float, float]:
     """Return a percentile bootstrap interval of a statistic of groups, each resampled separately.
 
-    It is too narrow with few values: of three normal ones, a 95% interval of the interquartile
-    mean holds the truth in about 75% of all cases, of five in 90% and of ten in 93%.
+    With few values it is too narrow: a 95% interval of the interquartile mean of three normal
+    values covers the truth in about 75% of all cases, of five in 90%, and of ten in 93%.
 
     Args:
-        strata: Groups of numbers, of shape (n,) each and n of its own: the seeds of an agent.
-        statistic: Called with the groups drawn again, each of shape (resamples, n), which are
-            averaged over the last axis.
+        strata: Groups of numbers, each of shape (n,) with its own n, such as the seeds of an agent.
+        statistic: Called with the resampled groups, each of shape (resamples, n), as separate
+            arguments; averages over the last axis (default: for a single group).
         level: Share of the resampled statistics inside the interval, between 0 and 1.
         resamples: How many times the groups are drawn again.
         seed: Seed of the drawing.
@@ -212,6 +212,9 @@ def holm(p_values: ArrayLike) -> Floats:
     """Return p-values adjusted for multiple tests; they control the family-wise error rate.
 
     Source: S. Holm, "A Simple Sequentially Rejective Multiple Test Procedure" (1979).
+
+    Args:
+        p_values: Numbers of shape (n,).
     """
     p = np.asarray(p_values, dtype=float)
     order = np.argsort(p, kind="stable")

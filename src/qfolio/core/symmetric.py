@@ -1,8 +1,8 @@
 """Eigenvectors of symmetric matrices, and their linear systems.
 
 On a CPU a batch is taken one matrix at a time, unless its systems are small. The library behind jax
-splits a batch over threads that all devices share, and waits in one of them for the others: several
-devices at once can wait for ever. One at a time is no slower.
+splits a batch over threads that all devices share, and one of them waits for the others, so that
+several devices at once can deadlock. One matrix at a time is no slower.
 """
 
 from collections.abc import Callable
@@ -16,11 +16,11 @@ from jaxtyping import Array, Float
 from qfolio.core.devices import LOCKSTEP
 
 SMALL = 12
-"""Largest systems that a batch solves side by side. For 8 equations this takes a fifth of the time,
-for 16 as long."""
+"""Largest systems that a batch solves side by side. Compared with one at a time, this takes a fifth
+of the time for 8 equations, and the same time for 16."""
 
 APART = 1e-4
-"""Eigenvalues that are closer count as equal in derivatives."""
+"""Eigenvalues that are closer than this count as equal in derivatives."""
 
 
 def solve(
@@ -38,7 +38,7 @@ def solve(
 def eliminate(
     positive: Float[Array, "n n *batch"], sides: Float[Array, "n m *batch"]
 ) -> Float[Array, "n m *batch"]:
-    """As ``solve``, by elimination, which needs no pivoting for positive definite matrices."""
+    """``solve`` by elimination, which needs no pivoting for positive definite matrices."""
     size = len(positive)
     rows = jnp.expand_dims(jnp.arange(size), range(1, positive.ndim))
 
@@ -54,11 +54,10 @@ def eliminate(
 
 @jax.custom_jvp
 def spectrum(symmetric: Float[Array, "*batch n n"]) -> tuple[Array, Array]:
-    """Eigenvalues and eigenvectors, with a derivative where eigenvalues are equal.
+    """Eigenvalues and eigenvectors, with a finite derivative even where eigenvalues are equal.
 
-    Vectors of equal eigenvalues are not defined one by one, and jax gives no number for their
-    derivatives. What is made from vectors and a smooth function of values has one nevertheless; the
-    terms left out here are zero for it.
+    The eigenvectors of equal eigenvalues are defined only up to a rotation, and jax returns NaN for
+    their derivatives. Here the terms that rotate them into each other are left out.
     """
     found: tuple[Array, Array] = _each(_decomposed, "(n,n)->(n),(n,n)")(symmetric)
     return found
@@ -84,6 +83,6 @@ def _decomposed(symmetric: Array) -> tuple[Array, Array]:
 
 
 def _each(function: Callable, signature: str) -> Callable:
-    """The function over leading axes, also those that a later vmap adds."""
+    """The function mapped over leading axes, including those that a later vmap adds."""
     lockstep = jax.default_backend() in LOCKSTEP
     return jnp.vectorize(function if lockstep else sequential_vmap(function), signature=signature)

@@ -11,7 +11,7 @@ UNSAFE = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
 reverse text), unassigned, private, surrogates, line and paragraph separators."""
 
 MENTIONED = 20
-"""Names that a message lists at most."""
+"""Most names that a message lists."""
 
 _FORMULA = re.compile(r"(^|[;\t\r\n])([^\S\t\r\n]*[=+\-@＝＋－＠])")
 
@@ -35,14 +35,14 @@ def amount(count: int, noun: str) -> str:
 
 
 def plural(noun: str, count: int) -> str:
-    """The noun, with an s unless there is one of it."""
+    """The noun, with an s unless ``count`` is 1."""
     return noun if count == 1 else f"{noun}s"
 
 
 def figure(value: float | None, form: str) -> str:
     """A number in one of Python's formats, such as ``+.1%``, as the terminal shows it.
 
-    Negative numbers have a true minus sign, which zero never has. A dash stands for NaN and None.
+    Negative numbers have a true minus sign; zero has none. A dash stands for NaN and None.
     """
     if value is None or value != value:
         return "–"
@@ -56,7 +56,7 @@ def listed(names: Sequence[str], word: str = "and") -> str:
 
 
 def closest(name: str, known: Iterable[str]) -> str | None:
-    """The known name that a wrong one resembles, whatever its case; None if none does."""
+    """The known name that is closest to a wrong one, ignoring case; None if none is close."""
     names = {other.casefold(): other for other in known if other}
     given = name.casefold()
 
@@ -68,7 +68,7 @@ def closest(name: str, known: Iterable[str]) -> str | None:
 
 
 def hint(name: str, known: Iterable[str]) -> str:
-    """A question in brackets with the closest known name; empty if none is close."""
+    """A question in parentheses with the closest known name; empty if none is close."""
     close = closest(name, known)
     return f" (did you mean {quote(close)}?)" if close else ""
 

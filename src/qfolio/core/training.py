@@ -33,7 +33,7 @@ class Tally(NamedTuple):
 
 
 class TrainingState(eqx.Module):
-    """One member's complete training state: training continues from a saved one bit for bit."""
+    """One member's complete training state, from which training resumes exactly, bit for bit."""
 
     agent: PyTree
     task: PyTree  # (environment, ...)
@@ -49,7 +49,7 @@ class Episodes(NamedTuple):
 
     finished: Bool[Array, "time environment"]
     returns: Float[Array, "time environment"]
-    metrics: dict[str, Float[Array, "time environment"]]  # as monitored, or means over the episode
+    metrics: dict[str, Float[Array, "time environment"]]  # current ones, or means over the episode
 
 
 def begin(task: Task, agent: Agent, seed: UInt32[Array, ""]) -> TrainingState:
