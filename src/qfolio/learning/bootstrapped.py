@@ -1,9 +1,9 @@
-"""Bootstrapped heads: several networks of action values, each of its own sample of the data.
+"""Bootstrapped heads: several networks of action values, each learned from its own sample.
 
-Their spread is the error of the values (Osband et al. 2016, "Deep exploration via bootstrapped
-DQN"). The heads share no layers, and the data is sampled in blocks of consecutive moves, because
-signals change slowly. Each head counts a block twice or not at all (double or nothing, Owen &
-Eckles 2012), the same ones at all times.
+Their spread estimates the error of the values (Osband et al. 2016, "Deep exploration via
+bootstrapped DQN"). The heads share no layers, and the data are sampled in blocks of consecutive
+moves, because signals change slowly. Each head counts a block twice or not at all (double or
+nothing, Owen & Eckles 2012), and this choice never changes.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from qfolio.learning.networks import Network
 from qfolio.learning.targets import Scalar
 
 BLOCKS = 32
-"""Blocks of the data, of equal length."""
+"""Number of blocks of equal length that the data are cut into."""
 
 
 class Heads(eqx.Module):
@@ -35,7 +35,7 @@ class Heads(eqx.Module):
 def samples(task: ExogenousTask, market: PyTree, heads: int) -> Float[Array, "head batch"]:
     """How often each head counts each move of a batch: twice or never.
 
-    Where moves are drawn anew, there is nothing to sample, and each counts once.
+    If moves are drawn anew, there is nothing to sample, and each move counts once.
     """
     block = jax.vmap(lambda one: block_of(task, one, BLOCKS))(market)
     counts = 2.0 * jax.random.bernoulli(jax.random.key(0), shape=(heads, BLOCKS))
@@ -47,7 +47,7 @@ def cautious(
 ) -> Float[Array, "batch action"]:
     """Advantages over the first action, less ``caution`` times their standard error.
 
-    The first action needs no evidence: to go part of the way to the anchor, or to order nothing.
+    The first action goes part of the way to the anchor, or orders nothing, and needs no evidence.
     """
     advantage = values - values[..., :1]
     return advantage.mean(0) - caution * advantage.std(0, ddof=1)

@@ -1,10 +1,10 @@
-"""A covariance of the next returns that is learned end to end.
+"""A forecast of the covariance of the next returns that is learned end to end.
 
 Its parts are those of Bongiorno, Manolakis & Mantegna (2025, "End-to-end large portfolio
 optimization for variance minimization with neural networks through covariance cleaning"): weights
 of past days, a cleaning of the eigenvalues of the correlations by a network that does not depend on
-the number of assets, and volatilities. Here weights of days fall exponentially, and the network
-sees one eigenvalue at a time.
+the number of assets, and volatilities. Here the weights of days decay exponentially with their age,
+and the network sees one eigenvalue at a time.
 """
 
 import math
@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from qfolio.core.symmetric import spectrum
 
 LEAST = 1e-3
-"""Eigenvalues of correlations are at least this."""
+"""Smaller eigenvalues of correlations are raised to this."""
 
 TINY = 1e-9
 """Added to variances, in units of the squared scale of returns."""
@@ -29,7 +29,7 @@ class Covariance(eqx.Module):
     C has the eigenvectors of the weighted sample correlations. Their eigenvalues λ become
     ((1 − a)λ + a) exp(g(log λ, log λ₊)), with a learned share a of the identity and a layer g of
     tanh units; then the diagonal is made 1 again. λ₊ = (1 + √q)² is the largest eigenvalue of noise
-    (Marčenko & Pastur 1967) for q assets to a day, where days count by their weights.
+    (Marčenko & Pastur 1967), where q is the number of assets over the effective number of days.
     """
 
     volatility: Float[Array, ""]  # log of a half-life in rows
@@ -40,7 +40,7 @@ class Covariance(eqx.Module):
     output: Float[Array, " unit"]
 
     def __init__(self, units: int, key: PRNGKeyArray) -> None:
-        """Half-lives of 60 and 250 rows, and a tenth of the identity; g is 0."""
+        """Starts with half-lives of 60 and 250 rows, a = 10% and g = 0."""
         self.volatility, self.correlation = jnp.log(60.0), jnp.log(250.0)
         self.shrinkage = jnp.array(math.log(0.1 / 0.9))
         first, second = jax.random.split(key)
@@ -60,9 +60,10 @@ class Covariance(eqx.Module):
     def __call__(
         self, returns: Float[Array, "*batch asset time"], open_to: Bool[Array, "*batch asset"]
     ) -> Float[Array, "*batch asset asset"]:
-        """Σ in units of the mean variance of the assets that are open; the others have none.
+        """Σ in units of the mean variance of the open assets; the others have almost no variance.
 
-        returns: scaled alike for all assets, the last one at the end.
+        returns: in the same unit for all assets, the latest last. open_to: the assets that can be
+        traded.
         """
         returns = jnp.where(open_to[..., None], returns, 0.0)
         weights = _decay(self.correlation, returns.shape[-1])
@@ -91,15 +92,15 @@ class Covariance(eqx.Module):
 class Means(eqx.Module):
     """Expected returns of assets in units of their volatility, from their own past.
 
-    The mean returns of each asset over some half-lives, less their mean over the assets, times
-    learned coefficients: momentum where they are positive, reversal where they are negative.
+    They are the sum of each asset's mean returns over several half-lives, less their mean over the
+    assets, times learned coefficients: momentum where these are positive, reversal where negative.
     """
 
     half_lives: Float[Array, " speed"]  # logs, in rows
     coefficients: Float[Array, " speed"]
 
     def __init__(self) -> None:
-        """Half-lives of 1, 5, 21 and 126 rows; nothing is expected."""
+        """Starts with half-lives of 1, 5, 21 and 126 rows and coefficients of 0."""
         self.half_lives = jnp.log(jnp.array([1.0, 5.0, 21.0, 126.0]))
         self.coefficients = jnp.zeros(4)
 
@@ -125,13 +126,13 @@ class Means(eqx.Module):
 
 
 def _decay(half_life: Float[Array, ""], rows: int) -> Float[Array, " time"]:
-    """Weights of rows, of sum 1; they halve from a row to the one that much earlier."""
+    """Weights of rows, which sum to 1 and halve with each half-life of age (given as its log)."""
     age = jnp.arange(rows)[::-1]
     return jax.nn.softmax(-math.log(2) * age * jnp.exp(-half_life))
 
 
 def _correlations(moments: Float[Array, "*batch asset asset"]) -> Array:
-    """Of second moments; assets without any have correlations of 0."""
+    """Correlations from second moments; those of assets whose moments are 0 are 0."""
     eye = jnp.eye(moments.shape[-1])
     moments = moments + TINY * eye
     scale = jnp.sqrt(jnp.diagonal(moments, axis1=-2, axis2=-1))

@@ -105,7 +105,7 @@ KINDS = ("expected", "categorical", "quantile")
 
 
 class ValueConfig(NamedTuple):
-    """An agent's settings of its action values; the names are those of the settings."""
+    """An agent's settings for its action values, by the names that they have there."""
 
     values: str  # one of KINDS
     atoms: int  # numbers for each action, if values are a distribution
@@ -140,7 +140,7 @@ def project(
     probabilities: Float[Array, "batch outcome"],
     support: Float[Array, " atom"],
 ) -> Float[Array, "batch atom"]:
-    """Probabilities of outcomes, projected onto an increasing support (Bellemare 2017, eq. 7).
+    """Outcomes' probabilities, projected onto an increasing support (Bellemare et al. 2017, eq. 7).
 
     Each outcome's probability is split linearly between its two neighbors, which preserves the
     mean; outcomes beyond the support go to its ends.

@@ -1,6 +1,6 @@
 """Parts of networks: layers, and encoders that read a window or an image.
 
-An encoder takes batches of observations of one shape (…, channel) to rows of ``width`` numbers.
+An encoder maps batches of observations of one shape (…, channel) to rows of ``width`` numbers.
 """
 
 import math
@@ -19,18 +19,18 @@ Gain = Float[Array, "*inputs"] | float
 """Factors of an encoder's first weights, one for each channel or for all."""
 
 ACTIVATIONS = {"relu": jax.nn.relu, "tanh": jnp.tanh, "silu": jax.nn.silu}
-"""Activations by name: jax's functions cannot be pickled."""
+"""Activations by name; networks keep the name, because jax's functions cannot be pickled."""
 
 INITIALIZATIONS = ("uniform", "orthogonal")
-"""How layers start, by name."""
+"""Names of the ways to initialize layers."""
 
 
 class MLP(eqx.Module):
     """Fully connected layers with an activation between them and none after the last.
 
-    Weights and biases start uniform in ±1/√inputs (LeCun et al. 1998, section 4.6, up to √3), or
-    ``orthogonal``: weights times √2 (the last layer's times 1), and biases of 0 (Saxe et al. 2014).
-    The first layer's weights are multiplied by ``input_gain``, one factor for each input.
+    Weights and biases start uniform in ±1/√inputs (LeCun et al. 1998, section 4.6, but for a factor
+    of √3), or ``orthogonal``: weights times √2 (the last layer's times 1), and biases of 0 (Saxe et
+    al. 2014). ``input_gain`` multiplies the first layer's weights: one factor for each input.
     """
 
     weights: list[Float[Array, "inputs outputs"]]
@@ -71,9 +71,11 @@ class CNN(eqx.Module):
     """A convolution along time or over an image, then one layer over all its outputs.
 
     Filters cover three rows of a window (time, channel), or 3 × 3 pixels of an image (height,
-    width, channel); there are ``width`` / 8 (16 for 128, as in MinAtar, Young & Tian 2019). On a
-    CPU, small convolutions are faster as one matrix product over copied neighborhoods than XLA's
-    own (docs/concepts/networks.md).
+    width, channel). There are ``width`` / 8 filters (16 for 128, as in MinAtar, Young & Tian 2019),
+    and at least 2. On a CPU, small convolutions are faster as one matrix product over copied
+    neighborhoods than XLA's own (docs/concepts/networks.md).
+
+    Raises QfolioError if the window or the image is smaller than a filter.
     """
 
     first: MLP
@@ -112,7 +114,7 @@ class CNN(eqx.Module):
 
 
 class RNN(eqx.Module):
-    """A gated recurrent unit along time (Cho et al. 2014); its last state."""
+    """A gated recurrent unit along time (Cho et al. 2014); the output is its last state."""
 
     inputs: MLP
     state: Float[Array, "width gates"]
@@ -137,9 +139,9 @@ class RNN(eqx.Module):
 
 
 class LSTM(eqx.Module):
-    """Long short-term memory along time (Hochreiter & Schmidhuber 1997); its last output.
+    """Long short-term memory along time (Hochreiter & Schmidhuber 1997); gives its last output.
 
-    With a forget gate (Gers et al. 2000) that starts open, with a bias of one.
+    It has a forget gate (Gers et al. 2000) that starts open, by an addition of 1 to its bias.
     """
 
     inputs: MLP
@@ -177,7 +179,7 @@ def _last(
 
 
 class Window(MLP):
-    """An MLP of one layer over a window's numbers."""
+    """A single layer over all numbers of a window."""
 
     def __init__(self, shape: tuple[int, ...], width: int, key: PRNGKeyArray) -> None:
         super().__init__((math.prod(shape), width), key)

@@ -1,4 +1,4 @@
-"""How far what is learned earns more than what it departs from, beyond luck."""
+"""Evidence that a learned policy earns more than the one it departs from, beyond luck."""
 
 from typing import NamedTuple
 
@@ -12,11 +12,11 @@ from qfolio.learning.trading import ratio
 
 
 class Evidence(NamedTuple):
-    """Active rewards, a policy's less those of what it departs from, by block of the data."""
+    """Active rewards (a policy's less those of the one it departs from), by block of the data."""
 
-    steps: Float[Array, " block"]  # earlier ones count less
-    total: Float[Array, " block"]
-    square: Float[Array, " block"]
+    steps: Float[Array, " block"]  # number of steps; earlier ones count less
+    total: Float[Array, " block"]  # sum of active rewards
+    square: Float[Array, " block"]  # sum of their squares
 
     @staticmethod
     def none(blocks: int) -> "Evidence":
@@ -31,7 +31,9 @@ class Evidence(NamedTuple):
     ) -> "Evidence":
         """The evidence with a rollout's steps added.
 
-        A step counts for the members that have not learned from it; older steps fade."""
+        unseen: whether a member has not learned from a step; the step counts only then. memory:
+        factor on the evidence so far, so that older steps fade.
+        """
         counted, earned = 1.0 * unseen.any(0), (unseen * active).sum(0)
         new = (counted, earned, earned**2)
         where = block.ravel()
@@ -41,7 +43,10 @@ class Evidence(NamedTuple):
 
     @property
     def t(self) -> Float[Array, ""]:
-        """The t-statistic over blocks of mean over deviation: each weighs the same, calm or not."""
+        """The t-statistic, over blocks, of each block's mean over its deviation.
+
+        So calm and volatile blocks weigh the same.
+        """
         known = self.steps > 1
         mean = ratio(self.total, self.steps)
         deviation = jnp.sqrt(jnp.maximum(ratio(self.square, self.steps) - mean**2, 0.0))
@@ -51,29 +56,29 @@ class Evidence(NamedTuple):
         return ratio(center * jnp.sqrt(1.0 * blocks), jnp.sqrt(spread))
 
     def share(self, threshold: Array | float) -> Float[Array, ""]:
-        """What it leaves of a departure: 1 − (threshold/t)², and 0 for t up to the threshold.
+        """The share of a departure that it leaves: 1 − (threshold/t)², or 0 for t ≤ threshold.
 
-        The positive-part estimator of James & Stein (1961) for one number.
+        The positive-part estimator of James & Stein (1961), for a single number.
         """
         t = jnp.maximum(self.t, 1e-9)
         return jnp.maximum(1 - (threshold / t) ** 2, 0.0)
 
 
 def block_of(task: ExogenousTask, market: PyTree, blocks: int) -> Int[Array, ""]:
-    """The block of the data that a move is in; the first one where moves are drawn anew."""
+    """The block of the data that a move is in; the first one if moves are drawn anew."""
     share = jnp.clip(task.place(market) / task.moves, 0.0, 1.0)
     return jnp.minimum((blocks * share).astype(jnp.int32), blocks - 1)
 
 
 def blocks_of(task: ExogenousTask, rollout: Transition, blocks: int) -> Int[Array, "time path"]:
-    """The block of each step; where moves are drawn anew, each path is of one block."""
+    """The block of each step; if moves are drawn anew, each path belongs to one block."""
     found = jax.vmap(jax.vmap(lambda one: block_of(task, one, blocks)))(rollout.state.market)
     own = jnp.arange(found.shape[1]) % blocks
     return jnp.where(jnp.isfinite(task.moves), found, own)
 
 
 def require_members(members: int, blocks: int) -> None:
-    """Raises QfolioError unless each member can leave out some block, and learn from another."""
+    """Raises QfolioError unless each member can leave out a block and learn from another."""
     if not 2 <= members <= blocks:
         raise QfolioError(
             f"members is {members}; each leaves blocks out, so it must be from 2 to the number of "
@@ -82,5 +87,5 @@ def require_members(members: int, blocks: int) -> None:
 
 
 def left_out(block: Int[Array, "time path"], members: int) -> Bool[Array, "member time path"]:
-    """The steps that each member does not learn from: every so-many-th block."""
+    """The steps that each member does not learn from: those of every ``members``-th block."""
     return block % members == jnp.arange(members)[:, None, None]

@@ -1,4 +1,4 @@
-"""Exploration: ε-greedy, by correlated noise, or by uniformly drawn actions."""
+"""Exploration: ε-greedy actions, correlated noise and uniformly drawn actions."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ class LinearSchedule(NamedTuple):
 
     epsilon_start: Scalar
     epsilon_end: Scalar
-    epsilon_steps: Scalar  # steps of the decay
+    epsilon_steps: Scalar  # length of the decay
 
     def __call__(self, steps: Float[Array, ""]) -> Float[Array, ""]:
         """ε after this many steps."""
@@ -43,7 +43,7 @@ def epsilon_greedy(
     last: Int[Array, " batch"] | None = None,
     persistence: float = 0.0,
 ) -> Int[Array, " batch"]:
-    """The best action, or with probability ε a random one.
+    """The best action or, with probability ε, a random one.
 
     If ``last`` is given, its actions are repeated with probability ε · persistence before anything
     is chosen, so that exploration persists for several steps (after Dabney et al. 2021,
@@ -81,7 +81,7 @@ class OrnsteinUhlenbeck(eqx.Module):
 
 
 def uniform(actions: Actions, key: PRNGKeyArray, n: int) -> Array:
-    """``n`` actions drawn uniformly; from [−1, 1] if they have no bounds."""
+    """``n`` actions drawn uniformly: weights without a cap, coordinates without bounds in ±1."""
     if isinstance(actions, Discrete):
         return jax.random.randint(key, (n,), 0, actions.n, jnp.int32)
     if isinstance(actions, Simplex):

@@ -34,7 +34,7 @@ class NoisyMLP(MLP):
         self.bias_scales = list(map(fill, mlp.biases, starts))
 
     def draw(self, key: PRNGKeyArray) -> "NoisyMLP":
-        """The same layers with noise on their weights."""
+        """The same layers with noise on their weights and biases."""
         weights, biases = [], []
         for i, (weight, scale) in enumerate(zip(self.weights, self.weight_scales, strict=True)):
             inputs, outputs = weight.shape
@@ -85,7 +85,7 @@ class HeadConfig(NamedTuple):
 
     atoms: int  # numbers for each action
     dueling: bool  # a stream for the state's value and one for advantages
-    noise: Scalar | None  # initial scale of the noise on their weights; None: no noise
+    noise: Scalar | None  # initial scale of the noise on these layers; None: no noise
 
 
 def build(
@@ -97,7 +97,8 @@ def build(
 ) -> networks.Network:
     """A network of action values: ``atoms`` numbers for each action.
 
-    If it is dueling, the numbers of the state's value come first.
+    If it is dueling, the numbers of the state's value come first. Raises QfolioError if the kind of
+    network does not fit the task or these settings.
     """
     atoms, dueling, noise = head
     if config.network == "positions" and (dueling or noise is not None or atoms > 1):
@@ -119,7 +120,7 @@ def build(
 def read(
     head: HeadConfig, network: networks.Network, observation: PyTree
 ) -> Float[Array, "batch action atom"]:
-    """The outputs of a network from ``build`` for each action."""
+    """The outputs for each action of a network that ``build`` made."""
     outputs = network(observation)
     z = outputs.reshape(outputs.shape[0], -1, head.atoms)
     return duel(z) if head.dueling else z

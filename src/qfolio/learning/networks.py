@@ -160,7 +160,7 @@ class Shared(eqx.Module):
 
 
 class PerAsset(eqx.Module):
-    """A ``Shared`` network's outputs in one row: the market's, then every asset's first, ….
+    """A ``Shared`` network's outputs in one row: the market's, all assets' first, their second, ….
 
     If an action has several numbers (``atoms``), these are adjacent.
     """
@@ -192,13 +192,13 @@ Network = Flat | LateAction | PerAsset | Values | OrderValue | Tilting
 
 
 class NetworkConfig(NamedTuple):
-    """An agent's settings of its networks; the names are those of the settings."""
+    """An agent's settings for its networks, by the names that they have there."""
 
-    network: str  # flat, an encoder of windows or images, or in markets one that assets share
+    network: str  # one of KINDS: flat, an encoder (shared by assets in a market), or positions
     hidden: tuple[int, ...]  # units of each hidden layer
-    input_gain: Scalar = 0.0  # of the first layer, for observations scaled to ±1; 0: unscaled
-    activation: str = "relu"  # of the hidden units; relu unless the network is flat
-    initialization: str = "uniform"  # uniform unless the network is flat
+    input_gain: Scalar = 0.0  # of the first layer on observations scaled to ±1; 0: unscaled
+    activation: str = "relu"  # of the hidden units; others only in a flat network
+    initialization: str = "uniform"  # others only in a flat network
 
     def check(self) -> None:
         """Raises QfolioError if the settings are invalid."""
@@ -215,7 +215,7 @@ class NetworkConfig(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """How many numbers a network outputs: for the whole, and for each asset of a market."""
+    """How many numbers a network outputs: in all, or in a market for it and for each asset."""
 
     pooled: int
     each: int = 0
@@ -223,7 +223,7 @@ class Outputs(NamedTuple):
 
 
 def outputs_of(actions: Actions) -> Outputs:
-    """A number for each action, each weight or each coordinate."""
+    """One output for each action, weight or coordinate."""
     if isinstance(actions, Simplex):
         return Outputs(1, 1)
     if isinstance(actions, MenuActions):
@@ -309,7 +309,7 @@ def build(
 
 
 def _linear(task: Task, observation: PyTree, outputs: Outputs) -> Values | Tilting:
-    """Values that are linear in positions; of weights, a policy of tilts."""
+    """Values that are linear in positions or, for an actor of weights, a policy of tilts."""
     fits = isinstance(observation, View) and observation.features.shape[-1] > 1
     weights = isinstance(task.actions, Simplex)
     if not fits or (observation.anchor if weights else observation.choices) is None:

@@ -52,9 +52,9 @@ class Moments(eqx.Module):
 
 
 class RewardScale(eqx.Module):
-    """The spread of discounted returns, Σ γᵏ r so far in an episode."""
+    """The spread of an episode's discounted past rewards, Σₖ γᵏ r_{t−k}."""
 
-    returns: Float[Array, " environment"]  # of the current episodes
+    returns: Float[Array, " environment"]  # these sums in the current episodes
     moments: Moments
 
     def update(
@@ -72,7 +72,7 @@ class RewardScale(eqx.Module):
 
 
 class Normalizer(eqx.Module):
-    """An agent's statistics; None where it does not normalize, which changes nothing."""
+    """An agent's statistics; None for what it does not normalize, which stays unchanged."""
 
     observations: Moments | None
     rewards: RewardScale | None
@@ -97,7 +97,7 @@ class Normalizer(eqx.Module):
         return jnp.clip(reward / self.unit, -LIMIT, LIMIT)
 
     def attached(self, weights: Weights) -> Weights:
-        """The weights, with these statistics in their field ``observations``."""
+        """The weights, with the statistics of observations in their field ``observations``."""
         if self.observations is None:
             return weights
         where: Any = lambda weights: weights.observations  # noqa: E731
@@ -117,7 +117,7 @@ def normalized(moments: Moments | None, observation: PyTree) -> PyTree:
 
 
 class NormalizationConfig(NamedTuple):
-    """An agent's settings of normalization; the names are those of the settings."""
+    """An agent's settings for normalization, by the names that they have there."""
 
     normalize_observations: bool
     normalize_rewards: bool
@@ -133,9 +133,8 @@ class NormalizationConfig(NamedTuple):
     def begin(self, task: Task, observation: PyTree, num_envs: int) -> Normalizer:
         """Statistics before the first step.
 
-        Raises QfolioError if observations are not one array of numbers.
-
-        observation: an example.
+        observation: an example. Raises QfolioError if observations are to be normalized and are not
+        one array of numbers.
         """
         observations, rewards = None, None
         if self.normalize_observations and task.states is None:  # numbered states stay numbered

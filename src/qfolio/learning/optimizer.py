@@ -1,4 +1,4 @@
-"""Gradient steps: Adam (Kingma & Ba 2015), or RMSProp and plain descent where a paper has them.
+"""Gradient steps: Adam (Kingma & Ba 2015), or RMSProp and plain descent where a paper uses them.
 
 The learning rate follows a cosine (Loshchilov & Hutter 2017).
 """
@@ -24,7 +24,7 @@ KINDS = ("adam", "rmsprop", "rmsprop-centered", "sgd")
 
 
 class OptimizerConfig(NamedTuple):
-    """An agent's settings of its optimizer; the names are those of the settings."""
+    """An agent's settings for its optimizer, by the names that they have there."""
 
     optimizer: str = "adam"
     rmsprop_decay: float = 0.99  # of the running mean of squared gradients
@@ -44,8 +44,8 @@ class Optimizer(eqx.Module):
     """The state of an optimizer; arrays that its kind does not use stay zero."""
 
     count: Int[Array, ""]  # gradient steps so far
-    mu: PyTree  # means of the gradients
-    nu: PyTree  # and of their squares
+    mu: PyTree  # running means of the gradients
+    nu: PyTree  # running means of their squares
     config: OptimizerConfig = eqx.field(static=True)
 
     def direction(self, gradient: Weights) -> tuple[Weights, "Optimizer"]:
@@ -66,14 +66,14 @@ class Optimizer(eqx.Module):
 
 
 class CosineSchedule(NamedTuple):
-    """A learning rate that falls along a cosine; the names are those of the agents' settings."""
+    """A learning rate that falls along a cosine; the names are those of agents' settings."""
 
     learning_rate: Scalar  # at the start
     learning_rate_final: Scalar  # share of it that remains at the end
     learning_rate_steps: Scalar  # gradient steps until then
 
     def __call__(self, update: Int[Array, ""]) -> Float[Array, ""]:
-        """The learning rate of a gradient step."""
+        """The learning rate of a gradient step, by its number."""
         done = jnp.minimum(update / self.learning_rate_steps, 1.0)
         weight = (1 + jnp.cos(jnp.pi * done)) / 2
         final = self.learning_rate_final
@@ -87,6 +87,7 @@ class CosineSchedule(NamedTuple):
 
 
 def begin(weights: Weights, config: OptimizerConfig = ADAM) -> Optimizer:
+    """The state before the first gradient step."""
     state = optax.scale_by_adam().init(weights)
     return Optimizer(state.count, state.mu, state.nu, config)
 

@@ -18,12 +18,12 @@ START = 0.3
 """The share of the way to its target that a new policy trades at a step."""
 
 LEAST_CASH, LEAST = 1e-3, 1e-6
-"""The least weights of cash and of an asset, so that their logarithms are finite. All others are
-measured by cash, which is 1 less their sum: it has to be far above the rounding of that."""
+"""The least weights of cash and of an asset, so that their logarithms are finite. All logits are
+relative to that of cash, so its floor is far above the rounding error of 1 less the others' sum."""
 
 
 class Values(eqx.Module):
-    """What the positions are worth that an action orders, or those held if there are no choices.
+    """The value of the positions that each action orders or, without choices, of those held.
 
     Q(s, a) = Σᵢ (bᵢ − anchorᵢ) θ·xᵢ − p Σᵢ |bᵢ − hᵢ| + v, where b are the weights that action a
     orders, h those held, and x the latest features of an asset except the first, its return. As one
@@ -60,8 +60,8 @@ class Tilting(eqx.Module):
     """Logarithms of an order's weights: a share of the way from the holding to a tilted anchor.
 
     The target is the anchor times exp(θ·x), with the anchor's sum and an asset's latest features x
-    as above. The logarithms of cash and of each asset come first; with ``spread``, a number for
-    each asset follows, the same for all.
+    as in ``Values``. The logarithms of cash and of each asset come first; with ``spread``, a number
+    for each asset follows, the same for all: the log standard deviation of a stochastic policy.
     """
 
     linear: Float[Array, " channel"]  # θ

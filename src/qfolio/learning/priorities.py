@@ -39,6 +39,7 @@ class Priorities(eqx.Module):
         return self.levels[0].sum()
 
     def of(self, index: Int[Array, " n"]) -> Float[Array, " n"]:
+        """The priorities of rows."""
         return self.levels[-1][index // FAN, index % FAN]
 
     def set(self, index: Int[Array, " n"], values: Float[Array, " n"]) -> "Priorities":
@@ -58,7 +59,7 @@ class Priorities(eqx.Module):
         return self.find(strata * self.total)
 
     def find(self, mass: Float[Array, " n"]) -> Int[Array, " n"]:
-        """The rows at which the running sum of all rows' numbers first exceeds ``mass``."""
+        """The rows at which the running sum of all rows' priorities first exceeds ``mass``."""
         node = jnp.zeros(mass.shape, jnp.int32)
         for level in self.levels:
             children = level[node]
@@ -75,7 +76,7 @@ class Priorities(eqx.Module):
     def update(
         self, index: Int[Array, " n"], off: Float[Array, " n"], exponent: Scalar
     ) -> "Priorities":
-        """Sets rows to their absolute errors ``off`` to the power of α (``exponent``)."""
+        """Sets rows to their absolute errors ``off``, raised to the power α (``exponent``)."""
         return self.set(index, (off + 1e-6) ** exponent)  # above 0, so that any is drawn again
 
     def importance(self, index: Int[Array, " n"], exponent: Scalar) -> Float[Array, " n"]:

@@ -24,8 +24,8 @@ Discount = Float[Array, "*#batch"] | float
 class Experience(NamedTuple):
     """A transition as the buffer stores it; nothing is bootstrapped after ``terminal``.
 
-    A view of a market is many times larger than the position that it is a view of, so the buffer
-    stores positions, and ``recalled`` gives the views of those that are drawn.
+    The view of a position in a market is many times larger than the position, so the buffer stores
+    positions, and ``recalled`` computes the views of those that are drawn.
     """
 
     observation: PyTree
@@ -33,13 +33,13 @@ class Experience(NamedTuple):
     reward: Float[Array, "*batch"]
     next_observation: PyTree
     terminal: Bool[Array, "*batch"]
-    last: Bool[Array, "*batch"] | None = None  # of its episode; returns over steps stop there
+    last: Bool[Array, "*batch"] | None = None  # step of its episode; n-step returns stop there
 
     @staticmethod
     def like(
         state: PyTree, observation: PyTree, action: Array, *, with_last: bool = False
     ) -> "Experience":
-        """An example of a row, for its shapes and types."""
+        """An example row, for its shapes and types."""
         no, seen = jnp.array(False), _stored(state, observation)
         last = no if with_last else None
         return Experience(seen, action, jnp.array(0.0), seen, no, last)
@@ -59,7 +59,7 @@ class Experience(NamedTuple):
         )  # fmt: skip
 
     def recalled(self, task: Task) -> "Experience":
-        """A batch with observations, as the agent saw them."""
+        """The batch with observations as the agent saw them."""
         if not isinstance(self.observation, Position):
             return self
         seen, then = map(jax.vmap(task.observe), (self.observation, self.next_observation))
@@ -73,11 +73,11 @@ def _stored(state: PyTree, observation: PyTree) -> PyTree:
 
 
 class ReplayConfig(NamedTuple):
-    """An agent's settings of its buffer; the names are those of the settings."""
+    """An agent's settings for its buffer, by the names that they have there."""
 
     num_envs: int  # rows written at a time
     batch_size: int
-    n_steps: int  # of a target's return
+    n_steps: int  # steps of the return in a target
     replay_capacity: int  # rows
     learning_starts: int  # rows that are stored before learning
     prioritized: bool = False
@@ -112,7 +112,7 @@ class Replay(eqx.Module):
     """Rows of any pytree of numbers; the oldest are overwritten.
 
     A row is packed into float32, which holds integers exactly up to 2²⁴. One matrix takes one
-    in-place write and one gather; XLA would copy whole columns of one number a row at each step.
+    in-place write and one gather; of separate columns, XLA would copy each as a whole at each step.
     Rows are written ``width`` at a time and the capacity is rounded up to a multiple of it, so that
     a write never wraps.
     """
@@ -120,10 +120,10 @@ class Replay(eqx.Module):
     rows: Float[Array, "capacity numbers"]
     position: Int[Array, ""]  # of the next write
     size: Int[Array, ""]  # rows that hold something
-    priorities: Priorities | None  # of the rows drawn; None: uniform
+    priorities: Priorities | None  # of the rows; None: rows are drawn uniformly
     like: PyTree = eqx.field(static=True)  # shape and type of a row's leaves
-    width: int = eqx.field(static=True)
-    steps: int = eqx.field(static=True)
+    width: int = eqx.field(static=True)  # rows per write
+    steps: int = eqx.field(static=True)  # as in ``empty``
 
     @staticmethod
     def empty(
@@ -131,7 +131,7 @@ class Replay(eqx.Module):
     ) -> "Replay":
         """Room for ``capacity`` rows shaped like ``row``, written ``width`` at a time.
 
-        steps: writes, its own included, that must exist before a row can be drawn.
+        steps: writes that a row needs before it can be drawn, its own included.
         """
         capacity = -(-capacity // width) * width
         like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), row)
@@ -177,11 +177,11 @@ class Replay(eqx.Module):
         return self.priorities.set(ready, values)
 
     def sample(self, key: PRNGKeyArray, n: int) -> PyTree:
-        """``n`` rows drawn with replacement; the cost does not grow with capacity."""
+        """``n`` rows drawn with replacement, as by ``draw``."""
         return self.at(self.draw(key, n))
 
     def draw(self, key: PRNGKeyArray, n: int) -> Int[Array, " n"]:
-        """Indices of ``n`` rows, drawn by priority or else uniformly."""
+        """Indices of ``n`` rows, drawn with replacement, by priority if there are priorities."""
         if self.priorities is not None:
             return self.priorities.draw(key, n)
         # One draw of uniforms instead of randint's two; float32 splits [0, 1) into 2²³ parts.
@@ -221,10 +221,9 @@ class Replay(eqx.Module):
 
 
 def join(replay: Replay, index: Int[Array, " n"], discount: Scalar) -> tuple[Experience, Discount]:
-    """Rows of experience over the buffer's ``steps``, and the discount of what follows them.
+    """Experience over the buffer's ``steps`` from each row, and the discount of the value after it.
 
-    They end with the last of these steps or with the episode, and lead to the true next observation
-    of their final step.
+    It ends earlier if the episode does, and leads to the true next observation of its last step.
     """
     if replay.steps == 1:
         return replay.at(index), discount

@@ -28,7 +28,7 @@ class Hidden(eqx.Module):
 
 
 class Attention(eqx.Module):
-    """A head of attention across assets (Vaswani et al. 2017); the output starts at zero.
+    """An attention head across assets (Vaswani et al. 2017); the output starts at zero.
 
     Each asset compares its inputs with those of all assets, and scores what it gathers from them.
     """

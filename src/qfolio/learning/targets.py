@@ -17,7 +17,7 @@ Scalar = Float[Array, ""] | float
 def chosen(
     values: Float[Array, "batch action *atom"], action: Int[Array, " batch"]
 ) -> Float[Array, "batch *atom"]:
-    """``values`` of one action of each row."""
+    """The values of the action chosen in each row."""
     index = action.reshape(-1, *[1] * (values.ndim - 1))
     return jnp.take_along_axis(values, index, axis=1)[:, 0]
 
@@ -61,7 +61,7 @@ def possible_values(rewards: Float[Array, "2"], discount: Scalar) -> Float[Array
 
 
 def squash(value: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """sign(v)(√(1 + |v|) − 1): like v/2 near zero, like a root far from it.
+    """sign(v)(√(1 + |v|) − 1): like v/2 near zero and like a square root far from it.
 
     Value rescaling of Pohlen et al. (2018, proposition A.2) without its small linear term. That
     term bounds the slope of the inverse; here the slope grows with the root.
@@ -97,9 +97,9 @@ def n_step(
     last: Bool[Array, "step batch"],
     discount: Scalar,
 ) -> tuple[Float[Array, " batch"], Int[Array, " batch"]]:
-    """Σ γᵏ rₖ up to the episode's last step, and the number of that step.
+    """Σ γᵏ rₖ up to the episode's last step, and the number k of that step.
 
-    If the episode continues, up to the last step given (Sutton & Barto 2018, eq. 7.1, the sum).
+    If the episode continues, the sum ends with the last step given (Sutton & Barto 2018, eq. 7.1).
     """
     before = jnp.concatenate([jnp.zeros_like(last[:1]), last[:-1]])
     counts = jnp.cumprod(1.0 - before, axis=0)

@@ -11,19 +11,19 @@ from qfolio.core import simplex
 
 
 class Trading(eqx.Module):
-    """A share of the way to the target, outside a band; both are learned."""
+    """Trades a learned share of the way to the target, outside a learned band."""
 
     rate: Float[Array, ""]  # logit of the share of the way that is traded at a step
-    band: Float[Array, ""]  # log of the deviation that is not traded, in equal weights
+    band: Float[Array, ""]  # log of the untraded deviation, in units of the equal weight
 
     @staticmethod
     def start(rate: float) -> "Trading":
-        """A share of the way at each step, outside a band of 5% of an equal weight."""
+        """Trades the share ``rate`` at each step, outside a band of 5% of the equal weight."""
         return Trading(jnp.array(math.log(rate / (1 - rate))), jnp.array(math.log(0.05)))
 
     @property
     def described(self) -> dict[str, Array]:
-        """The share of the way, and the band in equal weights, as named scalars."""
+        """The share of the way, and the band in units of the equal weight, as named scalars."""
         return {"rate": jax.nn.sigmoid(self.rate), "band": jnp.exp(self.band)}
 
     def __call__(
@@ -32,10 +32,11 @@ class Trading(eqx.Module):
         target: Float[Array, "*batch entry"],
         anchor: Float[Array, "*batch asset"],
     ) -> Float[Array, "*batch entry"]:
-        """The order: part of the way from the weights held to the target.
+        """The order, cash first: part of the way from the weights held to the target.
 
-        What an asset is off its target beyond the band is traded at the rate, as far as purchases
-        and sales pay for each other. Cash beyond the target's is invested at once.
+        An asset's deviation from its target beyond the band is traded at the rate, as far as
+        purchases and sales pay for each other. Cash above the target's is invested at once, in
+        proportion to the target; missing cash is raised at once, in proportion to the holdings.
         """
         gap = target[..., 1:] - held
         band = jnp.exp(self.band) * equal(anchor)
@@ -58,5 +59,5 @@ def equal(anchor: Float[Array, "*batch asset"]) -> Float[Array, "*batch asset"]:
 
 
 def ratio(part: Array | float, whole: Array) -> Array:
-    """The ratio, 0 for a whole of 0."""
+    """The ratio of ``part`` to ``whole``; 0 if ``whole`` is not positive."""
     return jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), 0.0)
