@@ -1,7 +1,7 @@
 """Advantage actor-critic (Mnih et al. 2016, in its synchronous form, A2C).
 
 After a few steps of all environments, the policy takes one step along the gradient of its actions'
-log probabilities times their advantages, and the critic one towards the returns.
+log probabilities times their advantages, and the critic takes one towards the returns.
 docs/algorithms/policy_gradients.md has the formulas and the deviations from the paper.
 """
 

@@ -71,7 +71,7 @@ def critic_loss(
     huber_delta: Scalar,
     weight_decay: float = 0.0,
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Mean Huber loss of the errors to one target, summed over the critics; and metrics.
+    """Mean Huber loss of all critics' errors against one target, summed over critics; and metrics.
 
     weight_decay: the loss adds half of it times the sum of all squared weights.
     """
@@ -84,7 +84,7 @@ def critic_loss(
 
 
 Draw = Callable[[PRNGKeyArray], tuple[Experience, Discount]]
-"""A batch of steps, and the discount of what follows them."""
+"""Draws a batch of steps, and the discount of the values that follow them."""
 
 
 class Batch(NamedTuple):
@@ -100,7 +100,7 @@ class Actor(eqx.Module):
 
     network: Callable[[PyTree], Array]
     actions: Actions
-    observations: Moments | None = None  # those it normalizes by; None while it learns
+    observations: Moments | None = None  # for normalization; None during training
 
     def seen(self, observation: PyTree) -> PyTree:
         """Observations as the network reads them."""
@@ -121,10 +121,10 @@ L = TypeVar("L", bound=Learned)
 
 
 class ActorCriticState(eqx.Module, Generic[L]):
-    """The state of an agent."""
+    """The state of an actor-critic agent."""
 
-    learned: L  # of normalized observations and rewards
-    replay: Replay  # of those before
+    learned: L  # from normalized observations and rewards
+    replay: Replay  # with observations and rewards that are not normalized
     steps: Int[Array, ""]  # of each environment
     rewards: Float[Array, "2"]  # the lowest and the highest so far
     normalizer: Normalizer
@@ -137,7 +137,7 @@ State = TypeVar("State", bound=ActorCriticState)
 class ActorCritic(Agent, Generic[L]):
     """Settings, buffer and gradient steps; an algorithm adds what it learns and how it explores."""
 
-    network: str = static("flat")  # the actor's; positions: also the critics', linear in them
+    network: str = static("flat")  # the actor's; with positions, the critics' as well
     hidden: tuple[int, ...] = sizes(256, 256)  # units of each hidden layer of actor and critics
     num_envs: int = static(1)  # environments stepped side by side
     episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
@@ -147,19 +147,19 @@ class ActorCritic(Agent, Generic[L]):
     replay_capacity: int = static(100_000)  # transitions that the replay buffer holds
     learning_starts: int = static(1000)  # transitions by random actions before learning
     tau: float = number(0.005)  # targets' step towards the online networks
-    discount: float = number(0.99)  # γ, the discount of a step
+    discount: float = number(0.99)  # γ, the discount per step
     learning_rate: float = number(1e-3)  # Adam's step size for the critics, at the start
     learning_rate_final: float = number(1.0)  # share of learning_rate at the end of its cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of that cosine
     actor_learning_rate_ratio: float = number(0.3)  # the actor's step size over the critics'
-    reward_scale: float = number(1.0)  # the critics learn values of scaled rewards
+    reward_scale: float = number(1.0)  # rewards are multiplied by it before learning
     input_gain: float = number(0.0)  # gain of the first layer on inputs scaled to ±1; 0: unscaled
-    normalize_observations: bool = static(False)  # by their mean and deviation so far
-    normalize_rewards: bool = static(False)  # by the deviation of discounted returns so far
+    normalize_observations: bool = static(False)  # by their running mean and standard deviation
+    normalize_rewards: bool = static(False)  # by the running deviation of discounted returns
     noise_theta: float = constant(1.0)  # mean reversion of the noise; 1: independent at each step
     huber_delta: float = number(math.inf)  # |error of a critic| beyond which its loss is linear
     value_rescaling: bool = static(False)  # critics learn roots of values: small ones weigh more
-    clip_bootstrap: bool = static(True)  # clips targets to values possible with rewards so far
+    clip_bootstrap: bool = static(True)  # clips next values to what rewards so far allow
 
     def __check_init__(self) -> None:
         self._replay.check()
@@ -274,7 +274,7 @@ class ActorCritic(Agent, Generic[L]):
     def practise(
         self, learned: L, draw: Draw, rewards: Float[Array, "2"], key: PRNGKeyArray
     ) -> tuple[L, Metrics]:
-        """``gradient_steps`` gradient steps on batches that are drawn."""
+        """``gradient_steps`` gradient steps, each on a batch from ``draw``."""
 
         def update(learned: L, key: PRNGKeyArray) -> tuple[L, Metrics]:
             draw_key, key = jax.random.split(key)
@@ -316,7 +316,7 @@ class ActorCritic(Agent, Generic[L]):
     def build_critics(
         self, task: Task, observation: PyTree, count: int, key: PRNGKeyArray, *, late: bool = False
     ) -> Critics:
-        """Critics over the whole observation and an action.
+        """``count`` critics over the whole observation and an action.
 
         late: the action enters at the second layer.
         """

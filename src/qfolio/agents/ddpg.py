@@ -33,7 +33,7 @@ from qfolio.learning.replay import Experience
 from qfolio.learning.targets import Scalar, follow, smallest
 
 REACH = 4.0
-"""Output beyond which tanh counts as flat; there it is within 0.0007 of its bound."""
+"""Output beyond which tanh counts as flat: at this output it is within 0.0007 of its bound."""
 
 
 class Actor(actor_critic.Actor):
@@ -58,7 +58,7 @@ class Actor(actor_critic.Actor):
     def perturb(
         self, action: Float[Array, "batch entry"], noise: Float[Array, "batch entry"]
     ) -> Float[Array, "batch entry"]:
-        """The allowed action nearest to ``action`` plus noise, which is in units of the bound."""
+        """The action nearest to ``action`` plus noise; the noise is in units of the bound."""
         if isinstance(self.actions, Simplex):
             return simplex.project(action + noise)
         bound = self.actions.bound
@@ -66,7 +66,7 @@ class Actor(actor_critic.Actor):
 
 
 class Learned(actor_critic.Learned):
-    """What gradient steps change, with a target of the actor."""
+    """What gradient steps change, including a target of the actor."""
 
     actor: Actor
     target_actor: Actor
@@ -91,7 +91,7 @@ class DDPG(ActorCritic[Learned]):
     saturation_penalty: float = number(0.1)  # penalty on outputs where tanh is flat; 0: none
     late_action: bool = static(False)  # the action enters the critic at its second layer
     critic_weight_decay: float = constant(0.0)  # coefficient of the critic's L2 penalty
-    last_layer_bound: float = constant(0.0)  # last layers start uniform in ± it; 0: in ±1/√inputs
+    last_layer_bound: float = constant(0.0)  # last layers start uniform in ± this; 0: in ±1/√inputs
 
     critics: ClassVar[int] = 1
 
@@ -161,7 +161,7 @@ class DDPG(ActorCritic[Learned]):
         return learned.target_critics(observation, learned.target_actor(observation))[0]
 
     def improve(self, learned: Learned, batch: Experience) -> Learned:
-        """A step of the actor up the critics; then an update of the targets."""
+        """A step of the actor up the critics' values, then an update of the targets."""
         rate = self.actor_learning_rate_ratio * self._schedule(learned.critic_adam.count)
         actor, adam, _ = optimizer.minimize(
             actor_loss,

@@ -1,8 +1,8 @@
 """Deep Q-network (Mnih et al. 2015), with its extensions as options.
 
-A Q-network estimates the discounted return of each action. Collecting: actions are ε-greedy on it,
-and transitions go into a replay buffer. Training: it regresses, on batches from the buffer, towards
-r + γ max_a Q'(s', a), where Q' is a slowly updated target network.
+A Q-network estimates the discounted return of each action. Collecting: actions are ε-greedy in its
+values, and transitions go into a replay buffer. Training: on batches from the buffer, the network
+regresses towards r + γ max_a Q'(s', a), where Q' is a slowly updated target network.
 
 Options, which together are Rainbow (Hessel et al. 2018): double Q-learning (van Hasselt et al.
 2016), dueling networks (Wang et al. 2016), returns over n steps, prioritized replay (Schaul et al.
@@ -52,7 +52,7 @@ class DQNState(eqx.Module):
     optimizer: optimizer.Optimizer
     replay: Replay
     episodes: Int[Array, ""]  # finished; ε follows it
-    steps: Int[Array, ""]  # of each environment; the target network follows them, and a linear ε
+    steps: Int[Array, ""]  # of each environment; target updates and a linear ε follow them
 
 
 Learned = tuple[Weights, optimizer.Optimizer, Priorities | None]
@@ -88,18 +88,18 @@ class DQN(Agent):
     values: str = static("expected")  # expected, categorical or quantile returns
     atoms: int = static(51)  # numbers for each action, if values are a distribution
     v_min: float = number(-10.0)  # lower end of categorical's support, in units of scaled reward
-    v_max: float = number(10.0)  # upper end of it, likewise
+    v_max: float = number(10.0)  # upper end of it, in the same units
     noisy: bool = static(False)  # explore by learned noise on weights, in addition to ε
     noise_scale: float = number(0.5)  # σ₀: the noise's size at the start
     all_actions: bool = static(False)  # learn all actions at once, from random holdings
     outcomes: int = static(0)  # with all_actions: actions learned per move; 0: all
-    market_baseline: bool = static(False)  # with all_actions: rewards over the anchor's or others'
-    bootstrap_heads: int = static(1)  # with all_actions: networks, each of some blocks of the data
-    caution: float = number(0.0)  # standard errors by which an action has to beat the first one
-    time_limit_terminal: bool = static(False)  # treats a time limit as an end, which is wrong
+    market_baseline: bool = static(False)  # with all_actions: rewards less the anchor's or a mean
+    bootstrap_heads: int = static(1)  # with all_actions: networks, each learned from some blocks
+    caution: float = number(0.0)  # standard errors by which an action must beat the first one
+    time_limit_terminal: bool = static(False)  # treats time limits as terminations (biased)
     target_update_interval: int = static(200)  # steps between target updates
     tau: float = number(1.0)  # target's step towards the online network; 1 copies it
-    discount: float = number(0.99)  # γ, the discount of a step
+    discount: float = number(0.99)  # γ, the discount per step
     learning_rate: float = number(1e-3)  # step size at the start
     learning_rate_final: float = number(1.0)  # share of learning_rate at the end of its cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of that cosine
@@ -109,12 +109,12 @@ class DQN(Agent):
     epsilon_start: float = number(1.0)  # share of random actions at the start
     epsilon_end: float = number(0.01)  # least share of random actions
     epsilon_decay: float = number(0.995)  # factor on ε per finished episode
-    epsilon_steps: float = constant(0.0)  # steps of a linear decay; 0: use epsilon_decay
+    epsilon_steps: float = constant(0.0)  # length of a linear decay in steps; 0: use epsilon_decay
     persistence: float = constant(0.0)  # share of exploring steps that repeat the last action
     huber_delta: float = number(math.inf)  # |TD error| beyond which the loss is linear
-    reward_scale: float = number(1.0)  # the network learns values of scaled rewards
+    reward_scale: float = number(1.0)  # rewards are multiplied by it before learning
     input_gain: float = number(0.0)  # gain of the first layer on inputs scaled to ±1; 0: unscaled
-    value_rescaling: bool = static(False)  # learn roots of values: small ones weigh more
+    value_rescaling: bool = static(False)  # learn roots of values, so that small ones weigh more
 
     def __check_init__(self) -> None:
         self._replay.check()

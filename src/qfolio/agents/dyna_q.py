@@ -18,7 +18,7 @@ from qfolio.core.mdp import Metrics, Task, Transition
 
 
 class Counts(eqx.Module):
-    """The model: the outcomes seen of each entry (state · actions + action).
+    """The model: the outcomes seen of each entry, numbered state · actions + action.
 
     An outcome is the next state's number, or the number of states if the task ended.
     """
@@ -98,7 +98,7 @@ class DynaQ(Tabular):
     """Q-learning from real steps and imagined ones."""
 
     planning_steps: int = static(10)  # imagined steps after each step of all environments
-    outcomes: int = static(8)  # next states that the model holds of each state and action
+    outcomes: int = static(8)  # next states that the model keeps for each state and action
 
     def __check_init__(self) -> None:
         require(

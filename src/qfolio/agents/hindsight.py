@@ -1,4 +1,4 @@
-"""Values of all actions at once, in markets whose prices do not depend on our trades.
+"""Values of all actions at once, in markets whose prices do not depend on the agent's trades.
 
 One move of the market gives the outcome of every action from any holding (hindsight learning for
 exogenous inputs, Sinclair et al. 2023): the buffer stores moves instead of transitions, holdings
@@ -72,14 +72,14 @@ class Rule(NamedTuple):
     discount: Scalar
     reward_scale: Scalar
     double: bool
-    market_baseline: bool  # rewards are relative to the anchor's, or another holding's mean
+    market_baseline: bool  # subtract the anchor's reward, or another holding's mean reward
     outcomes: int = 0  # actions learned for each move, drawn at random; 0: all
 
 
 def errors(
     rule: Rule, task: ExogenousTask, moves: Move, key: PRNGKeyArray, online: Q, target: Q
 ) -> tuple[Float[Array, "batch learned"], Float[Array, "batch action"]]:
-    """Target minus value of each action learned, from a random holding per move; all values."""
+    """Target minus value of each learned action, from a random holding per move; and all values."""
     count = len(jax.tree.leaves(moves)[0])
     holdings = jax.vmap(task.draw_reachable)(moves.market, jax.random.split(key, count))
     values = q = online(jax.vmap(task.observe)(Position(moves.market, holdings)))
@@ -92,9 +92,9 @@ def errors(
     after = partial(settle, moves.market, moves.next_market)
     reward, next_holdings = jax.vmap(partial(after, holdings))(actions)  # (action, batch)
     if rule.market_baseline:
-        # It depends on the market alone: subtracting it does not change the best policy, and
-        # removes the market noise that all actions share (input-dependent baselines, Mao et al.
-        # 2019).
+        # The baseline does not depend on the action: subtracting it does not change the best
+        # policy, and removes the market noise that all actions share (input-dependent baselines,
+        # Mao et al. 2019).
         shared = jax.vmap(task.reference)(moves.market, moves.next_market)
         if shared is None:
             others = jax.tree.map(lambda x: jnp.roll(x, 1, 0), holdings)

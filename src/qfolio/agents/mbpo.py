@@ -2,9 +2,9 @@
 
 An ensemble of networks learns from all real transitions how an action changes the observation, its
 reward, and whether the episode ends. From real observations the model then imagines a few steps of
-the policy, each predicted by a random member, and soft actor-critic learns from these steps, and
-from a share of real ones if one is set. Members differ in their initial weights and data: each
-counts a real transition 0, 1, 2, … times (on-line bootstrap, Oza & Russell 2001).
+the policy, each predicted by a random member. Soft actor-critic learns from these steps and, if so
+set, from a share of real ones. Members differ in their initial weights and their data: each counts
+a real transition 0, 1, 2, … times (online bootstrap, Oza & Russell 2001).
 docs/algorithms/model_based.md lists formulas and deviations.
 """
 
@@ -45,11 +45,12 @@ class Prediction(NamedTuple):
 
 
 class Model(eqx.Module):
-    """An ensemble of networks; their weights have a leading axis.
+    """An ensemble of networks, whose weights have a leading member axis.
 
-    Their inputs are observations and actions scaled to ±1; they predict the change of the
-    observation in units of its range, the reward's root, and whether the episode ends (as a number,
-    0 or 1). Small rewards matter once large ones are avoided, and a root resolves them better.
+    The inputs are observations and actions scaled to ±1. The networks predict the change of the
+    observation in units of its range, the reward's signed root (``squash``), and whether the
+    episode ends (0 or 1). Small rewards matter once large ones are avoided, and a root resolves
+    them better.
     gaussian: the outputs are the means of normal distributions and as many log variances.
     """
 
@@ -79,7 +80,7 @@ class Model(eqx.Module):
         return Prediction(mean, low + jax.nn.softplus(log_variance - low))
 
     def truth(self, step: Experience) -> Float[Array, "batch prediction"]:
-        """The true values of a prediction."""
+        """What a perfect model would predict."""
         change = (step.next_observation - step.observation) / self.scale
         return jnp.column_stack([change, squash(step.reward), step.terminal])
 
@@ -90,7 +91,7 @@ class Model(eqx.Module):
         among: Int[Array, " elite"],
         key: PRNGKeyArray,
     ) -> Experience:
-        """A step of each row, as a random member of ``among`` predicts it.
+        """One step from each row, predicted by a random member of ``among``.
 
         Members that predict distributions draw from them.
         """
@@ -162,12 +163,12 @@ class MBPO(SAC):
     """Soft actor-critic that learns from the steps of a learned model."""
 
     ensemble_size: int = static(5)  # networks in the ensemble
-    elites: int = static(0)  # members that imagine, those with the least error; 0: all
-    gaussian_model: bool = static(False)  # members predict normal distributions; false: means
+    elites: int = static(0)  # number of members that imagine: those with the least error; 0: all
+    gaussian_model: bool = static(False)  # members predict normal distributions instead of means
     model_hidden: tuple[int, ...] = sizes(128, 128)  # units of each hidden layer of the model
     model_updates: int = static(4)  # gradient steps of the model per step of all environments
     model_learning_rate_ratio: float = number(1.0)  # the model's step size over the critics'
-    model_rollout_batch: int = static(64)  # real observations that rollouts of the model start from
+    model_rollout_batch: int = static(64)  # rollouts of the model, each from a real observation
     model_rollout_length: int = static(5)  # steps of each such rollout
     model_replay_capacity: int = static(100_000)  # steps of the model that are kept
     real_ratio: float = constant(0.0)  # share of real steps in a batch of soft actor-critic
@@ -288,7 +289,7 @@ class MBPO(SAC):
     def _draw(
         self, replay: Replay, imagined: Replay, key: PRNGKeyArray
     ) -> tuple[Experience, Discount]:
-        """A batch of imagined steps, and first the real ones among them."""
+        """A batch of steps: the real ones first, then the imagined ones."""
         real = round(self.real_ratio * self.batch_size)
         if not real:
             return imagined.sample(key, self.batch_size), self.discount

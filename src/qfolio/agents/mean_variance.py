@@ -1,13 +1,13 @@
-"""Learned minimum variance, and learned mean and variance: portfolios that are trained end to end.
+"""Learned minimum variance and learned mean-variance: portfolios that are trained end to end.
 
 The policy estimates a covariance from its window of returns (``learning/covariance.py``), takes the
 best weights for it (``core/quadratic.py``), and trades a share of the way there, outside a band.
 All that it learns is trained together, by the gradient of realized variance and costs through whole
 paths, as in ``pathwise.py``.
 
-With returns, several members learn which ones to expect, each without some blocks of the data. As
-in ``tilts.py``, what a member earns over the least variance in blocks that it has not seen is the
-evidence; without it, the policy is that of least variance.
+With ``returns``, several members learn which returns to expect, each without some blocks of the
+data. As in ``tilts.py``, the evidence is what a member earns over the minimum-variance policy in
+blocks that it has not seen; without evidence, the policy is that of minimum variance.
 docs/algorithms/mean_variance.md lists formulas and their sources.
 """
 
@@ -40,7 +40,7 @@ class Learned(eqx.Module):
     """All that is trained."""
 
     covariance: Covariance
-    trading: Trading  # towards the least variance
+    trading: Trading  # towards the minimum variance
     members: Member | None  # with a leading member axis; None if no returns are expected
 
     def sigma(self, view: View) -> Float[Array, "*batch asset asset"]:
@@ -49,10 +49,10 @@ class Learned(eqx.Module):
 
 
 class Efficient(eqx.Module):
-    """Maps a view of the market to an order towards the weights of the best mean and variance."""
+    """Maps a view of the market to an order towards the mean-variance optimal weights."""
 
     learned: Learned
-    share: Float[Array, ""]  # of the expected returns that the evidence leaves
+    share: Float[Array, ""]  # share of the expected returns that the evidence leaves
     actions: Simplex
 
     def __call__(self, view: View) -> Float[Array, "*batch entry"]:
@@ -67,7 +67,7 @@ class Efficient(eqx.Module):
 
     @property
     def trading(self) -> Trading:
-        """How to trade: as for the least variance, moved by the share towards the members' mean."""
+        """How to trade: as for minimum variance, moved by the share towards the members' mean."""
         least, members = self.learned.trading, self.learned.members
         if members is None:
             return least
@@ -76,7 +76,7 @@ class Efficient(eqx.Module):
 
 
 def expected(view: View, means: Means) -> Float[Array, "*batch asset"]:
-    """Expected returns in units of the best weights' problem."""
+    """Expected returns in the units of ``quadratic.best``."""
     assert view.anchor is not None
     open_to = view.anchor > 0
     return means(view.features[..., 0], open_to) / open_to.sum(-1, keepdims=True)
@@ -105,28 +105,28 @@ class MeanVarianceState(eqx.Module):
     """The state of a MeanVariance agent."""
 
     policy: Efficient
-    start: Learned  # that a penalty pulls to
+    start: Learned  # where training began, to which a penalty pulls
     optimizer: optimizer.Optimizer
     evidence: Evidence
 
 
 class MeanVariance(Onlooker):
-    """Gradient ascent on mean return less realized variance and costs."""
+    """Gradient ascent on mean return less costs and half the risk aversion times variance."""
 
-    returns: bool = static(True)  # learn expected returns, too
+    returns: bool = static(True)  # learn expected returns, too; false: minimum variance
     members: int = static(4)  # members; each leaves out some blocks of the data
     units: int = static(8)  # units of the network that cleans eigenvalues
     blocks: int = static(32)  # equal blocks that the data are cut into
     num_envs: int = static(8)  # paths in a batch
     rollout_length: int = static(63)  # steps of a path
-    head: int = static(21)  # first steps of these, which only lead to a holding
-    every: int = static(7)  # steps from a covariance to the next one, in training
+    head: int = static(21)  # first steps of these, which build a holding and do not count
+    every: int = static(7)  # steps between covariance estimates in training
     episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
     learning_rate: float = number(0.05)  # step size at the start
     learning_rate_final: float = number(0.0)  # share of learning_rate at the end of its cosine
     learning_rate_steps: float = number(80.0)  # gradient steps of that cosine
-    risk_aversion: float = number(10.0)  # half of it times variance is worth a return, or a cost
-    ridge: float = number(3.0)  # penalty on squared changes of the learned, per move
+    risk_aversion: float = number(10.0)  # weight of half the variance against returns and costs
+    ridge: float = number(3.0)  # penalty on squared changes of parameters, per move of the data
     threshold: float = number(2.0)  # t-statistic up to which no returns are expected
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 
@@ -200,7 +200,7 @@ class MeanVariance(Onlooker):
         left = left_out(block, self.members)
 
         def loss(learned: Learned) -> tuple[Array, tuple[Array, Array | None]]:
-            # Covariances change slowly, so each serves some steps.
+            # Covariances change slowly, so each estimate serves several steps.
             sigma = learned.sigma(some)
             held = lambda x: jnp.repeat(x, self.every, 0)  # noqa: E731
             least = held(best(some, sigma, None, actions))
@@ -239,7 +239,7 @@ class MeanVariance(Onlooker):
     def _path(
         self, task: ExogenousTask, rollout: Transition, trading: Trading, target: Array
     ) -> tuple[Float[Array, "time path"], Float[Array, "time path"]]:
-        """Rewards net of costs and before them, from the first target on."""
+        """Rewards net of costs and before costs, beginning at the first target."""
         given = lambda view, target: (target,)  # noqa: E731
         (net,), (gross,) = self._followed(task, rollout, (trading,), given, target)
         return net, gross
@@ -253,7 +253,7 @@ def _moments(counted: Array, values: Array) -> tuple[Float[Array, ""], Float[Arr
 
 
 class MinimumVariance(MeanVariance):
-    """Learned minimum variance: no returns are expected, and risk counts for more than costs."""
+    """Learned minimum variance: expects no returns and weighs risk more heavily against costs."""
 
     returns: bool = static(False)
     num_envs: int = static(16)

@@ -1,9 +1,9 @@
 """What policy-gradient agents share: a stochastic policy and an estimate of its return.
 
 They act by drawing from the policy, and learn from rollouts of the current policy: each action's
-return is compared with the estimate (the advantage), the policy moves towards actions that did
-better, and the estimate towards the returns. ``reinforce.py``, ``a2c.py`` and ``ppo.py`` differ in
-how. docs/algorithms/policy_gradients.md has the formulas.
+return is compared with the estimate (the difference is its advantage), the policy moves towards
+actions that did better, and the estimate moves towards the returns. ``reinforce.py``, ``a2c.py``
+and ``ppo.py`` differ in how. docs/algorithms/policy_gradients.md has the formulas.
 """
 
 import abc
@@ -27,7 +27,7 @@ from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.targets import Scalar, advantages
 
 LARGEST = 1e18
-"""Bound of metrics: one that is not finite would count as a failed training."""
+"""Bound of metrics; a metric that is not finite would count as a failure of training."""
 
 REACH = 2.0
 """Mean, in units of the bound, beyond which nearly all draws are clipped."""
@@ -40,7 +40,7 @@ class PolicyAndValue(eqx.Module):
     log_std: Float[Array, " coordinate"]  # the same in all states; one for all assets of a market
     critic: Network
     actions: Actions = eqx.field(static=True)
-    observations: Moments | None = None  # those it normalizes by; None while it learns
+    observations: Moments | None = None  # for normalization; None during training
 
     def policy(self, observation: PyTree) -> Distribution:
         seen = normalized(self.observations, observation)
@@ -52,7 +52,9 @@ class PolicyAndValue(eqx.Module):
 
 
 class OnPolicyState(eqx.Module):
-    weights: PolicyAndValue  # of normalized observations
+    """The state of an agent that learns from its current policy's rollouts."""
+
+    weights: PolicyAndValue  # for normalized observations
     optimizer: optimizer.Optimizer
     normalizer: Normalizer
 
@@ -78,7 +80,7 @@ class OnPolicy(Agent):
     num_envs: int = static(8)  # environments stepped side by side
     rollout_length: int = static(128)  # steps of each environment that are learned from at once
     episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
-    discount: float = number(0.99)  # γ, the discount of a step
+    discount: float = number(0.99)  # γ, the discount per step
     learning_rate: float = number(3e-4)  # step size at the start
     learning_rate_final: float = number(1.0)  # share of learning_rate at the end of its cosine
     learning_rate_steps: float = number(1e5)  # gradient steps of that cosine
@@ -88,14 +90,14 @@ class OnPolicy(Agent):
     max_grad_norm: float = number(0.5)  # longer gradients are rescaled to it
     value_coef: float = number(0.5)  # weight of the critic's squared error in the loss
     entropy_coef: float = number(0.0)  # weight of the policy's entropy in the loss
-    initial_std: float = number(1.0)  # of actions, in units of the bound, or of logits
+    initial_std: float = number(1.0)  # deviation of actions, in units of the bound, or of logits
     normalize_advantages: bool = static(True)  # gives advantages mean 0, deviation 1 in a batch
-    time_limit_terminal: bool = static(False)  # treats a time limit as an end, which is wrong
+    time_limit_terminal: bool = static(False)  # treats time limits as terminations (biased)
     saturation_penalty: float = number(0.1)  # penalty on means far beyond the bounds; 0: none
-    reward_scale: float = number(1.0)  # the critic learns values of scaled rewards
+    reward_scale: float = number(1.0)  # rewards are multiplied by it before learning
     input_gain: float = number(0.0)  # gain of the first layer on inputs scaled to ±1; 0: unscaled
-    normalize_observations: bool = static(False)  # by their mean and deviation so far
-    normalize_rewards: bool = static(False)  # by the deviation of discounted returns so far
+    normalize_observations: bool = static(False)  # by their running mean and standard deviation
+    normalize_rewards: bool = static(False)  # by the running deviation of discounted returns
 
     def __check_init__(self) -> None:
         require(self, "num_envs rollout_length", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
@@ -220,13 +222,16 @@ class OnPolicy(Agent):
         return log_prob * self.weighed(batch)
 
     def weighed(self, batch: Batch) -> Float[Array, " batch"]:
-        """The advantages in the objective, normalized if so set."""
+        """The advantages in the objective, normalized with ``normalize_advantages``."""
         if not self.normalize_advantages:
             return batch.advantage
         return standardized(batch.advantage, batch.counted)
 
     def loss(self, weights: PolicyAndValue, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
-        """Minus the objective and the weighted entropy, plus the weighted critic's error."""
+        """Minus the objective and the weighted entropy, plus the critic's weighted error.
+
+        The saturation penalty is added.
+        """
         output = weights.actor(batch.observation)
         policy = policy_of(weights.actions, output, weights.log_std)
         mean = partial(jnp.mean, where=batch.counted)

@@ -2,8 +2,8 @@
 
 If prices do not depend on our trades, the reward of a whole episode is a differentiable function of
 the policy: each action earns the market's next return, pays the cost of trading from the last
-holding, and leaves the next one. The gradient of the sum is exact for the paths seen; no action is
-perturbed to estimate it (Moody & Saffell 1998; Jiang et al. 2017, eq. 21–22, whose memory of
+holding, and leads to the next one. The gradient of the sum is exact for the paths seen; no action
+is perturbed to estimate it (Moody & Saffell 1998; Jiang et al. 2017, eq. 21–22, whose memory of
 previous weights is the holding here). docs/algorithms/pathwise.md lists formulas and deviations.
 """
 
@@ -43,10 +43,9 @@ class Band(eqx.Module):
     The network outputs two edges for each asset; a holding outside them moves to the nearer one.
     With proportional costs the best policy of one asset has this form (Davis & Norman 1990; as a
     network: Imaki et al. 2021, "No-transaction band network"); two edges that meet are a target
-    from anywhere. If the wanted weights sum to more than 1, the projection reduces them, also those
-    of assets inside their edges.
-    The edges start close together, so that both are traded to and have gradients, around equal
-    weights or no position.
+    from anywhere. If the wanted weights sum to more than 1, the projection reduces them all, even
+    those of assets inside their edges. At first the edges lie close together around equal weights,
+    or no position, so that both are traded to and have gradients.
     """
 
     network: Shared
@@ -93,10 +92,10 @@ class Band(eqx.Module):
 
 
 class Slopes(eqx.Module):
-    """What a little more of each asset is worth after a rollout, in scaled rewards.
+    """The marginal value of each asset held after a rollout, in scaled rewards.
 
-    At the low edge it is the cost of buying, which is about to be saved, and at the high edge minus
-    the cost of selling, however close the two are. So the network sees the place of a holding
+    At the low edge it is the cost of buying that is about to be saved, and at the high edge minus
+    the cost of selling, however close the two edges are. So the network sees the place of a holding
     between its edges instead of the holding.
     """
 
@@ -111,6 +110,8 @@ class Slopes(eqx.Module):
 
 
 class PathwiseState(eqx.Module):
+    """The state of a Pathwise agent."""
+
     policy: Band
     optimizer: Optimizer
     steps: Int[Array, ""]
@@ -139,10 +140,10 @@ class Paths(NamedTuple):
         return time, paths
 
     def spread(self, task: ExogenousTask, policy: Band, key: PRNGKeyArray) -> "Paths":
-        """The paths, every second one beginning at a random place in the band.
+        """The paths, with every second one beginning at a random place in the band.
 
-        From elsewhere the first trade leads to an edge. Few paths would cross a wide band, and the
-        slopes would be learned from little there.
+        From outside the band, the first trade leads to an edge. Few paths would cross a wide band,
+        so the slopes inside it would be learned from few data.
         """
         market = jax.tree.map(lambda x: x[0], self.market)
         view = jax.vmap(task.observe)(Position(market, self.start))
@@ -157,8 +158,8 @@ class Paths(NamedTuple):
         """The paths and, beside them, their mirror images, if the market has any.
 
         These are antithetic paths (Hammersley & Morton 1956). A band adapts to the mean return of
-        the paths that it is learned from. Over 10,000 years at a volatility of 20% this differs
-        from the true one by 0.2% a year, and edges by .01; paths and images have the true one.
+        the paths that it learns from. In 10,000 years of paths at a volatility of 20%, this mean is
+        off by 0.2% a year, and the edges by 0.01; paths and their images have the true mean.
         """
         market, next_market = (jax.vmap(jax.vmap(task.mirror))(x) for x in self[:2])
         if market is None:
@@ -174,18 +175,18 @@ class Paths(NamedTuple):
 class Pathwise(OnPaths):
     """Gradient ascent on net growth through whole rollouts."""
 
-    network: str = static("mlp")  # mlp, cnn or rnn, shared by all assets
+    network: str = static("mlp")  # mlp, cnn, rnn or lstm, shared by all assets
     hidden: tuple[int, ...] = sizes(32, 32)  # units of each hidden layer
     num_envs: int = static(64)  # paths in a batch, without mirror images
     rollout_length: int = static(50)  # steps of each path that a gradient goes through
-    tail: int = static(0)  # last steps of these, without a gradient of their own
-    bootstrap: bool = static(False)  # learn what the last holdings are worth after the rollout
+    tail: int = static(0)  # last of these steps, whose decisions have no gradient
+    bootstrap: bool = static(False)  # learn the value of the holdings after the rollout
     episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
     gradient_steps: int = static(1)  # gradient steps per rollout
     learning_rate: float = number(1e-3)  # step size at the start
     learning_rate_final: float = number(1.0)  # share of learning_rate at the end of its cosine
     learning_rate_steps: float = number(1e4)  # gradient steps of that cosine
-    slope_learning_rate_ratio: float = number(20.0)  # rate of bootstrap, as a share of the band's
+    slope_learning_rate_ratio: float = number(20.0)  # learning rate of bootstrap over the band's
     max_grad_norm: float = number(math.inf)  # longer gradients are rescaled to it
     reward_scale: float = number(1.0)  # rewards are multiplied by it
     simplex_penalty: float = number(0.01)  # penalty on weights off the simplex
@@ -296,10 +297,10 @@ class Pathwise(OnPaths):
         task: ExogenousTask,
         paths: Paths,
     ) -> tuple[Float[Array, ""], Float[Array, "decision batch asset"]]:
-        """Minus the mean reward per step of ``policy`` along the paths; the holdings.
+        """Minus the mean reward per step of ``policy`` along the paths, plus the penalty; holdings.
 
-        Holdings are those before each decision that has a gradient. nudges: zeros, added to the
-        holdings; their gradient says what more of an asset is worth.
+        Holdings are those before each decision that has a gradient. nudges: zeros that are added to
+        the holdings; their gradient is the marginal value of each asset.
         """
 
         def follow(policy: Band, holding: PyTree, steps: slice) -> Any:

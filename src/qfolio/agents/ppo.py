@@ -75,7 +75,7 @@ def shuffled(key: PRNGKeyArray, n: int) -> Int[Array, " n"]:
     """The numbers from 0 to ``n`` − 1 in random order.
 
     Up to 2¹⁶ they are sorted with random high bits, ten times as fast on a CPU as sorting pairs,
-    which had taken a fifth of PPO's time. Ties keep their order.
+    which took a fifth of PPO's time. Ties keep their order.
     """
     if n > 2**16:
         return jax.random.permutation(key, n)
@@ -89,6 +89,6 @@ def clipped(
 ) -> Float[Array, " batch"]:
     """min(rA, clip(r, 1 − ε, 1 + ε)A) (Schulman et al. 2017, eq. 7).
 
-    ratio: an action's probability over its probability when drawn.
+    ratio: r, an action's probability over its probability when drawn. clip: ε.
     """
     return jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)

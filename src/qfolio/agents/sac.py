@@ -52,7 +52,7 @@ class Actor(actor_critic.Actor):
 
 
 class Learned(actor_critic.Learned):
-    """What gradient steps change, with the temperature."""
+    """What gradient steps change, including the temperature."""
 
     actor: Actor
     log_temperature: Float[Array, ""]
@@ -107,7 +107,7 @@ def actor_loss(
 def temperature_loss(
     log_temperature: Float[Array, ""], excess: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Lowers the temperature if the entropy exceeds its target, and else raises it."""
+    """The loss that lowers the temperature if the entropy exceeds its target, or else raises it."""
     return log_temperature * excess, {"temperature": jnp.exp(log_temperature)}
 
 
@@ -121,7 +121,7 @@ class Policy(NamedTuple):
 class SAC(ActorCritic[Learned]):
     """A stochastic actor, two critics with targets, and a temperature."""
 
-    spread: float = number(0.184)  # target entropy, as a share of the actions
+    spread: float = number(0.184)  # target entropy: of uniform actions in this share of their range
     initial_temperature: float = number(1.0)  # weight of the entropy at the start
 
     def __check_init__(self) -> None:
@@ -165,9 +165,9 @@ class SAC(ActorCritic[Learned]):
     def action_values(
         self, weights: Policy, observation: PyTree
     ) -> Float[Array, "batch action"] | None:
-        """Q(s, ·) in units of reward, if actions are numbered; includes later entropy.
+        """Q(s, ·) in units of reward, with the value of later entropy, if actions are numbered.
 
-        None if they are in units of normalized rewards.
+        None for other actions, and if values are in units of normalized rewards.
         """
         if weights.critics is None or self.normalize_rewards:
             return None

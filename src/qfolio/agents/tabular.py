@@ -72,10 +72,10 @@ class Tabular(Agent):
 
     num_envs: int = static(1)  # environments stepped side by side
     episode_steps: int = static(0)  # longest training episode; 0: the task's horizon
-    discount: float = number(0.99)  # γ, the discount of a step
+    discount: float = number(0.99)  # γ, the discount per step
     learning_rate: float = number(0.1)  # α: how far an entry moves towards its target
     learning_rate_decay: float = number(0.0)  # d: after n updates of an entry, α/(1 + d n)
-    initial_value: float = number(0.0)  # of every entry; above the largest return: optimism
+    initial_value: float = number(0.0)  # of every entry; optimistic above the largest return
     epsilon_start: float = number(1.0)  # share of random actions at the start
     epsilon_end: float = number(0.01)  # least share of random actions
     epsilon_decay: float = number(0.995)  # factor on ε per finished episode
@@ -166,7 +166,7 @@ def step_share(entry: Int[Array, " batch"], rate: Float[Array, " batch"]) -> Flo
 
 
 class QLearning(Tabular):
-    """Q-learning: towards the best action's value, whichever action is taken."""
+    """Q-learning: targets the best action's value, whichever action is taken."""
 
     def learn(
         self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
@@ -177,7 +177,7 @@ class QLearning(Tabular):
 
 
 class ExpectedSarsa(Tabular):
-    """Expected SARSA: towards the mean value of the ε-greedy policy's actions."""
+    """Expected SARSA: targets the mean value of the ε-greedy policy's actions."""
 
     def learn(
         self, task: Task, state: TableState, rollout: Transition, key: PRNGKeyArray
@@ -209,11 +209,11 @@ class DoubleQ(Tabular):
 class SarsaState(TableState):
     """A table and the last step."""
 
-    last: Move  # it waits for the next action
+    last: Move  # waits for the next action
 
 
 class Sarsa(Tabular):
-    """SARSA: towards the value of the next action.
+    """SARSA: targets the value of the next action.
 
     Learning from a step waits until the next one shows that action. After a truncation there is
     none, and one is drawn from the policy.

@@ -2,7 +2,7 @@
 
 DDPG with three changes against overestimation: the Bellman target takes the smaller of two critics'
 estimates; noise on its action smooths the value over similar actions; and the actor and all targets
-are updated only once for several steps of the critics. docs/algorithms/actor_critic.md lists
+are updated only once in several steps of the critics. docs/algorithms/actor_critic.md lists
 formulas and deviations.
 """
 
@@ -24,8 +24,8 @@ class TD3(DDPG):
     """DDPG with two critics, a smoothed target and a delayed actor."""
 
     target_noise: float = number(0.2)  # noise on the target's action, in units of the bound
-    target_noise_clip: float = number(0.5)  # the largest such noise
-    policy_delay: int = static(2)  # critics' steps for one of the actor and the targets
+    target_noise_clip: float = number(0.5)  # largest absolute value of that noise
+    policy_delay: int = static(2)  # critics' steps per step of the actor and the targets
     pessimistic_actor: bool = static(True)  # the actor ascends the smaller value
 
     critics: ClassVar[int] = 2
