@@ -48,8 +48,9 @@ def tilt(linear, interaction=None, rate=0.0, band=-20.0, cap=1.0, network=None):
     count = len(linear)
     square = np.zeros((count, count)) if interaction is None else interaction
     trading = Trading(jnp.asarray(rate, float), jnp.asarray(band, float))
-    one = Tilt(jnp.asarray(linear, float), jnp.asarray(square, float), network, trading)
-    return TiltPolicy(jax.tree.map(lambda x: x[None], one), jnp.array(1.0), Simplex(3, cap))
+    trading, network = jax.tree.map(lambda x: x[None], (trading, network))
+    one = Tilt(jnp.asarray([linear], float), jnp.asarray([square], float), network, trading)
+    return TiltPolicy(one, jnp.array(1.0), Simplex(3, cap))
 
 
 def view(held, features=((0.0,), (0.0,), (0.0,)), anchor=(0.25, 0.25, 0.5)):
@@ -73,9 +74,9 @@ def test_target_is_the_nearest_without_negative_weights():
 
 
 def test_interaction_multiplies_inputs_with_their_mean_over_the_assets():
-    one = jax.tree.map(lambda x: x[0], tilt([0.0, 0.0], [[0.0, 1.0], [0.0, 0.0]]).members)
+    members = tilt([0.0, 0.0], [[0.0, 1.0], [0.0, 0.0]]).members
     features = jnp.array([[[0.0, 1.0, 0.5]], [[0.0, 0.0, 0.5]], [[0.0, -1.0, 0.5]]])
-    np.testing.assert_allclose(one.scores(features), [0.5, 0.0, -0.5], atol=1e-6)
+    np.testing.assert_allclose(members.scores(features), [[0.5, 0.0, -0.5]], atol=1e-6)
 
 
 def test_without_tilts_and_at_the_anchor_nothing_is_traded():
