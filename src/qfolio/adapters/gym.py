@@ -41,8 +41,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
 
     **Observation**: "features", for each asset the window of scaled log returns (and any other
     features) up to today, of shape (assets, window, channels); and "holding", the weights of the
-    assets held now (the rest is cash). Where assets come and go, "tradable" is 1 for each that may
-    be bought now; what is wanted of the others goes to those, in proportion.
+    assets held now (the rest is cash), of shape (assets,). Where assets come and go, "tradable" is
+    1 for each that may be bought now; weight wanted in the others goes to those, in proportion.
 
     **Action**: N + 1 numbers, cash first. Target weights are the nearest point of the simplex
     (Euclidean projection, no asset above ``max_weight``), so valid weights are used unchanged.
@@ -50,12 +50,12 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
 
     **Step**: a decision at row t is executed at the close of row t + lag, and its reward is that of
     the return of row t + lag + 1, net of the exact cost. Wealth is simulated in double precision,
-    as in the backtest. Episodes are truncated after ``horizon`` steps and never terminate.
+    as in the backtest. Episodes are truncated after ``horizon`` steps, and terminate only at ruin.
 
     ``info`` holds "wealth" (1 at the start), "cost" (share of wealth paid for this step's trade),
     "turnover", "target" (weights decided, cash first), "date" (of the row observed) and
-    "return_date" (of the row that earned the last return). It includes later rows, which agents
-    must not use.
+    "return_date" (of the row that earned the last return). Some of it is about rows after the one
+    observed, which agents must not use.
 
     Args:
         prices: Anything that ``qfolio.load_prices`` reads (default: skfolio's 20 stocks).
@@ -64,7 +64,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         render_mode: "ansi" for a line of text, or None.
         task: Settings of the portfolio task, such as window, lag, cost, max_weight, menu, reward.
 
-    ``reset`` draws the first row, unless given ``options={"start": row}``.
+    ``reset`` draws the first row, unless given ``options={"start": row}``. Raises QfolioError for
+    invalid settings, starts and actions.
     """
 
     metadata = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012
@@ -123,7 +124,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts in cash, at a row from ``first`` to ``last``."""
+        """Starts in cash at a row from ``first`` to ``last``, drawn or given as ``start``."""
         super().reset(seed=seed)
         start = (options or {}).get("start")
         if start is None:
@@ -141,7 +142,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Decides for today's row and moves to the next."""
+        """Decides at today's row and moves to the next."""
         if self._steps >= self.task.horizon:
             raise QfolioError("The episode is over; call reset() first.")
         row, lag = self._row, self.task.lag
@@ -282,7 +283,7 @@ _programs = cache(_Programs)
 
 
 class TaskEnv(gymnasium.Env[Any, Any]):
-    """A task of ``qfolio train`` by its name, compiled, one step at a time.
+    """A task that ``qfolio train`` knows by name, compiled, one step at a time.
 
     Observations are those of qfolio's agents: numbers (Box), a state's number (Discrete) or, in
     markets, a Dict of each asset's "features" and the "holding". Actions are numbered (Discrete)

@@ -1,4 +1,4 @@
-"""A bar for whatever trains, in a notebook or on a terminal: ``qfolio.Progress``."""
+"""A progress bar for any training, in a notebook or on a terminal: ``qfolio.Progress``."""
 
 import datetime
 import math
@@ -13,14 +13,14 @@ from qfolio.core.text import printable
 from qfolio.experiments.log import Tracker
 
 EVERY = 0.2
-"""Seconds between two pictures."""
+"""Least seconds between two updates of the bar."""
 
 Show = Callable[[float, str], None]
-"""Shows the share that is done, and a text beside it."""
+"""Shows the share that is done, and a text beside the bar."""
 
 
 class Progress(Tracker):
-    """Shows how far a training is, and its latest numbers.
+    """Shows how far training has come, and its latest numbers.
 
     >>> with qfolio.tracked(qfolio.Progress()):
     ...     qfolio.train(qfolio.Pendulum(), qfolio.DQN(), episodes=200)

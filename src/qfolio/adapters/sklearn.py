@@ -38,7 +38,7 @@ class PortfolioPolicy(BaseOptimization):
     ``predict`` assumes that the rows of ``X`` follow the training rows. If both have dates, it
     looks up which rows came before, and if these are too few for a window (as on the training data
     themselves), it holds the portfolio without trading until there are enough. The policy does not
-    see rows that a splitter purges in between; it observes a market that does not move there.
+    see rows that a splitter purges in between; to the policy, the market stands still there.
 
     Parameters
     ----------
@@ -152,11 +152,14 @@ class PortfolioPolicy(BaseOptimization):
 
     @property
     def needs_previous_weights(self) -> bool:
-        """Always: a fold starts with the last one's weights, and pays for its trades."""
+        """Always true: a fold starts with the last fold's weights and pays for its trades."""
         return True
 
     def fit(self, X: Any, y: Any = None) -> "PortfolioPolicy":
-        """Learns a policy from simple returns of shape (n_observations, n_assets)."""
+        """Learns a policy from simple returns of shape (n_observations, n_assets).
+
+        Raises ValueError or QfolioError for invalid returns, holdings or settings.
+        """
         from qfolio.core import devices
         from qfolio.portfolio.policy import train
 
@@ -180,7 +183,8 @@ class PortfolioPolicy(BaseOptimization):
     def partial_fit(self, X: Any, y: Any = None) -> "PortfolioPolicy":
         """Continues learning from returns of the same assets that follow those seen before.
 
-        The first call is a ``fit``; later ones learn from as many of the last rows as it had.
+        The first call is a ``fit``; later calls learn from as many of the last rows as it had.
+        Raises ValueError if rows are dated before the end of those seen.
         """
         self._validate_partial_fit_fallback()
         if not hasattr(self, "policy_"):
@@ -315,7 +319,8 @@ class PolicyPortfolio(Portfolio):
     """A portfolio whose weights a policy changes every day; its returns are net of costs.
 
     ``weights`` are means over the days, ``weights_per_observation`` those of each day, and
-    ``turnover`` is the sum of all trades. simulation: cash, turnover and cost of each day.
+    ``turnover`` is the sum of all trades. ``simulation`` has the cash, turnover and cost of each
+    day.
     """
 
     __slots__ = {"simulation"}
@@ -345,11 +350,11 @@ class PolicyPortfolio(Portfolio):
         return float(self.simulation.turnover.sum())
 
     def contribution(self, *args: Any, **kwargs: Any) -> Any:
-        """Not defined: skfolio's contributions are derivatives by constant weights."""
+        """Not defined: skfolio's contributions are derivatives with respect to constant weights."""
         raise NotImplementedError("Contributions are not defined for weights that change daily.")
 
     def _get_init_params(self) -> dict[str, Any]:
-        """The arguments that rebuild it, by name."""
+        """The arguments that rebuild the portfolio, by name."""
         kept = set(inspect.signature(Portfolio.__init__).parameters)
         kept -= {"self", "kwargs", "weights", "weight_drift", "sample_weight"}
         params = {name: getattr(self, name) for name in sorted(kept)}

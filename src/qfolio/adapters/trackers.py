@@ -42,7 +42,7 @@ class TensorBoard(Tracker):
 class WeightsAndBiases(Tracker):
     """Weights & Biases, offline unless ``WANDB_MODE`` says otherwise.
 
-    Keys stay where wandb keeps them; the log of an experiment holds none.
+    API keys stay where wandb keeps them; the log of an experiment holds none.
     """
 
     name = "wandb"
@@ -69,10 +69,10 @@ class Trackio(WeightsAndBiases):
 
 
 def trackers(names: Iterable[str]) -> list[Tracker]:
-    """The trackers that a user names; imports the modules of their own.
+    """The trackers that a user names, one of each; imports the modules of a user's own.
 
     Raises:
-        QfolioError: There is none of this name, or its package is missing.
+        QfolioError: There is none of this name, its package is missing, or it needs arguments.
     """
     return [_made(name) for name in dict.fromkeys(names)]
 

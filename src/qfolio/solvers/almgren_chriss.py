@@ -10,14 +10,17 @@ from qfolio.solvers.shared import require
 
 
 class Liquidation(NamedTuple):
+    """The best schedule of a sale, and what it is expected to cost."""
+
     positions: Float[np.ndarray, " time"]
     """Shares held at each of the steps + 1 times; the last is 0."""
     kappa: float
-    """κ, the speed of the sale; 1/κ is its half-life in the absence of a horizon."""
+    """κ, the speed of the sale per unit of time; without a horizon, 1/κ is the time in which the
+    position falls by a factor of e."""
     cost: float
-    """Expected implementation shortfall, spread excluded."""
+    """Expected implementation shortfall in money, without the spread."""
     variance: float
-    """Variance of the implementation shortfall."""
+    """Variance of the implementation shortfall, in money squared."""
 
 
 def almgren_chriss(
@@ -40,16 +43,16 @@ def almgren_chriss(
     with E = γX²/2 + (η − γτ/2)/τ Σ n² and V = σ²τ Σ x². At λ = 0 it is a straight line.
 
     Source: R. Almgren and N. Chriss, "Optimal Execution of Portfolio Transactions" (2000),
-    equations 5, 8, 9, 16, 17. Their spread costs the same however one sells, and is left out.
+    equations 5, 8, 9, 16, 17. The cost of their spread is the same for all schedules and left out.
 
     Args:
-        shares: X, the position at the start.
-        volatility: σ ≥ 0, in money a share, of one unit of time.
-        temporary: η, in money a share for a share sold a unit of time.
-        permanent: γ ≥ 0, in money a share for a share sold; γτ/2 must be below η.
+        shares: X, the position at the start, in shares.
+        volatility: σ ≥ 0, in money per share, over one unit of time.
+        temporary: η, in money per share, for each share sold per unit of time.
+        permanent: γ ≥ 0, in money per share, for each share sold; γτ/2 must be below η.
         risk_aversion: λ ≥ 0, per unit of money.
         duration: T > 0, in units of time.
-        steps: N ≥ 1.
+        steps: N ≥ 1, the number of trades.
 
     Raises:
         QfolioError: A parameter is out of range.

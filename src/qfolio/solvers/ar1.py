@@ -32,6 +32,7 @@ class Ar1Optimum:
     growth: float
     """Log growth of the best policy, a year."""
     cost: float
+    """Proportional cost, one way."""
     growth_of: Callable[[Int[np.ndarray, "s h"]], float]
     """Stationary growth a year of any table of actions."""
 
@@ -66,8 +67,8 @@ def ar1(
     b(1 + r)/(1 + b r), and is brought back at a cost; without, it stays at its level.
 
     Value iteration on (signal, weight): the expectation over x' is a sum over equally spaced
-    signals within five standard deviations (exact to rounding for smooth functions), that over η
-    Gauss–Hermite quadrature; values between grid weights are interpolated. Values are exact to
+    signals within five standard deviations (exact to rounding for smooth functions), and that over
+    η is Gauss–Hermite quadrature; values between grid weights are interpolated. Values are exact to
     about 1e-6, growth to about 2e-5 a year at the default grids.
 
     Args:
@@ -75,9 +76,9 @@ def ar1(
         drift, slope, volatility: Parameters of the return, per step.
         cost: Proportional and one way, at least 0 and below 1.
         levels: Ascending weights in [0, 1] to choose from.
-        discount: Per step, from 0 to 0.9999.
+        discount: Discount per step, from 0 to 0.9999.
         drifting: Whether prices move the weights.
-        signal_points: Size of the signal's grid.
+        signal_points: Size of the signal's grid, at least 11.
         holding_parts: Cells of the grid of held weights between two levels.
         steps_per_year: Turns growth per step into growth a year.
 

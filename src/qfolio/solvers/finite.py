@@ -24,7 +24,7 @@ Values = Float[np.ndarray, "state action"]
 
 
 class Model(NamedTuple):
-    """A process as tables: each action of each state has some outcomes.
+    """A process as tables: each action in each state has a number of outcomes.
 
     ``successors`` are the next states, ``transitions`` their probabilities and ``rewards`` their
     rewards. Terminal states lead to themselves with reward 0.
@@ -82,14 +82,17 @@ def look_ahead(model: Model, values: Float[np.ndarray, " state"], discount: floa
 
 
 def soft(values: Values, epsilon: float) -> Float[np.ndarray, " state"]:
-    """State values if the action is random with probability ε, and else the best."""
+    """State values if the action is random with probability ε and otherwise the best."""
     return (1 - epsilon) * values.max(-1) + epsilon * values.mean(-1)
 
 
 def value_iteration(
     model: Model, discount: float, epsilon: float = 0.0, tol: float = 1e-10
 ) -> Values:
-    """Q to within ``tol``, by sweeps over all states; each multiplies the error by γ."""
+    """Q to within ``tol``, by sweeps over all states, each of which multiplies the error by γ.
+
+    Raises QfolioError unless 0 ≤ discount < 1 and 0 ≤ epsilon ≤ 1.
+    """
     _require(discount, epsilon)
     values = np.zeros(model.transitions.shape[:2])
     while True:
@@ -101,7 +104,10 @@ def value_iteration(
 
 
 def policy_iteration(model: Model, discount: float, epsilon: float = 0.0) -> Values:
-    """Q to rounding error, by the exact values of ever better policies."""
+    """Q to rounding error, by the exact values of ever better policies.
+
+    Raises QfolioError unless 0 ≤ discount < 1 and 0 ≤ epsilon ≤ 1.
+    """
     _require(discount, epsilon)
     states, actions, _ = model.transitions.shape
     best = np.zeros(states, int)
@@ -118,7 +124,10 @@ def policy_iteration(model: Model, discount: float, epsilon: float = 0.0) -> Val
 
 
 def policy_evaluation(model: Model, policy: Values, discount: float) -> Values:
-    """Q of the policy that takes each action with the given probability; rows sum to 1."""
+    """Q of the policy that takes each action with the given probability; rows sum to 1.
+
+    Raises QfolioError unless 0 ≤ discount < 1.
+    """
     _require(discount, 0.0)
     states = len(policy)
     weights = policy[:, :, None] * model.transitions

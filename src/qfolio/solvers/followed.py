@@ -1,4 +1,4 @@
-"""The optimum of a task whose best policy is known: its returns on an evaluation's paths."""
+"""The optimum of a task whose best policy is known, by that policy's returns in an evaluation."""
 
 from collections.abc import Callable
 from typing import Any

@@ -43,12 +43,13 @@ def garleanu_pedersen(
     Args:
         phi: Decay of each factor per step, in (0, 1]; shape (factor,), or a number for one.
         risk_aversion: γ > 0.
-        cost: Λ, shape (asset, asset), symmetric and not negative, or a number for one asset.
-        loading: B, shape (asset, factor); of one asset also (factor,) or a number.
-        covariance: Σ of the assets' noise, shape (asset, asset), positive definite, or a number.
+        cost: Λ, shape (asset, asset), positive semidefinite, or a number for one asset.
+        loading: B, shape (asset, factor); for one asset also (factor,) or a number.
+        covariance: Σ of the assets' noise per step, shape (asset, asset), positive definite, or a
+            number for one asset.
         rho: Discount rate per step, between 0 and 1, both excluded.
-        innovation: Covariance of ε, (factor, factor), or variances of independent factors. Only
-            the value depends on it.
+        innovation: Covariance of ε, shape (factor, factor), or variances of independent factors,
+            shape (factor,) or one number (default: 1). Only ``value`` depends on it.
 
     Raises:
         QfolioError: A parameter is out of range.
@@ -94,6 +95,6 @@ def garleanu_pedersen(
 
 
 def _least_eigenvalue(matrix: Float[np.ndarray, "..."], size: int) -> float:
-    """−∞ if it is no symmetric matrix of this size."""
+    """The least eigenvalue; −∞ if the matrix is not symmetric or not of this size."""
     symmetric = matrix.shape == (size, size) and np.allclose(matrix, matrix.T, rtol=1e-9, atol=0)
     return float(np.linalg.eigvalsh(matrix).min()) if symmetric else -np.inf

@@ -12,12 +12,12 @@ def kelly(up: float, down: float, probability: float) -> tuple[float, float]:
     is clipped to [0, 1].
 
     Args:
-        up: Relative with the given probability, above 1.
-        down: Relative otherwise, at least 0 and below 1.
+        up: What a stake of 1 becomes with the given probability, above 1.
+        down: What it becomes otherwise, at least 0 and below 1.
         probability: Probability of ``up``.
 
     Returns:
-        The fraction and the growth per bet.
+        The fraction and the expected log growth per bet.
 
     Raises:
         QfolioError: A parameter is out of range.

@@ -10,13 +10,13 @@ from qfolio.solvers.sifting import Floats, sift
 def maximum_ratio(
     mean: ArrayLike, covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-10
 ) -> Floats:
-    """The weights w that maximize μ'w/√(w'Σw) with Σw = 1 and 0 ≤ w ≤ cap.
+    """The weights w that maximize μ'w/√(w'Σw) with 1'w = 1 and 0 ≤ w ≤ cap.
 
-    The ratio does not depend on the scale of w, so that w = y/Σy, where y minimizes
-    ½ y'Σy − μ'y with 0 ≤ y ≤ cap Σy (cf. G. Cornuéjols and R. Tütüncü, "Optimization Methods in
+    The ratio does not depend on the scale of w, so that w = y/(1'y), where y minimizes
+    ½ y'Σy − μ'y with 0 ≤ y ≤ cap 1'y (cf. G. Cornuéjols and R. Tütüncü, "Optimization Methods in
     Finance", 2006, section 8.2). A primal-dual interior-point method (Wright 1997, chapter 5)
-    finds y, with multipliers z of y ≥ 0 and v of cap Σy − y ≥ 0. An iteration solves one system. Of
-    many assets those that are held are sifted out first.
+    finds y, with multipliers z of y ≥ 0 and v of cap 1'y − y ≥ 0. Each iteration solves one linear
+    system. Among many assets, sifting finds those that are held.
 
     Args:
         mean: μ, shape (asset,).
@@ -29,7 +29,7 @@ def maximum_ratio(
 
     Raises:
         QfolioError: The arguments are invalid, no portfolio has a positive mean, the cap is too
-            low, or there is no convergence, as without any risk.
+            low, or there is no convergence, for example if a portfolio has no risk.
     """
     mu, sigma = np.asarray(mean, dtype=float), np.asarray(covariance, dtype=float)
     count = len(mu)

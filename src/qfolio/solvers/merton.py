@@ -11,6 +11,8 @@ from qfolio.solvers.shared import gauss, require
 
 
 class GrowthOptimum(NamedTuple):
+    """The growth-optimal portfolio of ``growth_optimal``."""
+
     weights: Float[np.ndarray, " asset"]
     growth: float
     """Expected log relative per step."""
@@ -24,10 +26,10 @@ def growth_optimal(
     """The weights b on the simplex that maximize E log(b·x) over finitely many scenarios.
 
     On the rows of a price history this is the best constant-rebalanced portfolio. Since
-    b·∇E log(b·x) = 1, the maximum of E log(b·x) − Σb over b ≥ 0 lies on the simplex by itself, and
+    b·∇E log(b·x) = 1, the maximum of E log(b·x) − 1'b over b ≥ 0 lies on the simplex by itself, and
     b is optimal exactly if E[x_i/(b·x)] ≤ 1 for all i, with equality where b_i > 0 (T. Cover, "An
     Algorithm for Maximizing Expected Log Investment Return", 1984, theorem 1). Cover's iteration
-    starts, a primal-dual interior-point method follows, and Newton's method on the assets held
+    comes first, then a primal-dual interior-point method; Newton's method on the assets held
     refines the result to rounding error.
 
     Args:
@@ -177,12 +179,14 @@ def merton(
 
 
 class LeveragedOptimum(NamedTuple):
+    """The portfolio of ``leveraged_optimal``."""
+
     weights: Float[np.ndarray, " asset"]
     """Of the assets; the rest, which may be negative, is cash."""
     utility: float
-    """E u of the wealth's relative."""
+    """E u(g), the expected utility of the relative of wealth."""
     violation: float
-    """Largest slope that is left, E[u'(g) ∂g] / E u'(g), of those that should be 0."""
+    """Largest of the slopes E[u'(g) ∂g] / E u'(g), which should all be 0."""
 
 
 def leveraged_optimal(
@@ -196,20 +200,21 @@ def leveraged_optimal(
 
     Wealth grows by g = w·x + c R, where c = 1 − Σw is cash and R its relative: ``cash`` for c ≥ 0,
     else ``debt``, which is no less. E u(g), with u(g) = (g^(1−γ) − 1)/(1−γ) (log g for γ = 1), is
-    concave in w and has a kink where c = 0. The best weights without cash would neither lend nor
-    borrow at R = E[u'(g) g] / E u'(g). If that lies between the two relatives they are optimal;
-    else the optimum is that for the nearer one. Newton's method finds each.
+    concave in w and has a kink where c = 0. With the best weights without cash, the investor would
+    neither lend nor borrow at R = E[u'(g) g] / E u'(g). If this R lies between the two relatives,
+    those weights are optimal; else the optimum is the one for the nearer relative. Newton's method
+    finds each.
 
     Args:
         relatives: Shape (scenario, asset), above 0.
         probabilities: Shape (scenario,), summing to 1 (default: equal).
         risk_aversion: γ > 0.
         cash: Relative of cash over the step.
-        debt: Relative of what is borrowed, at least ``cash`` (default: ``cash``).
+        debt: Relative of what is borrowed over the step, at least ``cash`` (default: ``cash``).
 
     Raises:
-        QfolioError: The arguments are not valid scenarios, or a portfolio exists that never loses
-            against cash or debt, so that no optimum does.
+        QfolioError: The arguments are not valid scenarios, or there is no optimum, because some
+            portfolio never loses against cash or debt.
     """
     x = np.asarray(relatives, dtype=float)
     require(
@@ -299,7 +304,7 @@ def lognormal_scenarios(
 ) -> tuple[Float[np.ndarray, "scenario column"], Float[np.ndarray, " scenario"]]:
     """Merton's market over one step of ``dt`` years as scenarios for ``growth_optimal``.
 
-    Gauss–Hermite nodes of log relatives with mean (μ − diag(Σ)/2) dt and covariance Σ dt, so that
+    They are Gauss–Hermite nodes of log relatives with mean (μ − diag(Σ)/2) dt and covariance Σ dt;
     there are points**assets of them. With dt → 0 their optimum tends to ``merton``'s weights where
     those lie within the simplex.
 
@@ -327,6 +332,7 @@ def lognormal_scenarios(
 
 
 def drift_and_covariance(drift: ArrayLike, covariance: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Both as arrays of shapes (asset,) and (asset, asset); raises QfolioError if invalid."""
     mean, sigma = np.asarray(drift, dtype=float), np.asarray(covariance, dtype=float)
     require(
         mean.ndim == 1 and mean.size > 0 and sigma.shape == (mean.size, mean.size),

@@ -8,17 +8,17 @@ from qfolio.solvers.sifting import Floats, sift
 
 
 def minimum_variance(covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-12) -> Floats:
-    """The weights w that minimize w'Σw with Σw = 1 and 0 ≤ w ≤ cap.
+    """The weights w that minimize w'Σw with 1'w = 1 and 0 ≤ w ≤ cap.
 
     A primal-dual interior-point method (Wright 1997, chapter 5) from equal weights, with
-    multipliers z of w ≥ 0 and v of w ≤ cap: Σw − y − z + v = 0 holds after a full step, and the
-    products w z and (cap − w) v go to zero together. An iteration solves one system. Of many assets
-    those that are held are sifted out first.
+    multipliers y of 1'w = 1, z of w ≥ 0 and v of w ≤ cap: Σw − y − z + v = 0 holds after a full
+    step, and the products w z and (cap − w) v go to zero together. Each iteration solves one linear
+    system. Among many assets, sifting finds those that are held.
 
     Args:
         covariance: Σ, shape (asset, asset), positive semidefinite.
         cap: Largest weight, at least 1/assets.
-        tol: Largest mean product that is accepted, in units of the mean variance.
+        tol: Largest mean of these products that is accepted, in units of the mean variance.
 
     Returns:
         Weights of shape (asset,); those that are zero or at the cap are so exactly.

@@ -12,6 +12,8 @@ from qfolio.solvers.shared import log_remainder, require
 
 
 class NoTradeRegion(NamedTuple):
+    """The edges of a no-trade region, as weights of the asset, and the growth that it earns."""
+
     low: float
     high: float
     growth: float
@@ -91,9 +93,13 @@ def no_trade_growth(
     rate: float = 0.0,
     buying: float | None = None,
 ) -> Float[np.ndarray, "..."]:
-    """Growth a year of keeping the weight in any region low < high, as in ``no_trade_region``.
+    """Log growth a year of keeping the weight in any region low < high, as in ``no_trade_region``.
 
-    Evaluates a learned region without simulation. ``low`` and ``high`` lie in (0, 1) and broadcast.
+    Evaluates a learned region without simulation. ``low`` and ``high`` lie in (0, 1) and broadcast
+    to the shape of the result; the other arguments are those of ``no_trade_region``.
+
+    Raises:
+        QfolioError: An edge is out of range.
     """
     from scipy.special import exprel, logit
 
@@ -112,14 +118,14 @@ def no_trade_region_discrete(
 ) -> NoTradeRegion:
     """The no-trade region of an investor who may trade only every ``dt`` years.
 
-    The backtest's rule: at each step the agent sees the weight w, trades at the remainder factor
+    As in the backtest, at each step the agent sees the weight w, trades at the remainder factor
     (so that buying costs c/(1 − c) of the value bought), and then earns
     log(1 − w + w exp((θ − σ²/2)dt + σ√dt ε)). With dt → 0 the region tends to that of
     ``no_trade_region(…, buying=cost / (1 - cost))``.
 
-    Policy iteration for the average reward. Between the edges the relative value is a polynomial
-    at Chebyshev points, outside it is the value at the edge less the cost of going there; the
-    expectation is Gauss–Legendre quadrature between the edges and beyond them.
+    Solved by policy iteration for the average reward. Between the edges the relative value is a
+    polynomial at Chebyshev points; outside, it is the value at the edge less the cost of going
+    there. Expectations use Gauss–Legendre quadrature between the edges and beyond them.
 
     Args:
         drift, volatility, cost, rate: As in ``no_trade_region``.

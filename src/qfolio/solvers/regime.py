@@ -12,23 +12,25 @@ from qfolio.solvers.shared import require
 
 
 class RegimeOptimum(NamedTuple):
+    """The solution of ``regime``."""
+
     policy: Int[np.ndarray, "2 2"]
     """Position (0 or 1) to take, by (regime, position held)."""
     gain: float
     """Long-run log growth per step."""
     advantage: Float[np.ndarray, " 2"]
-    """Log wealth that holding the asset before the decision is worth, by regime; in [−κ, κ]."""
+    """Value in log wealth of holding the asset before the decision, by regime; in [−κ, κ]."""
 
 
 def regime(stay: ArrayLike, means: ArrayLike, cost_log: float) -> RegimeOptimum:
     """The best policy of being in or out of an asset whose mean follows a two-state Markov chain.
 
     In each step the agent sees the regime s and its position, chooses the position for this step,
-    pays ``cost_log`` if that is a switch, and earns position × means[s], the mean of the regime it
-    *saw*; then the regime changes. It maximizes the average reward. Only the advantage Δ of being
-    in rather than out matters (an optimal stopping problem): u = m + P Δ, Δ = clip(u, −κ, κ). The
-    agent enters where u > κ, leaves where u < −κ, and gains Σ π_s (u_s − κ)⁺ a step. Of the nine
-    ways to clip, the self-consistent one is found by linear solves.
+    pays ``cost_log`` if that is a switch, and earns position × means[s], with the mean of the
+    regime that it *saw*; then the regime may change. It maximizes the average reward. Only the
+    advantage Δ of being in rather than out matters (an optimal stopping problem): u = m + P Δ,
+    Δ = clip(u, −κ, κ). The agent enters where u > κ, leaves where u < −κ, and gains
+    Σ π_s (u_s − κ)⁺ a step. Linear solves find the one of the nine ways to clip that is consistent.
 
     Args:
         stay: Shape (2,), the probability that each regime lasts another step; below 1.

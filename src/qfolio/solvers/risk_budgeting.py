@@ -15,10 +15,10 @@ def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> NDArray[np.float64]
 
     Args:
         covariance: Σ, shape (asset, asset), positive semidefinite with positive variances.
-        tol: Largest relative difference of a contribution from the mean that is accepted.
+        tol: Largest relative difference between a contribution and the mean that is accepted.
 
     Returns:
-        Weights of shape (asset,), of sum 1.
+        Weights of shape (asset,), which sum to 1.
 
     Raises:
         QfolioError: The covariance is invalid, or the tolerance is not reached.

@@ -1,8 +1,8 @@
 """Shared by the solvers of markets: quadrature, checks and the log cost of a trade.
 
-In all of them, relatives are price ratios over one step and cash has relative 1; costs are
-proportional and one way (0.001 is 10 basis points); growth is the expected logarithm of the
-ratio of wealth. Everything is float64.
+In all of them, relatives are price ratios over one step, and cash has relative 1 unless a rate is
+given; costs are proportional and one way (0.001 is 10 basis points); growth is the expected
+logarithm of the ratio of wealth. Everything is float64.
 
 Rebalancing one asset and cash from weight w to weight b leaves the share (1 − c w)/(1 − c b) of the
 wealth when selling and (1 − c + c w)/(1 − c + c b) when buying: the seller receives 1 − c times the
@@ -15,7 +15,7 @@ from qfolio.core.errors import QfolioError
 
 
 def log_remainder(before: np.ndarray, after: np.ndarray, cost: float) -> np.ndarray:
-    """Log of the wealth left by a rebalancing between weights of one asset; broadcasts."""
+    """Log of the share of wealth left by rebalancing one asset between two weights; broadcasts."""
     buy = np.log1p(-cost * (1 - before)) - np.log1p(-cost * (1 - after))
     sell = np.log1p(-cost * before) - np.log1p(-cost * after)
     return np.asarray(np.where(after > before, buy, sell))
@@ -28,5 +28,6 @@ def gauss(points: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def require(holds: bool, sentence: str) -> None:
+    """Raises QfolioError with the sentence, which lacks its period, unless ``holds``."""
     if not holds:
         raise QfolioError(f"{sentence}.")

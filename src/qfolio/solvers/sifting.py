@@ -1,7 +1,7 @@
 """Sifting: an optimum over many assets from optima over few of them.
 
-Most weights of a long-only optimum are zero. The problem is solved among some assets; those that
-would then be bought are added, until there are none (R. Bixby et al., "Very Large-Scale Linear
+Most weights of a long-only optimum are zero. The problem is solved for some of the assets; others
+that would then be bought are added, until there are none (R. Bixby et al., "Very Large-Scale Linear
 Programming", 1992, for columns of linear programs). The result is the optimum over all.
 """
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 FIRST = 100
-"""Assets at the start, and the most that are added at a time."""
+"""Number of assets at the start (or more, for a low cap), and the most added at a time."""
 
 
 def sift(
@@ -28,10 +28,13 @@ def sift(
     Args:
         order: The assets with the smallest numbers are tried first, shape (asset,).
         cap: Largest weight of one asset.
-        solve: The optimal weights of some assets alone, by their places.
-        price: The marginal cost of each asset at weights of all; at an optimum no asset costs less
-            than one that is held, unless it is at the cap.
-        tol: Smaller differences of such costs are rounding errors.
+        solve: Returns the optimal weights of some assets alone, given their indices.
+        price: Returns the marginal cost of each asset, given the weights of all. At an optimum no
+            asset costs less than one that is held, unless the cheaper one is at the cap.
+        tol: Smaller differences between these costs count as rounding errors.
+
+    Returns:
+        Weights of shape (asset,).
     """
     count = len(order)
     chosen = np.zeros(count, dtype=bool)

@@ -17,7 +17,7 @@ from qfolio.core.mdp import Discrete, Step, Task
 
 
 class CatchState(NamedTuple):
-    """The columns of the falling things, the ball's first, their row, and the paddle's column."""
+    """The columns of the ball and the decoys, in this order, their row, and the paddle's column."""
 
     columns: Int[Array, "*batch thing"]
     row: Int[Array, "*batch"]  # from the top, of the ball and of the decoys' lower pixels
@@ -25,9 +25,9 @@ class CatchState(NamedTuple):
 
 
 class Catch(Task):
-    """Catch the ball, by actions left, stay and right.
+    """Catch the ball; the actions are left, stay and right.
 
-    Everything falls one row a step. The ball is one pixel; each of ``decoys`` is two, one above the
+    Ball and decoys fall one row per step. The ball is one pixel; each decoy is two, one above the
     other, in a column of its own. The episode ends when the ball reaches the bottom row, where the
     paddle is: reward 1 if it is under the ball, else −1, and 0 before. Observation: the image,
     (rows, columns, 1), pixels 0 or 1. Start: the paddle in the middle, all columns random.
@@ -35,7 +35,7 @@ class Catch(Task):
 
     rows: int = static(10)  # rows of the image, in pixels
     columns: int = static(5)  # columns of the image, in pixels
-    decoys: int = static(0)  # things that fall beside the ball
+    decoys: int = static(0)  # number of decoys, which fall beside the ball
 
     def __check_init__(self) -> None:
         require(self, "rows columns", lambda x: 3 <= x <= 256, "from 3 to 256")

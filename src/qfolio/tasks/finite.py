@@ -34,8 +34,9 @@ class FiniteMDP(Task):
             terminal).
         terminal: The states that end an episode: state numbers, or true and false for each state.
             The tables' entries for these states are ignored.
-        horizon: Steps after which an episode is truncated.
-        successors: The next state of each outcome, if few of many states can follow.
+        horizon: Steps after which an episode is truncated (default: 100).
+        successors: The next state of each outcome, (state, action, outcome), for processes in
+            which only few of many states can follow.
 
     Raises:
         QfolioError: An array has the wrong shape, or is not a distribution.
@@ -115,7 +116,7 @@ class FiniteMDP(Task):
 
     @property
     def actions(self) -> Discrete:
-        """The actions, as many in every state."""
+        """The actions, the same number in every state."""
         return Discrete(self.transitions.shape[1])
 
     def reset(self, key: PRNGKeyArray) -> Int[Array, ""]:
@@ -178,7 +179,7 @@ class FrozenLake(FiniteMDP):
     """Gymnasium's ``FrozenLake``: over the ice to the goal, which pays 1; holes end the episode.
 
     ``size`` 4 or 8. Actions: left, down, right, up; if ``slippery``, the step goes that way or to
-    either side, with probability 1/3 each. horizon: 0 for Gymnasium's, 100 and 200 steps.
+    either side, with probability 1/3 each. ``horizon`` 0 stands for Gymnasium's, 100 or 200 steps.
     """
 
     size: int = static(4)  # cells of a side: 4 or 8
@@ -212,7 +213,7 @@ class Garnet(FiniteMDP):
     interval at random points, and has a standard normal reward. It never ends.
     """
 
-    n_states: int = static(50)  # states
+    n_states: int = static(50)  # number of states
     n_actions: int = static(4)  # actions in each state
     branching: int = static(3)  # states that an action may lead to
     seed: int = static(0)  # seed of the process itself

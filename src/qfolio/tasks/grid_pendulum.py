@@ -1,4 +1,4 @@
-"""The pendulum for tables: observed on a grid, and as a finite process.
+"""The pendulum for tabular agents: observed on a grid, and as a finite process.
 
 ``GridPendulum`` moves as the pendulum does and shows only its cell of a grid, so that a table can
 learn it. The exact optimum is that of the pendulum itself, so a learned policy's regret includes

@@ -33,9 +33,9 @@ class GymnasiumTask(HostTask):
     Raises QfolioError for other spaces, for an unknown ID and if a dependency is not installed.
     """
 
-    id: str = static("CartPole-v1")  # with a module to import first: my_module:MyEnv-v0
+    id: str = static("CartPole-v1")  # ID; with a module to import first: my_module:MyEnv-v0
     kwargs: str = static("")  # arguments of gymnasium.make, as JSON: {"continuous": true}
-    horizon: int = static(0)  # episodes are truncated here; 0: the environment's limit
+    horizon: int = static(0)  # steps of an episode; 0: the environment's limit
 
     def __post_init__(self) -> None:
         if not self.horizon:
@@ -62,7 +62,7 @@ class GymnasiumTask(HostTask):
 
     @property
     def observation_scale(self) -> tuple[float, ...] | float:
-        """The bounds of an observation's numbers, or 1 if there are none."""
+        """The bounds of an observation's numbers; 1 for those without a bound below a million."""
         return self.facts.scale
 
     @property
@@ -82,7 +82,7 @@ class GymnasiumTask(HostTask):
         raise QfolioError(f"{self.id} cannot be compiled; qfolio.train steps it from Python.")
 
     def make(self, **options: Any) -> Any:
-        """The environment, without time limit and checks, which ``host.py`` does."""
+        """The environment without its time limit and checks, which ``host.py`` applies itself."""
         return _make(self.id, self.kwargs, **options)
 
 

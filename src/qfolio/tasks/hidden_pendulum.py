@@ -22,8 +22,8 @@ class HiddenPendulum(Task):
     """``Pendulum`` with the last ``window`` rows (cos θ, sin θ) as observation.
 
     Rows from before the start are zeros. Actions, rewards and starts are those of ``Pendulum``, and
-    so is the optimum, which knows the velocity: since the first action must be taken without it,
-    this is an upper bound that cannot quite be reached.
+    so is the optimum. It knows the velocity, without which the agent must take its first action, so
+    it is an upper bound that cannot quite be reached.
     """
 
     window: int = static(4)  # rows that are observed
