@@ -43,7 +43,7 @@ class PortfolioPolicy(BaseOptimization):
     Parameters
     ----------
     agent : str, default="pathwise"
-        "pathwise" or "dqn".
+        Any agent with a preset for portfolios, such as "pathwise", "tilts" or "dqn".
 
     preset : str, default="fast"
         Name of the hyperparameters to start from.

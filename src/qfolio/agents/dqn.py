@@ -67,7 +67,10 @@ class Losses(NamedTuple):
 
 
 class DQN(Agent):
-    """A deep Q-network; the defaults are those of the report that qfolio grew out of."""
+    """A deep Q-network.
+
+    The defaults are those of the report that qfolio grew out of (docs/algorithms/dqn.md).
+    """
 
     network: str = static("flat")  # flat, or a kind of docs/concepts/networks.md
     hidden: tuple[int, ...] = sizes(256, 256)  # units of each hidden layer

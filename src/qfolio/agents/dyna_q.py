@@ -31,6 +31,7 @@ class Counts(eqx.Module):
 
     @classmethod
     def empty(cls, entries: int, outcomes: int) -> "Counts":
+        """A model of ``entries`` entries with room for ``outcomes`` outcomes each."""
         table = jnp.zeros((entries, outcomes, 3)).at[..., 0].set(-1.0)
         return cls(table, jnp.zeros(entries, jnp.int32), jnp.array(0, jnp.int32))
 

@@ -71,6 +71,7 @@ class Model(eqx.Module):
         return jax.vmap(lambda member: member(inputs))(self.members)
 
     def predict(self, observation: Float[Array, "batch seen"], action: Array) -> Prediction:
+        """The predictions of all members, with log variances within soft bounds."""
         outputs = self(observation, action)
         if not self.gaussian:
             return Prediction(outputs, None)

@@ -44,6 +44,7 @@ class Learned(eqx.Module):
     members: Member | None  # with a leading member axis; None if no returns are expected
 
     def sigma(self, view: View) -> Float[Array, "*batch asset asset"]:
+        """The covariance estimated from a view, in units of the mean variance."""
         assert view.anchor is not None
         return self.covariance(view.features[..., 0], view.anchor > 0)
 
@@ -60,6 +61,7 @@ class Efficient(eqx.Module):
         return self.trading(view.holding, self.target(view), view.anchor)
 
     def target(self, view: View) -> Float[Array, "*batch entry"]:
+        """The best weights for the estimates, cash first."""
         members, gain = self.learned.members, None
         if members is not None:
             gain = self.share * jax.vmap(lambda one: expected(view, one.means))(members).mean(0)

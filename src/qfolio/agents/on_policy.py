@@ -43,6 +43,7 @@ class PolicyAndValue(eqx.Module):
     observations: Moments | None = None  # for normalization; None during training
 
     def policy(self, observation: PyTree) -> Distribution:
+        """The distribution of actions."""
         seen = normalized(self.observations, observation)
         return policy_of(self.actions, self.actor(seen), self.log_std)
 
@@ -190,7 +191,7 @@ class OnPolicy(Agent):
         """Learns from a rollout of normalized observations and rewards."""
 
     def judge(self, weights: PolicyAndValue, rollout: Transition, gae_lambda: Scalar) -> Batch:
-        """A rollout of these weights with its advantages and targets.
+        """The steps of a rollout that these weights made, with advantages and targets.
 
         gae_lambda: λ of the advantages, from 0 (trust the critic) to 1 (trust the rewards).
         """

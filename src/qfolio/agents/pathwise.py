@@ -129,6 +129,7 @@ class Paths(NamedTuple):
 
     @staticmethod
     def of(rollout: Transition) -> "Paths":
+        """The paths of a rollout, from the holdings of its first step."""
         start = jax.tree.map(lambda x: x[0], rollout.state.holding)
         markets = rollout.state.market, rollout.next_state.market
         return Paths(*markets, rollout.observation.features, start)

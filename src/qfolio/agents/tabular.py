@@ -61,6 +61,7 @@ class TableState(eqx.Module):
 
     @property
     def tables(self) -> Tables:
+        """The action values, of shape (table, state, action)."""
         return self.cells[..., 0]
 
 

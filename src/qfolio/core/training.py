@@ -92,8 +92,8 @@ def advance(
 ) -> tuple[TrainingState, Episodes]:
     """``steps`` steps of all environments, with learning after each rollout if ``learning``.
 
-    ``steps`` is a multiple of the agent's rollouts and at most ``chunk_steps``; the records beyond
-    it stay empty.
+    ``steps`` is a multiple of the agent's ``rollout_steps`` and at most ``chunk_steps``; records
+    beyond it stay empty.
     """
     length = agent.rollout_steps
     rollout = jax.jit(partial(_rollout, task, agent, learning=learning), inline=True)

@@ -29,6 +29,7 @@ class Heads(eqx.Module):
 
     @staticmethod
     def build(make: Callable[[PRNGKeyArray], Network], count: int, key: PRNGKeyArray) -> "Heads":
+        """``count`` networks from ``make``, each with a key of its own."""
         return Heads(jax.vmap(make)(jax.random.split(key, count)))
 
 

@@ -70,7 +70,7 @@ class Categorical(NamedTuple):
         target: Float[Array, "batch atom"],
         following: Float[Array, "batch atom"],
     ) -> Losses:
-        """Cross-entropy, and the KL divergence, its distance from the minimum."""
+        """Cross-entropy, and its distance from the minimum, the KL divergence."""
         wanted = project(target, jax.nn.softmax(following), self.support)
         loss = -(wanted * jax.nn.log_softmax(z)).sum(-1)
         return loss, jnp.maximum(loss - jax.scipy.special.entr(wanted).sum(-1), 0.0)

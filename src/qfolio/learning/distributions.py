@@ -1,7 +1,9 @@
 """Distributions of a stochastic policy's actions, one for each kind of action.
 
-All have leading batch axes. ``sample`` draws an action, ``log_prob`` is the log density of a drawn
-action, ``mode`` is the action without exploration.
+All have leading batch axes. ``sample`` draws an action, ``log_prob`` is the log density (or log
+probability) of a drawn action, and ``mode`` is the action without exploration. Distributions that
+are made from normal numbers have ``coordinates`` of them, and ``at`` maps standard normal numbers
+to an action.
 """
 
 import math

@@ -189,4 +189,5 @@ class Window(MLP):
 
 
 def uniform(key: PRNGKeyArray, shape: tuple[int, ...], bound: float) -> Array:
+    """Numbers drawn uniformly from ±``bound``."""
     return jax.random.uniform(key, shape, minval=-bound, maxval=bound)

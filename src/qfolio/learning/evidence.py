@@ -20,6 +20,7 @@ class Evidence(NamedTuple):
 
     @staticmethod
     def none(blocks: int) -> "Evidence":
+        """Evidence before the first step."""
         return Evidence(*jnp.zeros((3, blocks)))
 
     def add(

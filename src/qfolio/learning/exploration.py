@@ -69,6 +69,7 @@ class OrnsteinUhlenbeck(eqx.Module):
 
     @staticmethod
     def begin(key: PRNGKeyArray, shape: tuple[int, int]) -> "OrnsteinUhlenbeck":
+        """The noise of the first step; ``shape`` is (environment, entry)."""
         noise = OrnsteinUhlenbeck(jnp.zeros(shape), jax.random.key_data(key))
         return noise.step(1.0, jnp.ones(shape[0], bool))
 

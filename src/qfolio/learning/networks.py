@@ -152,6 +152,7 @@ class Shared(eqx.Module):
     def answer(
         self, reading: Reading, holding: Float[Array, "*batch asset"]
     ) -> tuple[Float[Array, "*batch pooled"], Float[Array, "*batch asset each"]]:
+        """The outputs for the market and for each asset, from what ``read`` found."""
         own = holding[..., None]
         of_own, of_all = self.join[-2], self.join[-1]
         joined = reading.joined + own * of_own + own.sum(-2, keepdims=True) * of_all

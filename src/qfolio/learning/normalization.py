@@ -36,6 +36,7 @@ class Moments(eqx.Module):
 
     @staticmethod
     def begin(shape: tuple[int, ...]) -> "Moments":
+        """The moments before the first row; ``shape`` is that of a row."""
         return Moments(jnp.array(0.0), jnp.zeros(shape), jnp.ones(shape))
 
     def update(self, rows: Float[Array, "rows *row"]) -> "Moments":
@@ -48,6 +49,7 @@ class Moments(eqx.Module):
 
     @property
     def std(self) -> Float[Array, "*row"]:
+        """The standard deviation, always above 0."""
         return jnp.sqrt(self.variance + EPSILON)
 
 
@@ -63,6 +65,8 @@ class RewardScale(eqx.Module):
         finished: Bool[Array, "time environment"],
         discount: Scalar,
     ) -> "RewardScale":
+        """The statistics after further rewards; sums start again where an episode has finished."""
+
         def step(returns: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
             returns = discount * returns + now[0]
             return jnp.where(now[1], 0.0, returns), returns
@@ -89,9 +93,11 @@ class Normalizer(eqx.Module):
         return Normalizer(observations, rewards)
 
     def observation(self, observation: PyTree) -> PyTree:
+        """Observations, normalized if the agent does so."""
         return normalized(self.observations, observation)
 
     def reward(self, reward: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """Rewards, normalized if the agent does so."""
         if self.rewards is None:
             return reward
         return jnp.clip(reward / self.unit, -LIMIT, LIMIT)

@@ -36,6 +36,7 @@ class Priorities(eqx.Module):
 
     @property
     def total(self) -> Float[Array, ""]:
+        """The sum of all priorities."""
         return self.levels[0].sum()
 
     def of(self, index: Int[Array, " n"]) -> Float[Array, " n"]:

@@ -193,6 +193,7 @@ class Replay(eqx.Module):
         return (self.position - self.size + drawn) % self.rows.shape[0]
 
     def at(self, index: Int[Array, " n"]) -> PyTree:
+        """Rows by their indices."""
         return self.unpack(self.rows[index])
 
     def latest(self) -> PyTree:
