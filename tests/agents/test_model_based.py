@@ -239,11 +239,16 @@ def test_learns_values_from_imagined_steps():
 
 @pytest.mark.slow
 def test_the_fast_preset_swings_the_pendulum_up_from_two_thousand_steps():
-    """A seed whose values once rose without end, to a regret of 773%, in states never seen."""
+    """Values of seed 302 once rose without end, to a regret of 773%, in states never seen.
+
+    So few steps leave much to chance: the regret of one seed is from 4 to 13%, by the processor.
+    """
     fast = preset("fast", "pendulum", "mbpo")
-    run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=1, seed=302)
+    run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=4, seed=302)
     assert run.population.steps <= 2000
-    assert run.grade()["regret_per_seed"][0] <= 0.1
+    regret = run.grade()["regret_per_seed"]
+    assert np.median(regret) <= 0.1
+    assert max(regret) <= 1
 
 
 @pytest.mark.parametrize("task", [Merton()])
