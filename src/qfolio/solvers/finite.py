@@ -115,7 +115,7 @@ def policy_iteration(model: Model, discount: float, epsilon: float = 0.0) -> Val
         policy = np.full((states, actions), epsilon / actions)
         policy[np.arange(states), best] += 1 - epsilon
         values = policy_evaluation(model, policy, discount)
-        # Gains within rounding error are ignored, or two equal actions would alternate for ever.
+        # Gains within rounding error are ignored, or two equal actions would alternate forever.
         held = np.take_along_axis(values, best[:, None], axis=1)[:, 0]
         better = values.max(-1) > held + 1e-12 * max(1.0, float(np.abs(values).max()))
         if not better.any():
