@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.agents import paths
+from qfolio.agents import paths, tilts
 from qfolio.agents.tilts import (
     Tilt,
     TiltPolicy,
@@ -159,10 +159,12 @@ def test_stays_at_the_anchor_where_prices_hold_nothing():
 
 
 def test_many_assets_learn_as_few_do(monkeypatch):
-    """Targets of a step at a time, as among many assets, are those of all steps at once."""
+    """A step at a time and a path at a time, as with many assets, or all of them at once."""
     table = walk(300, 3, seed=3)
     found = [trained(table, rounds=2).policy]
-    monkeypatch.setattr(paths, "AT_ONCE", 0)
+    for module in (paths, tilts):
+        monkeypatch.setattr(module, "AT_ONCE", 0)
+    monkeypatch.setattr(paths, "BLOCK", 1)
     programs_of.cache_clear()
     found.append(trained(table, rounds=2).policy)
     programs_of.cache_clear()

@@ -33,6 +33,11 @@ AT_ONCE = 2**21
 rollout would not fit the processor's cache; its targets are computed step by step."""
 
 
+BLOCK = 2**10
+"""Most paths times assets that are followed side by side: the arrays of a step and of its
+derivative then fit the cache of a core, for some members, too."""
+
+
 class OnPaths(Agent):
     """The schedule and the rollouts; subclasses define the policy and ``learn``."""
 
@@ -102,7 +107,7 @@ class OnPaths(Agent):
             targets = lambda _, given: given  # noqa: E731
 
         def step(holdings: PyTree, moves: tuple) -> tuple[PyTree, tuple]:
-            market, next_market, first, anchor, given = moves
+            first, market, next_market, anchor, given = moves
             settle, shift = jax.vmap(task.settle), jax.vmap(task.shift)
             views = [jax.vmap(task.observe)(Position(market, holding)) for holding in holdings]
 
@@ -119,14 +124,19 @@ class OnPaths(Agent):
             rewards, without, after = zip(*(settled(*one) for one in each), strict=True)
             return after, (rewards, without)
 
-        start = jax.tree.map(lambda x: x[0], rollout.state.holding)
         first = jnp.arange(self.rollout_length) == 0
-        market, next_market = rollout.state.market, rollout.next_state.market
-        moves = (market, next_market, first, rollout.observation.anchor, given)
         # The backward pass computes each step again, except for what a projection searched for.
         kept = jax.checkpoint_policies.save_only_these_names(SEARCHED)
         again = jax.checkpoint(step, policy=kept)
-        return lax.scan(again, (start,) * len(trades), moves)[1]
+
+        def follow(moves: tuple) -> tuple[Rewards, Rewards]:
+            start = jax.tree.map(lambda x: x[0], moves[0])
+            return lax.scan(again, (start,) * len(trades), (first, *moves[1:]))[1]
+
+        market, next_market = rollout.state.market, rollout.next_state.market
+        moves = (rollout.state.holding, market, next_market, rollout.observation.anchor, given)
+        assets = rollout.observation.holding.shape[-1]
+        return in_blocks(follow, moves, max(BLOCK // assets, 1))
 
 
 class Onlooker(OnPaths):
@@ -141,3 +151,22 @@ class Onlooker(OnPaths):
 
     def measure(self, task: Task, step: Transition) -> Metrics:
         return {}
+
+
+def in_blocks(function: Callable[[PyTree], PyTree], paths: PyTree, most: int) -> PyTree:
+    """A function of paths, computed for equal blocks of at most some paths, one after another.
+
+    Args:
+        function: Maps leaves of shape (time, path, ...) to leaves of shape (time, path).
+        paths: What it maps.
+        most: Paths in a block.
+    """
+    count = jax.tree.leaves(paths)[0].shape[1]
+    size = max(size for size in range(1, count + 1) if count % size == 0 and size <= most)
+    if size == count:
+        return function(paths)
+    blocks = jax.tree.map(
+        lambda x: jnp.moveaxis(x.reshape(len(x), count // size, size, *x.shape[2:]), 1, 0), paths
+    )
+    found = lax.map(function, blocks)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], count), found)

@@ -357,8 +357,10 @@ class Portfolio(Market):
         start = market - self.window + 1
         returns = lax.dynamic_slice_in_dim(self.log_relatives, start, self.window)
         others = lax.dynamic_slice_in_dim(self.extra, start, self.window)
-        channels = jnp.concatenate([returns[..., None], others], -1)
-        return jnp.swapaxes((channels - self.center) / self.scale, 0, 1)
+        # Scaled before they are joined: an agent that reads only signals then computes only them.
+        returns = (returns - self.center[0]) / self.scale[0]
+        others = (others - self.center[1:]) / self.scale[1:]
+        return jnp.swapaxes(jnp.concatenate([returns[..., None], others], -1), 0, 1)
 
     def anchor_weights(self, market: Row) -> Float[Array, " asset"] | None:
         """The anchor's weights; those of assets that cannot be traded go to the others.
