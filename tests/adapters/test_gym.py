@@ -142,6 +142,35 @@ def test_its_wealth_is_that_of_the_replay(lag, task):
     assert env.unwrapped.last + HORIZON + lag == ROWS - 1
 
 
+def test_a_mandate_with_shorts_and_a_loan_is_obeyed():
+    prices = table()
+    mandate = {"assets": {"floor": {"a": -0.3}}, "cash": {"min": -0.5}, "exposure": {"gross": 1.5}}
+    env = environment(prices, mandate=mandate)
+    assert env.action_space.shape == (3,)
+    check_env(env.unwrapped)
+    seen, _, infos = zip(*play(env, options={"start": 20}), strict=True)
+    decisions = np.array([info["target"] for info in infos[1:]])
+    np.testing.assert_allclose(decisions.sum(1), 1, atol=1e-12)
+    assert -0.3 - 1e-7 <= decisions[:, 1].min() < -0.1
+    assert -0.5 - 1e-7 <= decisions[:, 0].min() < -0.1
+    assert min(observation["holding"][0] for observation in seen) < -0.1
+    assert np.abs(decisions[:, 1:]).sum(1).max() <= 1.5 + 1e-7
+    replay = simulate(prices.values, decisions, first=20, cost=0.01, lag=1, long_only=False)
+    np.testing.assert_allclose([info["wealth"] for info in infos], replay.wealth, rtol=1e-12)
+    with pytest.raises(QfolioError, match="3 finite numbers, the weights of the assets"):
+        environment(prices, mandate=mandate).unwrapped._checked(CASH)
+
+
+def test_ruin_ends_the_episode():
+    env = environment(cost_model="itemized(fixed=1000,capital=100)")
+    env.reset(seed=0)
+    _, _, terminated, truncated, _ = env.step([0.0, 1, 0, 0])
+    assert terminated
+    assert not truncated
+    with pytest.raises(QfolioError, match="over"):
+        env.unwrapped.step(CASH)
+
+
 def coming_and_going():
     """b joins, c is delisted with a haircut, and a is no member for a time."""
     prices = table()

@@ -395,6 +395,7 @@ def test_discrete_no_trade_region_without_costs_is_growth_optimal() -> None:
         lambda: no_trade_region(0.02, 0.2, 1.0),
         lambda: no_trade_growth(0.5, 0.5, 0.02, 0.2, 0.01),
         lambda: no_trade_region_discrete(0.02, 0.2, 0.01, 0.0),
+        lambda: no_trade_region_discrete(0.02, 0.2, 1.0, 0.25),
     ],
 )
 def test_parameters_without_an_optimum(call: object) -> None:

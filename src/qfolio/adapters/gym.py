@@ -46,7 +46,9 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
 
     **Action**: N + 1 numbers, cash first. Target weights are the nearest point of the simplex
     (Euclidean projection, no asset above ``max_weight``), so valid weights are used unchanged.
-    With ``menu`` ("grid:10", "tilts:0.1"), the number of an allocation instead.
+    With a mandate that allows short positions or a loan, the weights of the N assets, and cash is
+    the rest. With ``menu`` ("grid:10", "tilts:0.1"), the number of an allocation. An order that the
+    mandate forbids becomes the nearest one that it allows.
 
     **Step**: a decision at row t is executed at the close of row t + lag, and its reward is that of
     the return of row t + lag + 1, net of the exact cost. Wealth is simulated in double precision,
@@ -78,7 +80,6 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         render_mode: str | None = None,
         **task: Any,
     ) -> None:
-        from qfolio.core.mdp import Discrete
         from qfolio.portfolio.mandate.mandate import settled
         from qfolio.portfolio.task import Portfolio
 
@@ -103,22 +104,19 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         assets, channels = len(self.prices.assets), self.task.center.shape[0]
         self.first = int(self.task.first_decision)
         self.last = int(self.task.last_decision) - self.task.horizon + 1
+        self._range = (0.0, 1.0) if self.task.feasible.long_only else (-_LARGEST, _LARGEST)
         self.observation_space = spaces.Dict(
             {
                 "features": spaces.Box(
                     -_LARGEST, _LARGEST, (assets, self.task.window, channels), np.float32
                 ),
-                "holding": spaces.Box(0.0, 1.0, (assets,), np.float32),
+                "holding": spaces.Box(*self._range, (assets,), np.float32),
                 **(
                     {} if self.prices.tradable is None else {"tradable": spaces.MultiBinary(assets)}
                 ),
             }
         )
-        self.action_space = (
-            spaces.Discrete(self.task.actions.n)
-            if isinstance(self.task.actions, Discrete)
-            else spaces.Box(-1.0, 1.0, (assets + 1,), np.float32)
-        )
+        self.action_space = _action_space(self.task.actions)
         self._row, self._steps = -1, self.task.horizon  # over
 
     def reset(
@@ -166,8 +164,10 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         self._wealth *= 1 + float(traded.returns[0])
         self._cost, self._turnover = float(traded.cost[0]), float(traded.turnover[0])
         self._row, self._steps = row + 1, self._steps + 1
-        over = self._steps >= self.task.horizon
-        return self._observe(), float(reward), bool(traded.ruined), over, self._info()
+        truncated = self._steps >= self.task.horizon and not traded.ruined
+        if traded.ruined:
+            self._steps = self.task.horizon
+        return self._observe(), float(reward), bool(traded.ruined), truncated, self._info()
 
     def render(self) -> str | None:
         """Date, wealth and holdings on one line."""
@@ -188,8 +188,9 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         except (TypeError, ValueError):
             scores = np.empty(0)
         if scores.shape != space.shape or not np.isfinite(scores).all():
+            wanted = "cash first" if self.task.feasible.long_only else "the weights of the assets"
             raise QfolioError(
-                f"An action must be {space.shape[0]} finite numbers, cash first; this one has the "
+                f"An action must be {space.shape[0]} finite numbers, {wanted}; this one has the "
                 f"shape {scores.shape}."
             )
         return scores
@@ -197,7 +198,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
     def _observe(self) -> Observation:
         seen = {
             "features": _programs().features(self.task, self._row),
-            "holding": np.clip(self._held[1:], 0, 1).astype(np.float32),
+            "holding": np.clip(self._held[1:], *self._range).astype(np.float32),
         }
         if self.prices.tradable is not None:
             seen["tradable"] = self.prices.tradable[self._row].astype(np.int8)
@@ -229,13 +230,14 @@ class _Programs:
         import jax
 
         from qfolio.core import devices, simplex
+        from qfolio.core.mdp import Simplex
         from qfolio.portfolio.rewards import Outcome
 
         devices.configure()
 
         @jax.jit
         def target(task: Any, row: Any, held: Any, plan: Any, action: Any) -> Any:
-            if not task.menu:
+            if isinstance(task.actions, Simplex):
                 action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
             holding = task.hold(held)._replace(plan=plan)
             traded, plan = task.trade(row, holding, task.wanted(row, holding, action))
@@ -282,6 +284,16 @@ class _Programs:
 _programs = cache(_Programs)
 
 
+def _action_space(actions: Any) -> spaces.Space[Any]:
+    from qfolio.core.mdp import Discrete, Simplex
+
+    if isinstance(actions, Discrete):
+        return spaces.Discrete(actions.n)
+    if isinstance(actions, Simplex):
+        return spaces.Box(-1.0, 1.0, (actions.assets + 1,), np.float32)
+    return spaces.Box(-actions.bound, actions.bound, (actions.n,), np.float32)
+
+
 class TaskEnv(gymnasium.Env[Any, Any]):
     """A task that ``qfolio train`` knows by name, compiled, one step at a time.
 
@@ -304,7 +316,6 @@ class TaskEnv(gymnasium.Env[Any, Any]):
 
         from qfolio.core import devices
         from qfolio.core.market import View
-        from qfolio.core.mdp import Discrete, Simplex
 
         if render_mode is not None:
             raise QfolioError(f"render_mode is {render_mode!r}; {name} has none.")
@@ -323,15 +334,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
             self.observation_space = spaces.Dict(shown)
         else:
             self.observation_space = number(seen)
-        actions = task.actions
-        self.action_space: spaces.Space[Any]
-        if isinstance(actions, Discrete):
-            self.action_space = spaces.Discrete(actions.n)
-        elif isinstance(actions, Simplex):
-            self.action_space = spaces.Box(-1.0, 1.0, (actions.assets + 1,), np.float32)
-        else:
-            bound = actions.bound
-            self.action_space = spaces.Box(-bound, bound, (actions.n,), np.float32)
+        self.action_space = _action_space(task.actions)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -138,6 +138,7 @@ def no_trade_region_discrete(
     from scipy.special import expit, logit
 
     require(0 < dt < math.inf, f"dt must be positive; not {dt}")
+    require(0 <= cost < 1, f"cost must be at least 0 and below 1; not {cost}")
     step, shift = volatility * math.sqrt(dt), (drift - volatility**2 / 2) * dt
     points = 48
     nodes, areas = np.polynomial.legendre.leggauss(points)
