@@ -358,8 +358,11 @@ class Portfolio(Market):
         returns = lax.dynamic_slice_in_dim(self.log_relatives, start, self.window)
         others = lax.dynamic_slice_in_dim(self.extra, start, self.window)
         # Scaled before they are joined: an agent that reads only signals then computes only them.
-        returns = (returns - self.center[0]) / self.scale[0]
-        others = (others - self.center[1:]) / self.scale[1:]
+        # Multiplied, because XLA divides or multiplies by the reciprocal, depending on how many
+        # folds share a program, and these round differently.
+        factor = 1 / self.scale
+        returns = (returns - self.center[0]) * factor[0]
+        others = (others - self.center[1:]) * factor[1:]
         return jnp.swapaxes(jnp.concatenate([returns[..., None], others], -1), 0, 1)
 
     def anchor_weights(self, market: Row) -> Float[Array, " asset"] | None:
