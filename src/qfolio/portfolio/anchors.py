@@ -1,7 +1,7 @@
 """Anchors: weights at each row of a table that a policy may depart from.
 
 An anchor is a baseline, followed on the whole table, or a column of the table with a benchmark's
-weights. What tracking error is measured against may also be an asset.
+weights. The benchmark of tracking error may also be a single asset.
 """
 
 import warnings
@@ -18,7 +18,7 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.signals import COLUMN
 
 MONTHS = 60
-"""Months before a decision that a baseline estimates from."""
+"""Months of prices up to a decision that a baseline estimates from."""
 
 Weights = NDArray[np.float64]
 
@@ -31,10 +31,10 @@ def made(name: str) -> Baseline | None:
 def path(name: str, prices: Prices) -> Weights:
     """The weights of an anchor at each row, of shape (row, asset); the rest is cash.
 
-    A row depends on it and earlier ones only. A baseline decides every month, or at every row if
-    that is its calendar; between, its holding drifts, unless its target is to be held at every row
-    (the calendar "fold"). It may hold the assets that have had prices for a year, or all there are
-    until then.
+    The weights at a row depend on no later row. A baseline decides every month, or at every row if
+    that is its calendar; between decisions its holding drifts, unless its target is to be held at
+    every row (the calendar "fold"). It may hold the assets that have had prices for a year; until
+    there are any, all that have a price.
 
     Raises QfolioError if there is no such baseline or column, if a baseline gives invalid weights,
     or if a column's weights are not at least 0, with a sum of at most 1.
@@ -45,14 +45,14 @@ def path(name: str, prices: Prices) -> Weights:
     if chosen is None:
         return _column(name.removeprefix(COLUMN), prices)
     month, values = prices.month, prices.values
-    # Targets of every row are spread anew whenever an asset comes or goes.
+    # A target that is held at every row is decided again at each one if assets come and go.
     anew = prices.tradable is not None and chosen.calendar == "fold"
     held = np.eye(values.shape[1] + 1)[0]
     rows = np.empty(values.shape)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a table's first rows are too few for any estimate
         for row in range(len(values)):
-            # The first two rows are too few for a baseline, which has a training window in a test.
+            # Two rows are too few for a baseline, which in a backtest has a whole training window.
             if row % month == 0 or row == 2 or chosen.calendar == "row" or anew:
                 rule = chosen if row >= 2 else EqualWeight()
                 history = _history(prices, row, month, rule.estimates)
@@ -66,7 +66,7 @@ def path(name: str, prices: Prices) -> Weights:
 
 
 def _history(prices: Prices, row: int, month: int, estimates: bool) -> History:
-    """What a baseline knows at a row; it estimates from five years, or from one after a start."""
+    """What a baseline knows at a row: five years of prices, or one if any asset starts later."""
     known = ~np.isnan(prices.values[: row + 1])
     tradable = known[max(0, row - 12 * month) :].all(0)
     if not tradable.any():

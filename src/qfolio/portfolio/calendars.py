@@ -1,4 +1,4 @@
-"""Calendars: at which rows of a table an account may trade, and how far it may drift until then."""
+"""Calendars: at which rows an account may trade, and how far it drifts before it does."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,16 +9,16 @@ PERIODS = ("weekly", "monthly", "quarterly", "yearly")
 """Calendars that are named after their periods."""
 
 DRIFT = "drift:"
-"""Begins a calendar that orders only what has drifted beyond a band, such as drift:0.05."""
+"""Prefix of a calendar that trades only when a weight has drifted beyond a band: drift:0.05."""
 
 
 def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bool_]:
-    """Which rows are for decisions, of shape (row,).
+    """Whether a decision is due at each row, of shape (row,).
 
     Args:
         calendar: "weekly", "monthly", "quarterly" or "yearly" for the first row of each period,
-            which is known without later rows; a number k for every k-th row; "" or "drift:" and a
-            ``band`` for every row.
+            which is known without later rows; a number k for every k-th row; "" or "drift:BAND" for
+            every row.
         dates: Dates of the rows.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a market knows at each row besides prices, as cost models use it: dates and columns."""
+"""What cost models read at each row besides prices: dates and columns of the table."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ YEAR = np.timedelta64(365, "D") / np.timedelta64(1, "s")
 """Seconds in a year of interest (actual/365)."""
 
 MEMORY = 21
-"""Log returns that a volatility is estimated from."""
+"""Number of log returns that a volatility is estimated from."""
 
 Floats = NDArray[np.float64]
 
@@ -24,8 +24,9 @@ class Conditions(NamedTuple):
 
     years: time of each row since the first, shape (row,). values: each column at each row, of shape
     (row, asset), or (row, 1) if all assets share it, by name. sums: their integrals over the years
-    since the first row, likewise; between two rows a column keeps its value at the first. listed:
-    1 where an asset has a price, of shape (row, asset); None if none is ever delisted.
+    since the first row, of the same shapes; between two rows, a column keeps the value of the
+    earlier one. listed: 1 where an asset has a price, of shape (row, asset); None if none is ever
+    delisted.
     """
 
     years: Any
@@ -45,7 +46,10 @@ class Conditions(NamedTuple):
         return Conditions(years, values, sums, listed)
 
     def part(self, start: int, stop: int) -> "Conditions":
-        """The conditions of some rows, as a table has them that begins with the first of these."""
+        """The conditions of rows ``start`` to ``stop``, the last one excluded.
+
+        Years and sums are not counted anew: only their differences are ever used.
+        """
         values, sums = ({k: x[start:stop] for k, x in d.items()} for d in (self.values, self.sums))
         listed = None if self.listed is None else self.listed[start:stop]
         return Conditions(self.years[start:stop], values, sums, listed)

@@ -8,7 +8,7 @@ Weights have a last axis of N + 1 entries, cash first, and sum to 1; a negative 
 loan, or assets sold short. Every function works on numpy and jax arrays (also under jit, vmap and
 grad) and broadcasts over leading axes.
 
-A sale of value s yields (1−c)s of cash, and spending m buys (1−c)m worth of the asset.
+With a one-way cost c, a sale of value s yields (1−c)s of cash; spending m buys (1−c)m of an asset.
 Paying for a rebalancing from weights w to weights b leaves the share mu of the wealth, the
 "transaction remainder factor" (Z. Jiang, D. Xu, J. Liang, "A deep reinforcement learning framework
 for the financial portfolio management problem", 2017, eq. 14), which solves
@@ -27,14 +27,14 @@ import numpy as np
 
 
 class Context(NamedTuple):
-    """The circumstances of a trade, or of a holding period, besides relatives.
+    """The circumstances of a trade, or of a holding period, besides price relatives.
 
     rows: number of rows from the decision to its trade, or of the holding period. years: length of
-    the holding period. columns: those that the cost model asks for, by name, of shape (..., 1) or
-    (..., N): their values in the row of the trade, or their integrals over the years of the holding
-    period. wealth: before the trade, in multiples of the wealth at the start, of shape (...).
-    listed: 1 for each asset that has a price at the end of the holding period, or else 0, of shape
-    (..., N); None if all have.
+    the holding period. columns: the columns that the cost model reads, by name, of shape (..., 1)
+    or (..., N): their values at the row of the trade, or their integrals over the holding period,
+    in years. wealth: wealth before the trade, as a multiple of initial wealth, of shape (...).
+    listed: 1 for each asset with a price at the end of the holding period, otherwise 0, of shape
+    (..., N); None if all have one.
     """
 
     rows: Any = 1
@@ -45,7 +45,7 @@ class Context(NamedTuple):
 
 
 class CostModel(abc.ABC):
-    """Costs of trading and holding; every method takes numpy and jax arrays, also traced ones.
+    """Costs of trading and holding; every method takes numpy arrays and jax arrays, traced or not.
 
     A model is a dataclass with a default for each field; a field with the name of a market's
     setting (such as ``cost``) takes its value.
@@ -59,7 +59,7 @@ class CostModel(abc.ABC):
         """Columns of the price table that ``trade``, ``carry`` and ``owe`` read (default: none).
 
         "price" is the price itself; "volatility" is that of the 21 log returns up to a row, unless
-        the table has a column of this name. "years" asks for the lengths of holding periods alone.
+        the table has a column of this name. "years" asks only for the lengths of holding periods.
         """
         return ()
 
@@ -103,7 +103,7 @@ class CostModel(abc.ABC):
         return weights.__array_namespace__().where(weights < 0, owed, owned)
 
     def held(self, weights: Any, relatives: Any, context: Context) -> Any:
-        """Weights after a holding period, without a trade; what is delisted by then is cash."""
+        """Weights after a holding period without a trade; assets delisted by then are cash."""
         after = grown(weights, self.growth(weights, relatives, context))
         return after if context.listed is None else cashed(after, context.listed)
 
@@ -128,9 +128,9 @@ def remainder_factor(
 ) -> Any:
     """The share of wealth that remains after paying for a rebalancing.
 
-    Right side minus left side of the equation above is decreasing, concave and piecewise linear in
-    mu, so that Newton's method from mu = 1 descends to the root without overshooting. A step, with
-    gᵢ = −c for the assets sold at mu, c/(1−c) for those bought and 0 for the rest, is
+    The right side minus the left side of the equation above is decreasing, concave and piecewise
+    linear in mu, so that Newton's method from mu = 1 descends to the root without overshooting. A
+    step, with gᵢ = −c for the assets sold at mu, c/(1−c) for those bought and 0 for the rest, is
 
         mu ← 1 + Σᵢ gᵢ(wᵢ − bᵢ) / (1 + Σᵢ gᵢbᵢ),
 
@@ -145,8 +145,8 @@ def remainder_factor(
         before: Weights w before the trade, of shape (..., N + 1), of sum 1.
         after: Weights b after it, likewise, an array of the same kind.
         cost: One-way trading cost c, as a fraction, 0 ≤ c < 1; a number or of shape (...).
-        highest: Upper bound of the cost if it is an array, whose values are not read.
-        gross: Upper bound of the sum of absolute weights of the assets, in b.
+        highest: Upper bound on the cost if that is an array, since its values may be traced.
+        gross: Upper bound on the sum of the assets' absolute weights in b.
 
     Returns:
         Remainder factors mu of shape (...), between (1−c)² and 1 for weights that are not negative.
@@ -190,7 +190,7 @@ def newton_steps(assets: int, cost: float, dtype: Any, gross: float = 1.0) -> in
 
 
 def traded(before: Any, after: Any, remainder: Any) -> Any:
-    """Turnover: value bought plus value sold, over the wealth before the trade.
+    """Turnover: value bought plus value sold, as a share of the wealth before the trade.
 
     Args:
         before: Weights before the trade, of shape (..., N + 1).
@@ -223,12 +223,12 @@ def grown(weights: Any, growth: Any) -> Any:
 
 
 def delisted(growth: Any, relatives: Any, listed: Any) -> Any:
-    """Growth factors, in which assets without a price earn their cash-out and then what cash does.
+    """Growth factors in which a delisted asset is paid out, and its payout earns what cash earns.
 
     Args:
         growth: Growth factors of cash and of each asset, of shape (..., N + 1).
         relatives: New price over old price of each asset, of shape (..., N).
-        listed: Whether an asset has a price at the end, likewise; None if all have.
+        listed: Whether each asset has a price at the end, of the same shape; None if all have one.
     """
     if listed is None:
         return growth
@@ -238,13 +238,13 @@ def delisted(growth: Any, relatives: Any, listed: Any) -> Any:
 
 
 def cashed(weights: Any, listed: Any) -> Any:
-    """Weights of shape (..., N + 1) with those of assets that are not listed, (..., N), in cash."""
+    """Weights of shape (..., N + 1), with those of unlisted assets in cash; listed: (..., N)."""
     kept = weights[..., 1:] * listed
     cash = weights[..., :1] + (weights[..., 1:] - kept).sum(-1, keepdims=True)
     return weights.__array_namespace__().concat([cash, kept], axis=-1)
 
 
 def with_cash(relatives: Any) -> Any:
-    """Relatives of the assets, of shape (..., N), with cash, whose relative is 1, before them."""
+    """Price relatives of cash, which are 1, and of the assets: shape (..., N) becomes N + 1."""
     xp = relatives.__array_namespace__()
     return xp.concat([xp.ones_like(relatives[..., :1]), relatives], axis=-1)

@@ -17,11 +17,12 @@ class Plan(NamedTuple):
 class Terms(NamedTuple):
     """When orders are given, and how they are filled; arrays of numpy or jax.
 
-    decides: rows for decisions, shape (row,); no rows if all are. elapsed: share of the calendar
-    year that has passed at each row, shape (row,); no rows unless ``turnover`` is limited. band: an
-    order is given only if some weight, cash included, is to change by more. fill: rows over which
-    an order is filled, in equal parts. turnover: the most in a calendar year, bought and sold.
-    called: with a larger sum of absolute weights, a decision is due at any row (a margin call).
+    decides: whether a decision is due at each row, shape (row,); no rows if always. elapsed: share
+    of the calendar year that has passed at each row, shape (row,); no rows unless ``turnover`` is
+    limited. band: an order is given only if some weight, cash included, is to change by more. fill:
+    rows over which an order is filled, in equal parts. turnover: maximum in a calendar year, bought
+    plus sold, as a multiple of wealth. called: sum of the assets' absolute weights above which a
+    decision is due at any row (a margin call).
     """
 
     decides: Any
@@ -44,11 +45,11 @@ class Terms(NamedTuple):
         return decides
 
     def beyond(self, held: Any, wanted: Any) -> Any:
-        """Whether what is held is so far from what is wanted that this is ordered."""
+        """Whether the holding is far enough from the target for an order."""
         return abs(wanted - held).max() > self.band if self.band else True
 
     def begin(self, held: Any, spent: Any = 0.0) -> Plan | None:
-        """The plan of an account without orders; None if it needs none."""
+        """The plan of an account without earlier orders; None if it needs none."""
         if not self.remembers:
             return None
         xp = held.__array_namespace__()
@@ -60,7 +61,7 @@ class Terms(NamedTuple):
         """The weights after the trade of a row, and the plan from there on.
 
         Each row buys and sells an equal part of what is left of the order, in shares. An order that
-        is ``given`` at this row takes the place of the rest.
+        is ``given`` at this row replaces what is left of the one before.
         """
         if given is True and plan is None:
             return order, None
@@ -75,13 +76,13 @@ class Terms(NamedTuple):
         return target, Plan(spent, order, xp.maximum(left - 1, 0))
 
     def unspent(self, plan: Plan | None) -> Any:
-        """The turnover that is left this year; None if it has no limit."""
+        """The turnover that is left this year; None if turnover is not limited."""
         if plan is None or self.turnover == float("inf"):
             return None
         return plan.spent.__array_namespace__().maximum(self.turnover - plan.spent, 0.0)
 
     def next_row(self, row: Any, plan: Plan, order: Any) -> Plan:
-        """The plan one row later; order: what it orders, drifted to there."""
+        """The plan one row later; order: its order, drifted to that row."""
         spent = plan.spent
         if len(self.elapsed):
             xp = spent.__array_namespace__()

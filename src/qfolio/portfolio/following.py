@@ -38,19 +38,19 @@ def follow(
     *,
     together: bool = False,
 ) -> tuple[np.ndarray, Holding]:
-    """Greedy decisions from row ``first`` on: of each member by itself, or of all together.
+    """Greedy decisions from row ``first`` on, of each member by itself or of all together.
 
     Together, they hold one portfolio and follow the mean of their targets. After the table's last
-    row prices do not move.
+    row, prices do not move.
 
     Args:
         members: The agents' weights, with a leading seed axis.
-        held: What is held at row ``first``, as of ``begin``, by each seed, or by one if together.
+        held: Holdings at row ``first``, made by ``begin``: one for each seed, or one if together.
         count: Number of decisions.
 
     Returns:
-        Target weights of shape (seed or 1, count, entry), and what is held one row after each
-        decision, with the same first axes.
+        Target weights of shape (seed or 1, count, entry), and the holdings one row after each
+        decision, with the same leading axes.
 
     Raises:
         QfolioError: Targets are not numbers, or not feasible.
@@ -63,7 +63,7 @@ def follow(
 
 
 def begin(task: Portfolio, weights: ArrayLike, spent: float = 0.0) -> Holding:
-    """Holdings without orders before, of weights of shape (portfolio, entry).
+    """Holdings of weights of shape (portfolio, entry), without earlier orders.
 
     spent: turnover since the calendar year began.
     """
@@ -73,9 +73,9 @@ def begin(task: Portfolio, weights: ArrayLike, spent: float = 0.0) -> Holding:
 
 
 def ordered(task: Portfolio, targets: np.ndarray, held: ArrayLike, after: np.ndarray) -> np.ndarray:
-    """Where targets are orders, of shape (seed, count); between, they are what is held.
+    """Whether each target is an order, of shape (seed, count); otherwise it is what is held.
 
-    held, after: weights before the first decision and after each.
+    held, after: weights before the first decision, and one row after each.
     """
     if not task.calendar:
         return np.ones(targets.shape[:2], bool)
@@ -89,11 +89,11 @@ def paths(
 ) -> tuple[
     Float[Array, "portfolio time entry"], Float[Array, "portfolio time entry"], Holding
 ]:  # fmt: skip
-    """The weights wanted at each row, the targets, and what is held one row later.
+    """The weights wanted at each row, the targets, and the holdings one row later.
 
-    As ``follow``, without its checks.
+    Like ``follow``, but without its checks.
 
-    members: with leading axes (portfolio, member); a portfolio follows the mean of its own.
+    members: with leading axes (portfolio, member); a portfolio follows the mean of its members.
     """
 
     def step(

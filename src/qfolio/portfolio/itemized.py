@@ -14,7 +14,7 @@ COLUMN = "column:"
 """Prefix of a quantity that is a column of the price table."""
 
 SMALLEST = 1e-6
-"""Smaller changes of a weight are no orders: they pay no fixed or minimum commission."""
+"""Smaller changes of a weight do not count as orders: they pay no fixed or minimum commission."""
 
 STEPS = 6
 """Newton's steps under jax; in numpy they go on until nothing changes, up to ``MOST``."""
@@ -29,20 +29,20 @@ TINY = 1e-20
 class Itemized(CostModel):
     """Costs of trading and holding by kind; each is 0 by default, except the commission.
 
-    A quantity is a number, or "column:NAME" for a column of the price table. Rates are fractions a
-    year, accrued continuously on the days between rows (actual/365); sums of money are in units of
-    the prices.
+    A quantity is a number, or "column:NAME" for a column of the price table. Rates are fractions
+    per year, accrued continuously on the days between rows (actual/365); sums of money are in the
+    currency of the prices.
 
     cost: commission, as a share of the value traded. buy, sell: quantities, further shares of the
     value bought and sold, such as a stamp duty. spread: quantity, the quoted spread as a share of
-    the price, of which a trade pays half. fixed, minimum: money for each order, and its least
-    commission. impact, impact_power: a trade of the share p of a row's volume moves its price by
-    impact · σ · p^impact_power (a square root by default; 1 is linear), where σ is the volatility
-    of a row's returns. volume: quantity, in shares. capital: wealth at the start. cash_rate:
-    quantity, the rate that cash earns. borrow_spread: what a loan costs above it. borrow_fee:
-    quantity, the rate that assets sold short cost. carry_rate: quantity, the rate that holding one
-    earns besides its price (a dividend paid out), or costs if negative (a management fee); a short
-    position pays it.
+    the price, of which a trade pays half. fixed, minimum: fee of each order, and its least
+    commission, in money. impact, impact_power: a trade of the share p of a row's volume moves its
+    price by impact · σ · p^impact_power (a square root by default; 1 is linear), where σ is the
+    volatility of a row's returns. volume: quantity, in shares. capital: wealth at the start, in
+    money. cash_rate: quantity, the rate that cash earns. borrow_spread: rate of a loan above
+    ``cash_rate``. borrow_fee: quantity, the rate paid on assets sold short. carry_rate: quantity,
+    the rate that holding an asset earns besides its price (a dividend paid out), or costs if
+    negative (a management fee); a short position pays it.
 
     Source of the impact: R. Almgren, C. Thum, E. Hauptmann and H. Li, "Direct Estimation of Equity
     Market Impact" (2005); B. Tóth et al., "Anomalous Price Impact and the Critical Nature of
@@ -144,7 +144,7 @@ class Itemized(CostModel):
 
 
 class _Rates:
-    """What a trade pays, asset by asset, of changes of weights."""
+    """The costs of a trade, asset by asset, as functions of the changes in weights."""
 
     def __init__(self, model: Itemized, context: Context, ordered: Any, dtype: Any) -> None:
         xp = self.xp = ordered.__array_namespace__()
@@ -168,7 +168,7 @@ class _Rates:
             for kind in dict.fromkeys([*buying, *selling])
         }
         self.totals = sum(buying.values()), sum(selling.values())
-        # An account that fees have wiped out still gives orders.
+        # An account that fees have wiped out may still give orders.
         self.money = xp.maximum(model.capital * xp.asarray(context.wealth, dtype=dtype), TINY)
         self.money = self.money[..., None]
         if model.impact > 0:
@@ -178,7 +178,7 @@ class _Rates:
             self.impact = model.impact * volatility * share**model.impact_power
 
     def paid(self, change: Any) -> tuple[dict[str, Any], Any]:
-        """Shares of wealth by kind of cost, and their derivative by the change of a weight."""
+        """Shares of wealth paid, by kind of cost, and the derivative of their sum by the change."""
         xp, model, size = self.xp, self.model, abs(change)
         bought, sold = (change > 0) * size, (change < 0) * size
         paid = {kind: bought * buy + sold * sell for kind, (buy, sell) in self.rates.items()}

@@ -37,14 +37,14 @@ from qfolio.portfolio.rewards import Outcome, Reward
 MENU_LIMIT = 2000
 
 RUIN = 1e-3
-"""The growth that an account which is wiped out is taken to have; it goes on in cash."""
+"""Growth factor of the step that wipes an account out; the account then stays in cash."""
 
 RATE = 0.3
-"""The share of the way to a target that the menu "signals" trades."""
+"""Fraction of the distance to its target that an order of the menu "signals" trades."""
 
 
 class Holding(NamedTuple):
-    """The last target weights, drifted to now, the state of the reward, and what is planned."""
+    """An account: its last target weights, drifted to now; the reward's state; planned orders."""
 
     weights: Float[Array, " entry"]
     reward: PyTree
@@ -55,8 +55,8 @@ class Relatives(NamedTuple):
     """New price over old price of each asset, after a decision."""
 
     waiting: Float[Array, " asset"]  # from the decision to its execution
-    earning: Float[Array, " asset"]  # from the execution to the next one
-    coming: Float[Array, " asset"]  # from the decision to the next one
+    earning: Float[Array, " asset"]  # from the execution to the next execution
+    coming: Float[Array, " asset"]  # from the decision to the next decision
 
 
 class Contexts(NamedTuple):
@@ -69,21 +69,21 @@ class Contexts(NamedTuple):
 
 
 class Signalled(NamedTuple):
-    """What a menu of signals starts from."""
+    """The anchor that a menu of signals tilts, and the signals."""
 
     anchor: Float[Array, " asset"]
-    signals: Float[Array, "asset signal"]  # in ±1 if they are ranks
+    signals: Float[Array, "asset signal"]  # from −1 to 1 if they are ranks
 
 
 class Menu(eqx.Module):
     """A menu of allocations: each mixes a share of the holding with a target.
 
-    limits: the largest weights; assets with 0 are left out of equal weights.
+    limits: largest weight of each asset; assets with 0 are left out of the equal weights.
     text: "grid:10" for all weights in tenths; "tilts:0.1" for: no order, all cash, equal weights,
     all in one asset, and a tenth of the holding moved into one asset (each for every asset);
     "overweight:0.1" for: no order, all cash, equal weights, and equal weights with a tenth of the
-    wealth moved into one asset; "signals:1" for: ``RATE`` of the way to the anchor, and to the
-    anchor times exp(±1·signal) for every signal. signals: how many there are.
+    wealth moved into one asset; "signals:1" for: the fraction ``RATE`` of the way to the anchor,
+    and to the anchor times exp(±1·signal) for every signal. signals: number of signals.
     """
 
     keep: Float[Array, " choice"]
@@ -139,7 +139,7 @@ class Menu(eqx.Module):
         choice: Int[Array, ""],
         signalled: Signalled | None = None,
     ) -> Float[Array, " entry"]:
-        """The allocation of a choice, given the weights held; ``signalled`` for signals only."""
+        """The allocation of a choice, given the weights held; only signals need ``signalled``."""
         target = self.target[choice]
         if self.tilts is not None:
             assert signalled is not None
@@ -209,11 +209,11 @@ class Market(ExogenousTask):
 
     @property
     def tilting(self) -> int:
-        """How many signals a menu may tilt by."""
+        """Number of signals that a menu may tilt by."""
         return 0
 
     def signalled(self, market: PyTree) -> Signalled | None:
-        """What a menu of signals starts from; None without signals."""
+        """The anchor that a menu of signals tilts, and the signals; None without signals."""
         return None
 
     @property
@@ -258,7 +258,10 @@ class Market(ExogenousTask):
     def trade(
         self, market: PyTree, holding: Holding, wanted: Float[Array, " entry"]
     ) -> tuple[Float[Array, " entry"], Plan | None]:
-        """The target weights for an order at once, and what is planned: the order, and nothing."""
+        """The weights to trade to now for an order, and the plan for later rows.
+
+        Here, an order is traded at once, and the plan is unchanged.
+        """
         return wanted, holding.plan
 
     def target(self, market: PyTree, holding: Holding, action: Array) -> Float[Array, " entry"]:
@@ -269,7 +272,7 @@ class Market(ExogenousTask):
         return self.target(state.market, state.holding, action)
 
     def anchor_weights(self, market: PyTree) -> Float[Array, " asset"] | None:
-        """The weights that a policy may depart from, if the market has any."""
+        """The anchor's weights, from which a policy may depart; None without an anchor."""
         return None
 
     def view(self, market: PyTree, holding: Holding) -> View:
@@ -288,9 +291,10 @@ class Market(ExogenousTask):
         return self.hold(self.feasible.draw(key))
 
     def draw_reachable(self, market: PyTree, key: PRNGKeyArray) -> Holding:
-        """With a menu of signals, the anchor tilted at random by all signals.
+        """A random holding; with a menu of signals, the anchor tilted at random by all signals.
 
-        It is as near to the anchor as what is held, and its returns have as little noise.
+        Such a holding is as near to the anchor as those that a policy reaches, and its returns are
+        no noisier.
         """
         menu, signalled = self._signal_menu, self.signalled(market)
         if menu is None or menu.tilts is None or signalled is None:
@@ -310,7 +314,7 @@ class Market(ExogenousTask):
         return self._earn(market, next_market, self.hold(weights), weights)[0]
 
     def hold(self, weights: Float[Array, " entry"]) -> Holding:
-        """A holding without a history."""
+        """A holding of some weights, without a history."""
         return Holding(weights, self.reward_function.init())
 
     def shift(self, holding: Holding, by: Float[Array, " asset"]) -> Holding:
@@ -326,8 +330,10 @@ class Market(ExogenousTask):
         return self._earn(market, next_market, holding._replace(plan=plan), target)
 
     def measure(self, step: Transition) -> Metrics:
-        """Turnover and cost, cash, the effective number of assets, growth (a row, logarithmic),
-        and half the absolute differences to the anchor, if there is one."""
+        """Log growth of a step, turnover, cost, weight of cash and effective number of assets.
+
+        With an anchor also the distance from it: half the sum of absolute differences in weight.
+        """
         costs = self.costs
         market, held = step.state.market, step.state.holding.weights
         next_market = step.next_state.market
@@ -371,7 +377,7 @@ class Market(ExogenousTask):
         return reward, Holding(drifted, state, self.planned(market, holding.plan))
 
     def planned(self, market: PyTree, plan: Plan | None) -> Plan | None:
-        """What is planned, drifted with prices after a decision."""
+        """The plan one row after a decision, drifted with prices."""
         return plan
 
 

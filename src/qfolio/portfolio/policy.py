@@ -31,7 +31,7 @@ from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 
 UPDATE_RATE = 0.1
-"""Share of the learning rate with which an update learns."""
+"""Learning rate of an update, as a fraction of the one in training."""
 
 UNKNOWN = np.datetime64("NaT", "s")
 
@@ -155,12 +155,12 @@ class Policy:
             episodes: Learning episodes of each agent (default: one for each of its environments).
 
         Raises:
-            QfolioError: The learning state was not kept, the table does not fit, or it has no row
+            QfolioError: The learning state was not saved, the table does not fit, or it has no row
                 newer than those already learned from.
         """
         if self.learner is None:
             raise QfolioError(
-                "This policy was kept without its learning state and cannot be updated; train it "
+                "This policy was saved without its learning state and cannot be updated; train it "
                 "again."
             )
         wanted = self.agent.num_envs if episodes is None else episodes
@@ -230,10 +230,10 @@ class Policy:
         missing = [name for name in self.assets if name not in table.assets]
         unknown = [name for name in table.assets if name not in self.assets]
         if missing or unknown:
-            said = [f"without {_list(missing)}"] * bool(missing)
-            said += [f"with {_list(unknown)}, unknown to the policy"] * bool(unknown)
+            said = [f"lacks {_list(missing)}"] * bool(missing)
+            said += [f"has {_list(unknown)}, which the policy does not know"] * bool(unknown)
             raise QfolioError(
-                f"The price table is {' and '.join(said)}; it must have the {len(self.assets)} "
+                f"The price table {' and '.join(said)}; it must have the {len(self.assets)} "
                 "assets that the policy was trained on, and no others."
             )
         if table.feature_names != self.features:
@@ -251,10 +251,10 @@ class Policy:
         if len(table) <= looked:
             raise QfolioError(
                 f"The price table has {amount(len(table), 'row')}; the policy's signals "
-                f"look back on {looked}, so bring at least {looked + 1}."
+                f"look back on {looked}, so it needs at least {looked + 1}."
             )
         table = table.select(self.assets)
-        if table.tradable is not None:  # it may hold those that are there
+        if table.tradable is not None:  # it may hold whichever assets are available
             return table
         # An asset that may be held needs prices in the whole window, the others at its end.
         tradable, last = np.asarray(self.task.limits) > 0, len(table) - 1

@@ -72,7 +72,9 @@ def read(folder: Path) -> Policy:
     try:
         learned = np.datetime64(config.learned, "s")
     except ValueError:
-        raise QfolioError(f"{path} is damaged: learned is {config.learned!r}, no date.") from None
+        raise QfolioError(
+            f"{path} is damaged: learned is {config.learned!r}, which is not a date."
+        ) from None
     agent: Agent = build("agent", config.agent, config.settings)
     task = _blank(config)
     state = state_template(task, agent, config.seeds)

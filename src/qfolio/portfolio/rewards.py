@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, PyTree
 from qfolio.core.fields import require
 
 LEAST_VARIANCE, LEAST_SHARE = 1e-10, 1e-3
-"""Lower bounds of the variance in a Sharpe ratio: a volatility of 0.1 bp a step, and a share of the
-mean square return (a Sharpe ratio of 32 a step), below which float32 rounding matters."""
+"""Lower bounds of the variance in a Sharpe ratio: that of a volatility of 0.1 bp per step, and a
+share of the mean square return (a Sharpe ratio of 32 per step); below, float32 rounding matters."""
 
 Number = Float[Array, ""] | float
 
@@ -102,7 +102,7 @@ class DifferentialSharpe(Reward):
 
     where the variance B − A² is bounded below (``LEAST_VARIANCE``, ``LEAST_SHARE``): it vanishes
     for a portfolio that stays in cash or grows at a constant rate. State: (A, B); the first B of
-    1e-4 stands for a volatility of 1% a step.
+    1e-4 stands for a volatility of 1% per step.
     """
 
     sharpe_rate: Number = 0.01  # η, the reciprocal of the memory in steps

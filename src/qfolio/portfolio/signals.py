@@ -1,11 +1,11 @@
 """Signals: numbers for each asset and row, from prices up to that row.
 
-``signals="momentum:252-21,volatility:21"`` of a portfolio names some, each with the rows that it
-looks back on and the latest rows that it skips; a user's own are ``module:Name``, with rows or
-without, and ``feature:NAME`` is a column of the table. Agents observe them after the log return and
-the table's own features. By default each is ranked across assets, from −1 to 1, and nothing has to
-be fitted; a number that all assets share stays as it is. docs/concepts/signals.md lists formulas
-and sources.
+A portfolio's setting ``signals="momentum:252-21,volatility:21"`` names signals, each with the
+number of rows that it looks back on and, after the hyphen, of latest rows that it skips. A user's
+own signal is ``module:Name``, with or without rows, and ``feature:NAME`` is a column of the table.
+Agents observe signals after the log return and the table's own features. By default each signal is
+ranked across assets, from −1 to 1, so that nothing has to be fitted; a number that all assets share
+is not scaled. docs/concepts/signals.md lists formulas and sources.
 """
 
 import abc
@@ -27,20 +27,20 @@ Floats = NDArray[np.float64]
 COLUMN = "feature:"
 
 SCALES = ("rank", "z-score", "centered", "raw")
-"""Across assets, row by row: ranks from −1 to 1; distances from the mean in standard deviations,
-cut at ±3; distances from the mean; or the numbers themselves."""
+"""How signals are scaled across assets, row by row: ranks from −1 to 1; distances from the mean in
+standard deviations, clipped at ±3; distances from the mean; or the numbers themselves."""
 
 
 class Signal(eqx.Module):
     """A number for each asset and row, which depends on no later row.
 
-    rows: how far it looks back. skip: latest rows that it leaves out.
+    rows: number of rows that it looks back on. skip: number of latest rows that it leaves out.
     """
 
     shared: ClassVar[bool] = False
     """Whether all assets have the same number, which then has no rank."""
     scale: ClassVar[str | None] = None
-    """One of ``SCALES`` that the signal always has; None for the one that is set."""
+    """The one of ``SCALES`` that the signal always uses; None for the portfolio's setting."""
 
     rows: int = static(21)
     skip: int = static(0)
@@ -55,7 +55,7 @@ class Signal(eqx.Module):
     def __call__(self, prices: Floats) -> Floats:
         """The signal, shape (row, asset), NaN where it is unknown.
 
-        prices: of the same shape, NaN before an asset's first.
+        prices: of the same shape, NaN before an asset's first price.
         """
         return self.measure(_before(prices, self.skip), self.rows - self.skip)
 
@@ -85,8 +85,9 @@ class Reversal(Momentum):
 class Drift(Signal):
     """Log return over the latest ``skip`` rows, in standard deviations of such a return.
 
-    The standard deviation is that of rows over all ``rows``, times √skip. It is never ranked: large
-    moves are rare, and tell more (Moskowitz, Ooi & Pedersen 2012 scale returns in the same way).
+    The standard deviation is that of one-row returns over all ``rows``, times √skip. The signal is
+    never ranked: large moves are rare and tell more (Moskowitz, Ooi & Pedersen 2012 scale returns
+    in the same way).
     """
 
     scale = "centered"
@@ -111,7 +112,7 @@ class Volatility(Signal):
 
 
 class VolatilityRatio(Signal):
-    """Log ratio of the volatility over the latest ``skip`` rows to that over all."""
+    """Log ratio of the volatility over the latest ``skip`` rows to that over all ``rows``."""
 
     rows: int = static(252)
     skip: int = static(21)
@@ -150,7 +151,7 @@ class Maximum(Signal):
 
 
 class Beta(Signal):
-    """Slope of an asset's log returns on the market's, their mean (Sharpe 1964)."""
+    """Slope of an asset's log returns on the market's, the mean over assets (Sharpe 1964)."""
 
     rows: int = static(252)
 
@@ -160,7 +161,7 @@ class Beta(Signal):
 
 
 class ResidualVolatility(Signal):
-    """Log standard deviation of what beta leaves of log returns (Ang et al. 2006)."""
+    """Log standard deviation of the residuals of log returns on the market's (Ang et al. 2006)."""
 
     rows: int = static(252)
 
@@ -234,7 +235,7 @@ def labels(text: str) -> list[str]:
 
 
 def lookback(signals: Sequence[Signal]) -> int:
-    """Rows before one at which all signals are known."""
+    """Number of rows needed before the first one at which all signals are known."""
     return max((signal.rows for signal in signals), default=0)
 
 
@@ -294,7 +295,8 @@ def _is_shared(signal: Signal, values: Floats) -> bool:
 def _column(name: str, columns: Mapping[str, Floats]) -> Floats:
     if name not in columns:
         raise QfolioError(
-            f"The signal {COLUMN}{name} names no column of the table; name it with --features, too."
+            f"The signal {COLUMN}{name} names no column of the table; also list the column in "
+            "--features."
         )
     return columns[name]
 
@@ -343,7 +345,7 @@ def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
 
 
 def _before(values: Floats, rows: int) -> Floats:
-    """The values of a given number of rows before."""
+    """The values a given number of rows earlier; NaN in the first rows."""
     return np.concatenate([np.full((min(rows, len(values)), *values.shape[1:]), np.nan),
                            values[: max(0, len(values) - rows)]])  # fmt: skip
 
@@ -354,7 +356,7 @@ def _returns(prices: Floats) -> Floats:
 
 
 def _market(returns: Floats) -> Floats:
-    """The mean over the assets that are there, the same for each."""
+    """The mean over the assets with a known return, repeated for each asset."""
     known = ~np.isnan(returns)
     count = known.sum(1, keepdims=True)
     mean = np.nansum(returns, 1, keepdims=True) / np.maximum(count, 1)

@@ -1,9 +1,9 @@
 """A portfolio of assets with given prices.
 
-State: the row of the price table, the portfolio. Observation: for each asset a window of log
+State: the row of the price table and the portfolio. Observation: for each asset, a window of log
 returns, of the table's features and of signals, and the current weights. Action: target weights, or
 a choice from a menu. A decision sees prices up to row t, is executed at the close of row t + lag,
-and earns the move to the row after. No observation at t depends on a later price.
+and earns the return from there to the next row. No observation at t depends on a later price.
 """
 
 import dataclasses
@@ -46,16 +46,16 @@ class Portfolio(Market):
     ``Portfolio.of(prices)`` uses all rows, ``part`` some of them.
     """
 
-    log_relatives: Float[Array, "row asset"]  # log of price over the row before; 0 if unknown
-    extra: Float[Array, "row asset feature"]
+    log_relatives: Float[Array, "row asset"]  # log return from the row before; 0 if unknown
+    extra: Float[Array, "row asset feature"]  # the table's features, then the signals
     anchors: Float[Array, "anchored asset"]  # weights of the anchor; no rows without one
     limits: Float[Array, " asset"]  # largest weight of each asset; 0 where it cannot be traded
-    center: Float[Array, " channel"]  # of the observed channels, from the rows of the part
-    scale: Float[Array, " channel"]
+    center: Float[Array, " channel"]  # subtracted from each observed channel; from the part's rows
+    scale: Float[Array, " channel"]  # divides each observed channel; likewise
     conditions: Conditions  # the columns that the cost model reads; empty if it reads none
-    decides: Bool[Array, " decision"]  # whether a row is for decisions; no rows if all are
-    elapsed: Float[Array, " dated"]  # of each row's year, see Terms; no rows if it does not matter
-    benchmarks: Float[Array, "benchmarked asset"]  # weights for tracking error; no rows without
+    decides: Bool[Array, " decision"]  # whether a decision is due at each row; no rows if always
+    elapsed: Float[Array, " dated"]  # share of the year at each row, see Terms; no rows if unused
+    benchmarks: Float[Array, "benchmarked asset"]  # a benchmark's weights; no rows without one
     year: Float[Array, ""]  # rows in a year
     tradable: Bool[Array, "row asset"] | None  # at each row; None if all assets always are
     first_decision: Row
@@ -64,21 +64,21 @@ class Portfolio(Market):
     lag: int = static(1)  # rows from a decision to its execution
     cost: float = constant(0.001)  # one way, as a share of the value traded
     cost_model: str = static("proportional")
-    calendar: str = static("")  # of decisions, see portfolio.calendars; between them nothing trades
+    calendar: str = static("")  # of decisions, see portfolio.calendars; no trades between them
     max_weight: float = constant(1.0)  # of one asset
     mandate: str = static("")  # text of a mandate, see portfolio.mandate
     menu: str = static("")
     signals: str = static("")  # names of signals that are observed, see portfolio.signals
     signal_scale: str = static("rank")  # of signals: rank, z-score, centered or raw
-    anchor: str = static("")  # that agents may depart from, see portfolio.anchors
+    anchor: str = static("")  # weights that agents may depart from, see portfolio.anchors
     reward: str = static("log")
-    active: bool = static(False)  # rewards are those over the anchor's
-    tracking_aversion: float = number(0.0)  # half of it times the square of these is subtracted
+    active: bool = static(False)  # rewards are in excess of the anchor's
+    tracking_aversion: float = number(0.0)  # half of it times the squared active reward is deducted
     risk_aversion: float = number(3.0)
     sharpe_rate: float = number(0.01)
     horizon: int = static(50)
     allowed: Mandated | None = None  # the weights that the mandate allows, if there is one
-    patterns: Patterns | None = None  # what it allows where assets come and go
+    patterns: Patterns | None = None  # the mandate's limits where assets come and go
 
     @staticmethod
     def of(prices: Prices, **settings: Any) -> "Portfolio":
@@ -113,9 +113,9 @@ class Portfolio(Market):
         )
 
     def on(self, prices: Prices) -> "Portfolio":
-        """The same task on another table, with all else as it is.
+        """The same task on another table, otherwise unchanged.
 
-        Signals are 0 where they are not known yet.
+        Signals are 0 where they are not yet known.
         """
         chosen = signals.parse(self.signals)
         logs = np.zeros(prices.values.shape)
@@ -163,7 +163,7 @@ class Portfolio(Market):
         _ = self.parts  # which check their own settings
         if self.active and not self.anchor:
             raise QfolioError(
-                "active rewards are those over the anchor's; set an anchor, such as "
+                "active=true measures rewards in excess of an anchor's; set an anchor, such as "
                 "anchor=equal-weight."
             )
         if self.active and self.path_dependent:
@@ -173,10 +173,11 @@ class Portfolio(Market):
             )
 
     def part(self, first: int, last: int, tradable: np.ndarray | None = None) -> "Portfolio":
-        """The same task on rows ``first`` to ``last`` alone.
+        """The same task on rows ``first`` to ``last`` only, both included.
 
         Windows, rewards and the scale of observations come from these rows only. tradable: which
-        assets may be held, shape (asset,).
+        assets may be held, shape (asset,) (default: all). Raises QfolioError if there are too few
+        rows, or no asset that may be held.
         """
         decisions = last - self.lag - 1 - (first + self.window) + 1
         if decisions < self.horizon:
@@ -196,7 +197,7 @@ class Portfolio(Market):
         if self.tradable is not None and not self.tradable[rows].all():
             channels = channels[np.asarray(self.tradable)[rows][:, usable]][:, None]
         center, scale = channels.mean((0, 1)), channels.std((0, 1))
-        center[0] = 0.0  # the sign of a return means something
+        center[0] = 0.0  # returns keep their sign, which is informative
         limits = np.where(usable, self.max_weight, 0.0)
         allowed = _allowed(self.mandate, usable, self.max_weight)
         if allowed is not None:
@@ -216,7 +217,7 @@ class Portfolio(Market):
 
     @property
     def parts(self) -> list[object]:
-        """Cost model, reward, signals and anchor, which a user may have named."""
+        """Cost model, reward, signals and anchor, any of which may be a user's own."""
         anchor = anchors.made(self.anchor) if self.anchor else None
         named = [*signals.parse(self.signals), *([] if anchor is None else [anchor])]
         return [self.costs, self.reward_function, *named]
@@ -240,7 +241,7 @@ class Portfolio(Market):
         )
 
     def filling(self, rows: int) -> "Portfolio":
-        """The same task with orders that are filled over some rows."""
+        """The same task with orders filled over a given number of rows."""
         if self.terms.fill == rows:
             return self
         assets, mandate = parse(self.mandate)
@@ -275,7 +276,11 @@ class Portfolio(Market):
     def trade(
         self, market: Row, holding: Holding, wanted: Float[Array, " entry"]
     ) -> tuple[Float[Array, " entry"], Plan | None]:
-        """As held where no decision is due; over several rows, if orders are filled so."""
+        """The weights to trade to now, and the plan for later rows.
+
+        Nothing new is ordered where no decision is due. An order that is filled over several rows
+        is traded in parts.
+        """
         terms, held = self.terms, holding.weights
         given = terms.due(market, held) & terms.beyond(held, wanted)
         return terms.trade(held, wanted, given, holding.plan)
@@ -284,14 +289,14 @@ class Portfolio(Market):
         if plan is None:
             return None
         order = self.drifted(market, plan.order)
-        if self.tradable is not None:  # what may not be bought any more is not
+        if self.tradable is not None:  # the rest of an order drops what may no longer be bought
             order = cashed(order, self.tradable[market + 1])
         return self.terms.next_row(market, plan, order)
 
     def of_mean(
         self, market: Row, holding: Holding, wanted: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
-        """The order for a mean of ``wanted``, which may break rules on holdings and trades."""
+        """The order for a mean of targets, which itself may break rules on holdings or trades."""
         return self.allow(market, holding, wanted) if self.mandate else wanted
 
     @property
@@ -309,7 +314,7 @@ class Portfolio(Market):
         return super().feasible if self.allowed is None else self.allowed
 
     def feasible_at(self, market: Row) -> Feasible:
-        """Without the assets that cannot be traded at a row, and with the risk that it knows."""
+        """The weights that may be ordered at a row, given its tradable assets and risk estimate."""
         allowed = self.allowed
         if allowed is None:
             return CappedSimplex(self._limits(market))
@@ -318,7 +323,7 @@ class Portfolio(Market):
         return allowed.knowing(self.risk_at(market)) if allowed.limits_risk else allowed
 
     def risk_at(self, market: Row) -> Risk:
-        """What is known of risk at a row."""
+        """The risk estimated at a row from the returns up to it."""
         past = self.written.risk.rows
         return Risk.at(self.log_relatives, self.benchmarks, market, past, self.year)
 
@@ -330,7 +335,7 @@ class Portfolio(Market):
         return jnp.where(there, self.limits, 0.0)
 
     def draw_reachable(self, market: Row, key: PRNGKeyArray) -> Holding:
-        """With some of the year's turnover spent, in proportion to what has passed of the year."""
+        """A random holding, with turnover spent up to the elapsed share of the year's maximum."""
         drawn = super().draw_reachable(market, key)
         if drawn.plan is not None and self.elapsed.shape[0]:
             pace = self.terms.turnover * self.elapsed[market]
@@ -368,8 +373,8 @@ class Portfolio(Market):
     def anchor_weights(self, market: Row) -> Float[Array, " asset"] | None:
         """The anchor's weights; those of assets that cannot be traded go to the others.
 
-        An asset that can be traded has at least ``LEAST`` times an equal weight, so that zeros say
-        which cannot.
+        An asset that can be traded has at least ``LEAST`` times an equal weight, so that a weight
+        of 0 marks an asset that cannot.
         """
         if not self.anchor:
             return None
@@ -412,11 +417,12 @@ class Portfolio(Market):
     def settle(
         self, market: Row, next_market: Row, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
-        """As in any market; ``active`` subtracts what holding the anchor earns, free of cost.
+        """As in any market; ``active`` subtracts the reward of holding the anchor, free of cost.
 
-        That depends on the market alone: the best policy stays the same, and the noise goes that
-        all policies share (input-dependent baselines, Mao et al. 2019). ``tracking_aversion`` adds
-        a price of tracking error, as the mean of squares is nearly the variance.
+        That reward depends on the market alone, so that the best policy stays the same and noise
+        that all policies share is removed (input-dependent baselines, Mao et al. 2019).
+        ``tracking_aversion`` penalizes tracking error: the mean square of active rewards is nearly
+        their variance.
         """
         reward, after = super().settle(market, next_market, holding, action)
         if self.active:
@@ -445,20 +451,20 @@ class Portfolio(Market):
         )
 
     def drifted(self, row: Row, weights: Float[Array, " entry"]) -> Float[Array, " entry"]:
-        """Weights one row after they were held at a row, without a trade."""
+        """Weights held at a row, drifted to the next row without a trade."""
         last = self.log_relatives.shape[0] - 1
         period = self.conditions.holding(row, jnp.minimum(row + 1, last))
         return self.costs.held(weights, self.coming(row), period)
 
     def coming(self, row: Row) -> Float[Array, " asset"]:
-        """Relatives from a row to the next; 1 after the table's last row."""
+        """Price relatives from a row to the next; 1 after the table's last row."""
         rows = self.log_relatives.shape[0]
         following = lax.dynamic_index_in_dim(self.log_relatives, row + 1, keepdims=False)
         return jnp.where(row + 1 < rows, jnp.exp(following), 1.0)
 
 
 def _allowed(mandate: str, usable: np.ndarray, most: float) -> Mandated | None:
-    """What a mandate allows over some rows, in float32; without one, nothing is to be said."""
+    """The weights that a mandate allows over some rows, in float32; None without a mandate."""
     if not mandate:
         return None
     made, _ = checks.relaxed(feasible(mandate, usable, most))

@@ -1,4 +1,4 @@
-"""Orders in a universe in motion, whose assets are listed, delisted, and members for a time."""
+"""Orders in a changing universe: assets are listed and delisted, and may be members for a time."""
 
 import dataclasses
 from functools import lru_cache
@@ -18,10 +18,10 @@ TINY = 1e-9
 def spread(
     wanted: Float[Array, " entry"], there: Bool[Array, " asset"], long_only: bool
 ) -> Float[Array, " entry"]:
-    """What is wanted of the assets that are not there goes to the others, in proportion.
+    """Moves the target weights of unavailable assets to the available ones, in proportion.
 
-    A policy over all assets so becomes one over those that are there; cash stays as it is. Where
-    weights may be negative, it goes to cash.
+    This turns a policy over all assets into one over those that are available; cash is unchanged.
+    Where weights may be negative, the weights of unavailable assets go to cash.
     """
     assets = wanted[1:]
     kept = jnp.where(there, assets, 0.0)
@@ -32,24 +32,24 @@ def spread(
 
 
 class Patterns(NamedTuple):
-    """What a mandate allows where assets come and go, for each set of assets that are there."""
+    """A mandate's limits where assets come and go, for each distinct set of available assets."""
 
     low: Any  # (pattern, asset)
     high: Any  # (pattern, asset)
-    most: Any  # (pattern, limit), of the rows of the limits
+    most: Any  # (pattern, limit), upper bounds of the mandate's linear limits
     of_row: Int[Any, " row"]  # the pattern of each row
 
     @staticmethod
     def of(mandate: str, tradable: np.ndarray, most: float) -> "tuple[Patterns, list[str]]":
-        """The patterns of a table, in float64, and in words what gives way at how many rows.
+        """The patterns of a table, in float64, and a text on each limit that is relaxed somewhere.
 
-        Assets that are not there have weight 0. Floors, and the maximum of cash, that cannot be met
-        then give way by the least in sum.
+        Assets that are not available have weight 0. Floors and the maximum of cash that cannot be
+        met then are relaxed by the smallest total amount; the texts say at how many rows.
 
         Args:
             mandate: Text of the mandate.
             tradable: Which assets may be bought at each row, of shape (row, asset).
-            most: Largest weight of an asset, beside its cap.
+            most: Largest weight of any asset, in addition to the mandate's caps.
         """
         return _patterns(mandate, tradable.tobytes(), tradable.shape, float(most))
 
@@ -75,7 +75,7 @@ def _patterns(
     distinct, of_row = np.unique(every, axis=0, return_inverse=True)
     of_row, found = of_row.reshape(-1), []
     yields: dict[str, int] = {}
-    full = feasible(mandate, np.ones(shape[1], bool), most)  # all patterns have its rows
+    full = feasible(mandate, np.ones(shape[1], bool), most)  # all patterns share its linear limits
     for i, there in enumerate(distinct):
         low, high = (np.where(there, bound, 0.0) for bound in full.limits[:2])
         limits = full.limits._replace(low=low, high=high)
