@@ -290,7 +290,7 @@ def test_orders_as_csv(folder, monkeypatch, capsys, tmp_path):
     paid = sum(float(row["expected_cost"]) for row in rows)
     assert paid == pytest.approx(plan["expected_cost"], abs=0.02)
     assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *of, "--layout", "ib") == 2
-    assert "has whole shares; add --whole-shares" in capsys.readouterr().err
+    assert "takes whole shares only; add --whole-shares" in capsys.readouterr().err
     whole = [*of, "--layout", "ib", "--whole-shares", "--currency", "EUR"]
     allocation(folder, monkeypatch, capsys, *whole)
     header, *lines = path.read_text().splitlines()

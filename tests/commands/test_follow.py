@@ -88,7 +88,7 @@ def test_a_loss_at_every_row_raises_the_alarm(folder, monkeypatch, capsys, tmp_p
     printed = " ".join(capsys.readouterr().out.split())
     assert f"ALARM since {first}: live returns are worse than the backtest's" in printed
     assert "Live is below the band." in printed
-    assert "a retrain is due for the alarm and its age of 80d or more" in printed
+    assert "a retrain is due because of the alarm and its age of 80d or more" in printed
 
 
 def test_before_the_first_return(folder, monkeypatch, capsys):

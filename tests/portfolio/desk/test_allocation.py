@@ -116,7 +116,7 @@ def test_orders_through_zero_are_two_where_brokers_tell_short_sales():
     assert [row[:3] for row in rows] == [
         ["A", 5, "sell"], ["A", 10.6, "sell"], ["B", 1, "buy"], ["B", 7.95, "buy"],
     ]  # fmt: skip
-    with pytest.raises(QfolioError, match="An order at Schwab has whole shares"):
+    with pytest.raises(QfolioError, match="An order at Schwab takes whole shares only"):
         order_rows(allocation, "schwab", "USD")
     whole = plan([0.9, -0.2, 0.3], [5, -1], 1000, cost=0.0, whole_shares=True)
     assert [str(row[1]) for row in order_rows(whole, "alpaca", "USD")[1]] == ["5", "10", "1", "8"]

@@ -64,7 +64,7 @@ def test_shorts_and_loans_where_they_are_allowed(tmp_path: Path):
         ("asset,shares\nBBB,1\nAAA\n", "line 3: there is no number of shares of 'AAA'"),
         ("asset,shares\nAAA,-1\n", "line 2: 'AAA' has -1 shares; give 0 or more"),
         ("asset,shares\nAAA,inf\n", "line 2: 'AAA' has inf shares; give 0 or more"),
-        ("asset,shares\nAAA,1\nAAA,2\n", "line 3: 'AAA' appears twice; add the two up"),
+        ("asset,shares\nAAA,1\nAAA,2\n", "line 3: 'AAA' appears twice; add the two numbers up"),
         ("asset,shares\ncash,1\nCash,2\n", "line 3: 'cash' appears twice"),
         (
             "asset,shares\nAAB,1\n",

@@ -74,7 +74,7 @@ def test_a_table_of_ones_own_goes_on_with_its_latest_rows(tmp_path):
     np.testing.assert_allclose(found, np.expm1(1e-3))
     made = desk(tmp_path / "orders", ORDERS)
     _, note = reference(made, later, 159, 28, None)
-    assert "The last order of benchmark is of 2020-05-10, and its holding drifts since" in note
+    assert "The last order of benchmark is of 2020-05-10, and its holding has drifted since" in note
     made = desk(tmp_path / "equal", None)
     with pytest.raises(QfolioError, match="equal-weight is a baseline, which needs no table"):
         reference(made, later, 159, 28, tmp_path / "index.csv")

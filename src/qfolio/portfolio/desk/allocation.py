@@ -72,7 +72,7 @@ class Allocation:
             prices: Prices up to the row after which to trade.
             shares: Shares held now, of shape (assets,).
             cash: Cash held now, in money.
-            whole_shares: Whether to trade whole shares only, as near to the target as they come.
+            whole_shares: Whether to trade whole shares only, as near to the target as possible.
                 Where the mandate has lots, whole lots are traded in any case.
             spent: Turnover since the calendar year began, for a mandate that limits it.
 
@@ -88,7 +88,7 @@ class Allocation:
             )
         held = np.append(cash, shares * known) / wealth
         names = ("cash", *prices.assets)
-        before: dict[str, Any] = {"spent": spent} if spent else {}  # few need to know
+        before: dict[str, Any] = {"spent": spent} if spent else {}  # not every policy takes it
         targets = policy.weights(prices, dict(zip(names, held.tolist(), strict=True)), **before)
         weights = _ordered(np.array([targets[name] for name in names]), held)
         trades = np.zeros(len(shares))
@@ -132,12 +132,12 @@ class Allocation:
 
     @property
     def turnover(self) -> float:
-        """The sum of all changes of weights, bought and sold."""
+        """Sum of the absolute changes in the assets' weights, bought and sold."""
         return float(abs(self.weights - self.held)[1:].sum())
 
     @cached_property
     def reached(self) -> np.ndarray:
-        """Weights after the trades, cash first, as shares and costs allow them."""
+        """Weights after the trades and their costs, cash first."""
         values = np.nan_to_num((self.shares + self.trades) * self.prices)
         held = np.append(self.cash_after, values)
         return np.asarray(held / held.sum())
@@ -182,7 +182,7 @@ def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
 
 
 def context_of(model: CostModel, prices: Prices, wealth: float) -> Context:
-    """The circumstances of a trade as the table's last row has them."""
+    """The circumstances of a trade at the table's last row."""
     known = Conditions.of(prices, model.columns)
     capital = model.capital if isinstance(model, Itemized) else wealth
     return known.trade(len(prices) - 1, 1, wealth / capital)
@@ -197,10 +197,10 @@ def settled(
     prices: np.ndarray,
     trades: np.ndarray,
 ) -> tuple[float, dict[str, float]]:
-    """The cash that trades leave, and their costs in money by kind.
+    """The cash that is left after trades, and their costs in money, by kind.
 
-    The cost model asks for weights after the trade, which depend on the cash that it leaves; the
-    cash is a fixed point, found in a few steps because costs are small.
+    The cost model asks for the weights after the trade, which depend on the cash that it leaves;
+    that cash is a fixed point, found in a few steps because costs are small.
     """
     values = (shares + trades) * prices
     invested = float(values.sum())
@@ -217,7 +217,7 @@ def settled(
 
 
 def require_fresh(prices: Prices, as_of: str | None) -> None:
-    """Raise QfolioError unless the last prices are of the week up to ``as_of`` (default: today)."""
+    """Raises QfolioError unless prices end in the week up to ``as_of`` (default: today)."""
     try:
         today = datetime.date.today() if as_of is None else datetime.date.fromisoformat(as_of)
     except ValueError:

@@ -1,13 +1,13 @@
 """Whether live returns are still those that a backtest promised, tested at every row.
 
-Live returns x, cut to the range of nearly all of the backtest's and divided by its width, are bet
-against: capital K = mean over bets b of Π (1 + b (m − x)), where m is a lower confidence limit of
-the backtest's mean. While their expectation, given the past, is at least m, K is a nonnegative
-supermartingale, whatever their variance. By Ville's inequality it ever reaches 2/α with probability
-α/2 at most; the limit m is wrong with another α/2. So an alarm is false with probability α at most,
-however often one looks (I. Waudby-Smith and A. Ramdas, "Estimating means of bounded random
-variables by betting", 2024). Both limits hold for returns whose expectation does not depend on the
-past; where it does, they are approximate.
+The test bets against live returns x, clipped to a range that holds nearly all of the backtest's and
+divided by its width. Its capital is K = mean over bets b of Π (1 + b (m − x)), where m is a lower
+confidence limit of the backtest's mean. As long as the expectation of x given the past is at least
+m, K is a nonnegative supermartingale, whatever the variance. By Ville's inequality, K ever reaches
+2/α with a probability of at most α/2; m is too high with a probability of α/2. So an alarm is false
+with a probability of at most α, however often one looks (I. Waudby-Smith and A. Ramdas, "Estimating
+means of bounded random variables by betting", 2024). Both bounds hold for returns whose expectation
+does not depend on the past; where it does, they are approximate.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ ALARM = 2 / ALPHA
 """The evidence at which the alarm is given."""
 
 TAIL = 0.005
-"""Share of the backtest's returns that is cut off at each end."""
+"""Share of the backtest's returns that is clipped at each end."""
 
 BETS = (0.02, 0.05, 0.1, 0.2, 0.4)
 """Shares of the largest bet that keeps the capital positive."""
@@ -36,9 +36,10 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Promise:
-    """What a backtest's returns say of those to come.
+    """What a backtest's returns promise of live ones.
 
-    low, high: the range that returns are cut to. least: lower limit of the mean of cut returns.
+    low, high: the range to which returns are clipped. least: lower confidence limit of the mean of
+    clipped returns.
     """
 
     low: float
@@ -57,7 +58,7 @@ class Promise:
 
 
 def evidence(promise: Promise, live: ArrayLike) -> Floats:
-    """Evidence against the promise after each live return, shape (n,): 1 is none, see ``ALARM``."""
+    """Evidence against the promise after each live return, shape (n,); 1 is none. See ``ALARM``."""
     width = promise.high - promise.low
     if width <= 0:
         return np.ones(np.shape(live))
@@ -73,11 +74,11 @@ def together(parts: list[Floats]) -> Floats:
 
 
 def band(tested: ArrayLike, rows: int, rng: np.random.Generator) -> Floats:
-    """Growth of wealth over the rows to come, if they are as the backtest's.
+    """Growth of wealth over the rows to come, if their returns are like the backtest's.
 
     Returns:
-        Numbers of shape (3, rows): the 2.5%, 50% and 97.5% quantiles of the histories that the
-        stationary bootstrap draws.
+        Growth factors of shape (3, rows): the 2.5%, 50% and 97.5% quantiles over histories drawn by
+        the stationary bootstrap.
     """
     returns = np.asarray(tested, dtype=float)
     block = block_length(returns)

@@ -1,4 +1,4 @@
-"""From a run to orders, with a trail: allocations that the run's ledger keeps and reproduces."""
+"""From a run to orders: allocations that the run's ledger records and can reproduce."""
 
 import datetime
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices, load
 
 SAME = 1e-6
-"""How far reproduced weights may be off: policies decide in float32, not alike on all machines."""
+"""How far reproduced weights may be off: policies decide in float32, which differs by machine."""
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Desk:
         known.setdefault("columns", tuple(run.config.prices.get("columns", ())))
         ends = "gap" if run.prices.tradable is None else "cash-out"
         known["ended"] = options.get("ended") or ends
-        # What is followed looks at the last rows only; assets may start at any row before.
+        # Policies and baselines look at the last rows only; assets may start at any row before.
         return Desk(run, Path(folder), lambda source: load(source, late="join", **known))
 
     @property
@@ -80,38 +80,41 @@ class Desk:
         table = self.load(prices)
         if table.members is None and self.run.prices.members is not None:
             raise QfolioError(
-                "The assets of the backtest are members for a time only; give the latest "
+                "The backtest's universe has members that change over time; give the latest "
                 "memberships with --members."
             )
         return followed.table(table)
 
     def spent(self, followed: Policy | Rule, table: Prices, before: int | None = None) -> float:
-        """The turnover of the ledger since the year of a table's last row began.
+        """The ledger's turnover since the calendar year of a table's last row began.
 
-        0 if the mandate does not limit it. before: as for ``Ledger.spent``.
+        It is 0 if the mandate does not limit turnover. before: as for ``Ledger.spent``.
         """
         limited = followed.task.written.trading.turnover_a_year is not None
         return self.ledger.spent(table.dates[-1], before) if limited else 0.0
 
     def terms(self, followed: Policy | Rule, allocation: Allocation, spent: float) -> list[str]:
-        """Sentences on how the mandate wants an allocation to be traded."""
+        """Sentences on how the mandate requires an allocation to be traded."""
         trading, said = followed.task.written.trading, []
         if trading.fill > 1:
             said.append(
                 f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
-                "order at every one of them."
+                "order at each of these rows."
             )
         if (most := trading.turnover_a_year) is not None:
             said.append(
-                f"Of this year's turnover of at most {most:.0%}, the ledger's orders took "
-                f"{spent:.1%}, and this one takes {allocation.turnover:.1%}."
+                f"The mandate allows a turnover of {most:.0%} a year: the ledger's orders have "
+                f"used {spent:.1%} this year, and this one uses {allocation.turnover:.1%}."
             )
         return said
 
     def record(
         self, name: str, allocation: Allocation, prices: Prices, whole_shares: bool
     ) -> tuple[Record, str]:
-        """Appends an allocation by the newest policy of an agent, or by a baseline."""
+        """Appends an allocation by the newest policy of an agent, or by a baseline.
+
+        Returns the record, and a sentence that says what was done.
+        """
         learned = name in self.run.agents
         stored = self.run.newest(name) if learned else None
         held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
@@ -137,7 +140,7 @@ class Desk:
         """The allocation of a date, computed again.
 
         Args:
-            date: As the ledger has it.
+            date: Date of the allocation, as in the ledger.
             prices: Prices to compare with those of the ledger; later rows are left out.
             holdings: Shares and cash to compare with those of the ledger.
 
@@ -184,7 +187,7 @@ class Desk:
         return record, again
 
     def _digests(self, name: str, stored: str | None) -> dict[str, str]:
-        """Of the run's settings and an agent's policy."""
+        """Digests of the run's settings and, with ``stored``, of an agent's policy."""
         found = {"settings": file_digest(self.folder / "config.json")}
         if stored is not None:
             path = BacktestFolder(self.folder).policy_file(name, stored)

@@ -28,11 +28,12 @@ SEED = 0
 class Following:
     """A ledger marked to market; arrays have an entry for each live row.
 
-    tested: what its agent (that of the last allocation) earned in the backtest, net, shape (T,).
-    benchmark: name of the backtest's. reference: its live net returns. note: on these, or "". band:
-    growth of wealth by the backtest, shape (3, rows). evidence: against the backtest. learned: the
-    last row that the policy knows, or None for a baseline. overdue: whether that is a test length
-    ago or more.
+    agent: that of the last allocation. tested: its net returns in the backtest, shape (T,).
+    benchmark: name of the backtest's benchmark. reference: its live net returns. note: a remark on
+    these, or "". band: growth of wealth that the backtest leads one to expect, shape (3, rows).
+    evidence: evidence against the backtest. learned: date of the last row that the policy learned
+    from; None for a baseline. overdue: whether that is a test length ago or more. test: the test
+    length.
     """
 
     agent: str
@@ -56,7 +57,7 @@ class Following:
 
     @property
     def alarm(self) -> np.datetime64 | None:
-        """The date of the first alarm, from which on the backtest is refuted; None without one."""
+        """The date of the first alarm, which refutes the backtest; None without one."""
         over = np.flatnonzero(self.evidence >= consistency.ALARM)
         return self.live.dates[over[0]] if over.size else None
 
@@ -75,7 +76,7 @@ class Following:
             f"{since}, {amount(len(live.returns), 'row')} up to {day(live.dates[-1])}: "
             f"{figure(earned - 1, '+.1%')} after costs, and {self.benchmark} "
             f"{figure(other - 1, '+.1%')}.",
-            f"Of histories like the backtest's, 95% end between {low} and {high}, half of them "
+            f"Of histories like the backtest's, 95% end between {low} and {high}, and half end "
             f"above {middle}.{place}",
         ]
         level = f"evidence against it {self.evidence[-1]:.2g}, alarm at {consistency.ALARM:.0f}"
@@ -91,12 +92,13 @@ class Following:
         if flows.size:
             said.append(
                 f"Holdings differed from those expected {amount(flows.size, 'time')}, by "
-                f"{flows.sum():+,.2f} in all (deposits, other fills); this counts as no return."
+                f"{flows.sum():+,.2f} in all (deposits, other fills); this is not counted as a "
+                "return."
             )
         if live.short:
             said.append(
-                f"After {amount(live.short, 'allocation')} prices rose before the trades were "
-                "filled, and cash was negative."
+                f"After {amount(live.short, 'allocation')}, prices rose before the trades were "
+                "filled, so that cash became negative."
             )
         return said
 
@@ -107,13 +109,13 @@ class Following:
         why += [f"its age of {self.test} or more, the backtest's test length"] * self.overdue
         until = f"The policy has learned from prices up to {day(self.learned)}"
         return (
-            f"{until}; a retrain is due for {' and '.join(why)}."
+            f"{until}; a retrain is due because of {' and '.join(why)}."
             if why
             else (f"{until}; no retrain is due before it is {self.test} old.")
         )
 
     def rows(self) -> dict[str, dict[str, float]]:
-        """Growth since the start and a year, volatility, Sharpe ratio and drawdown, by name."""
+        """Growth in all and per year, volatility, Sharpe ratio and maximum drawdown, by name."""
         return {
             "live": _measures(self.live.returns, self.periods_per_year),
             f"{self.benchmark}, live": _measures(self.reference, self.periods_per_year),
@@ -159,8 +161,8 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
     Args:
         desk: The run.
         prices: A table with the rows since the first allocation (default: the backtest's).
-        benchmark: Latest table of a benchmark that is a strategy of the user's own (default: as the
-            backtest kept it).
+        benchmark: Latest table of the benchmark, if that is a strategy of the user's own (default:
+            the table that the backtest kept).
 
     Raises:
         QfolioError: The ledger is empty, prices or the benchmark do not fit it, or the backtest is
@@ -212,7 +214,7 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
 def _tested(desk: Desk, name: str, first: Record) -> np.ndarray:
     """The net returns of a strategy in the backtest, all seeds of an agent together.
 
-    Rows by which the table has grown since the first allocation are live, and left out.
+    Rows that were added to the table since the first allocation are live, and are left out.
     """
     files, dates = BacktestFolder(desk.folder), desk.run.prices.dates
     last = dates[files.read_config().prices["rows"] - 1]

@@ -29,7 +29,7 @@ def read_holdings(
             Without it, all is cash.
         assets: The assets that may be held.
         capital: Cash, if the table does not give it.
-        debts: Whether shares may be negative (sold short), and cash (a loan).
+        debts: Whether shares may be negative (sold short), and cash too (a loan).
 
     Raises:
         QfolioError: The file is not such a table, names an unknown asset or one asset twice, a
@@ -60,7 +60,7 @@ def read_holdings(
             known = f"the backtest does not know {quote(name)}{hint(name, assets)}"
             raise QfolioError(f"{where}: {known if name else 'the asset has no name'}.")
         if name in held:
-            raise QfolioError(f"{where}: {quote(name)} appears twice; add the two up.")
+            raise QfolioError(f"{where}: {quote(name)} appears twice; add the two numbers up.")
         if is_missing(cells[i]):
             raise QfolioError(f"{where}: there is no number of shares of {quote(name)}.")
         if wrong[i] or (name != CASH and CURRENCIES & set(str(cells[i]))):
@@ -78,10 +78,10 @@ def read_holdings(
 def cashed_out(
     shares: np.ndarray, cash: float, prices: Prices
 ) -> tuple[np.ndarray, float, list[str]]:
-    """Shares and cash after the cash-out of what a table's last row does not list any more.
+    """Shares and cash after a cash-out of the assets that a table's last row no longer lists.
 
     Returns:
-        Shares of shape (assets,), cash, and a sentence for each asset that is taken as cash.
+        Shares of shape (assets,), cash, and a sentence for each asset that was cashed out.
     """
     if prices.listed is None:
         return shares, cash, []

@@ -27,9 +27,9 @@ PolicyName = Annotated[str, msgspec.Meta(pattern=r"^latest(-[0-9]+)?$")]
 
 
 class Record(msgspec.Struct, kw_only=True, frozen=True):
-    """An allocation; lists are by asset, weights have cash first.
+    """An allocation on record; lists are by asset, weights have cash first.
 
-    digests: SHA-256 of "prices" (the table as used), "policy" (its file; none of a baseline),
+    digests: SHA-256 of "prices" (the table as used), "policy" (its file; absent for a baseline),
     "settings" (config.json of the run) and "holdings".
     """
 
@@ -38,7 +38,7 @@ class Record(msgspec.Struct, kw_only=True, frozen=True):
     made: str  # when the record was written
     version: str  # of qfolio
     agent: str
-    policy: PolicyName | None  # among those of the agent; None of a baseline
+    policy: PolicyName | None  # name of the agent's policy; None for a baseline
     digests: dict[str, str]
     whole_shares: bool
     assets: list[str]
@@ -81,12 +81,12 @@ class Ledger:
         return [self._read(path) for path in paths]
 
     def current(self) -> list[Record]:
-        """The record that counts of each date, by date."""
+        """The record that counts for each date, in order of date."""
         last = {record.moment: record for record in self.records()}
         return [last[moment] for moment in sorted(last)]
 
     def spent(self, moment: np.datetime64, before: int | None = None) -> float:
-        """The turnover ordered since the calendar year of a moment began, without its own.
+        """The turnover ordered in the calendar year of a moment, up to but not at that moment.
 
         before: number of a record; only those before it count (default: all).
         """
@@ -100,25 +100,28 @@ class Ledger:
         )
 
     def on(self, date: str) -> Record:
-        """The record that counts of a date, or of the last moment of a day."""
+        """The record that counts for a date; for a day, that of its last moment.
+
+        Raises QfolioError if there is none.
+        """
         found = [record for record in self.current() if record.date.startswith(date)]
         if not found or not date:
             known = ", ".join(record.date for record in self.current()[-3:])
             raise QfolioError(
                 f"The ledger has no allocation of {quote(date)}; "
-                + (f"its last are of {known}." if known else "it is empty.")
+                + (f"its latest are of {known}." if known else "it is empty.")
             )
         return found[-1]
 
     def append(
         self, allocation: Allocation, prices: Prices, *, keep_prices: bool, **facts: Any
     ) -> tuple[Record, str]:
-        """Adds a record, unless that of the same date has the same inputs.
+        """Adds a record, unless the last one of the same date has the same inputs.
 
         Args:
             allocation: The allocation.
             prices: The table that it used.
-            keep_prices: Whether to store the table; without it, reproducing needs it again.
+            keep_prices: Whether to store the table; if not, it is needed again to reproduce.
             facts: The other fields of the record, except number, date and what it supersedes.
 
         Returns:
@@ -130,7 +133,7 @@ class Ledger:
             content = {**_of(allocation), **facts}
             before = next((r for r in reversed(records) if r.date == content["date"]), None)
             if before is not None and _inputs(before) == _inputs(content):
-                return before, f"It is record {before.number} of the ledger already."
+                return before, f"It is already record {before.number} of the ledger."
             record = msgspec.convert(
                 {
                     **content,
@@ -155,7 +158,7 @@ class Ledger:
         return record, said
 
     def prices(self, record: Record, known: Prices) -> Prices:
-        """The table that a record used: rows of ``known``, or what the ledger stored.
+        """The table that a record used: rows of ``known``, or the table that the ledger stored.
 
         Raises:
             QfolioError: The ledger did not store it, or its file is damaged.
@@ -237,7 +240,7 @@ def _of(allocation: Allocation) -> dict[str, Any]:
 
 
 def _inputs(record: Record | dict[str, Any]) -> dict[str, Any]:
-    """What decides an allocation."""
+    """The inputs that determine an allocation."""
     content = record if isinstance(record, dict) else msgspec.structs.asdict(record)
     names = ("prices", "policy", "settings", "holdings")
     digests = {name: content["digests"].get(name) for name in names}

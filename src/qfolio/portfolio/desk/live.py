@@ -20,12 +20,12 @@ class Live:
 
     dates: np.ndarray
     returns: np.ndarray  # net; the cost of a trade is charged to the row after it
-    wealth: np.ndarray  # money at each row, before its trades
-    cash: np.ndarray  # of it
+    wealth: np.ndarray  # in money, before the row's trades
+    cash: np.ndarray  # part of wealth
     costs: np.ndarray  # money paid for the trades of the row before
-    flows: np.ndarray  # money by which an allocation at the row before was given more than expected
+    flows: np.ndarray  # holdings given to an allocation at the row before, less those expected
     first: int  # row of the table before the first return
-    short: int  # trades after which cash was negative: prices rose before they were filled
+    short: int  # number of trades that left negative cash: prices rose before they were filled
 
 
 def mark(
@@ -35,16 +35,16 @@ def mark(
 
     Trades of an allocation are filled ``lag`` rows after it, at the close, in the shares of the
     ledger and at the costs of the model. Each allocation begins with the holdings that it was
-    given; what they differ from those expected (deposits, other fills) is a flow and earns nothing.
-    Shares count in units of the table: where an adjusted price differs from the ledger's, after a
-    split or a dividend, the value at the allocation is the same.
+    given; their difference from those expected (deposits, other fills) is a flow, not a return.
+    Shares are converted to units of the table: where an adjusted price differs from the ledger's,
+    after a split or a dividend, the value at the allocation is the same.
 
     Args:
         records: One record for each date, in order of date.
         prices: A table with a row for each of these dates and the assets of the records.
         model: Costs of trading and holding.
         lag: Rows from an allocation to its trades.
-        fill: Rows over which these are filled, in equal parts.
+        fill: Rows over which the trades are filled, in equal parts.
 
     Raises:
         QfolioError: The ledger is empty, or prices do not fit it.
@@ -77,9 +77,9 @@ def mark(
                 values[row], values[row - 1], out=np.ones(len(units)), where=values[row - 1] > 0
             )
             growth = model.growth(before, relatives, known.holding(row - 1, row))
-            # What holding earns besides the price is paid in cash.
+            # What a holding earns besides its price is paid in cash.
             cash = cash * growth[0] + float(before[1:] @ (growth[1:] - relatives))
-            if known.listed is not None:  # what is delisted is cash, and its orders are void
+            if known.listed is not None:  # delisted assets become cash, and their orders void
                 gone = known.listed[row] == 0
                 cash += float(units[gone] @ values[row][gone])
                 units = np.where(gone, 0.0, units)

@@ -11,7 +11,7 @@ from qfolio.core.text import near, quote
 from qfolio.portfolio.desk.allocation import Allocation
 
 DIGITS = 6
-"""Decimal places of fractional shares; what is beyond is not ordered."""
+"""Decimal places of fractional shares; anything smaller is not ordered."""
 
 Rows = list[list[Any]]
 
@@ -74,7 +74,7 @@ def _interactive_brokers(allocation: Allocation, currency: str) -> tuple[list[st
     for i, side, quantity in _orders(allocation):
         if quantity != int(quantity):
             raise QfolioError(
-                "A basket of Interactive Brokers has whole shares; add --whole-shares."
+                "A basket of Interactive Brokers takes whole shares only; add --whole-shares."
             )
         symbol = allocation.assets[i]
         rows.append([side, int(quantity), symbol, "STK", "SMART", currency, "DAY", "MKT", tag])
@@ -82,7 +82,7 @@ def _interactive_brokers(allocation: Allocation, currency: str) -> tuple[list[st
 
 
 def _alpaca(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
-    """Market orders for the day, in the fields of POST /v2/orders; Alpaca imports no file.
+    """Market orders for the day, in the fields of POST /v2/orders; Alpaca does not import files.
 
     Source: Alpaca, "Working with /orders".
     """
@@ -95,7 +95,7 @@ def _alpaca(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
 
 
 def _schwab(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
-    """Market orders for the day, in the fields of the Trader API; accounts import no file.
+    """Market orders for the day, in the fields of the Trader API; Schwab does not import files.
 
     Source: Schwab Trader API, "Place Order": instruction, quantity, symbol and assetType are those
     of a leg in ``orderLegCollection``; orderStrategyType is SINGLE.
@@ -106,7 +106,7 @@ def _schwab(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
     rows: Rows = []
     for i, instruction, quantity in _legs(allocation):
         if quantity != int(quantity):
-            raise QfolioError("An order at Schwab has whole shares; add --whole-shares.")
+            raise QfolioError("An order at Schwab takes whole shares only; add --whole-shares.")
         rows.append(
             [allocation.assets[i], "EQUITY", instruction, int(quantity), "MARKET", "NORMAL", "DAY"]
         )
@@ -119,11 +119,11 @@ LAYOUTS: dict[str, Callable[[Allocation, str], tuple[list[str], Rows]]] = {
     "alpaca": _alpaca,
     "schwab": _schwab,
 }
-"""Columns by name."""
+"""Layouts of an order file, by name."""
 
 
 def _orders(allocation: Allocation) -> list[tuple[int, str, float]]:
-    """The place of each asset traded, the side and the quantity; sales first, as they pay."""
+    """Index, side and quantity of each asset traded; sales first, since they raise the cash."""
     scale = 10**DIGITS
     found = []
     for i in map(int, np.argsort(allocation.trades, kind="stable")):
@@ -137,9 +137,9 @@ def _orders(allocation: Allocation) -> list[tuple[int, str, float]]:
 
 
 def _legs(allocation: Allocation) -> list[tuple[int, str, float]]:
-    """The orders, with short sales told from others: SELL, SELL_SHORT, BUY_TO_COVER or BUY.
+    """The orders, with short positions told apart: SELL, SELL_SHORT, BUY_TO_COVER or BUY.
 
-    What goes through zero is two orders, of which the first closes the position.
+    A trade through zero becomes two orders, of which the first closes the position.
     """
     found = []
     for i, side, quantity in _orders(allocation):

@@ -20,14 +20,14 @@ def reference(
 ) -> tuple[np.ndarray, str]:
     """The benchmark's net returns, under the run's costs, calendar and mandate.
 
-    A baseline learns from the rows up to the first decision. A strategy of the user's own is that
-    of the backtest, or that of ``source``.
+    A baseline learns from the rows up to the first decision. A strategy of the user's own is read
+    from the backtest, or from ``source``.
 
     Args:
         desk: The run.
         table: The prices.
         first: Row of the first decision.
-        count: Number of returns; the first is that to row ``first`` + lag + 1.
+        count: Number of returns; the first ends at row ``first`` + lag + 1.
         source: Latest table of a benchmark that is a strategy of the user's own.
 
     Returns:
@@ -56,7 +56,7 @@ def reference(
         placed = place(name, each, table, fold.decisions, task, config.cap)
     except QfolioError as error:
         raise QfolioError(
-            f"The benchmark cannot be followed: {error} Its latest table is given with --benchmark."
+            f"The benchmark cannot be followed: {error} Give its latest table with --benchmark."
         ) from None
     return _earned(replay.own("baseline", placed)), _ended(name, each, table.dates[first])
 
@@ -66,10 +66,10 @@ def _earned(entry: Entry) -> np.ndarray:
 
 
 def _ended(name: str, own: Own, start: np.datetime64) -> str:
-    """Says that a strategy which was rebalanced has had no order since the first allocation."""
+    """A note if a rebalanced strategy has had no order since the first allocation; else ""."""
     if own.kind != "weights" or len(own.dates) == 1 or own.dates[-1] >= start:
         return ""
     return (
-        f"The last order of {name} is of {day(own.dates[-1])}, and its holding drifts since; give "
-        "later ones with --benchmark."
+        f"The last order of {name} is of {day(own.dates[-1])}, and its holding has drifted since; "
+        "give later orders with --benchmark."
     )

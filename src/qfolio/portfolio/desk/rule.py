@@ -1,4 +1,4 @@
-"""A baseline of a backtest, asked for tomorrow's weights as a learned policy is."""
+"""A baseline of a backtest, which gives tomorrow's weights as a learned policy does."""
 
 import dataclasses
 from typing import Any
@@ -18,9 +18,9 @@ from qfolio.portfolio.task import Portfolio
 
 
 class Rule:
-    """A baseline's orders after the last row of a table, whatever its calendar but for a band.
+    """A baseline's orders after the last row of a table; of its calendar, only a band applies.
 
-    It learns from the training window that ends there: all rows, or the last ``train``.
+    The baseline learns from the training window that ends there: all rows, or the last ``train``.
     """
 
     def __init__(
@@ -53,14 +53,15 @@ class Rule:
             off = sorted(set(table.assets) ^ set(self.assets))
             raise QfolioError(
                 f"The price table must have the {len(self.assets)} assets of the backtest, and no "
-                f"others; {off[0]!r} is in one of them only."
+                f"others; {off[0]!r} is in only one of the two."
             )
         return table.select(self.assets)
 
     def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:
-        """Target weights by asset, with "cash" first; as held if the baseline gives no order.
+        """Target weights by asset, with "cash" first; the holdings if the baseline gives no order.
 
-        spent: turnover since the calendar year began, for a mandate that limits it.
+        spent: turnover since the calendar year began, for a mandate that limits it. Raises
+        QfolioError if the table's assets are not the backtest's, or none can be traded.
         """
         table = self.table(prices)
         held = np.array([(holdings or {"cash": 1.0}).get(n, 0.0) for n in ("cash", *self.assets)])

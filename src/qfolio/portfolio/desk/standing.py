@@ -1,4 +1,4 @@
-"""What a finished backtest found of an agent or a baseline, for those who follow it."""
+"""What a finished backtest found about an agent or a baseline, for those who follow it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ class Standing:
     agent: its name, or that of a baseline.
     verdict: the sentence of the report, or the measures of a baseline; empty if the backtest is not
     finished.
-    worse: whether an agent falls short of the benchmark in growth, or of its best rebalancing.
+    worse: whether an agent grows more slowly than the benchmark, or than its best rebalancing.
     learned: whether it is an agent, not a baseline.
     """
 
@@ -56,7 +56,7 @@ class Standing:
             ) from None
 
     def require_sound(self, folder: Path, named: bool) -> None:
-        """Raise QfolioError unless the policy may be traded without an explicit override.
+        """Raises QfolioError unless the policy may be traded without an explicit override.
 
         Args:
             folder: The backtest's folder, for the message.

@@ -18,22 +18,22 @@ def whole_shares(
 ) -> np.ndarray:
     """The trades in whole shares that track the ideal ones best.
 
-    Each trade is rounded down or up. The distance to the target is the sum of squares of what each
-    asset and the cash are off, in money. From all trades rounded down, the best change of one trade
-    or of two is made until none makes the distance smaller. That is no proof of the optimum; the
-    tests compare it with every rounding. Fractions of a share, or of a lot, that are held are never
-    sold.
+    Each trade is rounded down or up. The distance to the target is the sum of squared deviations of
+    each asset and of the cash, in money. Starting with all trades rounded down, the best change of
+    one or two trades is made until none reduces the distance. This local search does not prove the
+    optimum; the tests compare it with every rounding. Fractions of a share, or of a lot, that are
+    held are never sold.
 
     Args:
         ideal: Shares to buy, negative to sell, of shape (assets,).
         shares: Shares held now, likewise.
         prices: Prices of the assets, same shape.
-        cash: What the ideal trades leave.
-        cash_after: The cash that trades leave, after costs; at the result it is not negative, or
-            no larger a loan than that of the ideal trades.
-        lots: Shares of each asset that are traded together (default: single shares).
+        cash: Cash that the ideal trades leave.
+        cash_after: The cash that trades leave, after costs. The result leaves no negative cash, or
+            no larger loan than the ideal trades.
+        lots: Number of shares in a lot of each asset (default: single shares).
     """
-    if lots is not None:  # a lot is a share of so many times the price
+    if lots is not None:  # a lot is traded like one share at the price of them all
         number = whole_shares(
             ideal / lots, shares / lots, prices * lots, cash, lambda n: cash_after(n * lots)
         )
@@ -69,7 +69,7 @@ def _improved(
     cash: float,
     cash_after: Callable[[np.ndarray], float],
 ) -> np.ndarray | None:
-    """The trades after the best change of one or of two by a share each; None if there is none."""
+    """The trades after the best change of one or two by a share each; None if none is better."""
     step = np.where(trades < high, 1.0, np.where(trades > low, -1.0, 0.0))
     (some,) = np.nonzero(step)
     money, off = (step * prices)[some], ((trades - ideal) * prices)[some]
@@ -80,7 +80,7 @@ def _improved(
         moved = off + change
         return float(moved @ moved + (after - cash) ** 2 - off @ off - error**2)
 
-    # Costs of a share more or less are left out here, and counted when a change is made.
+    # The costs of one share more or less are ignored here, and counted when a change is made.
     own = 2 * off * money + money**2
     gains = own + own[:, None] + (error - money - money[:, None]) ** 2 - error**2
     np.fill_diagonal(gains, own + (error - money) ** 2 - error**2)

@@ -17,6 +17,8 @@ from qfolio.solvers.ar1 import ar1
 
 
 class Ar1Market(NamedTuple):
+    """The signal, and the asset's latest price relative."""
+
     signal: Float[Array, ""]
     relative: Float[Array, ""]  # of the step that led here
 
@@ -25,10 +27,10 @@ class Ar1(OneAsset):
     """One asset whose mean return follows a signal: x' = ρx + noise ε, r = drift + slope·x + ση."""
 
     rho: float = number(0.95)  # persistence of the signal
-    noise: float = number(0.3122)  # deviation of the signal's shocks, a step
-    drift: float = number(0.0002)  # mean return without a signal, a step
-    slope: float = number(0.004)  # mean return for a signal of 1
-    volatility: float = number(0.01)  # deviation of the return, a step
+    noise: float = number(0.3122)  # standard deviation of the signal's shocks, per step
+    drift: float = number(0.0002)  # mean return without a signal, per step
+    slope: float = number(0.004)  # additional mean return for a signal of 1
+    volatility: float = number(0.01)  # standard deviation of the return, per step
     cost: float = constant(0.002)  # one way, as a share of the value traded
     menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(252)  # steps of an episode

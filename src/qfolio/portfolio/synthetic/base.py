@@ -1,4 +1,4 @@
-"""The base of the markets with known answers: an exact policy, and scenes to draw it in.
+"""The base of the markets with known solutions: an exact policy, and scenes to plot it in.
 
 ``rule`` extracts the few numbers that describe a policy (a fraction, the edges of a no-trade
 region, a trading rate), to compare a learned policy with the exact one.
@@ -30,11 +30,11 @@ class Synthetic(ExogenousTask):
         """The exact policy."""
 
     drawn = (-2.0, 2.0)
-    """The least and the largest holding to draw a policy for, of the first asset."""
+    """Range of the first asset's holding over which a policy is plotted."""
 
     @abc.abstractmethod
     def scenes(self) -> list[tuple[str, Any]]:
-        """Names and market states in which to draw a policy."""
+        """Names and states of the market in which to plot a policy."""
 
     def optimum(self) -> FollowedOptimum:
         return FollowedOptimum(self, self.best())
@@ -63,13 +63,13 @@ class OneAsset(SyntheticMarket):
         return jnp.ones(1)
 
     def weight(self, policy: Policy, market: Any, weight: float) -> float:
-        """The asset's target weight for a holder of ``weight``."""
+        """The asset's target weight for an account that holds ``weight`` of it."""
         return float(policy(self._state(market, weight))[1])
 
     def weights(
         self, policy: Policy, market: Any, weights: Float[np.ndarray, " holder"]
     ) -> Float[np.ndarray, " holder"]:
-        """The asset's target weight for each of several holders."""
+        """The asset's target weight for each of several holdings, shape (holder,)."""
         states = jax.vmap(lambda weight: self._state(market, weight))(weights)
         return np.asarray(jax.vmap(policy)(states)[:, 1])
 

@@ -16,12 +16,14 @@ from qfolio.solvers.garleanu_pedersen import garleanu_pedersen
 
 
 class Factors(NamedTuple):
+    """The factors, and the discount of the current step."""
+
     factors: Float[Array, " factor"]
     weight: Float[Array, ""]  # (1 − ρ)ᵗ
 
 
 class Tables(NamedTuple):
-    """The numbers of a market of several assets and factors; the names are the solver's."""
+    """The parameters of a market of several assets and factors, named as in the solver."""
 
     phi: Float[Any, " factor"]
     loading: Float[Any, "asset factor"]
@@ -36,15 +38,15 @@ class Tables(NamedTuple):
 
 
 class QuadraticCosts(Synthetic):
-    """Positions in assets with fading signals, quadratic risk and quadratic trading costs.
+    """Positions in assets with decaying signals, quadratic risk and quadratic trading costs.
 
-    Gârleanu & Pedersen (2013): returns are B f, with f' = (1 − φ)f + ε; holding x costs ½γ x'Σx of
-    risk, a trade Δx costs ½Δx'ΛΔx. Rewards include their discount, so that the return is the
-    paper's objective.
+    Gârleanu & Pedersen (2013): mean returns are B f, with f' = (1 − φ)f + ε; a position x costs
+    ½γ x'Σx for its risk, and a trade Δx costs ½Δx'ΛΔx. Rewards include their discount, so that
+    their sum is the paper's objective.
     """
 
     risk_aversion: float = number(1.0)  # γ: price of variance
-    rho: float = number(0.01)  # discount rate, a step
+    rho: float = number(0.01)  # discount rate, per step
     horizon: int = static(300)  # steps of an episode
 
     def __check_init__(self) -> None:
@@ -54,7 +56,7 @@ class QuadraticCosts(Synthetic):
     @property
     @abc.abstractmethod
     def tables(self) -> Tables:
-        """The market's numbers."""
+        """The market's parameters."""
 
     @property
     def actions(self) -> Box:
@@ -73,7 +75,7 @@ class QuadraticCosts(Synthetic):
         return jax.random.normal(key, (self.actions.n,))
 
     def observe(self, state: Position) -> View:
-        # Each asset has channels of its own, so that a network that all share can tell them apart.
+        # Each asset has channels of its own, so that a network shared by all can tell them apart.
         scaled = state.market.factors / self.tables.spread
         blocks = jnp.einsum("ij,k->ijk", jnp.eye(self.actions.n), scaled)
         return View(blocks.reshape(self.actions.n, 1, -1), state.holding)
@@ -94,7 +96,10 @@ class QuadraticCosts(Synthetic):
         return lambda state: previous @ state.holding + factors @ state.market.factors
 
     def coefficients(self, policy: Policy) -> Float[np.ndarray, "asset entry"]:
-        """Least-squares coefficients of positions and factors, over two standard deviations."""
+        """Least-squares coefficients of a policy in positions and factors.
+
+        They are fitted to positions from −2 to 2, and factors within two standard deviations.
+        """
         n, spread = self.actions.n, np.asarray(self.tables.spread)
         points = np.random.default_rng(2013).uniform(-2, 2, (500, n + len(spread)))
         points[:, n:] *= spread
@@ -104,7 +109,7 @@ class QuadraticCosts(Synthetic):
         return np.linalg.lstsq(points, targets, rcond=None)[0].T
 
     def scenes(self) -> list[tuple[str, Any]]:
-        """The first factor at its mean and a standard deviation from it; the others at theirs."""
+        """The first factor at its mean and a standard deviation either side; the others at 0."""
         values = (-1.0, 0.0, 1.0)
         names = [f"{k:+.0f} σ" if k else "0" for k in values]
         first = np.eye(len(self.tables.phi))[0] * self.tables.spread
@@ -116,10 +121,10 @@ class GarleanuPedersen(QuadraticCosts):
     """One asset and one signal; costs are ``cost_scale`` times the variance."""
 
     loading: float = number(1.0)  # mean return for a factor of 1
-    phi: float = number(0.25)  # share by which the factor fades in a step
-    noise: float = number(0.066)  # deviation of the factor's shocks, a step
-    cost_scale: float = number(5.0)  # cost of a trade over the variance
-    variance: float = number(0.04)  # variance of the return, a step
+    phi: float = number(0.25)  # share of the factor that decays in a step
+    noise: float = number(0.066)  # standard deviation of the factor's shocks, per step
+    cost_scale: float = number(5.0)  # trading cost Λ, as a multiple of the variance
+    variance: float = number(0.04)  # variance of the return, per step
 
     def __check_init__(self) -> None:
         require(self, "phi", lambda x: 0 < x <= 1, "above 0 and at most 1")
@@ -138,7 +143,7 @@ class GarleanuPedersen(QuadraticCosts):
 
 
 class Signals(QuadraticCosts):
-    """Three assets that differ in liquidity, and four signals that fade at different rates.
+    """Three assets that differ in liquidity, and four signals that decay at different rates.
 
     The costs are not proportional to the covariance, so that no two portfolios of the assets are
     traded equally fast, and a position in one asset depends on those in the others.

@@ -14,10 +14,10 @@ from qfolio.solvers.kelly import kelly
 
 
 class Kelly(OneAsset):
-    """A repeated bet: the stake is multiplied by ``up`` with ``probability``, else by ``down``."""
+    """A repeated bet: a stake is multiplied by ``up`` with ``probability``, or else by ``down``."""
 
-    up: float = number(1.1)  # relative of the asset after a win
-    down: float = number(0.9)  # relative after a loss
+    up: float = number(1.1)  # price relative after a win
+    down: float = number(0.9)  # price relative after a loss
     probability: float = number(0.53)  # probability of a win
     menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(100)  # steps of an episode

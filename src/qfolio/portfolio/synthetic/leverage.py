@@ -19,7 +19,7 @@ from qfolio.solvers.merton import LeveragedOptimum, leveraged_optimal
 
 
 class Anything(Feasible):
-    """All weights, negative ones included; random ones are near zero."""
+    """All weights, including negative ones; random draws are near zero."""
 
     assets: int
 
@@ -43,12 +43,12 @@ class Leverage(SyntheticMarket):
     Returns over a quarter are drawn from a fixed set of log-normal scenarios; the third asset is
     best sold short. An action is the weights of the assets, of any size and sign; cash is the rest.
     The best weights maximize the expected utility of the next step, with constant relative risk
-    aversion (1: log growth). At the default rates those with an aversion below 1.6 borrow, those
-    above 3.2 lend, and those between hold no cash.
+    aversion (1: log growth). At the default rates, investors with a risk aversion below 1.6 borrow,
+    those above 3.2 lend, and those between hold no cash.
     """
 
-    cash_rate: float = constant(0.02)  # what lent cash earns, a year
-    borrow_spread: float = constant(0.03)  # what a loan costs above it, a year
+    cash_rate: float = constant(0.02)  # rate that cash earns, per year
+    borrow_spread: float = constant(0.03)  # rate of a loan above it, per year
     risk_aversion: float = number(2.0)  # relative risk aversion; 1: log growth
     menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(100)  # quarters of an episode
@@ -56,7 +56,7 @@ class Leverage(SyntheticMarket):
     cost = 0.0
     reward = "crra"
     dt = 0.25
-    drift = (0.10, 0.08, 0.02)  # a year, as the volatilities
+    drift = (0.10, 0.08, 0.02)  # per year, like the volatilities
     volatilities = (0.2, 0.15, 0.25)
     correlation = 0.3
     scenarios = 500
@@ -89,7 +89,7 @@ class Leverage(SyntheticMarket):
         return action
 
     def table(self) -> np.ndarray:
-        """Relatives of each scenario, shape (scenario, asset)."""
+        """Price relatives of each scenario, shape (scenario, asset)."""
         return lognormal_table(
             tuple(mean * self.dt for mean in self.drift),
             tuple(sigma * self.dt**0.5 for sigma in self.volatilities),

@@ -15,23 +15,23 @@ from qfolio.solvers.almgren_chriss import almgren_chriss, sinh_ratio
 
 
 class Liquidation(Synthetic):
-    """A position must be sold within ``horizon`` steps, which make ``days``.
+    """A position that must be sold within ``horizon`` steps, which take ``days`` in total.
 
     Almgren & Chriss (2000), with the numbers of their table 1 in million shares, days and million
     dollars. The action is the position to be left after the step; the last step sells all of it.
-    The reward of a step is minus its expected shortfall and ``risk_aversion`` times its variance,
-    so that returns do not depend on luck in prices.
+    The reward of a step is minus the sum of its expected shortfall and ``risk_aversion`` times its
+    variance, so that returns do not depend on luck in prices.
     """
 
-    volatility: float = number(0.95)  # dollars a share, of a day
-    temporary: float = number(2.5)  # dollars a share for a million shares a day
-    permanent: float = number(0.25)  # dollars a share for a million shares
+    volatility: float = number(0.95)  # of a day, in dollars per share
+    temporary: float = number(2.5)  # impact of a million shares a day, in dollars per share
+    permanent: float = number(0.25)  # impact of a million shares, in dollars per share
     risk_aversion: float = number(1.0)  # per million dollars
     days: float = number(5.0)  # days of an episode
     horizon: int = static(5)  # steps of an episode
 
     START = (0.5, 1.5)
-    """The least and the most shares to sell, in millions."""
+    """Smallest and largest number of shares to sell, in millions."""
 
     drawn = (0.0, 1.5)
 

@@ -19,7 +19,14 @@ from qfolio.solvers.merton import growth_optimal
 def lognormal_table(
     means: tuple[float, ...], volatilities: tuple[float, ...], correlation: float, scenarios: int
 ) -> np.ndarray:
-    """Relatives of each scenario, shape (scenario, asset), with exactly the given moments."""
+    """Price relatives, shape (scenario, asset), whose logs have exactly the given moments.
+
+    Args:
+        means: Drift μ of each asset over a period; its mean log return is μ − σ²/2.
+        volatilities: Standard deviations of the log returns.
+        correlation: Correlation of any two assets' log returns.
+        scenarios: Number of scenarios, all equally likely.
+    """
     n = len(means)
     normal = np.random.default_rng(1969).standard_normal((scenarios, n))
     normal -= normal.mean(0)
@@ -52,7 +59,7 @@ class Merton(SyntheticMarket):
 
     @staticmethod
     def table() -> np.ndarray:
-        """Relatives of each scenario, shape (scenario, asset)."""
+        """Price relatives of each scenario, shape (scenario, asset)."""
         return lognormal_table(
             Merton.means, Merton.volatilities, Merton.correlation, Merton.scenarios
         )

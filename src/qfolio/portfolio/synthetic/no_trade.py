@@ -16,7 +16,7 @@ from qfolio.portfolio.synthetic.base import OneAsset, require_cost
 from qfolio.solvers.no_trade import NoTradeRegion, no_trade_region_discrete
 
 PROBES = 1001
-"""Holdings, from all cash to all in the asset, that probe a policy's edges."""
+"""Number of holdings, from all cash to all in the asset, at which a policy is probed."""
 
 NO_TRADE = 1e-4
 """Smaller changes of a weight do not count as trades."""
@@ -26,13 +26,13 @@ class NoTrade(OneAsset):
     """One asset with constant drift over cash; proportional costs make it best not to trade within
     a region. The reward is the *expected* log growth of each step, net of costs.
 
-    Rates are a year; ``dt`` years pass in a step. ``rate`` is the asset's drift above that of cash,
-    which is ``cash_rate``.
+    Rates are per year, and a step lasts ``dt`` years. The asset's drift is ``rate`` above that of
+    cash, ``cash_rate``.
     """
 
-    rate: float = number(0.02)  # drift above that of cash, a year
-    cash_rate: float = constant(0.0)  # growth of cash, a year
-    volatility: float = number(0.2)  # deviation of the asset's return, a year
+    rate: float = number(0.02)  # the asset's drift above that of cash, per year
+    cash_rate: float = constant(0.0)  # growth of cash, per year
+    volatility: float = number(0.2)  # of the asset, per year
     cost: float = constant(0.01)  # one way, as a share of the value traded
     dt: float = number(1 / 12)  # years of a step
     menu: str = static("")  # choices of weights, such as grid:10; empty: any
@@ -88,7 +88,7 @@ class NoTrade(OneAsset):
         remainder, _ = self.costs.trade(holding.weights, target, at.trade)
         nodes, chances = np.polynomial.hermite_e.hermegauss(self.NODES)
         weights = jnp.asarray(chances / chances.sum(), jnp.float32)
-        # Over cash, so that no digits are lost: steps may be days.
+        # In excess of cash, so that no digits are lost where steps are short.
         interest = self.cash_rate * self.dt
         gains = jnp.expm1(self._log_relative(jnp.asarray(nodes, jnp.float32)) - interest)
         growth = interest + (weights * jnp.log1p(target[1] * gains)).sum()
@@ -96,7 +96,7 @@ class NoTrade(OneAsset):
         return jnp.log(remainder) + growth, self.hold(grown(target, moved))
 
     def region(self) -> NoTradeRegion:
-        """The exact region, for steps of ``dt``."""
+        """The exact no-trade region, for steps of ``dt`` years."""
         return no_trade_region_discrete(
             self.rate, self.volatility, self.cost, self.dt, self.cash_rate
         )

@@ -16,14 +16,14 @@ from qfolio.solvers.regime import regime
 
 
 class Regime(OneAsset):
-    """One asset that grows by ``mean`` a step in good times and loses it in bad ones.
+    """One asset, whose log return per step is ``mean`` in good times and minus that in bad times.
 
-    Each regime lasts another step with probability ``stay``; it is observed before it pays.
-    Two numbers are those of bad and of good times: stay=0.9,0.98 mean=-0.004,0.001.
+    Each regime lasts another step with probability ``stay``, and is observed before its return.
+    Two numbers stand for bad and good times: stay=0.9,0.98 mean=-0.004,0.001.
     """
 
     stay: tuple[float, ...] = numbers(0.95)  # probability that a regime lasts another step
-    mean: tuple[float, ...] = numbers(0.002)  # log growth of a good step
+    mean: tuple[float, ...] = numbers(0.002)  # log return of a step in good times
     cost: float = constant(0.005)  # one way, as a share of the value traded
     menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(250)  # steps of an episode
@@ -46,7 +46,7 @@ class Regime(OneAsset):
 
     @property
     def means(self) -> tuple[float, float]:
-        """Mean returns of a step in bad and in good times."""
+        """Log returns of a step in bad and in good times."""
         return (
             (-self.mean[0], self.mean[0]) if len(self.mean) == 1 else (self.mean[0], self.mean[1])
         )
