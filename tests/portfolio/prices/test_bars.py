@@ -207,7 +207,7 @@ def test_rows_that_are_longer_than_the_header(tmp_path: Path):
 
 
 def test_a_feature_that_is_the_column_of_dates():
-    with pytest.raises(QfolioError, match="'Date' holds dates or row numbers, no feature"):
+    with pytest.raises(QfolioError, match="'Date' holds dates or row numbers, not a feature"):
         load(pd.DataFrame({"A": range(1, 6)}, index=DAYS), features=("Date",))
 
 

@@ -98,7 +98,7 @@ def test_other_jumps_are_counted_in_a_note():
     values[100:, 2] *= 0.7
     (note,) = found(values)
     assert (note.severity, note.row, note.column) == ("note", AT, "A1")
-    assert note.message.startswith("2 large moves that no other asset explains")
+    assert note.message.startswith("2 large moves that neither other assets nor a split explain")
     assert "is 1.97 times the one before" in note.message
 
 

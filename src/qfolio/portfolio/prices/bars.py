@@ -1,7 +1,7 @@
 """Picks the closing prices among columns of bars: open, high, low, close and volume.
 
 Bars come with a header on two levels (yfinance: kind and ticker), with both in one name
-(AAPL_Close, Close AAPL), or, of a single asset, under the names of the kinds alone (Stooq).
+(AAPL_Close, Close AAPL), or, for a single asset, with only the kinds as names (Stooq).
 """
 
 import re
@@ -36,7 +36,7 @@ _BEGINS = re.compile(rf"(?P<kind>{_WORDS}){_GAP}(?P<asset>.+)", re.I)
 class Bar(NamedTuple):
     """One column of an asset's bars."""
 
-    kind: str  # as the table calls it, such as Adj Close; empty if the name is the asset's alone
+    kind: str  # as the table calls it, such as Adj Close; empty if the name is only the asset's
     column: int
 
 

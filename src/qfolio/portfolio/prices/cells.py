@@ -49,7 +49,7 @@ def numbers(cells: np.ndarray, decimal: str = ".") -> tuple[np.ndarray, np.ndarr
     """Cells as float64 (NaN: missing or not a number), and a mask of those that are not numbers.
 
     A currency sign may stand before or after a number. Groups of thousands are read where they
-    cannot be anything else (1,234.50), and 1,234 is in a column that has such numbers.
+    cannot be anything else (1,234.50), and so is 1,234 in a column that has such numbers.
     """
     wrong = np.zeros(len(cells), dtype=bool)
     if cells.dtype.kind == "f":
@@ -101,7 +101,7 @@ def has_decimal(cell: str, decimal: str) -> bool:
 
 
 def has_two_readings(cell: str, decimal: str) -> bool:
-    """True for 1,234 where the decimal mark is a point: a thousand, or little over 1."""
+    """True for 1,234 where the decimal mark is a point: over a thousand, or a little over 1."""
     match = _GROUPED.fullmatch(_plain(cell, decimal))
     return bool(match) and not groups(cell, decimal)
 

@@ -75,7 +75,7 @@ def find_columns(
     by_asset = {name: columns_of_kind(table, name) for name in features}
     for name in features:
         if name not in single and not by_asset[name]:
-            findings.error(f"the column {quote(name)} holds dates or row numbers, no feature")
+            findings.error(f"the column {quote(name)} holds dates or row numbers, not a feature")
             return None
     channels = {j for name in features for j in by_asset[name].values()}
     channels |= {single[name] for name in features if name in single}
@@ -106,7 +106,7 @@ def find_columns(
 def _check_names(
     table: Table, features: tuple[str, ...], date: str | None, findings: Findings
 ) -> list[int]:
-    """The columns that count: all but those without name and content."""
+    """The columns that matter: all but those that have neither a name nor content."""
     names = table.names
     columns = [j for j, name in enumerate(names) if name or not _is_blank(table.columns[j])]
     places: dict[str, list[int]] = {}
@@ -145,7 +145,7 @@ def _is_blank(cells: np.ndarray) -> bool:
 
 
 def _counts_rows(table: Table, j: int) -> bool:
-    """True for the row numbers that many programs write as a column of their own."""
+    """Whether a column holds the row numbers that many programs write."""
     if table.names[j] not in ("", "Unnamed: 0", "index", "__index_level_0__"):
         return False
     values, _ = numbers(table.columns[j])
@@ -168,7 +168,7 @@ def _date_column(table: Table, columns: list[int], date: str | None) -> int | No
 
 
 def _time_column(table: Table, columns: list[int], when: int) -> int | None:
-    """The column of times of day beside the dates, as Stooq and MetaTrader have it."""
+    """The column of times of day beside the dates, as Stooq and MetaTrader write it."""
     for j in columns:
         if j != when and plain(table.names[j]) == "time" and are_times(table.columns[j]):
             return j

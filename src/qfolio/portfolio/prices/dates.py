@@ -46,7 +46,7 @@ UNITS = (
         )
     ),
 )
-"""Days that are counted from 1970 are no unit: today's number of them is a day of 1956 in Excel."""
+"""Days since 1970 are not among them: today's count is also a day of 1956 in Excel."""
 MOST = 1e19  # more than any unit's
 LONGEST_STEP = 10 * 366 * _DAY  # between dates in one unit; two units mixed are further apart
 
@@ -65,8 +65,8 @@ def read_dates(cells: np.ndarray) -> Dates:
     Accepts dates and times, ISO 8601 and similar texts (2020-01-31, 2020/1/31, 20200131,
     2020-01-31 16:00+01:00), and 31/01/2020 or 01/31/2020 if at least one cell of the column shows
     which number is the day. Time zones are dropped: if all times are midnight in their own zones,
-    the dates stay; otherwise times become UTC. A column of numbers alone may be of one of
-    ``UNITS``.
+    the dates are kept; otherwise times are converted to UTC. A column that holds only numbers may
+    count one of ``UNITS``.
     """
     import pandas as pd
 
@@ -144,7 +144,7 @@ def _number(cell: Any) -> float:
 
 
 def _unit(counts: np.ndarray) -> Unit | None:
-    """What the numbers of a column count, if they can count one thing alone."""
+    """What the numbers of a column count, if they can count only one thing."""
     known = np.unique(counts[~np.isnan(counts)])
     if not len(known) or np.abs(known).max() > MOST:
         return None

@@ -29,7 +29,7 @@ def from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set[
     """The table in the bytes of a file of this name; texts: see ``reading.read``.
 
     Raises:
-        QfolioError: The file is not text, or its rows and columns cannot be told.
+        QfolioError: The file is not text, or its rows and columns cannot be made out.
     """
     try:
         wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")

@@ -1,4 +1,4 @@
-"""Joins the tables of a folder, such as one file of bars for each asset, to one."""
+"""Joins the tables of a folder, such as one file of bars for each asset, into one."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 def join(folder: Path, load: Callable[[Path], "Prices"]) -> Any:
     """A long data frame of all tables in a folder; load: reads one of them.
 
-    Assets of files that do not name them are called as their files.
+    An asset that its file does not name takes the name of the file.
 
     Raises:
-        QfolioError: A table has errors, or there is none.
+        QfolioError: A table has errors, or the folder has none.
     """
     import pandas as pd
 

@@ -22,12 +22,12 @@ class Rest:
 
 
 class _Span(NamedTuple):
-    """Where prices are, rows counted in the grid."""
+    """Where there are prices; rows are those of the grid."""
 
     head: int  # the first row with any price
     start: np.ndarray  # (assets,): the row of the first price; the number of rows if there is none
     end: np.ndarray  # (assets,): the row after the last price
-    gaps: np.ndarray  # (rows, assets): after the first price, and without one
+    gaps: np.ndarray  # (rows, assets): whether there is no price, after the first one
     delists: bool  # whether there are no gaps after the last price
 
     @property
@@ -37,15 +37,15 @@ class _Span(NamedTuple):
 
 
 LEAST_PAID = 1e-9
-"""Share of the last price that a haircut leaves at least; prices stay positive."""
+"""Least share of the last price that a haircut leaves, so that prices stay positive."""
 
 
 def cash_outs(values: np.ndarray, features: np.ndarray, haircut: float) -> dict[str, np.ndarray]:
-    """Prices and features that go on after assets' last rows, and where assets are listed.
+    """Prices and features continued after each asset's last row, and where assets are listed.
 
-    values: of shape (rows, assets). After its last price, an asset's is what is paid out for it,
-    less the haircut. features: (rows, assets, features); their last ones stay. ``listed`` is left
-    out if no asset ends.
+    values: of shape (rows, assets). After its last price, an asset's price is its payout: the last
+    price less the haircut. features: (rows, assets, features); the last ones are kept. ``listed``
+    is left out if no asset ends.
     """
     priced = ~np.isnan(values)
     listed = np.logical_or.accumulate(priced[::-1])[::-1]  # or before the first row
@@ -63,7 +63,7 @@ def cash_outs(values: np.ndarray, features: np.ndarray, haircut: float) -> dict[
 def complete(
     grid: Grid, missing: str, late: str, findings: Findings, *, delists: bool = False
 ) -> Rest:
-    """Close gaps and drop assets as the user chose: first ``missing``, then ``late``.
+    """Closes gaps and drops assets as the user chose: first ``missing``, then ``late``.
 
     delists: whether an asset ends with its last price, so that none is missing after it.
     """
@@ -210,7 +210,7 @@ def _report_dropped(grid: Grid, drop: np.ndarray, reason: str, findings: Finding
 
 
 def _report_filled(grid: Grid, gaps: np.ndarray, findings: Findings) -> None:
-    """Warn how much is filled, and where the longest gap is."""
+    """Warns how many prices are filled, and where the longest gap is."""
     run = np.zeros(gaps.shape[1], dtype=np.int64)
     longest = np.zeros_like(run)
     for row in gaps:

@@ -126,7 +126,7 @@ def _wide(
 def _in_order(
     table: Table, date: int, moments: np.ndarray, lines: np.ndarray, findings: Findings
 ) -> np.ndarray:
-    """The rows, reversed if the newest comes first; errors if they are not in order."""
+    """The rows, reversed if the newest comes first; reports errors if they are not in order."""
 
     def spot(line: int) -> dict[str, Any]:
         return table.spot(line, date)

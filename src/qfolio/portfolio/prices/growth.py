@@ -1,4 +1,4 @@
-"""Whether a price table is another one with more rows at its end."""
+"""Checks that a price table is an earlier one with more rows at its end."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ REMEDY = "start a new backtest, or restore the earlier rows."
 
 
 def require_grown(before: Prices, after: Prices) -> None:
-    """Raise QfolioError unless a table begins with all rows of an earlier one.
+    """Raises QfolioError unless a table begins with all rows of an earlier one.
 
     Prices that a provider adjusts again after each dividend do not: all of their rows change.
     """
@@ -26,12 +26,12 @@ def require_grown(before: Prices, after: Prices) -> None:
         for name in new:
             if name not in old:
                 raise QfolioError(
-                    f"The new table has the {kind} {quote(name)}, which the backtest's has not; "
+                    f"The new table has the {kind} {quote(name)}, which the backtest's lacks; "
                     f"leave it out, or {REMEDY}"
                 )
         if old != new:
             raise QfolioError(f"The new table has its {kind}s in another order; restore it.")
-    # The first delisting may be new, unless assets started late, which then may be held earlier.
+    # A first delisting may be new, but not where assets started late: it lets them be held earlier.
     ends = before.listed is None and not np.isnan(before.values).any()
     if before.masks.keys() != after.masks.keys() - ({"listed"} if ends else set()):
         raise QfolioError(
@@ -47,7 +47,7 @@ def require_grown(before: Prices, after: Prices) -> None:
 
 
 def _require_same(before: Prices, after: Prices) -> None:
-    """Raise QfolioError, which names the first row and column that differ."""
+    """Raises QfolioError, naming the first row and column that differ, unless none does."""
     for old_day, new_day in zip(before.dates, after.dates, strict=True):
         if old_day != new_day:
             raise QfolioError(

@@ -22,9 +22,9 @@ _PAIR = re.compile(r"""\((["'])(.*?)\1, (["'])(.*?)\3\)""")  # how pandas writes
 class Header(NamedTuple):
     """The header of a table."""
 
-    names: tuple[str, ...]  # of the columns; of two levels, both with a space between
+    names: tuple[str, ...]  # of the columns; two levels are joined by a space
     levels: dict[int, tuple[str, str]]  # both levels, by column, if there are two
-    lines: int = 1  # its length in the file
+    lines: int = 1  # number of lines in the file
 
 
 def name_columns(names: Iterable[Any]) -> Header:
@@ -72,7 +72,7 @@ def parse_header(records: list[list[str]]) -> Header:
 
 
 def _below_settings(records: list[list[str]]) -> Header | None:
-    """The header below lines such as Start Date,2024-01-02; None if the first line is none."""
+    """The header below lines such as Start Date,2024-01-02; None if there are no such lines."""
     if _setting(records[0]) not in SETTINGS:
         return None
     begins = (

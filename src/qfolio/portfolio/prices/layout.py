@@ -1,4 +1,4 @@
-"""A table as it is read, and tables that lie on their side."""
+"""A table as it is read, and the turning of tables with their dates across the first row."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,7 +17,7 @@ FEWEST_DATES = 3  # across the first row
 class Table:
     """Columns of equal length: float64, datetime64 or, where kinds are mixed, objects.
 
-    names: one for each column; of a header on two levels, both with a space between.
+    names: one for each column; the two levels of a header are joined by a space.
     first_row: the number of the first row for users: 2 below a header of one line, 0 in a data
         frame.
     decimal: the decimal mark.

@@ -20,13 +20,13 @@ def membership(source: Any, dates: np.ndarray, assets: tuple[str, ...]) -> np.nd
 
     Args:
         source: A file or a data frame, with a column of dates and one of 0 or 1 for each asset
-            (a row stands until the next one), or with the columns asset, from and to (both are days
-            of membership; an empty one is open).
+            (a row holds until the next one), or with the columns asset, from and to (both days are
+            included; an empty one leaves the span open).
         dates: Dates of the price table, ascending, of shape (rows,).
         assets: Assets of the price table.
 
     Raises:
-        QfolioError: The source cannot be read, or does not say of each asset when it is a member.
+        QfolioError: The source cannot be read, or does not say when each asset is a member.
     """
     table = read(source, lambda names: {0, *range(len(names))} if _spans(names) else {0})
     try:
@@ -53,7 +53,7 @@ def _of_rows(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.nda
         values, wrong = numbers(table.columns[column])
         if (bad := wrong | ~np.isin(values, (0, 1))).any():
             row = table.first_row + int(bad.argmax())
-            raise QfolioError(f"{quote(name)} is neither 0 nor 1 in row {row}; write one of both.")
+            raise QfolioError(f"{quote(name)} is neither 0 nor 1 in row {row}; write one of them.")
         known[:, j] = values == 1
     return np.where((latest >= 0)[:, None], known[order][np.maximum(latest, 0)], False)
 
@@ -87,7 +87,7 @@ def _dates(table: Table, column: int) -> np.ndarray:
 
 
 def _require_all(named: Any, assets: tuple[str, ...]) -> None:
-    """The members may be of a larger universe, but must say something of each asset."""
+    """The members may be those of a larger universe, but every asset must be named."""
     for name in assets:
         if name not in named:
             raise QfolioError(

@@ -1,8 +1,8 @@
 """Reports moves that no market makes: impossible ones, bad ticks and splits that were not adjusted.
 
-A jump is a large move for its asset that the other assets do not share. One that goes back within a
-few rows is a bad tick. One that stays, at a ratio that companies split their shares by, looks like
-a split; any other is left to the reader.
+A jump is a large move for its asset that the other assets do not share. One that reverts within a
+few rows is a bad tick. One that persists, at a ratio at which companies split their shares, looks
+like a split; any other is left for the reader to judge.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ LARGEST_MOVE = 1e6  # within one row; beyond it relatives and their products ove
 LEAST_JUMP = 0.3  # in log; the smallest split, 3/2, is 0.41
 UNUSUAL = 6.0  # times the usual move of the asset, over the table and around the jump
 AROUND = 30  # rows before and after a jump: in a crisis large moves are usual
-TICKS = 10  # a jump by fewer steps of the price says nothing: from 0.02 the next price is 0.03
+TICKS = 10  # a jump of fewer price ticks says nothing: the next price above 0.02 is 0.03
 BRIEF = 3  # rows that a bad tick lasts at most
 SPLITS = (1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 100, 1000)
 EXACT = 0.005  # how far a split's ratio may be from one of these
@@ -76,9 +76,9 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
         i, j = max(others, key=lambda jump: sizes[jump])
         when = day(grid.dates[rest.head + i + 1])
         findings.note(
-            f"{amount(len(others), 'large move')} that no other asset explains and no usual split; "
+            f"{amount(len(others), 'large move')} that neither other assets nor a split explain; "
             f"the largest: {subject(j)} on {when} is {relatives[i, j]:.4g} times the one before",
-            advice="Check them: a split on a day on which the price moved looks like this, too.",
+            advice="Check them: a split on a day on which the price also moved looks like this.",
             **spot(i + 1, j),
         )
 
@@ -109,7 +109,7 @@ def _jumps(values: np.ndarray, moves: np.ndarray, sizes: np.ndarray) -> list[Jum
 def _sort_out(
     values: np.ndarray, logs: np.ndarray, moves: np.ndarray, jumps: Iterable[Jump]
 ) -> tuple[dict[Jump, int], dict[Jump, str], list[Jump]]:
-    """Bad ticks with the rows that they last, splits with their ratios, and other jumps."""
+    """Bad ticks with the number of rows that they last, splits with their ratios, other jumps."""
     ticks: dict[Jump, int] = {}
     splits: dict[Jump, str] = {}
     others: list[Jump] = []

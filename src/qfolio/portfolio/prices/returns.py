@@ -1,4 +1,4 @@
-"""Turns returns into prices that start at 100, and tells returns from prices."""
+"""Cumulates returns to prices that start at 100, and tells returns from prices."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ SIGNED = (0.3, 0.7)  # the share of negative numbers among returns
 
 
 def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
-    """The grid with prices in place of simple returns over the row before.
+    """The grid with prices in place of simple returns from the row before.
 
     An asset's price is 100 in the row before its first return. If that row is not in the table,
     it is 100 in the row of its first return, which is then not used.
@@ -60,7 +60,7 @@ def cumulate(grid: Grid, unit: str, findings: Findings) -> Grid:
 
 
 def look_like_returns(values: np.ndarray) -> bool:
-    """True for numbers of which many are negative and many are not."""
+    """Whether many numbers are negative and many are not."""
     known = values[np.isfinite(values)]
     low, high = SIGNED
     return bool(known.size and low <= (known < 0).mean() <= high)

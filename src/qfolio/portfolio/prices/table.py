@@ -29,7 +29,7 @@ DEFAULT_NOTE = (
     "that hold them look better than they could have been at the time."
 )
 OF_ALL = ("ended", "delisting_haircut", "members")
-"""Choices that only a whole table can follow, not one asset's file of a folder."""
+"""Choices that apply to a whole table, not to each file of a folder."""
 
 DEFAULT_TRIALS = 177
 """Earlier trials on the default table, as docs/results/real_prices.md lists them."""
@@ -42,19 +42,18 @@ class Prices:
     Attributes:
         dates: datetime64[s] of shape (rows,), strictly increasing.
         assets: Names of the columns, each different.
-        values: float64 of shape (rows, assets), finite and positive; NaN only before an asset's
-            first row, if loaded with late="join". After an asset's last row they are what is paid
-            out for it.
+        values: Prices, float64 of shape (rows, assets), finite and positive; NaN only before an
+            asset's first row, if loaded with late="join". After an asset's last row, its payout.
         features: float64 of shape (rows, assets, channels); NaN only before an asset's first row.
         feature_names: Names of the channels.
         source: The origin of the table.
         note: A caveat for readers of results on the table.
-        market: float64 of shape (rows, names), finite: columns of the whole market, such as a cash
-            rate, which agents do not see.
+        market: float64 of shape (rows, names), finite: columns that all assets share, such as a
+            cash rate, which agents do not see.
         market_names: Names of these columns.
         listed: Whether an asset has a price, bool of shape (rows, assets); None if none ends.
-        members: Whether an asset may be bought, likewise; None if all may be as long as they are
-            listed.
+        members: Whether an asset may be bought, of the same shape; None if all assets may be as
+            long as they are listed.
 
     Raises:
         QfolioError: The arrays break one of these rules.
@@ -130,7 +129,7 @@ class Prices:
 
     @property
     def masks(self) -> dict[str, np.ndarray]:
-        """``listed`` and ``members``, those that are not None."""
+        """``listed`` and ``members`` by name, without those that are None."""
         both = {"listed": self.listed, "members": self.members}
         return {name: mask for name, mask in both.items() if mask is not None}
 
@@ -138,7 +137,7 @@ class Prices:
     def tradable(self) -> np.ndarray | None:
         """Whether an asset may be bought at a row, bool of shape (rows, assets).
 
-        None if assets neither end nor have a membership: then any may be from its first row on.
+        None if assets neither end nor have a membership: then each may be from its first row on.
         """
         masks = list(self.masks.values())
         return np.logical_and.reduce([~np.isnan(self.values), *masks]) if masks else None
@@ -237,16 +236,16 @@ def load(
     """Read and check a price table.
 
     Args:
-        source: Path of a CSV or Parquet file, or of a folder of such files, each of one asset or
-            more; a data frame that narwhals knows (pandas, polars,
-            pyarrow, …); None for skfolio's 20 US stocks, 1990 to 2022, which need no download;
-            or Prices, which are returned as they are. A table is wide (a column of dates, then a
-            column per asset) or long (columns of dates, assets and prices, found by their names,
-            such as date, ticker and close, with rows in any order). Columns of bars (open, high,
-            low, close, volume) may have a header on two levels, as yfinance has them; their
-            adjusted close is taken, or else their close.
+        source: Path of a CSV or Parquet file, or of a folder of such files, each with one or more
+            assets; a data frame that narwhals knows (pandas, polars, pyarrow, …); None for
+            skfolio's 20 US stocks, 1990 to 2022, which need no download; or Prices, which are
+            returned as they are. A table is wide (a column of dates, then a column per asset) or
+            long (columns of dates, assets and prices, found by their names, such as date, ticker
+            and close, with rows in any order). Columns of bars (open, high, low, close, volume) may
+            have a header on two levels, as in yfinance's downloads; their adjusted close is used,
+            or their close if there is none.
         missing: How to treat missing prices after an asset's first: "error", "drop-asset", or
-            "forward-fill" (the last known price stands; also for features). Applied before
+            "forward-fill" (the last known price is kept; likewise for features). Applied before
             ``late``.
         late: How to treat assets that start later than the table: "error", "drop-asset", "trim"
             (the table starts with the last of them) or "join" (they are NaN before their first
@@ -255,14 +254,14 @@ def load(
             "cash-out" (the asset is delisted: a holding becomes cash at the last price).
         delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
         members: Which assets may be bought at each date: a file or data frame with a column of
-            dates and one of 0 or 1 for each asset, each row of which stands until the next, or with
+            dates and one of 0 or 1 for each asset, each row of which holds until the next, or with
             the columns asset, from and to (default: all).
         features: Columns that hold features: in a long table one number for each asset and date,
             in a wide table one for the whole market, or, under a header on two levels, a kind such
             as Volume, which has a column per asset.
         columns: Columns that hold one number for the whole market, such as a cash rate; agents do
             not see them.
-        returns: "percent" or "fraction" if the table holds simple returns over the row before;
+        returns: "percent" or "fraction" if the table holds simple returns from the row before;
             they are cumulated to prices that start at 100 (default: it holds prices).
         date: Column of dates (default: found by its name).
 
@@ -287,20 +286,21 @@ def load(
 
 
 def check(source: Any = None, **options: Any) -> list[Finding]:
-    """All findings on a table; ``inspect`` without its prices."""
+    """All findings on a table, like ``inspect`` but without its prices."""
     return inspect(source, **options)[1]
 
 
 def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Finding]]:
     """The prices, and all errors, warnings and notes on a table, by row and column.
 
-    The arguments are ``load``'s. At most five cells of one kind are named, the others are counted.
+    The arguments are ``load``'s. Of each kind, at most five cells are named; the others are
+    counted.
 
     Returns:
         The prices (None if a finding is an error), and the findings.
 
     Raises:
-        QfolioError: There is no table to check: no such file, not text, rows of unequal length.
+        QfolioError: There is no table to check: no such file, not text, or rows of unequal length.
     """
     label, note = "", ""
     if source is None:
@@ -315,7 +315,7 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
         chosen = replace(chosen, returns=None, date="date")
     table = reading.read(source, lambda names: text_columns(names, chosen.date))
     content, findings = examine(table, chosen)
-    if joined:  # whose rows are those of no file
+    if joined:  # its rows are not those of any file
         findings = [replace(finding, row=None) for finding in findings]
     if not content:
         return None, findings

@@ -9,7 +9,7 @@ PRICE_NAMES = ("close", "price", "value")
 SETTINGS = (
     "security", "securities", "start date", "end date", "period", "periodicity", "currency",
 )  # fmt: skip
-"""What exports name in the lines above their column names."""
+"""Names of the settings that exports write in the lines above their column names."""
 KINDS = {
     "adjusted": (*ADJUSTED_NAMES, "adjusted"),
     "close": ("close", "closing price", "close/last", "price", "last", "last price", "px last"),
