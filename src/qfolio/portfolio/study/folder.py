@@ -53,7 +53,7 @@ class TableConfig(msgspec.Struct, frozen=True, kw_only=True):
     first: str
     last: str
     note: str
-    trials: int  # earlier looks at this table, those of earlier studies included
+    trials: int  # earlier looks at this table, including those of earlier studies
 
 
 class Look(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,9 +80,10 @@ class VariantResult(msgspec.Struct, frozen=True, kw_only=True):
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """The result of a study.
 
-    variants: the main one first. looks: taken by this study. earlier: looks at its tables before.
-    trials: the most looks at any one of its tables, all of them counted. threshold: z that the best
-    of so many trials is expected to reach without skill. verdicts: sentences by agent.
+    variants: the main one first. looks: number taken by this study. earlier: number of earlier
+    looks at its tables. trials: the largest number of looks at any one table, earlier ones
+    included. threshold: z that the best of so many trials is expected to reach without skill.
+    verdicts: sentences by agent.
     """
 
     variants: list[VariantResult]
@@ -123,7 +124,10 @@ class StudyFolder:
         write_config(self.path / FILE, config)
 
     def read(self) -> StudyConfig:
-        """Raises QfolioError if the folder holds no study of this version."""
+        """The content of study.json.
+
+        Raises QfolioError if the folder holds no study of this version.
+        """
         return read_config(self.path / FILE, StudyConfig)
 
     def place(self, table: str, variant: Variant) -> Path:
@@ -157,7 +161,7 @@ class StudyFolder:
             ) from None
 
     def write_table(self, result: Result) -> None:
-        """study.csv: a row for each table, variant and agent."""
+        """Writes study.csv, with a row for each table, variant and agent."""
         rows = list(_rows(result))
         write_csv(self.path / "study.csv", rows[0], (row.values() for row in rows))
 

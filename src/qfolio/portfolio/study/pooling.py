@@ -26,7 +26,7 @@ from qfolio.portfolio.backtest.measures import (
 )
 
 RESAMPLES = 2000
-"""Histories that the hierarchical bootstrap draws."""
+"""Number of histories that the hierarchical bootstrap draws."""
 
 _CHUNK = 2_000_000  # resampled days held at a time
 
@@ -52,16 +52,16 @@ class TableReturns(NamedTuple):
 
 
 class Active(msgspec.Struct, frozen=True, kw_only=True):
-    """An agent less a reference on one table; numbers are annual, None if they are not finite."""
+    """An agent minus a reference on one table; numbers are annual, None if they are not finite."""
 
     reference: str
-    growth: float | None  # of log wealth
+    growth: float | None  # difference in the growth of log wealth
     low: float | None  # 95% interval of the growth
     high: float | None
     tracking_error: float | None  # standard deviation of the differences in log return
     information_ratio: float | None  # growth over tracking error
     t: float | None  # growth over its standard error, which allows for autocorrelation
-    z: float | None  # the normal quantile of the one-sided p-value that the agent is better
+    z: float | None  # normal quantile of the one-sided test that the agent is better
 
 
 class Evidence(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,28 +72,28 @@ class Evidence(msgspec.Struct, frozen=True, kw_only=True):
     days: int
     years: float
     to_reference: Active
-    to_rebalanced: Active  # less the best rebalancing; z is of the claim that it beats them all
-    baseline: str  # that with the highest Sharpe ratio over the same days
-    sharpe: float | None  # annual Sharpe ratio less that of this baseline
+    to_rebalanced: Active  # minus the best rebalancing; z tests the claim that it beats them all
+    baseline: str  # the one with the highest Sharpe ratio over the same days
+    sharpe: float | None  # annual Sharpe ratio minus that of this baseline
     sharpe_t: float | None
 
 
 class Pooled(msgspec.Struct, frozen=True, kw_only=True):
     """What all tables say about one agent against one reference."""
 
-    growth: float | None  # mean over tables of the active growth a year
+    growth: float | None  # mean over tables of the annual active growth
     low: float | None  # 95% interval by the hierarchical bootstrap
     high: float | None
     z: float | None  # Stouffer's
     p: float | None  # two-sided; against rebalancings only the claim "better" is tested
-    p_holm: float | None = None  # corrected for all comparisons of the main variant; decides
+    p_holm: float | None = None  # corrected for all comparisons of the main variant; sets finding
     finding: Finding | None = None  # none for other variants
     positive: int  # tables on which the agent grew more
     worst: str  # the table with the least active growth
 
 
 class Pools(msgspec.Struct, frozen=True, kw_only=True):
-    """What all tables say about one agent; evidence: of each table, by its name."""
+    """What all tables say about one agent; evidence: that of each table, by its name."""
 
     evidence: dict[str, Evidence]
     to_reference: Pooled
@@ -199,9 +199,9 @@ def _pooled(
 
 
 def z_of(difference: Estimate) -> float:
-    """The standard normal quantile of an estimate: as likely as its t, without any difference.
+    """The standard normal quantile of an estimate: as unlikely as its t, if there is no difference.
 
-    0 for a rounding error, NaN if the error is not known.
+    It is 0 if the estimate is a rounding error, and NaN if its standard error is not known.
     """
     from scipy.special import ndtri, stdtr
 
@@ -222,7 +222,7 @@ def stouffer(z: ArrayLike, weights: ArrayLike, correlation: ArrayLike | None = N
     Args:
         z: Normal quantiles of shape (tables,).
         weights: Positive numbers of the same shape. √years has the most power if all tables have
-            one information ratio, because the expected z is that ratio times √years.
+            the same information ratio, because the expected z is that ratio times √years.
         correlation: R of shape (tables, tables) (default: independent tables).
     """
     scores, w = np.asarray(z, dtype=float), np.asarray(weights, dtype=float)
@@ -233,7 +233,7 @@ def stouffer(z: ArrayLike, weights: ArrayLike, correlation: ArrayLike | None = N
 def correlations(days: Sequence[Sequence[str]], active: Sequence[Floats]) -> Floats:
     """Estimate the correlations of the tables' mean active returns from their common days.
 
-    That of two means is ρ · n / √(n₁n₂), where ρ is the correlation of the n common days. Negative
+    The correlation of two means is ρ · n / √(n₁n₂), where ρ is that of the n common days. Negative
     ones count as 0, so that the pooled z is never larger than that of independent tables.
 
     Args:
@@ -258,13 +258,13 @@ def hierarchical_bootstrap(
     """Resample the mean over tables of their means over days: draw tables, then days within them.
 
     Tables are drawn with replacement, and the days of each drawn table by the stationary bootstrap
-    (Davison & Hinkley 1997, section 3.8; Politis & Romano 1994). The days' noise is in the
-    differences between tables, too, so intervals are wide rather than narrow. One table alone is
-    resampled by days.
+    (Davison & Hinkley 1997, section 3.8; Politis & Romano 1994). The noise of days is already in
+    the differences between tables, so that intervals are too wide rather than too narrow. A single
+    table is resampled by days.
 
     Args:
-        tables: Daily numbers of each table, shape (series, days); days may differ, series not.
-        resamples: How many to draw.
+        tables: Daily numbers of each table, shape (series, days); all have the same series.
+        resamples: Number of means to draw.
         rng: Source of randomness.
 
     Returns:
@@ -280,14 +280,14 @@ def hierarchical_bootstrap(
 
 
 def p_value(z: float, *, both: bool) -> float:
-    """The two-sided p-value of a z; if not ``both``, that of a negative z is 1."""
+    """The two-sided p-value of a z; if not ``both``, that of a z of 0 or less is 1."""
     from scipy.special import ndtr
 
     return float(np.minimum(1.0, 2 * ndtr(-abs(z) if both else -z)))
 
 
 def finite(value: float) -> float | None:
-    """The number as JSON can hold it: None if it is not finite."""
+    """The number in a form that JSON can hold: None if it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 

@@ -213,7 +213,7 @@ class Study:
                 place = trainings.store(job, trained)
                 if not (place.left or stop.is_set()):
                     self._conclude(place.table, place.variant, place.backtest, report)
-            for table, variant in missing:  # those of which nothing but the end was missing
+            for table, variant in missing:  # those whose training was complete already
                 if not (self.finished(table, variant) or stop.is_set()):
                     self._conclude(table, variant, self.backtest(table, variant), report)
             self.interrupted = stop.is_set() and not self._complete
@@ -221,7 +221,7 @@ class Study:
 
     @property
     def _about(self) -> dict[str, Any]:
-        """What the log says of the study."""
+        """What the log says about the study."""
         config = self.config
         tables, variants = len(config.tables), len(config.variants)
         about = f"{amount(tables, 'table')}, {amount(variants, 'variant')}"
@@ -313,15 +313,15 @@ def summarize(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]])
 
 
 def looks_of(folder: Path | str) -> list[Look]:
-    """All looks that a study knows of: those before it and its own."""
+    """All looks that a study knows of: earlier ones and its own."""
     config = StudyFolder(Path(folder)).read()
     return [*config.earlier, *config.looks]
 
 
 def corrected(agents: Mapping[str, Pools], rebalanced: bool) -> dict[str, Pools]:
-    """The pooled evidence with Holm's correction over all agents and references, which decides.
+    """The pooled evidence with findings, by Holm's correction over all agents and references.
 
-    rebalanced: whether the reference has rebalancings; without, there is one comparison an agent.
+    rebalanced: whether the reference has rebalancings; if not, there is one comparison per agent.
     """
     against = AGAINST if rebalanced else AGAINST[:1]
     pooled: list[Pooled] = [getattr(agents[name], key) for name in agents for key in against]
@@ -364,8 +364,10 @@ def _count(looks: Sequence[Look], digest: str) -> int:
 
 
 def _require_plan(tables: Mapping[str, Prices], variants: Sequence[Variant]) -> None:
-    """Raises QfolioError if there is nothing to do, something counts twice, or a name is no
-    folder's."""
+    """Raises QfolioError if there is nothing to do, something is given twice, or a name is invalid.
+
+    Names become folders.
+    """
     if not (tables and variants):
         what = "table; name its file" if variants else "lag and one cost"
         raise QfolioError(f"A study needs at least one {what}.")

@@ -1,4 +1,4 @@
-"""Training the backtests of a study: the jobs of one after another, as workers become free."""
+"""Training for a study: the jobs of one backtest after another, as workers become free."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -34,7 +34,7 @@ class PlacedJob:
 
 @dataclass
 class Place:
-    """A backtest in training, with the number of its jobs, and of those that are left."""
+    """A backtest in training, with the numbers of all its jobs and of those that are left."""
 
     table: str
     variant: Variant
@@ -45,10 +45,10 @@ class Place:
 
 
 class Trainings:
-    """The training that backtests miss, for an executor.
+    """The training that backtests still need, as jobs for an executor.
 
-    places: tables and variants. open_backtest: called when a worker is free for its first job.
-    listen: called when that begins. log: of the study.
+    places: tables and variants. open_backtest: called when a worker is free for a backtest's first
+    job. listen: called when that job begins. log: the study's log.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Trainings:
 
 @contextlib.contextmanager
 def of_table(name: str) -> Iterator[None]:
-    """Errors in this block name the table."""
+    """Puts the table's name in front of errors in this block."""
     try:
         yield
     except QfolioError as error:

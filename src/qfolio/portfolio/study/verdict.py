@@ -64,7 +64,7 @@ def _tables(pools: Pools) -> str:
 
 
 def looks_sentence(result: Result) -> str:
-    """How many looks were taken, and what luck alone would reach."""
+    """How many looks were taken, and which z luck alone is expected to reach."""
     earlier = (
         f"; {result.earlier:,} earlier looks at its tables are known" if result.earlier else ""
     )

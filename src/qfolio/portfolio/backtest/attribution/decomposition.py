@@ -1,4 +1,4 @@
-"""Where a return came from: weights that were held all the time, their timing, and costs.
+"""Where a return came from: constant weights, the timing of weights, and costs.
 
 A day's net return is R = Σᵢ wᵢrᵢ − c, with weights w after the trade, returns r of cash and assets
 while they were held, and the day's cost c. Over all days the mean of Σᵢ wᵢrᵢ is Σᵢ w̄ᵢr̄ᵢ, what
@@ -16,7 +16,7 @@ from qfolio.portfolio.backtest.attribution.hac import Floats, mean_t
 
 
 class AssetPart(msgspec.Struct, frozen=True):
-    """The contribution of cash or an asset, a year."""
+    """The annual contribution of cash or of an asset."""
 
     name: str
     weight: float  # the mean
@@ -25,9 +25,9 @@ class AssetPart(msgspec.Struct, frozen=True):
 
 
 class FoldPart(msgspec.Struct, frozen=True):
-    """A fold's parts, a year of its own days: static + timing − cost = net.
+    """A fold's parts, annualized over its own days: static + timing − cost = net.
 
-    static: of the mean weights of the whole test. timing: of the departures from them.
+    static: return of the mean weights of the whole test. timing: return of departures from them.
     """
 
     name: str
@@ -38,14 +38,14 @@ class FoldPart(msgspec.Struct, frozen=True):
 
 
 class Decomposition(msgspec.Struct, frozen=True):
-    """The parts of the arithmetic mean return, a year: equal + tilts + timing − cost = net."""
+    """The parts of the annual arithmetic mean return: equal + tilts + timing − cost = net."""
 
     net: float
-    equal: float  # of equal weights of all assets, without costs
-    tilts: float  # what the mean weights earned beyond it
+    equal: float  # return of equal weights of all assets, without costs
+    tilts: float  # what the mean weights earned beyond that
     timing: float
-    timing_t: float  # HAC, given the mean weights
-    between: float  # of the timing: mean weights that differ from fold to fold
+    timing_t: float  # HAC t-statistic, given the mean weights
+    between: float  # part of the timing: mean weights that differ from fold to fold
     cost: float
     assets: list[AssetPart]  # cash first
     folds: list[FoldPart]
@@ -72,7 +72,7 @@ def decompose(
         returns: Returns of cash and assets while these weights were held, same shape.
         folds: The days of each fold, by its name.
         assets: Names of the N assets.
-        periods_per_year: For example 252 for days of trading.
+        periods_per_year: For example 252 for trading days.
         known: Whether an asset had a price on a day, shape (D, N) (default: all had).
     """
     year = periods_per_year

@@ -1,4 +1,4 @@
-"""Dead agents, in one plain sentence: those that never trade, hold one asset, or see nothing."""
+"""Diagnoses dead agents in plain sentences: they never trade, hold one asset, or see nothing."""
 
 from collections.abc import Sequence
 
@@ -7,13 +7,13 @@ import numpy as np
 from qfolio.portfolio.backtest.replay import Entry
 
 STILL = 1e-6
-"""Turnover of a row below which nothing is traded; the agents compute in float32."""
+"""Turnover of a row up to which nothing counts as traded; the agents compute in float32."""
 
 SAME = 1e-4
-"""Target weights that differ less are the same."""
+"""Target weights that differ by less count as the same."""
 
 ALONE = 0.99
-"""Weight of an asset that is held alone, on this share of the days as well."""
+"""Weight above which an asset is held alone, and the share of days on which it has to be."""
 
 
 def diagnose(
@@ -63,6 +63,6 @@ def _dead(entry: Entry, seed: int, folds: Sequence[slice], assets: Sequence[str]
 
 
 def _same(targets: np.ndarray) -> bool:
-    """Whether all orders are the same; NaN gives none."""
+    """Whether all orders are the same; rows of NaN are not orders."""
     given = targets[~np.isnan(targets[:, 0])]
     return not len(given) or bool(np.ptp(given, axis=0).max() < SAME)

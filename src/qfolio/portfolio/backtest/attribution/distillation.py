@@ -1,8 +1,8 @@
 """A policy in one line: its active target weights as a linear rule in the signals.
 
-Within each row, target weights and signals are taken less their mean over the assets; what remains
-is pooled over rows. The rule is fitted on every other fold and tested on the others, whose agents
-were trained anew: R² is out of sample in days and in policies.
+Within each row, target weights and signals are measured from their mean over the assets, and then
+pooled over rows. The rule is fitted on every other fold and tested on the others, whose agents were
+trained anew: R² is out of sample in days and in policies.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ _LEAST = 1e-6
 """Smaller active weights are rounding errors."""
 
 BLOCK = 1_000_000
-"""Numbers that are factorised together."""
+"""Largest number of table entries in one QR factorization."""
 
 
 class Term(msgspec.Struct, frozen=True):
@@ -47,11 +47,11 @@ def distil(
 
     Args:
         targets: Target weights of the assets, shape (D, N).
-        anchor: The weights that they are active against, likewise.
+        anchor: Weights of the same shape; active weights are the targets minus these.
         signals: Each asset's latest signals, shape (D, N, C).
         names: Names of the signals.
         tradable: 1 for assets that may be held on a day, else 0, shape (D, N).
-        fitted: Whether a row fits the rule (else it tests it), shape (D,).
+        fitted: Whether the rule is fitted on a row (or else tested on it), shape (D,).
     """
 
     def triangle(days: np.ndarray) -> Floats:

@@ -1,8 +1,8 @@
 """Why these trades: how far each signal moves the target weights of one decision.
 
-By the integrated gradients of ``gradients.py``, for the latest row: an asset's change of weight is
-the sum of what each channel moves, against a typical observation (the mean in training), and of a
-rest, the way from the weight held to the target of a typical observation.
+The integrated gradients of ``gradients.py`` at the latest row say it. An asset's change of weight
+is the sum of what each channel contributes, relative to a typical observation (the mean in
+training), and of a rest: the change from the weight held to the target of a typical observation.
 """
 
 import jax.numpy as jnp
@@ -19,10 +19,10 @@ from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
 
 TRADES = 3
-"""Largest trades that are explained."""
+"""Number of largest trades that are explained."""
 
 SHOWN = 3
-"""Largest contributions to each."""
+"""Number of largest contributions that are shown for each trade."""
 
 
 VISIBLE = 5e-5
@@ -30,23 +30,23 @@ VISIBLE = 5e-5
 
 
 class Driver(msgspec.Struct, frozen=True):
-    """What a channel does to an asset's target weight."""
+    """A channel's contribution to an asset's target weight."""
 
     name: str
     weight: float
 
 
 class Reason(msgspec.Struct, frozen=True):
-    """A trade by what drives it: the change is the sum of all drivers and the rest."""
+    """A trade and what drives it: the change is the sum of all drivers and the rest."""
 
     asset: str
-    change: float  # target weight less the weight held
+    change: float  # target weight minus the weight held
     drivers: list[Driver]  # every channel, the largest first
     rest: float  # with a typical observation, the weight would change by this
 
 
 def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reason]:
-    """The largest changes of weight, and what drives them; none of a policy with a menu.
+    """The largest changes of weight, and what drives them; empty for a policy with a menu.
 
     Args:
         policy: The policy that was followed.

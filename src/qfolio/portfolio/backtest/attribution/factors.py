@@ -1,9 +1,10 @@
 """Factors made from the price table itself, and a strategy's exposures to them.
 
-Each factor but the market is long one unit and short one unit of the assets, by weights that are
-known at the close before the return; none pays costs. Momentum, reversal and low volatility weigh
-assets by the rank of a signal. The components are the largest ones of training returns less the
-market's, fitted on the rows that the fold's agents were trained on (Connor & Korajczyk 1988).
+Except for the market, each factor is long one unit of assets and short one unit, with weights that
+are known at the close before the return; no factor pays costs. Momentum, reversal and low
+volatility weight assets by the rank of a signal. The components are the largest principal
+components of returns minus the market's, fitted on the rows that the fold's agents were trained on
+(Connor & Korajczyk 1988).
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from qfolio.portfolio.backtest.folds import Fold
 COMPONENTS = 2
 
 _DISTINCT = 1e-6
-"""Share of its variance that a factor must have for itself, beside those before it."""
+"""Least share of a factor's variance that the factors before it must leave unexplained."""
 
 
 class Exposure(msgspec.Struct, frozen=True):
@@ -32,7 +33,7 @@ class Exposure(msgspec.Struct, frozen=True):
 class Exposures(msgspec.Struct, frozen=True):
     """A regression of active returns on factors."""
 
-    alpha: float  # the intercept, a year
+    alpha: float  # annual intercept
     alpha_t: float
     r2: float
     lags: int  # of Newey & West
@@ -44,12 +45,12 @@ def exposures(
 ) -> Exposures | None:
     """Regress a strategy's active returns on factors; None if there are too few days.
 
-    A factor that others before it span is left out.
+    A factor that is spanned by those before it is left out.
 
     Args:
-        active: Net returns less those of the reference, shape (D,).
+        active: Net returns minus those of the reference, shape (D,).
         factors: Returns of each factor on the same days, by its name.
-        periods_per_year: For example 252 for days of trading.
+        periods_per_year: For example 252 for trading days.
     """
     chosen: dict[str, Floats] = {}
     for name, series in factors.items():
@@ -77,10 +78,10 @@ def factor_returns(
     """The returns of every factor on the days of a test.
 
     Args:
-        values: Prices of shape (rows, N), NaN before an asset's first.
+        values: Prices of shape (rows, N), NaN before an asset's first price.
         folds: The folds, in order and without gaps.
         lag: Rows from a decision to its execution.
-        periods_per_year: It sets the factors' lengths: a year, a month, a week.
+        periods_per_year: Sets the number of rows in a year, a month and a week.
 
     Returns:
         Series of shape (D,), by the name of the factor.
@@ -101,7 +102,7 @@ def factor_returns(
 
 
 def _signals(periods_per_year: float) -> dict[str, signals.Signal]:
-    """Signals by name, with lengths in rows, as far as the table is fine enough for them."""
+    """Signals by name, with lengths in rows; those that the table's frequency allows."""
     year, month, week = (max(0, round(periods_per_year / part)) for part in (1, 12, 52))
     found: dict[str, signals.Signal] = {}
     if year > month > 0:
@@ -122,7 +123,7 @@ def _long_short(scores: Floats) -> Floats:
 def _components(
     values: Floats, active: Floats, folds: Sequence[Fold], shift: int
 ) -> dict[str, Floats]:
-    """The components' returns, each fold's weights from its training rows alone."""
+    """The components' returns, with each fold's weights from its training rows only."""
     series: list[Floats] = []
     last: Floats | None = None
     for fold in folds:
@@ -134,7 +135,7 @@ def _components(
         if last is None:
             largest = np.take_along_axis(vectors, abs(vectors).argmax(1)[:, None], 1)
             signs = np.sign(largest[:, 0])
-        else:  # as in the fold before
+        else:  # the sign of the fold before
             signs = np.where((vectors * last).sum(1) < 0, -1.0, 1.0)
         last = vectors * signs[:, None]
         days = slice(fold.decisions.start + shift, fold.decisions.stop + shift)

@@ -1,10 +1,10 @@
 """Integrated gradients of target weights: how far each signal moves them (Sundararajan, Taly & Yan
 2017, "Axiomatic attribution for deep networks").
 
-For target weights f of what is observed, x, against a typical observation x₀ (0, the mean in
+For target weights f(x) of an observation x, relative to a typical observation x₀ (0, the mean in
 training), channel c moves the weights by ∫₀¹ ∂f/∂x_c (x₀ + α(x − x₀)) · (x − x₀)_c dα. Over all
-channels this adds up to f(x) − f(x₀), with holding and anchor as they were. The integral is a mean
-over midpoints, and each directional derivative one forward pass.
+channels this adds up to f(x) − f(x₀), with the holding and the anchor unchanged. The integral is a
+mean over midpoints, and each directional derivative takes one forward pass.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.task import Portfolio
 
 DAYS = 24
-"""Days of the test, evenly spread; at least one in each fold."""
+"""Number of days of the test that are examined, evenly spread; at least one in each fold."""
 
 STEPS = 16
 
@@ -42,7 +42,7 @@ class Gradients(msgspec.Struct, frozen=True):
     pulls: list[Pull]
     days: int
     whole: float  # mean absolute change by all channels together
-    gap: float  # mean absolute error of their sum, from the midpoints
+    gap: float  # mean absolute error of their sum, due to the midpoint rule
 
 
 def integrated_gradients(
@@ -90,9 +90,9 @@ def integrated(
 ) -> tuple[
     Float[Array, "day channel asset"], Float[Array, "day asset channel"], Float[Array, "day asset"]
 ]:
-    """What each channel moves at some rows, the channels' latest values, and the whole change.
+    """How far each channel moves weights at some rows, its latest values, and the whole change.
 
-    members: the agents' weights, with a leading seed axis. held: weights at the rows.
+    members: the agents' weights, with a leading seed axis. held: weights held at the rows.
     """
     places = (jnp.arange(STEPS) + 0.5) / STEPS
 

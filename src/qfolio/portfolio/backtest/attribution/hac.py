@@ -1,8 +1,8 @@
-"""Least squares with errors that allow for heteroskedasticity and autocorrelation.
+"""Least squares with standard errors that allow for heteroskedasticity and autocorrelation.
 
 Newey & West (1987), "A simple, positive semi-definite, heteroskedasticity and autocorrelation
-consistent covariance matrix"; the number of lags is chosen from the data as Newey & West (1994),
-"Automatic lag selection in covariance matrix estimation", do for Bartlett's kernel.
+consistent covariance matrix"; the number of lags is chosen from the data as for Bartlett's kernel
+in Newey & West (1994), "Automatic lag selection in covariance matrix estimation".
 """
 
 import math
@@ -18,19 +18,19 @@ class Regression(NamedTuple):
     """Coefficients of an intercept and K regressors, in this order."""
 
     coefficients: Floats  # (K + 1,)
-    errors: Floats  # (K + 1,)
+    errors: Floats  # standard errors, (K + 1,)
     r2: float  # 0 if there is nothing to explain
     lags: int
 
     @property
     def t(self) -> Floats:
-        """Coefficients over their errors; 0 where there is no error."""
+        """Coefficients over their standard errors; 0 where the error is 0."""
         known = self.errors > 0
         return np.where(known, self.coefficients / np.where(known, self.errors, 1.0), 0.0)
 
 
 def regress(values: Floats, regressors: Floats) -> Regression:
-    """Regress a series on an intercept and others.
+    """Regresses a series on an intercept and other series.
 
     Args:
         values: Shape (T,).
@@ -44,7 +44,7 @@ def regress(values: Floats, regressors: Floats) -> Regression:
     coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
     residuals = values - design @ coefficients
     scores = design * residuals[:, None]
-    # As in the paper, the intercept has no say in the choice of lags, unless it is alone.
+    # As in the paper, the intercept does not count in the choice of lags, unless it is alone.
     lags = newey_west_lags(scores[:, 1:].sum(1) if regressors.shape[1] else scores[:, 0])
     middle = scores.T @ scores
     for lag in range(1, lags + 1):
@@ -76,7 +76,7 @@ def newey_west_lags(scores: Floats) -> int:
 
 
 def mean_t(values: Floats) -> float:
-    """The mean of a series over its error; 0 for rounding errors."""
+    """The t-statistic of a series' mean, shape (T,); 0 if the series is rounding errors."""
     if abs(values).max() < 1e-12:
         return 0.0
     return float(regress(values, np.empty((len(values), 0))).t[0])

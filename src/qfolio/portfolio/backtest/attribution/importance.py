@@ -1,4 +1,4 @@
-"""What a signal is worth: the growth a year that is lost without it.
+"""What a signal is worth: the annual growth that is lost without it.
 
 The policy is replayed on the same days, at the same costs, while it sees one signal shuffled
 (permutation importance, Breiman 2001; measured in net growth after Jensen, Kelly, Malamud &
@@ -24,29 +24,30 @@ from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.backtest.simulation import simulate
 
 DRAWS = 3
-"""Shuffles of each signal."""
+"""Number of shuffles of each signal."""
 
 WORK = 4e9
-"""Most observed numbers that the replays of an agent read: seconds on two cores. Beyond it, each
-signal is shuffled once; then only the first seed is followed; then only everything is shuffled."""
+"""Most observed numbers that the replays of an agent may read, which takes seconds on two cores. If
+there are more, each signal is shuffled once only; if still more, only the first seed is followed;
+and beyond that, only everything at once is shuffled."""
 
 SEED = 0
 
 UNMOVED = 1e-5
-"""Targets that move less do not depend on what was shuffled; they are computed in float32."""
+"""Targets that move by less do not depend on what was shuffled; they are computed in float32."""
 
 EVERYTHING = "all together"
 
 
 class Worth(msgspec.Struct, frozen=True):
-    """The growth a year that is lost without a signal; negative if the policy does better so."""
+    """The annual growth that is lost without a signal; negative if the policy does better then."""
 
     name: str
-    lost: float  # the mean over the draws
-    low: float  # the least and the most
-    high: float
-    t: float  # of the mean over the days, HAC
-    shared: bool  # shuffled in time; else among the assets
+    lost: float  # mean over the draws
+    low: float  # smallest over the draws
+    high: float  # largest over the draws
+    t: float  # HAC t-statistic of the mean over the days
+    shared: bool  # whether it was shuffled in time; otherwise among the assets
 
 
 class Importance(msgspec.Struct, frozen=True):
@@ -54,9 +55,9 @@ class Importance(msgspec.Struct, frozen=True):
 
     signals: list[Worth]  # none if the replays would take too long
     everything: Worth
-    ignored: bool  # no shuffle of everything moves any target
+    ignored: bool  # whether no shuffle of everything moves any target
     draws: int
-    seeds: int  # that the policy is the mean of
+    seeds: int  # number of seeds that the policy is the mean of
     replays: int
 
 
@@ -73,7 +74,7 @@ def importance(
         stretches: The folds with its policies.
         names: Names of the channels that the agent observes.
         values: Prices, shape (rows, N).
-        periods_per_year: It sets the length of blocks, a quarter of a year.
+        periods_per_year: Sets the length of blocks, a quarter of a year.
 
     Returns:
         The worth of each channel, and the weights held when deciding, shape (D, entry).
@@ -128,13 +129,13 @@ def importance(
 
 
 def of_seeds(stretches: Sequence[Stretch], count: int) -> list[Stretch]:
-    """The folds with the policies of the first seeds alone."""
+    """The folds with the policies of the first seeds only."""
     few = lambda tree: jax.tree.map(lambda x: x[:count], tree)  # noqa: E731
     return [each._replace(members=few(each.members)) for each in stretches]
 
 
 def _affordable(stretches: Sequence[Stretch], count: int) -> tuple[bool, int, int]:
-    """Whether to shuffle signals one by one, the number of draws, and of seeds to follow."""
+    """Whether to shuffle signals one by one, the number of draws, and the number of seeds."""
     task = stretches[0].task
     seeds = int(jax.tree.leaves(stretches[0].members)[0].shape[0])
     days = sum(fold.decisions.stop - fold.decisions.start for *_, fold in stretches)

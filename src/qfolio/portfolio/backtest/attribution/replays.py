@@ -1,9 +1,9 @@
 """Replays of a policy that sees some of its channels shuffled.
 
-Two shuffles take a channel's information away and leave its distribution: the assets swap what is
-seen of them, or blocks of rows swap places. Assets are relabeled anew every quarter of a year, not
-every row: else a slow signal would become noise that a policy pays costs to follow, and its value
-would be confused with that of trading less. All else is as it was: prices, holdings, costs.
+Two kinds of shuffle take a channel's information away but keep its distribution: the assets swap
+their values, or blocks of rows swap places. Assets are relabeled anew every quarter of a year, not
+every row: otherwise a slow signal would become noise that a policy pays costs to follow, and its
+value would be confused with that of trading less. Prices and costs are unchanged.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from qfolio.portfolio.market import Holding, Signalled
 from qfolio.portfolio.task import Portfolio
 
 AT_ONCE = 16
-"""Most replays in one vectorized loop; their inputs and weights are in memory together."""
+"""Most replays in one vectorized loop; all their inputs and weights are in memory at once."""
 
 
 class Observed(Portfolio):
@@ -52,9 +52,9 @@ class Observed(Portfolio):
 
 
 class Shuffle(NamedTuple):
-    """What a replay takes away.
+    """What a replay shuffles.
 
-    mask: 1 for each shuffled channel. rows, assets: number of the draw of each kind; 0: none.
+    mask: 1 for each shuffled channel. rows, assets: index of the draw of each kind; 0 for none.
     """
 
     mask: np.ndarray  # (channel,)
@@ -114,7 +114,7 @@ def channels(task: Portfolio) -> Float[Array, "row asset channel"]:
 def replay(
     agent: Agent, stretches: Sequence[Stretch], shuffles: Shuffles, wanted: Sequence[Shuffle]
 ) -> Iterator[Replays]:
-    """Follow the mean of all seeds over all folds, once for each of some shuffles.
+    """Follows the mean of all seeds over all folds, once for each shuffle that is wanted.
 
     The replays come in groups of at most ``AT_ONCE``, so that not all weights are in memory.
     """

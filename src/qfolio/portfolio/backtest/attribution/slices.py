@@ -1,16 +1,17 @@
-"""A policy by pictures: the weight of one asset, against one thing that it depends on.
+"""A policy in pictures: the weight of one asset, against one quantity that it depends on.
 
-The asset is the one that is held most. What it gains, a partner gives, the one held second most
-(or cash if there is no other): while the asset's signal goes up, the partner's goes down. Many
-policies buy only what others sell, and alone an asset would not move.
+The asset is the one that is held most. Its partner, the one held second most (or cash if there is
+no other), gives what the asset gains: as the asset's signal rises, the partner's falls. Many
+policies buy an asset only by selling others, and would not react to the signal of one asset alone.
 
-Against the weight held, the picture is the target of one decision: on the diagonal nothing is
-traded. Against a signal, it is the weight at which the policy comes to rest if it decides again and
-again while prices stand still: from all that the two hold in the partner, and from all of it in the
-asset. A policy with a no-trade band rests at the band's two edges, others at one weight.
+Against the weight held, the picture shows the target of one decision: on the diagonal, nothing is
+traded. Against a signal, it shows the weight at which the policy comes to rest if it decides again
+and again while prices stand still. It starts with all that the two hold in the partner, and then
+with all of it in the asset. A policy with a no-trade band rests at the band's two edges, others at
+one weight.
 
-All else is typical: other channels are at their mean in training (returns at 0), the holding is the
-mean over the test. A signal or feature has its value in the whole window, a return only in its
+All else is typical: other channels are at their mean in training (returns at 0), and the holding is
+the mean over the test. A signal or feature has its value in the whole window, a return only in its
 latest row.
 """
 
@@ -32,10 +33,10 @@ from qfolio.portfolio.task import Portfolio
 POINTS = 17
 
 SHOWN = 8
-"""Most folds whose policies are drawn, evenly spread."""
+"""Largest number of folds whose policies are drawn, evenly spread."""
 
 DECISIONS = 24
-"""Decisions in a row until a policy rests; one that trades a tenth of the way has come 92%."""
+"""Decisions in a row until a policy rests; at a tenth of the way each, 92% of it is covered."""
 
 TAIL = 0.01
 """Share of the signal's values that lies beyond each end of a slice."""
@@ -47,8 +48,8 @@ class Slice(msgspec.Struct, frozen=True):
     name: str
     x: list[float]
     lines: list[list[float]]  # (fold, point); against a signal, those reached from below
-    above: list[list[float]]  # those reached from above; none against the holding
-    shared: bool  # the quantity is changed for all assets at once
+    above: list[list[float]]  # those reached from above; empty against the holding
+    shared: bool  # whether the quantity is changed for all assets at once
 
 
 class Slices(msgspec.Struct, frozen=True):
@@ -68,7 +69,7 @@ def slices(
     held: np.ndarray,
     shared: Sequence[bool],
 ) -> Slices:
-    """Draw an agent's policy, the mean of all seeds.
+    """The slices of an agent's policy, the mean of all seeds.
 
     Args:
         stretches: The folds with its policies.
@@ -127,7 +128,7 @@ def slices(
 def answer(
     task: Portfolio, agent: Agent, members: PyTree, row: Array, features: Array, held: Array
 ) -> Float[Array, " entry"]:
-    """The target weights at a row whose features are given, the mean of all members."""
+    """The target weights at a row with the given features, the mean of all members."""
     asked = eqx.tree_at(lambda t: t.decides, task, jnp.ones_like(task.decides))  # on any day
     seen = Observed.given(asked, jnp.swapaxes(features, 0, 1), row - task.window + 1)
     holding = seen.hold(held)

@@ -1,4 +1,4 @@
-"""What the attributions of a backtest say, as why.json keeps it."""
+"""The attributions of a backtest, as why.json keeps them."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,13 +33,13 @@ class Why(msgspec.Struct, frozen=True):
     agents, by strategy.
     """
 
-    reference: str  # that active returns are measured against
+    reference: str  # the strategy that active returns are measured against
     agents: dict[str, AgentWhy]
     diagnosis: dict[str, list[str]]
 
     @staticmethod
     def read(content: Mapping[str, Any]) -> "Why":
-        """From the content of why.json; raises QfolioError if it is another's."""
+        """The attributions in the content of why.json; raises QfolioError if it is damaged."""
         try:
             return msgspec.convert(content, Why)
         except msgspec.ValidationError as error:
@@ -49,6 +49,6 @@ class Why(msgspec.Struct, frozen=True):
             ) from None
 
     def to_json(self) -> dict[str, Any]:
-        """Return dictionaries, lists, texts and numbers."""
+        """The attributions as JSON values."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain

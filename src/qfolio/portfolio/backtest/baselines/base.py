@@ -52,10 +52,10 @@ class Baseline(ABC):
     Attributes:
         calendar: When ``decide`` is called. "fold": at the first decision of each fold; its result
             is the target of every row of the fold, so that drift is traded back at every row.
-            "month": every ``History.month`` rows from the first decision of the test on; between,
-            the holding drifts. "row": at every row; None then lets the holding drift.
-        estimates: Whether ``decide`` reads past prices. If not, it may hold any asset that is there
-            at the decision, where assets come and go.
+            "month": every ``History.month`` rows from the first decision of the test on; the
+            holding drifts in between. "row": at every row; None then lets the holding drift.
+        estimates: Whether ``decide`` reads past prices. If not, it may hold any asset that is
+            available at the decision, where assets come and go.
     """
 
     calendar: ClassVar[Literal["fold", "month", "row"]] = "fold"
@@ -91,7 +91,7 @@ class Fitted(Baseline):
 
     @abstractmethod
     def fit(self, returns: Floats, cap: float) -> Floats:
-        """Return weights of shape (assets,) up to a factor; a ValueError says there are none.
+        """Return weights of shape (assets,) up to a factor; raise ValueError if there are none.
 
         Args:
             returns: Simple returns of shape (rows, assets), each asset with some variance.
@@ -119,7 +119,7 @@ def baseline(name: str) -> Baseline:
     """Make a baseline by its name, or by ``module:Name`` if that module has been imported.
 
     Raises:
-        QfolioError: There is none, or its module has not been imported.
+        QfolioError: There is no such baseline, or its module has not been imported.
     """
     made: Baseline = imported("baseline", name)()
     return made
@@ -144,13 +144,13 @@ def nearest(wanted: Floats, low: Floats | float, high: Floats | float) -> Floats
     """The weights between bounds and of sum 1 that are nearest to those wanted.
 
     They are clip(wanted − τ, low, high) for the one τ that makes the sum 1, which falls piecewise
-    linearly in τ. If the upper bounds add up to less than 1, all are at them.
+    linearly in τ. If the upper bounds add up to less than 1, all weights are at them.
 
     Args:
         wanted: Numbers of shape (assets,).
         low, high: Bounds, numbers or of the same shape; the lower ones add up to 1 or less.
     """
-    kinks = np.concatenate([wanted - high, wanted - low])  # where a weight begins and ends to fall
+    kinks = np.concatenate([wanted - high, wanted - low])  # where a weight starts and stops falling
     order = np.argsort(kinks)
     kinks, falling = kinks[order], np.cumsum(np.where(order < wanted.size, 1, -1))
     fallen = np.concatenate([[0.0], np.cumsum(falling[:-1] * np.diff(kinks))])

@@ -57,7 +57,7 @@ def nonlinear(returns: Floats) -> Floats:
 
 
 def exponential(returns: Floats, decay: float = 0.97) -> Floats:
-    """Second moments, in which each row counts ``decay`` times as much as the one after it.
+    """Second moments, where each row counts ``decay`` times as much as the one after it.
 
     J.P. Morgan, "RiskMetrics: Technical Document" (1996), whose decay for a month is 0.97.
     """

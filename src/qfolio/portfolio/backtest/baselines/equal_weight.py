@@ -14,7 +14,7 @@ from qfolio.portfolio.backtest.baselines.base import (
 )
 
 SPEEDS = (0.3, 0.1, 0.03, 0.01, 0.0)
-"""Speeds of rebalancing, beside 1, from which a backtest chooses the best in hindsight."""
+"""Speeds of rebalancing, besides 1, from which a backtest chooses the best in hindsight."""
 
 
 class EqualWeight(Baseline):
@@ -33,7 +33,7 @@ class EqualWeightMonthly(EqualWeight):
 
 
 class EqualWeightAt(Baseline):
-    """Equal weights bought once, then a share of the way back to them at every row.
+    """Equal weights bought once, then traded a share of the way back to them at every row.
 
     Agents are compared with the best of several speeds, because rebalancing at every row pays
     costs that any slower trading saves.

@@ -1,6 +1,6 @@
 """The long-only portfolio of least variance, on four estimates of the covariance.
 
-The first is the sample's over the training window and all rows since. The others use the latest
+The first is the sample covariance over the training window and since. The others use the latest
 twelve months, as Ledoit & Wolf (2017, "Markowitz meets Goldilocks") do with daily returns.
 """
 

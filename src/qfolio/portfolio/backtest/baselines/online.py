@@ -1,7 +1,8 @@
 """On-line portfolio selection: rules that move a little at every row and estimate nothing.
 
-The target of a row is moved by what the last row did to it. It is not stored: prices have turned it
-into the holding, so the holding divided by the relatives is the target again.
+Each decision moves the last target by a step that depends on the latest prices. That target is not
+stored: prices have turned it into the holding, so the holding divided by the price relatives is
+proportional to it.
 """
 
 from abc import abstractmethod

@@ -1,4 +1,4 @@
-"""The highest Sharpe ratio and two ways to risk parity, on the training window and since."""
+"""The highest Sharpe ratio and two kinds of risk parity, on the training window and since."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,7 @@ from qfolio.solvers.maximum_ratio import maximum_ratio
 from qfolio.solvers.risk_budgeting import equal_risk
 
 ORDERED = 300
-"""Assets up to which the tree is ordered, which takes a time that grows with their fourth power."""
+"""Largest number of assets whose tree is ordered; the time grows with its fourth power."""
 
 
 class MaximumRatio(Fitted):
@@ -29,10 +29,11 @@ class HierarchicalRiskParity(Fitted):
     """Risk parity over a hierarchy of clusters.
 
     M. López de Prado, "Building Diversified Portfolios that Outperform Out of Sample" (2016): a
-    tree of their correlations orders the assets, and the order is halved again and again; the two
+    tree built on correlations orders the assets, and this order is halved again and again; the two
     halves of each cluster share its weight in inverse proportion to their variances, with weights
-    ∝ 1/σ² inside. The tree is Ward's and neighbors are as near as it allows, as in skfolio. Beyond
-    ``ORDERED`` assets the order is the tree's own, as in the paper.
+    ∝ 1/σ² inside. The tree is Ward's, and its leaves are ordered so that neighbors are as close as
+    possible, as in skfolio. Beyond ``ORDERED`` assets, the order is the tree's own, as in the
+    paper.
     """
 
     def fit(self, returns: Floats, cap: float) -> Floats:

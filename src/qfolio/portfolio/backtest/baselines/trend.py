@@ -14,7 +14,7 @@ from qfolio.portfolio.backtest.baselines.base import (
 
 
 class Momentum(Baseline):
-    """The third of the assets that rose most over a year but its last month, in equal parts.
+    """Equal weights of the third of the assets that rose most over a year, its last month excluded.
 
     N. Jegadeesh and S. Titman, "Returns to Buying Winners and Selling Losers" (1993). If the cap
     would leave cash, more assets are held.
