@@ -323,7 +323,7 @@ def test_a_budget_of_the_year_is_that_of_the_ledger(tmp_path, monkeypatch, capsy
     printed = capsys.readouterr()
     first = json.loads(printed.out)
     assert "fills orders over 3 rows" in printed.err
-    assert "at most 90%, the ledger's orders took 0.0%, and this one takes 90.0%" in printed.err
+    assert "orders have used 0.0% this year, and this one uses 90.0%" in printed.err
     assert first["spent"] == 0
     assert sum(row["weight"] for row in first["assets"]) == pytest.approx(0.9)  # the whole order
     newer = write_table(tmp_path / "newer.csv", rows=270)

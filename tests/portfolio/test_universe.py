@@ -397,7 +397,7 @@ def test_a_mandate_in_motion_is_said_and_checked_over_a_whole_backtest(tmp_path:
     )  # fmt: skip
     backtest.run()
     entries, notes = Backtest.open(tmp_path / "run").entries()
-    assert any(note.startswith("The mandate yields to the assets") for note in notes)
+    assert any(note.startswith("The mandate is relaxed to fit the assets") for note in notes)
     assert any(note.startswith("mine breaks the mandate in") for note in notes)
     first = backtest.folds[0].decisions.start
     for name in ("pathwise", "dqn", "momentum", "equal-weight"):

@@ -231,11 +231,11 @@ HOURS = Prices(np.datetime64("2020-01-01T09:30", "s") + np.arange(ROWS) * np.tim
         (weights([100, 100], asset=["A", "A"], weight=[1, 1]), None, "'A' appears twice"),
         (weights([100, 101], A=[1, 1]).assign(date="soon"), None, "row 0: .*write dates as"),
         (weights([100], C=[1.0]), table(late=120), "orders C on 2020-04-10, before its first"),
-        (weights([2], A=[1.0]), HOURS, "is no row of the prices; where a day has several"),
+        (weights([2], A=[1.0]), HOURS, "is not a row of the prices; where a day has several"),
         (weights(np.arange(130), **{"return": 0.01}), None, "has no return on 2020-05-10.* 30 of"),
         (weights(np.arange(ROWS), **{"return": -1.5}), None, "returns are fractions"),
         (weights(np.arange(90), level=1.0), None, "no level on 2020-04-09 or in the week before"),
-        (weights(np.arange(ROWS), level=-1.0), None, "'level' is no index: .*negative"),
+        (weights(np.arange(ROWS), level=-1.0), None, "'level' is not an index: .*negative"),
         (np.ones((ROWS, 7)), None, r"must be \(160, 4\) for weights, cash first, or \(160,\)"),
         ({"a": 1}, None, "Strategy 'mine'"),
         ("nothing.csv", None, "nothing.csv' cannot be read"),
@@ -249,19 +249,19 @@ def test_strategies_that_are_refused(source, prices, message):
 def test_a_return_on_a_day_between_rows_is_refused():
     prices = table(step="W")
     dates = [*days(prices), "2022-03-31"]
-    with pytest.raises(QfolioError, match="return on 2022-03-31, which is no row"):
+    with pytest.raises(QfolioError, match="return on 2022-03-31, which is not a row"):
         placed(pd.DataFrame({"date": dates, "return": 0.001}), prices)
 
 
 @pytest.mark.parametrize(
     ("name", "benchmark", "message"),
     [
-        ("pathwise", None, "has a strategy pathwise already"),
+        ("pathwise", None, "already has a strategy pathwise"),
         ("pathwise-together", None, "already"), ("momentum", None, "already"),
         ("equal-weight at 0.3", None, "already"), ("/b", None, "cannot be called '/b'"),
-        ("pathwise/0", None, "has a strategy pathwise/0 already"), ("_b", None, "cannot be called"),
+        ("pathwise/0", None, "already has a strategy pathwise/0"), ("_b", None, "cannot be called"),
         ("mine", "pathwise", "benchmark pathwise is an agent"),
-        ("mine", "min", r"'min' is no strategy .* no asset and no file \(did you mean 'mine'\?\)"),
+        ("mine", "min", r"'min' is not a strategy .* an asset or a file \(did you mean 'mine'\?\)"),
     ],
 )  # fmt: skip
 def test_names_that_are_refused(name, benchmark, message):

@@ -66,7 +66,7 @@ def test_the_benchmark_earns_what_the_backtest_says(tmp_path, benchmark, options
 
 def test_a_table_of_ones_own_goes_on_with_its_latest_rows(tmp_path):
     made, later = desk(tmp_path / "index", INDEX), table(190)
-    with pytest.raises(QfolioError, match=r"no level on 2020-06-.* given with --benchmark"):
+    with pytest.raises(QfolioError, match=r"no level on 2020-06-.* latest table with --benchmark"):
         reference(made, later, 159, 28, None)
     longer = pd.DataFrame({"date": days(slice(190)), "level": np.exp(np.arange(190) * 1e-3)})
     longer.to_csv(tmp_path / "index.csv", index=False)

@@ -52,14 +52,14 @@ JUDGED = ("agent", "ensemble", "strategy")
 class Strategy(NamedTuple):
     """The track records of one strategy over the test days, one row per seed.
 
-    A deterministic baseline has one row, and so has an ensemble.
+    A deterministic baseline has one row, and so does an ensemble.
     """
 
     kind: str  # one of KINDS
     returns: ArrayLike  # (seeds, periods), simple, net of costs
-    turnover: ArrayLike | None  # (seeds, periods), bought plus sold over wealth; none: not known
-    cost: ArrayLike | None  # (seeds, periods), share of the wealth; none: not known
-    weights: Floats | None = None  # (seeds, periods, N + 1), cash first; none: not known
+    turnover: ArrayLike | None  # (seeds, periods), bought plus sold over wealth; None if unknown
+    cost: ArrayLike | None  # (seeds, periods), share of the wealth; None if unknown
+    weights: Floats | None = None  # (seeds, periods, N + 1), cash first; None if unknown
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +72,7 @@ class SharpeTest:
     minimum_years: float  # track record needed until that probability reaches 95%; may be inf
     threshold: float  # annual Sharpe ratio expected of the best trial if none has any skill
     deflated: float  # probability that the true Sharpe ratio exceeds the threshold
-    trials: int  # that the threshold counts; 1 for a baseline
+    trials: int  # number that the threshold counts; 1 for a baseline
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,9 +82,9 @@ class StrategyAssessment:
     kind: str
     seeds: int
     measures: dict[str, Measure]  # by the names in MEASURES
-    to_reference: Difference | None  # none for the reference itself
-    to_rebalanced: Difference | None  # none for it, and if only one speed was replayed
-    to_best_baseline: Difference | None  # none for it, and if the reference is the best
+    to_reference: Difference | None  # None for the reference itself
+    to_rebalanced: Difference | None  # None for itself, or if only one speed was replayed
+    to_best_baseline: Difference | None  # None for itself, or if the reference is the best
     sharpe_test: SharpeTest
     relative: dict[str, Measure]  # to the reference, by the names in RELATIVE; empty for itself
 
@@ -102,15 +102,15 @@ class Assessment:
     block_length: float  # mean, in periods
     trials: int  # every seed of every agent, ensembles, own strategies, and earlier trials
     earlier_trials: int
-    comparisons: int  # that Holm's correction counts
+    comparisons: int  # number that Holm's correction counts
     reference: str
     rebalanced: str  # the reference or its rebalancing, whichever grew most over the same days
-    best_baseline: str  # or strategy of the user's own; by growth over the same days
+    best_baseline: str  # or a user's own strategy, whichever grew most over the same days
     strategies: dict[str, StrategyAssessment]
     bound: float | None = None  # annual growth that no constant weights exceed, even without costs
 
     def to_json(self) -> dict[str, Any]:
-        """Return dictionaries, lists, texts and finite numbers; other numbers become None."""
+        """The statistics as JSON values; numbers that are not finite become None."""
         plain: dict[str, Any] = _plain(dataclasses.asdict(self))
         return plain
 
@@ -131,7 +131,7 @@ def assess(
 
     Agents, ensembles and strategies of the user's own are compared with a reference, with the
     rebalancing of the reference that grew most over the days of the test, and with the baseline or
-    other strategy that did; see ``differences.py``.
+    other strategy that grew most; see ``differences.py``.
 
     All strategies share the resampled days and so one block length: the longest that their returns
     (mean over seeds) or squared returns require. Squared returns are autocorrelated for months, and
@@ -142,13 +142,13 @@ def assess(
     Args:
         strategies: The strategies by name, with at least one baseline; all on the same days.
         dates: Days on which the returns were earned, shape (periods,), strictly increasing.
-        periods_per_year: For example 252 for days of trading.
+        periods_per_year: For example 252 for trading days.
         reference: The name of the baseline chosen in advance for comparison.
         earlier_trials: Number of earlier trials on these days, in addition to every seed of every
             agent, every ensemble and every strategy of the user's own.
         resamples: Number of histories that the bootstrap draws.
-        seed: Seed of the drawing.
-        risk_free: Returns of cash, shape (periods,), which Sharpe and Sortino ratios leave out
+        seed: Seed of the bootstrap.
+        risk_free: Returns of cash, shape (periods,), which Sharpe and Sortino ratios subtract
             (default: 0).
 
     Raises:
@@ -257,7 +257,7 @@ def _relative(
     resamples: int,
     seed: int,
 ) -> dict[str, dict[str, Measure]]:
-    """Measures to the reference of all but itself and its rebalancings, by strategy."""
+    """Measures relative to the reference, by strategy; not for itself and its rebalancings."""
     names = [
         name
         for name, each in strategies.items()
@@ -274,7 +274,7 @@ def _relative(
         for ours, weights in ((tracks[name][0], strategies[name].weights) for name in names)
     ]
     observed = relative(np.concatenate(returns), theirs, periods_per_year, np.concatenate(shares))
-    # With the seeds in an order of their own, as above.
+    # With the seeds in their canonical order, as above.
     orders = [_seed_order(tracks[name]) for name in names]
     returns, shares = (
         [each[order] for each, order in zip(tables, orders, strict=True)]
@@ -303,7 +303,7 @@ def _relative(
 def _sharpe_test(
     returns: Floats, sharpe: float, trials: int, variance: float, periods_per_year: float
 ) -> SharpeTest:
-    """The tests of a Sharpe ratio, given returns of shape (seeds, periods) and its annual mean."""
+    """The tests of an annual Sharpe ratio, the mean over seeds; returns: (seeds, periods)."""
     year = math.sqrt(periods_per_year)
     periods = returns.shape[1]
     moments = skewness_and_kurtosis(returns)
@@ -338,7 +338,7 @@ def _common_block(series: list[Floats]) -> float:
 
 
 def _canonical(track: Floats) -> Floats:
-    """The seeds sorted by their values: (3, seeds, periods)."""
+    """A track with its seeds sorted by their values, shape (3, seeds, periods)."""
     return track[:, _seed_order(track)]
 
 

@@ -1,4 +1,4 @@
-"""What the strategies of a backtest are compared with, and the names of the user's own."""
+"""The benchmark of a backtest, and the user's own strategies by name."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,9 +20,9 @@ _NAME = re.compile(r"[A-Za-z0-9.&+%(-][\w.&+%()/:, -]{0,59}")
 
 
 class Field(NamedTuple):
-    """The strategies beside the agents.
+    """The strategies other than agents.
 
-    benchmark: the name of one of them. baselines: as they are registered. own: by name.
+    benchmark: the name of one of them. baselines: names as registered. own: the user's, by name.
     """
 
     benchmark: str
@@ -43,9 +43,9 @@ def field_of(
         prices: The table of the backtest.
         agents: Names of the agents.
         baselines: Names of the baselines; equal weights are added.
-        strategies: Sources of the user's own by name, as ``read_own`` takes them.
+        strategies: Sources of the user's own strategies by name, as ``read_own`` takes them.
         benchmark: The name of one of them, of a baseline or of an asset, which is then bought and
-            held; or a source of its own (default: equal weights).
+            held; or another source (default: equal weights).
 
     Raises:
         QfolioError: A name cannot be used or is used twice, a source cannot be read, or the
@@ -64,7 +64,7 @@ def field_of(
         of_agent = name.rpartition("/")[0] in agents  # a column of returns.csv
         if name in taken or name in own or of_agent or name.startswith(f"{EQUAL_WEIGHT} at "):
             raise QfolioError(
-                f"The backtest has a strategy {name} already; give yours another name."
+                f"The backtest already has a strategy {name}; give yours another name."
             )
         own[name] = source if isinstance(source, Own) else read_own(name, source, prices)
 
@@ -91,7 +91,7 @@ def field_of(
     if not Path(name).exists():
         known = [*own, *BASELINES, *prices.assets]
         raise QfolioError(
-            f"The benchmark {quote(name)} is no strategy of the backtest, no asset and no "
+            f"The benchmark {quote(name)} is not a strategy of the backtest, an asset or a "
             f"file{hint(name, known)}."
         )
     add(Path(name).stem, Path(name))

@@ -24,7 +24,7 @@ LEVEL = 0.95
 
 _CHUNK = 2_000_000  # resampled days held at a time: tens of megabytes, whatever the resamples
 
-_TOGETHER = 100  # least histories at a time, because each chunk loops over all days in Python
+_TOGETHER = 100  # fewest histories at a time, because each chunk loops over all days in Python
 
 
 def block_length(series: ArrayLike) -> float:
@@ -98,7 +98,7 @@ def histories(
 
     Yields:
         Their days, and how often each day was drawn, both of shape (some, periods). Averages over a
-        history depend on the latter alone, so they are one matrix product.
+        history depend only on the latter, so they are one matrix product.
     """
     chunk = max(_TOGETHER, _CHUNK // periods)
     for start in range(0, resamples, chunk):

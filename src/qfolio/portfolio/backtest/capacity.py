@@ -25,15 +25,15 @@ class Capacity(NamedTuple):
 
 
 def capacity(replay: Replay, entries: Mapping[str, Entry], reference: str) -> Capacity | None:
-    """The same orders with other capitals, of the strategies that are judged and the reference.
+    """Net growth of the same orders with other capitals, for judged strategies and the reference.
 
-    Orders are not learned again: a policy that trades for a small account trades too much for a
+    Policies are not trained again: one that was trained for a small account trades too much for a
     large one. None if no cost depends on the capital.
 
     Args:
         replay: The rules of the backtest.
         entries: Its strategies.
-        reference: What they are compared with.
+        reference: The name of the strategy that they are compared with.
     """
     costs = replay.task.costs
     if not isinstance(costs, Itemized) or not costs.depends_on_wealth:

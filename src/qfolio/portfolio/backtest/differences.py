@@ -1,4 +1,4 @@
-"""Differences of strategies on the same days: intervals, p-values and corrected findings.
+"""Differences between strategies on the same days: intervals, p-values and corrected findings.
 
 Agents, ensembles and the user's own strategies are tested in growth, Sharpe ratio and volatility
 against the reference, which was chosen in advance, and against the reference at its best speed of
@@ -6,8 +6,8 @@ rebalancing, which is known only in hindsight; and in growth against the best ba
 of the user's own), likewise. The tests account for such a choice: beating the best means beating
 all that it was chosen from, so the largest of their p-values applies (an intersection–union test,
 Berger 1982); falling short of the best has the p-value of White's reality check (2000), which asks
-how far ahead the luckiest of them would be if none were better. Holm's correction for all of these
-comparisons decides.
+how far ahead the luckiest of them would be if none were better. P-values with Holm's correction for
+all of these comparisons decide on findings.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from qfolio.portfolio.backtest.estimates import (
 from qfolio.portfolio.backtest.measures import Floats, Range
 
 DRAWS = 10_000
-"""Draws of the luckiest rival."""
+"""Number of draws of the luckiest rival."""
 
 Finding = Literal["better", "worse", "none"]
 
@@ -44,7 +44,7 @@ class Contrast:
     value: float
     interval: Range
     p: float | None = None  # two-sided; accounts for a choice in hindsight
-    p_holm: float | None = None  # corrected for all comparisons of the backtest; decides
+    p_holm: float | None = None  # corrected for all comparisons of the backtest; sets finding
     finding: Finding | None = None
 
 
@@ -68,9 +68,9 @@ class Difference:
 
 @dataclasses.dataclass(frozen=True)
 class Rival:
-    """What strategies are compared with: the best of some that are alike.
+    """What strategies are compared with: the best of a family.
 
-    name: which of them is shown. among: all of them, itself included. tested: in which measures.
+    name: the one that is shown. among: the family, itself included. tested: in which measures.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Rival:
     tested: tuple[Measured, ...] = MEASURED
 
     def without(self, name: str) -> tuple[str, ...]:
-        """All of them but one, which may be what is compared."""
+        """The family without one strategy, which may be the one that is compared."""
         return tuple(other for other in self.among if other != name)
 
 
@@ -96,12 +96,12 @@ def compare(
         returns: Simple returns of shape (seeds, periods), by strategy.
         rivals: The rivals, by their role.
         judged: Which strategies are tested.
-        periods_per_year: For example 252 for days of trading.
+        periods_per_year: For example 252 for trading days.
         seed: Seed of the draws.
-        risk_free: Returns of cash, shape (periods,), which Sharpe ratios leave out (default: 0).
+        risk_free: Returns of cash, shape (periods,), which Sharpe ratios subtract (default: 0).
 
     Returns:
-        Differences by role and strategy, but none of a rival to itself.
+        Differences by role and strategy, without those of a rival to itself.
     """
     tails: dict[tuple[str, str, Measured], Tails] = {}
     differences: dict[str, dict[str, Difference]] = {role: {} for role in rivals}
@@ -142,7 +142,7 @@ def compare(
 def estimates(
     ours: Floats, theirs: Floats, periods_per_year: float, risk_free: Floats | None
 ) -> dict[Measured, Estimate]:
-    """The differences of a pair, with Sharpe ratios of the returns over cash."""
+    """The differences of a pair, with Sharpe ratios of returns in excess of cash."""
     found = estimate(ours, theirs, periods_per_year)
     if risk_free is None:
         return found
@@ -154,11 +154,11 @@ def estimates(
 def tails_to(
     shown: Estimate, among: Sequence[Estimate], more: bool, rng: np.random.Generator
 ) -> Tails:
-    """P-values that a strategy is not better, and not worse, than the best of several.
+    """P-values of the claims that a strategy is better, and worse, than the best of several.
 
     Args:
-        shown: Its difference to the one that is shown as the best.
-        among: Its differences to all of them.
+        shown: Its difference from the one that is shown as the best.
+        among: Its differences from all of them.
         more: Whether more is better.
         rng: Source of randomness.
     """

@@ -94,7 +94,7 @@ class Estimate(NamedTuple):
 
 
 def estimate(ours: Floats, theirs: Floats, periods_per_year: float) -> dict[Measured, Estimate]:
-    """Estimate our differences to another strategy, all annual.
+    """Estimate the differences of one strategy from another, all annual.
 
     Growth: the mean of the difference in log returns. Sharpe ratio: the delta method of Ledoit &
     Wolf (2008), "Robust performance hypothesis testing with the Sharpe ratio". Volatility: the log
@@ -105,7 +105,7 @@ def estimate(ours: Floats, theirs: Floats, periods_per_year: float) -> dict[Meas
     Args:
         ours: Simple returns of shape (seeds, periods).
         theirs: Likewise, with the same periods; usually one seed.
-        periods_per_year: For example 252 for days of trading.
+        periods_per_year: For example 252 for trading days.
     """
     year = math.sqrt(periods_per_year)
     logs = paired_difference(log_growth(ours), log_growth(theirs).mean(axis=0))
@@ -133,7 +133,7 @@ def luckiest(family: list[Estimate], draws: int, rng: np.random.Generator) -> Fl
 
     Args:
         family: Estimates on the same days and with the same seeds.
-        draws: How many to draw.
+        draws: Number of draws.
         rng: Source of randomness.
 
     Returns:

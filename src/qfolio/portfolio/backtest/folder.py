@@ -178,7 +178,7 @@ class BacktestFolder:
         self.write_prices(prices, trained)
 
     def read_config(self) -> BacktestConfig:
-        """Raises QfolioError if the folder holds no backtest of this version."""
+        """The configuration; raises QfolioError if the folder holds no backtest of this version."""
         return read_config(self.path / "config.json", BacktestConfig)
 
     def read_prices(self, config: BacktestConfig) -> tuple[Prices, list[tuple[int, int]]]:
@@ -206,7 +206,7 @@ class BacktestFolder:
         except (KeyError, TypeError, ValueError, QfolioError) as error:
             raise QfolioError(f"{path} is damaged ({error}); restore it or start over.") from None
         if first.digest != config.prices["digest"]:
-            raise QfolioError(f"{path} does not belong to config.json beside it; restore the two.")
+            raise QfolioError(f"{path} does not belong to config.json beside it; restore both.")
         return prices, [(int(n), int(rows)) for n, rows in arrays.get("trained", ())]
 
     def policies(self, agent: str) -> list[str]:
@@ -230,8 +230,7 @@ class BacktestFolder:
             }
         except KeyError:
             raise QfolioError(
-                f"{self.path / STRATEGIES} does not belong to config.json beside it; restore the "
-                "two."
+                f"{self.path / STRATEGIES} does not belong to config.json beside it; restore both."
             ) from None
 
     def has_policy(self, agent: str, fold: str) -> bool:
@@ -259,7 +258,7 @@ class BacktestFolder:
             raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
 
     def write_returns(self, days: Sequence[str], columns: dict[str, np.ndarray]) -> None:
-        """returns.csv, a column per strategy and seed."""
+        """Writes returns.csv, with a column per strategy and seed."""
         rows = zip(days, *(column.tolist() for column in columns.values()), strict=True)
         write_csv(self.path / "returns.csv", ["date", *columns], rows)
 
@@ -284,10 +283,10 @@ class BacktestFolder:
         assets: Sequence[str],
         weights: dict[str, np.ndarray],
     ) -> None:
-        """weights.csv: after each row's trade, cash first, of each strategy.
+        """Writes weights.csv: each strategy's weights after each row's trade, cash first.
 
-        Where that would be too much, after the last trade of each day or month. days: the dates as
-        text.
+        If these are too many, only those of the last row of each day or month are written. days:
+        the dates as text.
         """
         rows = rows_written(dates, len(weights) * (1 + len(assets)))
         lines = (
@@ -302,7 +301,7 @@ class BacktestFolder:
         write_json(self.path / "summary.json", summary)
 
     def read_measures(self) -> dict[str, dict[str, float]]:
-        """The measures of each strategy (means over seeds); none before there is a summary."""
+        """The measures of each strategy (means over seeds); empty before there is a summary."""
         path = self.path / "summary.json"
         if not path.exists():
             return {}
@@ -321,7 +320,7 @@ class BacktestFolder:
         write_json(self.path / "why.json", content)
 
     def read_why(self) -> dict[str, Any]:
-        """Raises QfolioError if the file is missing or holds no JSON object."""
+        """The content of why.json; raises QfolioError if it is missing or not a JSON object."""
         return read_json(self.path / "why.json")
 
     def _policy(self, agent: str, fold: str) -> Path:

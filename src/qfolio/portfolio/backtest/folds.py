@@ -23,7 +23,7 @@ class Fold(NamedTuple):
     def complete(self, values: np.ndarray) -> "Fold":
         """The fold, with a training window in which all of its tradable assets have prices."""
         gaps = np.isnan(values[self.train][:, self.tradable(values)]).any(1)
-        begin = self.train.start + int(gaps.sum())  # prices are missing before a start only
+        begin = self.train.start + int(gaps.sum())  # prices are missing only before a first one
         return self._replace(train=slice(begin, self.train.stop))
 
 
@@ -33,9 +33,9 @@ def walk_forward(
     """Consecutive folds, without gaps between their returns.
 
     Training ends at the row of the first decision. A decision at row t earns the return to row
-    t + lag + 1, so the last lag + 1 decisions are purged and no reward is earned later. Windows of
-    observations lie within the training window. The first fold trains on the first rows of the
-    table; with ``expanding``, later folds keep that start.
+    t + lag + 1, so the last lag + 1 decisions are purged, and training earns no later reward.
+    Windows of observations lie within the training window. The first fold trains on the first rows
+    of the table; with ``expanding``, later folds keep that start.
 
     Args:
         dates: Shape (row,), ascending.
@@ -69,7 +69,7 @@ def walk_forward(
 
 
 def require_fold(dates: np.ndarray, train: str, test: str, lag: int) -> None:
-    """Raise QfolioError unless a table has rows for training and one whole fold.
+    """Raises QfolioError unless a table has rows for training and one whole fold.
 
     The last row may be a holiday, a weekend or one period early.
     """
@@ -118,7 +118,7 @@ def spell_all(some: np.ndarray, dates: np.ndarray) -> list[str]:
 
 
 def parse_length(text: str) -> tuple[int, str]:
-    """Number and unit (y, m, w or d) of a length such as "5y"."""
+    """Number and unit (y, m, w or d) of a length such as "5y"; raises QfolioError for others."""
     match = re.fullmatch(r"\s*([0-9]{1,5})\s*([ymwd])\s*", text)
     if match is None or int(match[1]) == 0:
         raise QfolioError(f"A length is {text!r}; it must be like 5y, 6m, 8w or 500d (rows).")

@@ -1,4 +1,4 @@
-"""What no constant weights could have exceeded: a bound, which nobody could have followed."""
+"""The growth that no constant weights could have exceeded: a bound, known only in hindsight."""
 
 import math
 

@@ -40,7 +40,7 @@ class Kept:
         return self.folder.policies(agent)
 
     def updates(self, agent: str) -> int:
-        """Updates of an agent's newest policy for tomorrow; -1 before it has one."""
+        """Number of updates of an agent's newest policy for tomorrow; −1 before it has one."""
         return max(map(updates_of, self.names(agent)), default=-1)
 
     def newest(self, agent: str) -> str:
@@ -71,7 +71,7 @@ class Kept:
         self.write_policy(agent, fold, policy)
 
     def write_policy(self, agent: str, fold: str, policy: Any) -> None:
-        """Keeps a policy alone."""
+        """Keeps a policy, without records of training."""
         if self.folder is None:
             self._policies[agent, fold] = policy
         else:
@@ -84,7 +84,7 @@ def tomorrow(updates: int) -> str:
 
 
 def updates_of(name: str) -> int:
-    """The updates of a policy for tomorrow; -1 for that of a fold."""
+    """Number of updates of a policy for tomorrow; −1 for the policy of a fold."""
     match = _UPDATED.fullmatch(name)
     return int(match[1]) if match else -(name != LATEST)
 

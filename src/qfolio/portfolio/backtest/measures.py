@@ -32,7 +32,7 @@ def measures(
         returns: Simple returns net of costs, shape (..., periods), each at least −1.
         turnover: Value bought plus value sold, over wealth, same shape.
         cost: Share of wealth that a period's trade cost, at least 0 and below 1, same shape.
-        periods_per_year: For example 252 for days of trading.
+        periods_per_year: For example 252 for trading days.
         risk_free: Returns of cash, shape (periods,) (default: 0).
 
     Returns:
@@ -40,10 +40,10 @@ def measures(
 
         - growth: geometric mean, as a simple annual rate; a total loss gives −1;
         - volatility: standard deviation (n − 1) of the returns;
-        - sharpe: mean over standard deviation, of returns over cash;
+        - sharpe: mean over standard deviation, of returns in excess of cash;
         - sortino: mean over the downside deviation, the root mean square of min(return, 0), of
-          returns over cash;
-        - drawdown: the maximum drawdown below an earlier peak (or the start), between 0 and 1;
+          returns in excess of cash;
+        - drawdown: the maximum drawdown from an earlier peak (or the start), between 0 and 1;
         - calmar: growth over drawdown;
         - turnover: mean times periods per year;
         - cost_drag: growth without costs minus growth with them, where a return without costs is
@@ -105,7 +105,7 @@ def monthly(returns: ArrayLike, dates: ArrayLike) -> tuple[list[int], Floats]:
 def per_period(track: Floats, center: Floats, free: Floats | None) -> Floats:
     """Quantities whose means over time give all measures but the drawdown: (7, ..., periods).
 
-    With returns of cash there are 9; the downside is that of returns over them.
+    With returns of cash there are 9, and the downside is that of returns in excess of cash.
     """
     returns, turnover, cost = track
     deviation = returns - center[..., None]  # centered, or the variance would lose precision
@@ -128,6 +128,7 @@ def from_moments(
     periods: int,
     periods_per_year: float,
 ) -> dict[str, Floats]:
+    """The measures from the means of ``per_period`` and the maximum drawdowns."""
     deviation, square, downside, log_net, log_free, ruined, turnover, *of_excess = moments
     bessel = periods / (periods - 1) if periods > 1 else math.nan
     spread = np.sqrt(bessel * _variance(square, deviation, center))
@@ -164,6 +165,7 @@ def _variance(square: Floats, deviation: Floats, center: Floats) -> Floats:
 
 
 def ratio_or_zero(above: ArrayLike, below: ArrayLike) -> Floats:
+    """A ratio, which is 0 for 0/0 and infinite for other divisions by 0."""
     above, below = np.broadcast_arrays(above, below)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where((above == 0) & (below == 0), 0.0, np.divide(above, below))
@@ -191,8 +193,8 @@ def log_growth(returns: Floats) -> Floats:
 def deepest_drawdown(steps: Floats, days: NDArray[np.int32]) -> Floats:
     """The maximum drawdown of every resampled history.
 
-    Goes through time once, for all histories and series at a time, and stores no path: relative to
-    its peak, log wealth follows depth ← min(depth + log return, 0).
+    It goes through time once, for all histories and series together, and stores no path: relative
+    to its peak, log wealth follows depth ← min(depth + log return, 0).
 
     Args:
         steps: Log returns of shape (periods, series).
@@ -240,12 +242,12 @@ def checked_risk_free(risk_free: ArrayLike | None, periods: int) -> Floats | Non
     return free if free.any() else None
 
 
-# The least and the greatest value; rounding may leave a turnover or a cost slightly below zero.
+# Smallest and largest values; rounding may leave a turnover or a cost slightly below zero.
 _BOUNDS = {"returns": (-1.0, 1e100), "turnover": (-1e-9, 1e100), "cost": (-1e-9, 1 - 1e-9)}
 
 
 def _checked_series(name: str, values: ArrayLike, who: str = "the track record") -> Floats:
-    """Numbers within their bounds, at least one along the last axis, or a QfolioError."""
+    """Checked numbers; raises QfolioError if there are none, or one is missing or out of range."""
     try:
         array = np.asarray(values, dtype=float)
     except (ValueError, TypeError):
@@ -264,6 +266,7 @@ def _checked_series(name: str, values: ArrayLike, who: str = "the track record")
 
 
 def checked_dates(dates: ArrayLike, periods: int) -> NDArray[np.datetime64]:
+    """Dates of shape (periods,); raises QfolioError unless they increase strictly."""
     try:
         days = np.asarray(dates, dtype="datetime64[s]")
     except (ValueError, TypeError):

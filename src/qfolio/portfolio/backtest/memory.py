@@ -16,11 +16,11 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
 MENTIONED = 2**30
-"""Bytes from which a user is told beforehand."""
+"""Bytes from which on a user is told beforehand."""
 
 
 def needed(prices: Prices, config: BacktestConfig) -> int:
-    """About the bytes that a backtest has in memory at once, beside what training takes."""
+    """About how many bytes a backtest has in memory at once, besides those that training takes."""
     folds = walk_forward(prices.dates, config.train, config.test, config.lag, config.expanding)
     days = folds[-1].decisions.stop - folds[0].decisions.start
     channels = [
@@ -38,15 +38,15 @@ def needed(prices: Prices, config: BacktestConfig) -> int:
 def total(
     rows: int, days: int, assets: int, channels: Sequence[int], seeds: int, others: int
 ) -> int:
-    """The bytes, from the sizes of everything.
+    """The number of bytes, from the sizes of everything.
 
     Args:
         rows: Rows of the price table.
         days: Days of the test.
         assets: Assets in the table.
-        channels: Channels that each agent observes of an asset, an entry for each agent.
-        seeds: Agents of each kind.
-        others: Strategies that are not trained.
+        channels: Number of channels of an asset that an agent observes, an entry for each agent.
+        seeds: Number of agents of each kind.
+        others: Number of strategies that are not trained.
     """
     table, path = rows * assets, days * (assets + 1)
     values = 3 * 8 * table  # prices as read, as relatives, and as baselines see them
@@ -59,7 +59,7 @@ def total(
 
 
 def require(prices: Prices, config: BacktestConfig) -> None:
-    """Raises QfolioError if the machine has less memory than is needed."""
+    """Raises QfolioError if the machine has less memory than the backtest needs."""
     there, wanted = devices.host_memory(), needed(prices, config)
     if there is not None and wanted > there:
         raise QfolioError(

@@ -69,16 +69,16 @@ def orders(
         tradable: Which assets a fold may hold, of shape (folds, N) (default: those with prices in
             all of its training rows).
         cap: Largest weight of one asset when it is ordered.
-        feasible: The weights that a mandate allows, given the number of a fold and a row. Targets
-            are projected onto them at every row at which there is one; a target of the calendar
-            "fold" is one of every row.
+        feasible: The weights that a mandate allows, given the number of a fold and a row. Every
+            target is projected onto them; with the calendar "fold", there is one at every row.
         month: Rows in a month.
-        terms: When orders are given and how they are filled, in numpy; rows for decisions take the
-            place of the baseline's calendar.
+        terms: When orders are given and how they are filled, in numpy; its rows for decisions
+            replace the baseline's calendar.
         universe: Which assets may be bought at each row, of shape (rows, N), if they come and go.
-            One that estimates may hold those of them with prices in all of the fold's training
-            rows. A target of the calendar "fold" is asked for at every row.
-        listed: Which assets have a price at each row, likewise; what is delisted is held as cash.
+            A baseline that estimates may hold only those of them with prices in all of the fold's
+            training rows. With the calendar "fold", it then decides at every row.
+        listed: Which assets have a price at each row, of the same shape; holdings of delisted
+            assets become cash.
 
     Returns:
         Decisions for all rows of the folds, and notes that name the fold.
@@ -103,7 +103,7 @@ def orders(
         decides = terms.decides if len(terms.decides) else None
         asked = set(_asked(baseline, rows, folds[0].decisions.start, month, decides))
         trading = np.ones(len(rows), bool) if decides is None else decides[fold.decisions]
-        stands = baseline.calendar == "fold"  # its target is one of every row
+        stands = baseline.calendar == "fold"  # its target holds for every row
         each = universe is not None and stands
         asked |= {row for row in rows if each and (decides is None or decides[row])}
         again = stands and (feasible is not None or terms.band > 0)

@@ -24,7 +24,7 @@ Kind = Literal["weights", "returns", "levels"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 OLDEST = np.timedelta64(7, "D")
-"""How long a level stands for the rows after it, which bridges holidays of other exchanges."""
+"""How long a level is carried forward to later rows, which bridges holidays of other exchanges."""
 
 Dates = NDArray[np.datetime64]
 Rows = NDArray[np.intp]
@@ -34,10 +34,10 @@ Rows = NDArray[np.intp]
 class Own:
     """A strategy as it was given.
 
-    kind: "weights": targets at the close of a date, executed with the backtest's lag and costs;
-        between them there is no order. "returns": net already. "levels": of an index.
+    kind: "weights": targets at the close of a date, executed with the backtest's lag and costs,
+        with no orders in between. "returns": net returns. "levels": those of an index.
     dates: increasing, of shape (k,).
-    values: of shape (k, N + 1) for weights, cash first; else of shape (k,).
+    values: of shape (k, N + 1) for weights, cash first; otherwise of shape (k,).
     """
 
     kind: Kind
@@ -49,7 +49,7 @@ class Own:
 class Placed:
     """A strategy on the days of a test, with sentences for the report.
 
-    decisions: (D, N + 1), cash first, NaN for no order. returns: (D,), if it has no weights.
+    decisions: (D, N + 1), cash first, NaN for no order. returns: (D,); None if it has weights.
     """
 
     decisions: Floats
@@ -69,8 +69,8 @@ def place(name: str, own: Own, prices: Prices, days: slice, task: Portfolio, cap
     """Put a strategy on the days of a test.
 
     A date without a row of prices counts at the next row, so that nothing is known too early.
-    Before its first order a strategy holds cash. If that order is older than the test, the test
-    begins with an order of what it has drifted to.
+    Before its first order a strategy holds cash. If it has an order before the test, the test
+    begins with an order for the weights that this has drifted to.
 
     Args:
         name: Name of the strategy, for messages.
@@ -190,7 +190,11 @@ def _require_long_only(name: str, own: Own) -> None:
 
 
 def rows_at(name: str, dates: Dates, prices: Prices) -> tuple[Rows, Dates]:
-    """The rows at which dates count, the number of rows if they are later, and those in between."""
+    """The row at which each date counts, and the dates that have no row of their own.
+
+    A date after the last row has the number of rows. Raises QfolioError if a date without a row is
+    given for a table with several rows a day.
+    """
     ours, days = prices.dates, dates.astype("datetime64[D]")
     by_day = ours.astype("datetime64[D]")
     if (by_day[1:] > by_day[:-1]).all():
@@ -201,20 +205,20 @@ def rows_at(name: str, dates: Dates, prices: Prices) -> tuple[Rows, Dates]:
     known = rows < len(ours)
     if (other := dates[known][ours[rows[known]] != dates[known]]).size:
         raise QfolioError(
-            f"{name}: {str(other[0]).replace('T', ' ')} is no row of the prices; where a day has "
-            "several rows, give the time of one of them."
+            f"{name}: {str(other[0]).replace('T', ' ')} is not a row of the prices; where a day "
+            "has several rows, give the time of one of them."
         )
     return rows, dates[:0]
 
 
 def _returns(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
-    """Returns as they are given."""
+    """Returns on the days of the test, as they are given."""
     rows, moved = rows_at(name, own.dates, prices)
     first, last = prices.dates[earned][[0, -1]].astype("datetime64[D]")
     if (inside := moved[(moved > first) & (moved < last)]).size:
         raise QfolioError(
-            f"{name} has a return on {inside[0]}, which is no row of the prices; give a return for "
-            "each row, from one row to the next."
+            f"{name} has a return on {inside[0]}, which is not a row of the prices; give a return "
+            "for each row, from one row to the next."
         )
     at = np.full(len(prices) + 1, np.nan)
     at[rows] = own.values
@@ -229,7 +233,7 @@ def _returns(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
 
 
 def _growth(name: str, own: Own, prices: Prices, earned: slice) -> Floats:
-    """Returns between the last levels that were known at each row."""
+    """Returns on the days of the test, from the last levels that were known at each row."""
     rows = prices.dates[earned.start - 1 : earned.stop]
     dates = own.dates
     if (dates == dates.astype("datetime64[D]")).all():

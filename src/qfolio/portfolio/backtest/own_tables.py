@@ -1,7 +1,7 @@
 """Reads strategies of the user's own from files, data frames and arrays.
 
-The columns say what a table holds: target weights (a column an asset, and perhaps cash; or the
-columns date, asset and weight), orders in shares, returns, or the levels of an index.
+The columns say what a table holds: target weights (a column per asset, and perhaps one for cash; or
+the columns date, asset and weight), orders in shares, returns, or the levels of an index.
 """
 
 from typing import Any
@@ -26,10 +26,10 @@ RETURN_NAMES = ("return", "returns", "ret", "net return", "net returns", "daily 
 WEIGHT_NAMES = ("weight", "weights", "target", "target weight")
 
 ROUNDING = 1e-3
-"""How far a row of weights may be off a sum of 1, as rounded weights are; it is then scaled."""
+"""How far the sum of rounded weights may be from 1; they are then scaled to it."""
 
 FORMS = (
-    "A strategy is a table of weights (date, and a column an asset), of orders in shares (date, "
+    "A strategy is a table of weights (date, and a column per asset), of orders in shares (date, "
     "asset, shares), of returns (date, return) or of an index (date, level)."
 )
 
@@ -45,8 +45,8 @@ def read_own(name: str, source: Any, prices: Prices) -> Own:
         prices: The table.
 
     Raises:
-        QfolioError: The source cannot be read, its columns are those of no such table, weights do
-            not sum to 1 with cash, or a cell is missing or cannot be read.
+        QfolioError: The source cannot be read, its columns fit no such table, weights do not sum to
+            1 with cash, or a cell is missing or cannot be read.
     """
     try:
         if isinstance(source, list | tuple) or type(source).__module__.partition(".")[0] in (
@@ -112,7 +112,7 @@ def _levels(
         index = load(source)
     except QfolioError as error:
         if len(others) == 1:
-            raise QfolioError(f"the column {quote(unknown[0])} is no index: {error}") from None
+            raise QfolioError(f"the column {quote(unknown[0])} is not an index: {error}") from None
         index = None
     if index is None or len(index.assets) > 1:
         raise QfolioError(
@@ -156,12 +156,12 @@ def _long_weights(table: Table, when: int, asset: int, weight: int, prices: Pric
                 f"{where}: the prices have no asset {quote(name)}{hint(name, prices.assets)}."
             )
         if not np.isnan(weights[place[i], known + 1]):
-            raise QfolioError(f"{where}: {quote(name)} appears twice; give it one weight a date.")
+            raise QfolioError(f"{where}: {quote(name)} appears twice; give one weight per date.")
         weights[place[i], known + 1] = found[i]
     named = ~np.isnan(weights[:, 0])
     if named.any() and not named.all():
         moment = day(moments[int((~named).argmax())])
-        raise QfolioError(f"{moment} has no weight of cash, other dates have one; add it.")
+        raise QfolioError(f"{moment} has no weight of cash, but other dates have one; add it.")
     cash = weights[:, 0] if named.any() else None
     held = np.nan_to_num(weights[:, 1:])
     return Own("weights", moments, _with_cash(held, cash, [day(moment) for moment in moments]))
@@ -170,8 +170,8 @@ def _long_weights(table: Table, when: int, asset: int, weight: int, prices: Pric
 def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Prices) -> Own:
     """Weights at each date with an order, from cash that is paid in and shares that are traded.
 
-    Shares count at the close of the row that decides; what costs and the lag change is not known
-    yet.
+    Shares are valued at the close of the row that decides; the effects of costs and of the lag are
+    not known yet.
     """
     dates = _dates(table, when)
     traded = _numbers(table, shares, dates)
@@ -206,8 +206,8 @@ def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Pric
         values = np.append(cash, holding * np.nan_to_num(close))
         if not values.sum() > 0:
             raise QfolioError(
-                f"its holding of {day(prices.dates[row])} is worth {values.sum():,.2f}; give the "
-                "money that it begins with as the shares of cash, in a row of the first date."
+                f"its holding on {day(prices.dates[row])} is worth {values.sum():,.2f}; give the "
+                "money that it begins with as shares of cash, in a row of the first date."
             )
         moments.append(prices.dates[row])
         weights.append(values / values.sum())
@@ -217,7 +217,7 @@ def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Pric
 
 
 def _asset(name: str, prices: Prices) -> int | None:
-    """The place of an asset, −1 for cash, None if it is unknown."""
+    """The index of an asset, −1 for cash, None if it is unknown."""
     if name in prices.assets:
         return prices.assets.index(name)
     return -1 if plain(name) == CASH else None
@@ -235,7 +235,7 @@ def _dates(table: Table, column: int) -> np.ndarray:
 def _numbers(
     table: Table, column: int, rows: np.ndarray, blank: np.ndarray | None = None
 ) -> Floats:
-    """The numbers of a column; none may be missing, but where a whole row is blank."""
+    """The numbers of a column; none may be missing, except where a whole row is blank."""
     cells = table.columns[column]
     values, wrong = numbers(cells, table.decimal)
     missing = np.isnan(values) & ~wrong
@@ -251,19 +251,19 @@ def _numbers(
 
 
 def _increasing(rows: np.ndarray, table: Table) -> np.ndarray:
-    """The order of rows by date, each different."""
+    """The order of rows by date; raises QfolioError if a date appears twice."""
     order = np.argsort(rows, kind="stable")
     again = np.flatnonzero(rows[order][1:] == rows[order][:-1])
     if again.size:
         row = int(order[again[0] + 1])
         raise QfolioError(
-            f"row {table.first_row + row}: {day(rows[row])} appears twice; keep one row a date."
+            f"row {table.first_row + row}: {day(rows[row])} appears twice; keep one row per date."
         )
     return order
 
 
 def _with_cash(weights: Floats, cash: Floats | None, spelled: list[str]) -> Floats:
-    """Weights of shape (k, N) with cash, or what they leave, as (k, N + 1) with sums of 1."""
+    """Weights of shape (k, N) and cash (default: the rest), as (k, N + 1) with sums of 1."""
     total = weights.sum(axis=1)
     rest = 1 - total if cash is None else cash
     if cash is None:

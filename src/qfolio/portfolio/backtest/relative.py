@@ -1,4 +1,4 @@
-"""Measures of a track record beside a benchmark: active return, tracking error, beta, captures."""
+"""Measures of a track record against a benchmark: active return, tracking error, beta, capture."""
 
 import math
 
@@ -24,20 +24,20 @@ def relative(
     periods_per_year: float,
     share: ArrayLike | None = None,
 ) -> dict[str, Floats]:
-    """Compute measures of track records beside a benchmark, annualized where it says so.
+    """Compute measures of track records against a benchmark, annualized where it says so.
 
     Args:
         returns: Simple returns of shape (..., periods).
         benchmark: Simple returns of the benchmark, of shape (periods,).
-        periods_per_year: For example 252 for days of trading.
+        periods_per_year: For example 252 for trading days.
         share: The active share by period, of the shape of the returns; NaN where it is not known
             (default: nowhere).
 
     Returns:
         One array of shape (...) for each name in ``RELATIVE``:
 
-        - active_return: mean of the differences in returns, a year;
-        - tracking_error: their standard deviation (n − 1), a year;
+        - active_return: mean of the differences in returns, annualized;
+        - tracking_error: their standard deviation (n − 1), annualized;
         - information_ratio: active return over tracking error;
         - beta: covariance with the benchmark over its variance;
         - up_capture, down_capture: geometric mean of the returns over that of the benchmark, in

@@ -34,7 +34,7 @@ from qfolio.portfolio.task import Portfolio
 from qfolio.portfolio.universe import Patterns
 
 BARELY = 1e-3
-"""Risk above a limit by a smaller share of it is rounding."""
+"""Risk that exceeds a limit by a smaller share of it is a rounding error."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Entry:
         return not bool(np.isnan(self.simulation.turnover[0, 0]))
 
     def track(self, days: slice) -> Strategy:
-        """What is assessed of some days."""
+        """The track record over some days, for the assessment."""
         result = self.simulation
         returns = result.returns[:, days]
         if not self.weighted:
@@ -77,10 +77,9 @@ class Stretch(NamedTuple):
 def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: bool) -> np.ndarray:
     """Decisions over all folds, (seed, day, entry); each fold starts with the last one's holding.
 
-    NaN where the calendar has no decision, or nothing is to be traded.
-
-    With ``together`` one portfolio follows the mean of all seeds, and ``seeds`` is 1. The agents
-    see their portfolio in float32; the replay is in float64.
+    They are NaN where the calendar has no decision, or nothing is to be traded. With ``together``,
+    one portfolio follows the mean of all seeds, and ``seeds`` is 1. The agents see their portfolio
+    in float32; the replay is in float64.
     """
     cash = np.eye(1 + len(stretches[0].task.limits))[:1]
     held = begin(stretches[0].task, np.repeat(cash, seeds, 0))
@@ -123,7 +122,7 @@ class Replay:
     cap: float
 
     def left_out(self) -> list[str]:
-        """A note on each fold that leaves out assets, and on those that are delisted."""
+        """A note on each fold that leaves out assets, or one on all that are delisted."""
         listed, assets = self.prices.listed, self.prices.assets
         if self.prices.tradable is not None:
             last = np.ones(len(assets), bool) if listed is None else listed[-1]
@@ -144,9 +143,10 @@ class Replay:
         notes = checks.require(self.task.mandate, every, self.cap)
         if self._patterns is not None and (yields := self._patterns[1]):
             said = ", ".join(yields)
-            notes.append(f"The mandate yields to the assets that can be traded: {said}.")
+            notes.append(f"The mandate is relaxed to fit the assets that can be traded: {said}.")
         return notes + [
-            f"In fold {fold.name} the mandate yields to the assets that can be traded: {said}."
+            f"In fold {fold.name} the mandate is relaxed to fit the assets that can be traded: "
+            f"{said}."
             for fold, (_, lowered) in zip(self.folds, self._relaxed, strict=True)
             for said in lowered
         ]
@@ -263,7 +263,7 @@ class Replay:
         return self.entry(kind, given.decisions[None]), given.notes
 
     def own(self, kind: str, placed: Placed) -> Entry:
-        """A strategy of the user's own; what is not known of returns is NaN."""
+        """A strategy of the user's own; with returns only, all else is NaN."""
         if placed.returns is None:
             return self.entry(kind, placed.decisions[None])
         unknown = np.full((1, len(placed.returns)), np.nan)
@@ -273,7 +273,7 @@ class Replay:
     def others(
         self, baselines: Mapping[str, Baseline], own: Mapping[str, Placed], benchmark: str
     ) -> tuple[dict[str, Entry], list[str]]:
-        """All strategies but the agents, and notes; equal weights as benchmark at every speed."""
+        """All strategies but the agents, and notes; equal weights at every speed as a benchmark."""
         notes: list[str] = []
         entries: dict[str, Entry] = {}
         for name, placed in own.items():
@@ -301,7 +301,7 @@ class Replay:
         return kept(name, entry.decisions[0], entry.simulation.turnover[0], allowed)
 
     def entry(self, kind: str, decisions: np.ndarray, costs: CostModel | None = None) -> Entry:
-        """Decisions of shape (seed, day, entry), carried out; costs: instead of the task's."""
+        """A strategy by its decisions of shape (seed, day, entry); costs: default, the task's."""
         simulation = simulate(
             self.prices.values,
             decisions,

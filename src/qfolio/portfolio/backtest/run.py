@@ -48,7 +48,7 @@ from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
 
 PROPORTIONAL = "proportional"
-"""The cost model, unless one is chosen."""
+"""The default cost model."""
 
 FOLDS_AT_ONCE = 8
 """Folds that train at once if members advance in lockstep; results are kept after each group."""
@@ -72,10 +72,10 @@ class Backtest:
         own: Mapping[str, Own] | None = None,
         trained: Sequence[tuple[int, int]] = (),
     ) -> None:
-        """Args: as ``create`` or ``open`` make them.
+        """Takes its arguments as ``create`` or ``open`` make them.
 
-        trained: for each table so far, the updates of the policies for tomorrow before they were
-            trained on it, and its rows (default: one table).
+        trained: for each table so far, the number of updates of the policies for tomorrow before
+            they were trained on it, and its number of rows (default: one table).
         """
         self._trained = list(trained) or [(0, len(prices))]
         if len(prices) > config.prices["rows"]:
@@ -154,18 +154,19 @@ class Backtest:
             cap: Largest weight of one asset.
             mandate: Limits that all orders obey, of agents and of baselines: a ``Mandate``, the
                 path of a file, or a dictionary of its sections. Its costs, calendar and benchmark
-                hold where the arguments of these names have their defaults.
+                apply where the arguments of these names have their defaults.
             cost_model: Cost of trading and holding, in training and replay: a name of the registry,
                 or your own as ``module:Name``, with its settings as in "itemized(fixed=5)".
             calendar: When all strategies may trade: weekly, monthly, quarterly or yearly, on the
-                first row of each, a number of rows, or "drift:0.05" where some weight is more than
-                0.05 from its target (default: at every row, and baselines by their own calendars).
-                All may trade on the first row of the test.
-            baselines: Names of the baselines, likewise; equal weights are always included.
+                first row of each period; every so many rows; or "drift:0.05", when some weight is
+                more than 0.05 from its target (default: at every row, and baselines by their own
+                calendars). All may trade on the first row of the test.
+            baselines: Names of the registry, or your own as ``module:Name``; equal weights are
+                always included.
             strategies: Strategies of your own by name, as ``own_tables.read_own`` takes them.
             benchmark: What all are compared with, as ``benchmark.field_of`` takes it (default:
                 equal weights).
-            seeds: Agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
+            seeds: Number of agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
             episodes: Training episodes in a fold of each agent without a preset.
             task: Settings of the portfolio task for agents without a preset.
             trials: Earlier trials on these prices, for the deflated Sharpe ratio; those of the
@@ -173,6 +174,10 @@ class Backtest:
             command: The command that started it, for the report.
             title: The report's title (default: agents, table and years).
             out: A new or empty folder; without it nothing is written.
+
+        Raises:
+            QfolioError: There is no agent, a name or a setting is invalid, the arguments do not fit
+                the table, or the machine has too little memory.
         """
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")
@@ -329,7 +334,7 @@ class Backtest:
 
     @property
     def _about(self) -> dict[str, Any]:
-        """What the log says of the backtest."""
+        """What the log says about the backtest."""
         config = self.config
         return {
             "kind": config.kind,
@@ -339,7 +344,7 @@ class Backtest:
         }
 
     def jobs(self, executor: Executor) -> list[FoldsJob]:
-        """The training that is missing, in jobs that fill a worker; each goes to ``store``."""
+        """The training that is missing, in jobs that fill a worker; results go to ``store``."""
         return [job for name in self.agents for job in self._missing(name, executor)]
 
     def store(self, job: Job[dict[str, TrainedFold]], trained: dict[str, TrainedFold]) -> None:
@@ -447,7 +452,7 @@ class Backtest:
             risk_free=self.replay.growth[days, 0] - 1,
         )
         if not self._task_of_all.feasible.long_only:
-            return assessed  # debts may exceed any bound on weights without them
+            return assessed  # accounts with debts may exceed a bound for weights without debts
         bound = constant_bound(self.replay.growth[days], table.periods_per_year)
         return dataclasses.replace(assessed, bound=bound)
 

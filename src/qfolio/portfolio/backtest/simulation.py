@@ -5,8 +5,8 @@ prices of row t. This is an order in shares, scaled to the wealth. It is execute
 row t + lag, after prices have moved both the holding and the order, and the cost of that trade is
 charged to the return of row t + lag + 1.
 
-An account whose debts exceed what it owns is wiped out: its return is −1, and 0 from then on. So is
-one with an order whose debts exceed what it buys by the time of its trade.
+An account whose debts exceed what it owns is wiped out: its return is −1, and 0 from then on. The
+same holds if the debts of its order exceed what the order buys by the time of the trade.
 """
 
 import operator
@@ -36,7 +36,7 @@ ROUNDS = 100
 """Most repetitions until costs and the wealth that they depend on agree."""
 
 MOST = 1 - 1e-6
-"""Largest cost of a trade, as a share of wealth, also if its fees exceed the wealth."""
+"""Largest cost of a trade, as a share of wealth, even if its fees exceed the wealth."""
 
 BLOCK = 60_000
 """Numbers per array in a block: several such arrays fit into a core's cache."""
@@ -110,7 +110,7 @@ def simulate(
         lag: Rows between a decision and its trade, 0 or more.
         start: Weights held at row ``first``, of shape (N + 1,) or (..., N + 1) (default: all cash).
         conditions: The columns of the table that the cost model reads, at the rows of ``values``,
-            and which assets are listed: what is held of others at a trade is cash.
+            and which assets are listed: at a trade, holdings of others are cash.
         long_only: Whether negative weights are refused.
 
     Returns:
@@ -257,7 +257,7 @@ class _Market:
 
 
 def _by_sign(weights: Floats, growth: list[Floats]) -> Floats:
-    """The growth factors of a holding's entries."""
+    """The growth factors of a holding's entries, by the signs of their weights."""
     return growth[0] if len(growth) == 1 else np.where(weights < 0, growth[1], growth[0])
 
 
@@ -279,7 +279,7 @@ def _replay(
     if not given.all():
         raise QfolioError("The start weights are NaN; give weights that sum to 1, or none at all.")
     start = start[..., 0].T
-    # Of the holding at the next trade.
+    # The value of the holding's entries at the next trade.
     worth = start * _by_sign(start, market.moved(np.array(0), np.array(0)))
     latest = np.full((len(orders), 1), -1)  # day of the last order
     wealth, ruined = np.ones((len(orders), 1)), np.zeros((len(orders), 1), bool)
@@ -342,7 +342,7 @@ def _traded(
     """Remainder factors and costs of some days, and the wealth after them, of shape (S, 1).
 
     A trade's costs may depend on the wealth, which earlier trades' costs have lowered. Starting
-    from no costs, each repetition is right for one more day at least, and far sooner in practice.
+    from no costs, each repetition settles at least one more day; in practice, few are needed.
     """
     remainder = np.ones(given.shape)
     for _ in range(ROUNDS if market.costs.depends_on_wealth else 1):

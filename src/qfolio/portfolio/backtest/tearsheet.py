@@ -21,7 +21,7 @@ from qfolio.portfolio.backtest.measures import (
 from qfolio.portfolio.backtest.sharpe import skewness_and_kurtosis
 
 TAIL = 0.05
-"""The share of the worst returns that value at risk and its mean, CVaR, look at."""
+"""Share of returns in the tail beyond the value at risk, whose mean loss is CVaR."""
 
 
 class Fall(NamedTuple):
@@ -39,7 +39,7 @@ def falls(returns: ArrayLike, count: int) -> list[Fall]:
 
     Args:
         returns: Simple returns of shape (periods,).
-        count: The most drawdowns to return.
+        count: Largest number of drawdowns to return.
     """
     depth = drawdown(returns)
     below = np.concatenate([[False], depth > 0, [False]])
@@ -69,8 +69,8 @@ def rolling_sharpe(returns: ArrayLike, window: int, periods_per_year: float) -> 
 
     Args:
         returns: Simple returns of shape (..., periods).
-        window: At least 2.
-        periods_per_year: For example 252 for days of trading.
+        window: Number of returns, at least 2.
+        periods_per_year: For example 252 for trading days.
     """
     (mean, variance), _ = _rolling(np.asarray(returns, dtype=float), None, window)
     ratio = ratio_or_zero(mean, np.sqrt(variance * window / (window - 1)))
@@ -85,7 +85,7 @@ def rolling_beta(returns: ArrayLike, reference: ArrayLike, window: int) -> Float
     Args:
         returns: Simple returns of shape (..., periods).
         reference: Simple returns of the reference, shape (periods,).
-        window: At least 2.
+        window: Number of returns, at least 2.
     """
     other = np.asarray(reference, dtype=float)
     _, covariance = _rolling(np.asarray(returns, dtype=float), other, window)
@@ -97,7 +97,7 @@ def rolling_beta(returns: ArrayLike, reference: ArrayLike, window: int) -> Float
 def effective_number(weights: ArrayLike) -> Floats:
     """Return the effective number of assets: one over the sum of squared shares.
 
-    Shares are those of the assets in what is invested; 0 if all is cash.
+    An asset's share is its part of what is invested. The number is 0 if all is cash.
 
     Args:
         weights: Weights of shape (..., assets + 1), cash first.
@@ -111,11 +111,10 @@ def effective_number(weights: ArrayLike) -> Floats:
 def contributions(
     returns: ArrayLike, weights: ArrayLike, moves: ArrayLike, periods_per_year: float
 ) -> tuple[Floats, float]:
-    """Return what each asset added to the mean return a year, and the rest.
+    """Return what each asset contributed to the annual mean return, and the rest.
 
-    An asset's contribution is the mean of its weight times its return; the rest is what the mean
-    net return lacks: trading costs, and interest and fees if there are any. All parts add up to
-    the arithmetic mean return.
+    An asset's contribution is the mean of its weight times its return. The rest is the mean net
+    return minus all contributions: trading costs, and interest and fees if there are any.
 
     Args:
         returns: Simple net returns of shape (seeds, periods).
@@ -145,7 +144,7 @@ def figures(returns: ArrayLike, dates: ArrayLike, periods_per_year: float) -> di
     Args:
         returns: Simple net returns, of shape (periods,).
         dates: Days on which the returns were earned, shape (periods,), strictly increasing.
-        periods_per_year: For example 252 for days of trading.
+        periods_per_year: For example 252 for trading days.
     """
     values = np.asarray(returns, dtype=float)
     checked_dates(dates, len(values))

@@ -29,10 +29,10 @@ class TrainedFold(NamedTuple):
 class FoldsJob:
     """Trains all seeds of an agent on some folds, as one population.
 
-    agent_name: of the agent in the backtest. folds: their names. tasks: each fold's part of the
-    table. whole: the fold whose states are kept, to learn on from; of the others only weights are,
-    because a state may hold a large replay memory. most: folds of the backtest's largest job; all
-    share its programs.
+    agent_name: the agent's name in the backtest. folds: their names. tasks: each fold's part of the
+    table. whole: the fold whose whole states are kept, so that learning can continue; the others
+    keep only weights, because a state may hold a large replay memory. most: number of folds in the
+    backtest's largest job; all jobs share its programs.
     """
 
     agent_name: str
@@ -50,7 +50,7 @@ class FoldsJob:
 
     @property
     def members(self) -> list[str]:
-        """The names of its members for the log: a seed of a fold each."""
+        """The names of its members for the log, one for each fold and seed."""
         return [f"{fold}, seed {seed}" for fold in self.folds for seed in self.seeds]
 
     def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:

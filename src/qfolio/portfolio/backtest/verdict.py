@@ -32,10 +32,10 @@ def verdicts(assessment: Assessment) -> dict[str, list[str]]:
 
 
 def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
-    """What was found of an agent, without numbers, and the difference that each claim is about.
+    """What was found about an agent, without numbers, and the difference of each claim.
 
-    Claims against the reference come first, one that says the agent grew less before all others. If
-    the agent does not beat the reference at every speed of rebalancing, a claim says so.
+    Claims against the reference come first, and of these, one that says the agent grew less. If the
+    agent does not beat the reference at every speed of rebalancing, a claim says so.
     """
     entry, reference, best = (
         assessment.strategies[name],
@@ -112,7 +112,7 @@ def evidence(difference: Difference, assessment: Assessment) -> str:
 
 
 def shown(key: Measured, contrast: Contrast) -> tuple[float, float, float]:
-    """A difference and its interval as readers see them: that in volatility is a ratio less 1."""
+    """A difference and its interval as readers see them: in volatility, the ratio minus 1."""
     values = (contrast.value, *contrast.interval)
     if key != "volatility":
         return values
@@ -163,13 +163,13 @@ def luck(name: str, strategy: StrategyAssessment) -> str:
 
 
 def bound_sentence(assessment: Assessment) -> str:
-    """What no constant weights could have exceeded; empty if it is not known."""
+    """A sentence on the growth that no constant weights exceeded; empty if it is not known."""
     if assessment.bound is None:
         return ""
     growth = f"{_number(100 * assessment.bound, 1)}%"
     return (
         f"A bound: even without costs, no constant weights grew by more than {growth} a year. "
-        "They are known only in hindsight, so nobody could have followed them."
+        "The best ones are known only in hindsight, so nobody could have followed them."
     )
 
 
