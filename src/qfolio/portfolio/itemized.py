@@ -69,12 +69,12 @@ class Itemized(CostModel):
         require(self, "fixed minimum impact", lambda x: 0 <= x < math.inf, "at least 0")
         require(self, "impact_power", lambda x: 0 < x <= 2, "above 0 and at most 2")
         require(self, "capital", lambda x: 0 < x < math.inf, "above 0")
-        require(self, "borrow_spread", lambda x: 0 <= x <= 1, "from 0 to 1, a year")
+        require(self, "borrow_spread", lambda x: 0 <= x <= 1, "from 0 to 1 per year")
         for name in ("buy", "sell", "spread"):
             require(self, name, lambda x: _fits(x, 0, 0.2), "from 0 to 0.2, or column:NAME")
         require(self, "volume", lambda x: _fits(x, 1e-9, math.inf), "above 0, or column:NAME")
         for name in ("cash_rate", "borrow_fee", "carry_rate"):
-            require(self, name, lambda x: _fits(x, -1, 1), "from -1 to 1, a year, or column:NAME")
+            require(self, name, lambda x: _fits(x, -1, 1), "from -1 to 1 per year, or column:NAME")
 
     @property
     def depends_on_wealth(self) -> bool:  # type: ignore[override]

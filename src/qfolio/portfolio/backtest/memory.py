@@ -16,7 +16,7 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
 MENTIONED = 2**30
-"""Bytes from which on a user is told beforehand."""
+"""Number of bytes from which a user is told beforehand."""
 
 
 def needed(prices: Prices, config: BacktestConfig) -> int:

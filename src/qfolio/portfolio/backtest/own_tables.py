@@ -86,7 +86,7 @@ def _from_table(source: Any, prices: Prices) -> Own:
     when = next((j for j, name in enumerate(names) if name in DATE_NAMES), 0)
     others = [j for j in range(len(names)) if j != when and names[j]]
     if not others:
-        raise QfolioError(f"the table has no column beside its dates. {FORMS}")
+        raise QfolioError(f"the table has no column besides its dates. {FORMS}")
     asset = next((j for j in others if names[j] in ASSET_NAMES), None)
     shares = next((j for j in others if names[j] in SHARES_NAMES), None)
     if asset is not None and shares is not None:

@@ -1,4 +1,4 @@
-"""The files of a finished backtest, beside its report."""
+"""Writes the files of a finished backtest, except for its report."""
 
 import math
 from collections.abc import Mapping
@@ -19,9 +19,9 @@ def write_tables(
     assessed: Assessment,
     why: Why | None = None,
 ) -> None:
-    """Write returns.csv (a column per strategy and seed), weights.csv (means) and summary.json.
+    """Writes returns.csv (a column per strategy and seed), weights.csv (means) and summary.json.
 
-    With attributions, why.json as well, and the diagnosis in summary.json.
+    With attributions, it also writes why.json, and the diagnosis into summary.json.
     """
     assert backtest.folder is not None
     folder, dates, first = BacktestFolder(backtest.folder), backtest.dates, backtest.config.seed

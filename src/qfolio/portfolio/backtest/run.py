@@ -242,7 +242,7 @@ class Backtest:
         """The same backtest on its table with more rows at the end, in the same folder.
 
         Finished folds keep their policies, and the last one decides up to its end. ``run`` then
-        trains the folds that are new and policies for tomorrow, beside those before them.
+        trains new folds and new policies for tomorrow; earlier ones are kept.
 
         Raises:
             QfolioError: The table does not begin with the backtest's rows; the error names the
@@ -385,7 +385,7 @@ class Backtest:
         )
 
     def keep(self, agent: str | None, policy: Policy) -> None:
-        """Stores an updated policy as the agent's policy for tomorrow, beside those before it."""
+        """Stores an updated policy as the agent's policy for tomorrow; earlier ones are kept."""
         kept = learning(policy.learner, policy.updates, policy.learned)
         self._kept.write_policy(self._name(agent), tomorrow(policy.updates), kept)
 

@@ -24,6 +24,7 @@ _SWAP = str.maketrans(",.", ".,")
 
 
 def is_missing(cell: Any) -> bool:
+    """Whether a cell is empty, or says that there is no value."""
     if isinstance(cell, str):
         return cell.strip().lower() in MISSING
     if cell is None or type(cell).__name__ in ("NAType", "NaTType"):
@@ -89,6 +90,7 @@ def not_a_number(cell: Any, decimal: str) -> str:
 
 
 def is_number(cell: str, decimal: str = ".") -> bool:
+    """Whether a cell is a number with this decimal mark."""
     return _number(cell, decimal) is not None
 
 

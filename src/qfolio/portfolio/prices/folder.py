@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def join(folder: Path, load: Callable[[Path], "Prices"]) -> Any:
-    """A long data frame of all tables in a folder; load: reads one of them.
+    """A long data frame of all tables in a folder; load: function that reads one of them.
 
     An asset that its file does not name takes the name of the file.
 

@@ -44,7 +44,7 @@ def upright(table: Table) -> Table:
     """The table with a row per date, if its dates stand across the first row.
 
     Raises:
-        QfolioError: There is more than one column beside the dates.
+        QfolioError: There is more than one column besides the dates.
     """
     names = table.names[1:]
     if len(names) < FEWEST_DATES or not readable_date(names[-1]) or readable_date(table.names[0]):

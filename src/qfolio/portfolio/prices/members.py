@@ -62,7 +62,7 @@ def _of_spans(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.nd
     names = [plain(name) for name in table.names]
     place = next((j for j, name in enumerate(names) if name in ASSET_NAMES), None)
     if place is None:
-        raise QfolioError("there is no column of assets beside from and to; name it asset.")
+        raise QfolioError("there is no column of assets besides from and to; name it asset.")
     labels = [label(cell) for cell in table.columns[place].tolist()]
     _require_all(labels, assets)
     begin, end = (_dates(table, names.index(name)) for name in SPANS)

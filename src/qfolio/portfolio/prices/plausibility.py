@@ -14,6 +14,7 @@ FEWEST_ROWS, FEW_ROWS = 3, 60
 
 
 def check_cells(grid: Grid, findings: Findings) -> None:
+    """Reports cells that are not prices or features, and a table without assets or rows."""
     table = grid.table
     if not grid.assets:
         findings.error("there is no asset", advice="Give a column of prices for each asset.")
@@ -71,6 +72,7 @@ def _complaint(grid: Grid, block: Block, i: int, j: int) -> str:
 
 
 def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:
+    """Reports what is left of a table if that is too short, and gaps between its dates."""
     dates = grid.dates[rest.head :]
     if len(dates) < FEWEST_ROWS:
         findings.error(

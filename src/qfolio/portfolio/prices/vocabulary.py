@@ -42,4 +42,5 @@ def kind(name: str) -> str | None:
 
 
 def is_price(name: str) -> bool:
+    """Whether a column of this name holds closing prices, adjusted or not."""
     return kind(name) in ("adjusted", "close")

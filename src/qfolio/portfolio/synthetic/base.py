@@ -41,6 +41,7 @@ class Synthetic(ExogenousTask):
 
 
 def require_cost(task: Any) -> None:
+    """Raises QfolioError unless a task's trading cost is from 0 to 0.2."""
     require(task, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
 
 

@@ -62,8 +62,8 @@ class Leverage(SyntheticMarket):
     scenarios = 500
 
     def __check_init__(self) -> None:
-        require(self, "cash_rate", lambda x: -0.1 <= x <= 0.5, "from -0.1 to 0.5, a year")
-        require(self, "borrow_spread", lambda x: 0 <= x <= 0.5, "from 0 to 0.5, a year")
+        require(self, "cash_rate", lambda x: -0.1 <= x <= 0.5, "from -0.1 to 0.5 per year")
+        require(self, "borrow_spread", lambda x: 0 <= x <= 0.5, "from 0 to 0.5 per year")
         require(self, "risk_aversion", lambda x: 0.5 <= x <= 100, "from 0.5 to 100")
 
     @property

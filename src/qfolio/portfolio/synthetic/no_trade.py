@@ -42,7 +42,7 @@ class NoTrade(OneAsset):
 
     def __check_init__(self) -> None:
         require(self, "volatility", lambda x: 0.01 <= x <= 2, "from 0.01 to 2")
-        require(self, "cash_rate", lambda x: -1 <= x <= 1, "from -1 to 1, a year")
+        require(self, "cash_rate", lambda x: -1 <= x <= 1, "from -1 to 1 per year")
         require(self, "dt", lambda x: 0.001 <= x <= 1, "from 0.001 to 1 years")
         require_cost(self)
         if not 0.01 <= self.rate / self.volatility**2 <= 0.99:
