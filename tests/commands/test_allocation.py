@@ -138,7 +138,7 @@ def test_a_backtest_without_a_verdict(copy, monkeypatch, capsys):
 def test_prices_that_do_not_match(folder, monkeypatch, capsys, tmp_path):
     other = write_table(tmp_path / "other.csv", names=("A", "B", "D"))
     assert qfolio(monkeypatch, "allocate", folder, "--prices", other, *AS_OF) == 2
-    assert "without 'C' and with 'D'" in capsys.readouterr().err
+    assert "lacks 'C' and has 'D'" in capsys.readouterr().err
 
 
 def records(folder):
