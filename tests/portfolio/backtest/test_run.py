@@ -320,7 +320,7 @@ def test_the_policy_for_tomorrow(finished):
                               ({"A": 0.7, "B": 0.7}, "sum to")):  # fmt: skip
         with pytest.raises(QfolioError, match=message):
             policy.weights(latest, holdings)
-    with pytest.raises(QfolioError, match="without 'B'"):
+    with pytest.raises(QfolioError, match="lacks 'B'"):
         policy.weights(latest.select(["A", "=<b>C"]))
     with pytest.raises(QfolioError, match="5 rows"):
         policy.weights(latest.between(0, 5))
