@@ -83,7 +83,7 @@ def test_tensorboard_gets_every_record(tmp_path):
 
 def test_tensorboard_needs_a_folder():
     with (
-        pytest.raises(QfolioError, match="name one with out"),
+        pytest.raises(QfolioError, match="set one with out"),
         tracked(*trackers(["tensorboard"])),
         Log(None).opened(kind="run"),
     ):

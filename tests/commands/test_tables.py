@@ -60,4 +60,4 @@ def test_costs_read_a_column_of_the_market(table):
 def test_shares_need_prices(monkeypatch, capsys, tmp_path):
     given = ["--returns", "fraction", "--whole-shares"]
     assert qfolio(monkeypatch, "allocate", tmp_path, *given) == 2
-    assert "--returns gives no prices of shares" in " ".join(capsys.readouterr().err.split())
+    assert "--returns gives no share prices" in " ".join(capsys.readouterr().err.split())

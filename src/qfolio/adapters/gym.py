@@ -42,13 +42,14 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
     **Observation**: "features", for each asset the window of scaled log returns (and any other
     features) up to today, of shape (assets, window, channels); and "holding", the weights of the
     assets held now (the rest is cash), of shape (assets,). Where assets come and go, "tradable" is
-    1 for each that may be bought now; weight wanted in the others goes to those, in proportion.
+    1 for each asset that may be bought now; weight decided for other assets is spread over those,
+    in proportion.
 
     **Action**: N + 1 numbers, cash first. Target weights are the nearest point of the simplex
     (Euclidean projection, no asset above ``max_weight``), so valid weights are used unchanged.
-    With a mandate that allows short positions or a loan, the weights of the N assets, and cash is
-    the rest. With ``menu`` ("grid:10", "tilts:0.1"), the number of an allocation. An order that the
-    mandate forbids becomes the nearest one that it allows.
+    With a mandate that allows short positions or a loan, the action is the weights of the N assets,
+    and cash is the rest. With ``menu`` ("grid:10", "tilts:0.1"), it is the number of an allocation.
+    An order that the mandate forbids becomes the nearest one that it allows.
 
     **Step**: a decision at row t is executed at the close of row t + lag, and its reward is that of
     the return of row t + lag + 1, net of the exact cost. Wealth is simulated in double precision,
@@ -56,8 +57,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
 
     ``info`` holds "wealth" (1 at the start), "cost" (share of wealth paid for this step's trade),
     "turnover", "target" (weights decided, cash first), "date" (of the row observed) and
-    "return_date" (of the row that earned the last return). Some of it is about rows after the one
-    observed, which agents must not use.
+    "return_date" (of the row that earned the last return). Some of these values are of rows
+    after the one observed, so agents must not use them.
 
     Args:
         prices: Anything that ``qfolio.load_prices`` reads (default: skfolio's 20 stocks).
@@ -122,7 +123,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts in cash at a row from ``first`` to ``last``, drawn or given as ``start``."""
+        """Starts an episode in cash, at a row from ``first`` to ``last``: drawn, or ``start``."""
         super().reset(seed=seed)
         start = (options or {}).get("start")
         if start is None:
@@ -140,7 +141,10 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Decides at today's row and moves to the next."""
+        """Takes the decision at today's row and moves to the next row.
+
+        Raises QfolioError for an invalid action, or after the end of an episode.
+        """
         if self._steps >= self.task.horizon:
             raise QfolioError("The episode is over; call reset() first.")
         row, lag = self._row, self.task.lag
@@ -170,7 +174,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         return self._observe(), float(reward), bool(traded.ruined), truncated, self._info()
 
     def render(self) -> str | None:
-        """Date, wealth and holdings on one line."""
+        """A line with date, wealth and holdings; None without ``render_mode``."""
         if self.render_mode is None or self._row < 0:
             return None
         named = zip(("cash", *self.prices.assets), self._held, strict=True)
@@ -222,7 +226,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
 class _Programs:
     """The task's functions, compiled once for all environments; jax is imported at first use.
 
-    They run in double precision if their inputs do.
+    They compute in double precision if their inputs have it.
     """
 
     def __init__(self) -> None:
@@ -295,13 +299,13 @@ def _action_space(actions: Any) -> spaces.Space[Any]:
 
 
 class TaskEnv(gymnasium.Env[Any, Any]):
-    """A task that ``qfolio train`` knows by name, compiled, one step at a time.
+    """A task that ``qfolio train`` knows by name, as a compiled environment.
 
-    Observations are those of qfolio's agents: numbers (Box), a state's number (Discrete) or, in
-    markets, a Dict of each asset's "features" and the "holding". Actions are numbered (Discrete)
-    or numbers (Box); weights of a market are projected onto the nearest point of the simplex.
-    Episodes are truncated after the task's ``horizon``. Raises QfolioError for invalid settings and
-    actions.
+    Observations are those of qfolio's agents: a vector (Box), the index of a state (Discrete)
+    or, in markets, a Dict of each asset's "features" and the "holding". Actions are an index
+    (Discrete) or a vector (Box); portfolio weights are projected onto the nearest point of the
+    simplex. Episodes are truncated after the task's ``horizon``. Raises QfolioError for invalid
+    settings and actions.
 
     Args:
         name: The task, such as "pendulum".

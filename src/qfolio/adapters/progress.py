@@ -13,7 +13,7 @@ from qfolio.core.text import printable
 from qfolio.experiments.log import Tracker
 
 EVERY = 0.2
-"""Least seconds between two updates of the bar."""
+"""Minimum number of seconds between two updates of the bar."""
 
 Show = Callable[[float, str], None]
 """Shows the share that is done, and a text beside the bar."""
@@ -31,7 +31,7 @@ class Progress(Tracker):
     def start(self, folder: Path | None, about: Mapping[str, Any]) -> None:
         agents = ", ".join(map(str, about.get("agents", [])))
         self._name = " on ".join(filter(None, (agents, str(about.get("task", "")))))
-        self._jobs: dict[str, float] = {}  # done of each
+        self._jobs: dict[str, float] = {}  # finished share of each
         self._text, self._begun, self._shown = "", perf_counter(), 0.0
         self._show, self._close = _in_notebook() or _on_terminal()
 

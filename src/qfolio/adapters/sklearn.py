@@ -30,10 +30,10 @@ class PortfolioPolicy(BaseOptimization):
     """A learned policy that trades every day, as an estimator.
 
     ``X`` holds simple returns, of shape (observations, assets), as in skfolio; each row is earned
-    by the decision made ``lag`` + 1 rows before. Predictions therefore begin with decisions at the
-    last rows of the training data, whose returns the fitted estimator keeps, as it does for the
-    policy's window; and ``fit`` learns from all rows but the last ``lag``, which come after the
-    first of those decisions. No decision depends on a later row.
+    by the decision made ``lag`` + 1 rows before. The first decisions of a prediction therefore fall
+    on the last rows of the training data, so the fitted estimator keeps the returns of these rows
+    and of the policy's window. ``fit`` learns from all rows but the last ``lag``, which come after
+    the first of those decisions. No decision depends on a later row.
 
     ``predict`` assumes that the rows of ``X`` follow the training rows. If both have dates, it
     looks up which rows came before, and if these are too few for a window (as on the training data
@@ -56,17 +56,17 @@ class PortfolioPolicy(BaseOptimization):
         None.
 
     seeds : int, default=None
-        Number of agents trained, whose mean decision is followed; the preset's if None.
+        Number of agents trained; the policy follows their mean decision. The preset's if None.
 
     seed : int, default=0
-        The first agent's seed; the others have the next ones.
+        The first agent's seed; the others have the seeds that follow.
 
     window : int, default=None
         Rows of returns that the policy observes; the preset's if None.
 
     cost : float, default=0.001
-        One-way trading cost, as a fraction of the value traded; learning and predicted returns both
-        pay it exactly.
+        One-way trading cost, as a fraction of the value traded; both training rewards and predicted
+        returns are exactly net of it.
 
     lag : int, default=1
         Rows between a decision and its execution.
@@ -183,7 +183,7 @@ class PortfolioPolicy(BaseOptimization):
     def partial_fit(self, X: Any, y: Any = None) -> "PortfolioPolicy":
         """Continues learning from returns of the same assets that follow those seen before.
 
-        The first call is a ``fit``; later calls learn from as many of the last rows as it had.
+        The first call is a ``fit``; later calls learn from as many of the latest rows as it had.
         Raises ValueError if rows are dated before the end of those seen.
         """
         self._validate_partial_fit_fallback()
@@ -245,7 +245,7 @@ class PortfolioPolicy(BaseOptimization):
         return chosen._replace(settings={**chosen.settings, **of_agent}), task
 
     def _learned(self) -> Prices:
-        """The rows up to the first decision of a prediction."""
+        """Prices of the rows to learn from: those up to the first decision of a prediction."""
         learned = self.returns_[: len(self.returns_) - self.lag]
         dropped = self.n_samples_seen_ - len(self.returns_)
         return _prices(learned, self._assets(), first=dropped)
@@ -257,7 +257,10 @@ class PortfolioPolicy(BaseOptimization):
         return tuple(map(str, named))
 
     def _held(self) -> np.ndarray:
-        """``previous_weights`` with cash first, of shape (entry,)."""
+        """``previous_weights`` with cash first, of shape (n_assets + 1,).
+
+        Raises ValueError if a weight is negative or their sum exceeds 1.
+        """
         weights = np.zeros(self.n_features_in_)
         if self.previous_weights is not None:
             weights = self._clean_previous_weights(n_assets=self.n_features_in_)

@@ -27,7 +27,7 @@ class TensorBoard(Tracker):
     def start(self, folder: Path | None, about: Mapping[str, Any]) -> None:
         if folder is None:
             raise QfolioError(
-                "TensorBoard's files lie in the experiment's folder; name one with out."
+                "TensorBoard's files are written to the experiment's folder; set one with out."
             )
         self._writer = self._module.SummaryWriter(str(folder / "tensorboard"))
 
@@ -40,7 +40,7 @@ class TensorBoard(Tracker):
 
 
 class WeightsAndBiases(Tracker):
-    """Weights & Biases, offline unless ``WANDB_MODE`` says otherwise.
+    """Weights & Biases, offline unless ``WANDB_MODE`` is set.
 
     API keys stay where wandb keeps them; the log of an experiment holds none.
     """
@@ -69,7 +69,7 @@ class Trackio(WeightsAndBiases):
 
 
 def trackers(names: Iterable[str]) -> list[Tracker]:
-    """The trackers that a user names, one of each; imports the modules of a user's own.
+    """The trackers of these names, each once; imports the modules of a user's own.
 
     Raises:
         QfolioError: There is none of this name, its package is missing, or it needs arguments.

@@ -1,4 +1,4 @@
-"""The desk: trades for tomorrow from a backtest's policy, and the ledger of those made before."""
+"""Commands of the desk: compute tomorrow's trades, and follow the ledger of past allocations."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -44,37 +44,37 @@ def allocate(
 ) -> Document:
     """Compute tomorrow's target weights, and the trades to reach them.
 
-    The verdict of the backtest on the agent is printed, too. If the first agent did worse than
-    the benchmark, nothing is allocated without --agent or --anyway. Each allocation is recorded in
-    the ledger of the folder.
+    The backtest's verdict on the agent is printed, too. If the first agent did worse than the
+    benchmark, nothing is allocated without --agent or --anyway. Each allocation is recorded in the
+    folder's ledger.
 
     Examples:
         qfolio allocate runs/mine --capital 10000
         qfolio allocate runs/mine --holdings holdings.csv --orders orders.csv
 
     Args:
-        folder: Folder of a backtest; its policies are also trained on the latest rows.
+        folder: Folder of a backtest, which also holds a policy trained on its latest rows.
         prices: Latest prices, CSV or Parquet, of the assets of the backtest (default: the prices
             of the backtest).
         holdings: Table with a column of assets (asset, symbol, ticker) and one of shares (shares,
             quantity, qty); a row "cash" holds money (default: all is cash). Shares sold short and
             loans are negative, where the mandate allows them.
-        capital: Cash, unless the holdings include it.
+        capital: Cash to invest, unless the holdings include a cash row.
         agent: Agent to follow, or a baseline such as equal-weight (default: the first agent of the
             backtest).
         anyway: Allocate even if the backtest is not finished, or found the agent worse than the
             benchmark.
         whole_shares: Trade whole shares only.
         as_of: Day of the allocation; prices may be up to a week older (default: today).
-        update: Update the policy on the new rows first, and store the updated policy beside those
-            before it.
+        update: Update the policy on the new rows first, and store the new version beside the
+            earlier ones.
         orders: Write the trades to this CSV file.
         layout: Columns of that file: generic, ib for a basket of Interactive Brokers, or alpaca or
             schwab for the fields of an order in their APIs.
         currency: Currency in that file, where the layout names one.
         dry_run: Write nothing: neither a record in the ledger nor an updated policy.
-        reproduce: Compute the ledger's allocation of this date again, from the inputs that it kept
-            or, if they are given, from --prices and --holdings, and compare the two.
+        reproduce: Recompute the allocation that the ledger records for this date and compare the
+            two, with the inputs stored there or, if given, --prices and --holdings.
         trust: Modules of your own code that the folder may name (default: none).
         missing: How to treat missing prices.
         ended: How to treat prices that end early: as missing ones, or as a delisting (default:
@@ -108,8 +108,8 @@ def allocate(
 
     if returns and (holdings or whole_shares or orders):
         raise QfolioError(
-            "--returns gives no prices of shares; leave out --holdings, --whole-shares and "
-            "--orders, or bring prices."
+            "--returns gives no share prices; leave out --holdings, --whole-shares and --orders, "
+            "or give a table of prices."
         )
     universe = {"ended": ended, "delisting_haircut": delisting_haircut, "members": members}
     desk = Desk.open(
@@ -130,7 +130,7 @@ def allocate(
     followed = desk.followed(name)
     if returns and lots(followed.mandate) is not None:
         raise QfolioError(
-            "The mandate has lots, and --returns gives no prices of shares; bring prices."
+            "The mandate has lots, but --returns gives no share prices; give a table of prices."
         )
     table = desk.table(followed, prices)
     require_fresh(table, as_of)
@@ -189,10 +189,10 @@ def follow(
     features: Names = (),
     date: Name = None,
 ) -> Document:
-    """Show what the allocations of a ledger have earned, beside what the backtest promised.
+    """Show what the allocations of a ledger have earned, compared with the backtest.
 
     The ledger is marked to market at every row of the prices. A sequential test says whether live
-    returns are still consistent with the backtest, and a sentence says when a retrain is due.
+    returns are still consistent with the backtest; the report also says when to retrain.
 
     Examples:
         qfolio follow runs/mine --prices prices.csv
@@ -201,8 +201,8 @@ def follow(
         folder: Folder of a backtest with a ledger.
         prices: Prices with all rows since the first allocation, CSV or Parquet (default: the
             prices of the backtest).
-        benchmark: Latest table of the backtest's benchmark, if that is a strategy of your own
-            (default: as the backtest read it).
+        benchmark: Latest file of the backtest's benchmark, if that is a strategy of your own
+            (default: the data that the backtest read).
         out: CSV file with a row for each row of the prices (default: follow.csv in the folder); a
             page is written beside it, with the suffix html.
         trust: Modules of your own code that the folder may name (default: none).
@@ -258,7 +258,7 @@ def _reproduce(
     holdings: Path | None,
     capital: float | None,
 ) -> Document:
-    """Computes an allocation of the ledger again and says how near it comes."""
+    """Recomputes an allocation of the ledger and prints the largest difference in weight."""
     from qfolio.commands import console
     from qfolio.portfolio.desk.holdings import read_holdings
 

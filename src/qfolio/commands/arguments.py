@@ -52,7 +52,7 @@ def budget_of(episodes: int | None, steps: int | None) -> Budget | None:
 def again(command: str, folder: Path, *parts: object, on: str = "here") -> str:
     """The command line that resumes the work in a folder.
 
-    parts: its tasks and agents; a user's own modules must be trusted again. on: where it ran.
+    parts: the tasks and agents; modules of a user's own must be trusted again. on: where it ran.
     """
     modules = own_modules(*parts)
     words = [command, str(folder), *(["--trust", *modules] if modules else [])]

@@ -1,4 +1,4 @@
-"""What ``backtest`` and ``study`` share: their options, and what these choose."""
+"""The options that ``backtest`` and ``study`` share, and the settings made from them."""
 
 import dataclasses
 import datetime
@@ -53,15 +53,15 @@ class Options(Reading):
         cost_model: Cost of trading and holding: proportional, itemized or your own as module:Name;
             settings follow in brackets, as in "itemized(fixed=5, cash_rate=0.03)".
         calendar: When all strategies may trade: weekly, monthly, quarterly, yearly, a number of
-            rows, or drift:0.05 where some weight is more than 0.05 from its target (default: at
-            every row, and baselines by their own calendars).
-        signals: Signals that agents observe beside returns, separated by commas, each with the rows
-            that it looks back on and those that it skips: momentum:252-21,volatility:21, or your
-            own as module:Name (default: the preset's).
-        strategy: Strategies of your own, each a CSV of target weights (date, and a column an
-            asset), of orders in shares (date, asset, shares), of returns (date, return) or of an
-            index (date, level); may be repeated.
-        benchmark: What all strategies are compared with: the name of a baseline, an asset (bought
+            rows, or drift:0.05 to trade when a weight is more than 0.05 from its target (default:
+            at every row; baselines keep their own calendars).
+        signals: Signals that agents observe beside returns, separated by commas, each with its
+            lookback in rows and the latest rows that it skips: momentum:252-21,volatility:21, or
+            your own as module:Name (default: the preset's).
+        strategy: Strategies of your own, each a CSV of target weights (date, and a column for
+            each asset), of orders in shares (date, asset, shares), of returns (date, return) or
+            of an index (date, level); may be repeated.
+        benchmark: Benchmark of all strategies: the name of a baseline, an asset (bought
             and held) or a strategy of your own, or such a CSV (default: equal-weight).
         baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight
             is always among them (default: all of qfolio's).
@@ -73,7 +73,7 @@ class Options(Reading):
         assignments: Hyperparameters of all agents that have them (learning_rate=1e-3) or of one
             (dqn.discount=0.9), or of the task (window=20 reward=crra).
         out: New folder (default: one in runs/).
-        resume: Folder to resume; a backtest goes on with a table that has more rows at its end.
+        resume: Folder to resume; a backtest may be given a table with more rows at its end.
         on: Where agents train: here, processes:4 (or another number), ray or ray://HOST:10001.
         track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
             module:Name (default: none).
@@ -117,7 +117,7 @@ class Options(Reading):
         return rest == DEFAULTS
 
     def folder(self, kind: str) -> Path:
-        """The new folder."""
+        """The path of the new folder: ``out``, or runs/KIND-TIME."""
         return self.out or Path("runs") / f"{kind}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
 
     def presets(self) -> "dict[str, Preset]":
@@ -130,7 +130,7 @@ class Options(Reading):
         return _assign(chosen, observed | settings.parse(self.assignments))
 
     def terms(self) -> "Mandate | None":
-        """The mandate of the file and of the limits that are given."""
+        """The mandate from the file and the limits on the command line; None without either."""
         from qfolio.portfolio.mandate.mandate import Mandate
 
         if self.mandate is None and not self.limits:
@@ -138,7 +138,7 @@ class Options(Reading):
         return (Mandate.read(self.mandate) if self.mandate else Mandate()).changed(self.limits)
 
     def settings(self) -> dict[str, Any]:
-        """The other arguments of ``Backtest.create``, but lag, cost and folder."""
+        """The other arguments of ``Backtest.create``, except lag, cost and folder."""
         seeds = (preset.seeds for preset in self.presets().values())
         return {
             "train": self.train,
@@ -167,7 +167,10 @@ Shared = Annotated[Options, arg(name="")]
 
 
 def basis_points(option: str, value: float) -> float:
-    """A cost in basis points as a fraction; option: its name, for the message."""
+    """A cost in basis points as a fraction; raises QfolioError outside 0 to 2,000.
+
+    option: the option's name, for the message.
+    """
     if not 0 <= value <= 2000:
         raise QfolioError(f"{option} is {value:g}; it must be from 0 to 2000.")
     return value * BASIS_POINT
@@ -178,18 +181,18 @@ def _split(text: str) -> dict[str, str]:
     agents = [name.strip() for name in text.split(",") if name.strip()]
     names = {registry.short(agent): agent for agent in agents}
     if len(names) < len(agents):
-        raise QfolioError(f"{text} names one twice.")
+        raise QfolioError(f"{text} has a name twice; give each once.")
     return names
 
 
 def _known(kind: registry.Kind, name: str) -> str:
-    """The name of a part that a user has typed; imports its module."""
+    """The name itself, once it is known to exist; imports its module."""
     registry.find(kind, name)
     return name
 
 
 def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
-    """The parts that a setting of the task names."""
+    """The signals, baseline or reward that a setting of the task names, each with its kind."""
     from qfolio.portfolio.signals import COLUMN, names
 
     if setting == "signals":
@@ -208,8 +211,10 @@ def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
 
 
 def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "Preset"]:
-    """Presets with changed settings: of one agent (dqn.discount), of all that have it, or of the
-    task. Imports the modules of parts that they name."""
+    """The presets with changed settings of one agent, of all agents that have them, or of the task.
+
+    A key such as dqn.discount is for one agent. Imports the modules that settings name.
+    """
     from qfolio.portfolio.task import Portfolio
 
     used = set()
@@ -243,7 +248,7 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
         known = set().union(*map(settings.names, kinds)) - own_options
         name = key.rpartition(".")[2]
         raise QfolioError(
-            f"--set {key}: none of {', '.join(presets)} has this setting, nor the portfolio task"
+            f"--set {key}: neither {', '.join(presets)} nor the portfolio task has this setting"
             f"{hint(name, known)}; its lag, costs, cap and mandate have options of their own."
         )
     return changed

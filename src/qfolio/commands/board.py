@@ -1,4 +1,4 @@
-"""The command that shows trainings in a browser."""
+"""The command that shows training runs in a browser."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ def board(
 ) -> None:
     """Show all runs below a folder in the browser, live; Ctrl-C ends it.
 
-    The page is for this machine alone and changes nothing.
+    The page is served to this machine only and is read-only.
 
     Examples:
         qfolio board
@@ -22,7 +22,7 @@ def board(
 
     Args:
         runs: Folder of runs.
-        port: Port on 127.0.0.1; 0 takes a free one.
+        port: Port on 127.0.0.1; 0 chooses a free one.
         open: Open the page in a browser.
     """
     import webbrowser

@@ -47,8 +47,7 @@ def compare(
         task: Task to learn (default: pendulum).
         agents: Agents, separated by commas, each with an optional preset after a colon:
             dqn,pathwise or dqn:fast,dqn:report. Your own are module:Name or module:Name:PRESET.
-        preset: Preset of agents without one of their own (default: fast if there is one, else the
-            first).
+        preset: Preset of agents that name none (default: fast if there is one, else the first).
         episodes: Training episodes of each seed (default: the presets' numbers).
         steps: Environment steps of each seed, instead of episodes.
         seeds: Number of seeds of each agent (default: 10).
@@ -111,7 +110,7 @@ def compare(
 def _entrants(
     task: str, agents: str, preset: str | None, budget: "Budget | None"
 ) -> "dict[str, Entrant]":
-    """The agents of ``--agents``, by their names there."""
+    """The agents that ``--agents`` lists, by name."""
     from qfolio.core import settings
     from qfolio.experiments import presets
     from qfolio.experiments.comparison.run import Entrant
@@ -141,14 +140,14 @@ def _entrants(
 
 
 def _parts(entry: str) -> tuple[str, str]:
-    """An agent and its preset, "" if there is none: dqn:fast, module:Name:fast."""
+    """The agent and the preset of an entry such as dqn:fast or module:Name:fast; "" without one."""
     parts = entry.split(":")
     count = 1 if registry.is_known("agent", parts[0]) else 2
     return ":".join(parts[:count]), ":".join(parts[count:])
 
 
 def _train(run: "Comparison", executor: "Executor") -> None:
-    """Trains with a bar, and a line for each agent that starts."""
+    """Trains with a progress bar, and prints a line when an agent starts."""
     from qfolio.commands import console
     from qfolio.commands.progress import JobsProgress
 
@@ -178,7 +177,7 @@ def _finish(run: "Comparison") -> Document:
 
 
 def _print_ranking(content: dict[str, Any]) -> None:
-    """A row for each agent, best first, and the conclusion."""
+    """Prints a row for each agent, best first, and the conclusion."""
     from qfolio.commands import console
     from qfolio.core.statistics import FEWEST_SEEDS
     from qfolio.experiments.comparison import conclusion

@@ -1,4 +1,4 @@
-"""The command that changes a task after training, and compares ways to go on."""
+"""The command that changes a task after training, and compares ways to adapt."""
 
 import datetime
 import re
@@ -40,7 +40,7 @@ def continual(
     track: Trackers = (),
     trust: Modules = (),
 ) -> Document:
-    """Change a task after training and compare how soon each way to go on recovers, at what cost.
+    """Change a task after training and compare how fast each way to adapt recovers, and its cost.
 
     Examples:
         qfolio continual --change mass=2
@@ -55,11 +55,11 @@ def continual(
         seeds: Number of seeds trained side by side (default: the preset's number).
         seed: First seed; the others follow it (default: 0).
         rate: Learning rate after the change, as a share of the initial one (default: 0.3).
-        renewal: Training of a renewed agent, as a share of the first training (default: 0.5).
-        epsilon: Initial exploration of a renewed agent (default: 0.3).
+        renewal: Length of a renewed agent's training, as a share of the first (default: 0.5).
+        epsilon: Initial exploration rate ε of a renewed agent (default: 0.3).
         assignments: Settings of the agent, and of the task before the change.
         out: New folder for the report (default: one in runs/).
-        resume: Folder to resume; only the training that was stopped is done again.
+        resume: Folder to resume; finished trainings are not repeated.
         track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
             module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
@@ -137,7 +137,7 @@ def _plan(
 
 
 def _print_ways(content: dict[str, Any]) -> None:
-    """A row for each way."""
+    """Prints a row for each way to adapt."""
     from qfolio.commands import console
     from qfolio.core.statistics import interquartile_mean
 

@@ -1,4 +1,4 @@
-"""From a command's signature and docstring to what can be typed: grouped options and ``--json``."""
+"""Commands as tyro parses them: grouped options and ``--json``, from signatures and docstrings."""
 
 import contextlib
 import dataclasses
@@ -119,9 +119,9 @@ def grouped(command: Callable[..., Any]) -> Callable[..., None]:
 
 
 def chosen(command: Callable[..., Any], name: str, words: list[str]) -> Callable[[], Any]:
-    """The command with the options that the words choose, ready to run.
+    """The command bound to the options in ``words``, ready to run.
 
-    Raises QfolioError where tyro would show a box.
+    Raises QfolioError where tyro would print an error box.
     """
 
     @functools.wraps(command)
@@ -139,7 +139,7 @@ def chosen(command: Callable[..., Any], name: str, words: list[str]) -> Callable
 
 
 def refusal(box: str) -> str:
-    """What tyro says in a box, as one sentence."""
+    """The error in tyro's box, as one sentence."""
     text = " ".join(re.sub("[╭╮╰╯│]", " ", box).split())
     parts = [part.strip() for part in re.split("─+|-{3,}", text) if part.strip()]
     said = parts[min(1, len(parts) - 1)]  # after the title
@@ -186,12 +186,12 @@ def example(command: Callable[..., Any]) -> list[str]:
 
 
 def outcome(folder: Path, content: Document) -> Document:
-    """What a command reports of a folder that has a report."""
+    """The document of a command that has written a report to a folder."""
     return {"folder": folder, "report": folder / PAGE, **content}
 
 
 def _report(command: Callable[..., Any], given: dict[str, Any], as_json: bool) -> None:
-    """Runs a command; with ``as_json``, only what it reports reaches the standard output."""
+    """Runs a command; with ``as_json``, prints only its document to the standard output."""
     if not as_json:
         command(**given)
         return
@@ -207,7 +207,7 @@ def _report(command: Callable[..., Any], given: dict[str, Any], as_json: bool) -
 
 
 def _finite(value: Any) -> Any:
-    """A document in which null stands for numbers that JSON lacks."""
+    """The document with None in place of numbers that JSON lacks: NaN and infinities."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -216,7 +216,7 @@ def _finite(value: Any) -> Any:
 
 
 def _meanings(part: Any) -> dict[str, str]:
-    """What the docstring of a function or a class says of each parameter."""
+    """The description of each parameter in a function's or a class's docstring."""
     parsed = docstring_parser.parse(part.__doc__ or "")
     return {found.arg_name: " ".join((found.description or "").split()) for found in parsed.params}
 

@@ -1,4 +1,4 @@
-"""The commands about prices: check a table, and backtest agents on it."""
+"""The commands that check a price table and backtest agents on it."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ def prices(file: Positional[File] = None, *, reading: Read = READING) -> Documen
     Args:
         file: CSV or Parquet file, wide (a column per asset), long (date, asset, price) or as
             yfinance saves it, or a folder with a file for each asset (default: the 20 US stocks
-            that come with qfolio).
+            that come with skfolio).
     """
     from qfolio.commands import console
     from qfolio.portfolio.prices.table import describe, inspect

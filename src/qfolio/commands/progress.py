@@ -1,4 +1,4 @@
-"""Live progress of trainings on the terminal: listeners that print."""
+"""Listeners that print the progress of training on the terminal."""
 
 import datetime
 import math
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class RunProgress(Listener):
     """A line for each point of a run's learning curve, and a bar between them.
 
-    optimum: on the curve's start states, None if it is unknown. show: called with the run at
-    each point of the curve.
+    optimum: the optimal mean return on the curve's start states; None if it is unknown. show:
+    called with the run at each point of the curve.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class RunProgress(Listener):
 
 
 class BarProgress(Listener):
-    """Moves a bar of ``console.bar``; name: of the training."""
+    """Moves a bar of ``console.bar``; name: the name of the training."""
 
     def __init__(self, update: Callable[..., None], name: str) -> None:
         self.update, self.name = update, name
@@ -81,7 +81,7 @@ class BarProgress(Listener):
 
 
 class JobsProgress:
-    """A bar over all jobs of an experiment, or a line for each tenth without a terminal.
+    """A bar over all jobs of an experiment; without a terminal, a line for each tenth.
 
     Called before each job, it returns the listener of that job's training. Jobs may run side by
     side.
@@ -89,16 +89,16 @@ class JobsProgress:
 
     def __init__(self, update: Callable[..., None]) -> None:
         self.update, self.begun, self.said = update, perf_counter(), ""
-        self.parts: dict[str, float] = {}  # of all work: what each job has done
+        self.parts: dict[str, float] = {}  # share of all work that each job has done
 
     def __call__(self, job: "Job", done: float, share: float) -> list[Listener]:
         """done, share: the finished share of all jobs, and the share of this job."""
         return [_JobProgress(self, job.name, share)]
 
     def note(self, job: str, part: float, learning: bool) -> None:
-        """learning: whether the job has begun to learn, so that its speed predicts the time left.
+        """Notes the share of all work that a job has done (``part``) and updates the bar.
 
-        part: of all work, which the job has done.
+        learning: whether the job has begun to learn, so that its speed predicts the time left.
         """
         self.parts[job] = part
         agent, done = job.partition("/")[0], sum(self.parts.values())
@@ -137,7 +137,7 @@ class SearchProgress:
         self.bar.__exit__(None, None, None)
 
     def chunk(self, done: float) -> None:
-        """done: share of the batch."""
+        """Moves the bar; done: the finished share of the batch."""
         self.update(completed=done)
 
     def batch(self, now: "Progress") -> None:
@@ -153,6 +153,6 @@ def time_left(seconds: float) -> str:
 
 
 def stop(command: str) -> NoReturn:
-    """Prints how to resume after Ctrl-C, and exits with the conventional code."""
+    """Prints how to resume after Ctrl-C, and exits with ``EXIT_CODE``."""
     say(f"Stopped. Resume with: {command}")
     raise SystemExit(EXIT_CODE)

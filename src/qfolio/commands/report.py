@@ -1,4 +1,4 @@
-"""The command that writes a folder's report again, also as PDF."""
+"""The command that rewrites a folder's report and can print it as PDF."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,13 +11,13 @@ from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 FILES = ("comparison.json", "continual.json", "study.json", "config.json")
-"""The files that say of which kind a folder is."""
+"""The files that identify the kind of a folder."""
 
 PDF = "report.pdf"
 
 
 def report(folder: Positional[Path], *, pdf: bool = False, trust: Modules = ()) -> Document:
-    """Write the report of a finished run again, and print it as PDF.
+    """Rewrite the report of a finished run, and optionally print it as PDF.
 
     Examples:
         qfolio report runs/mine
@@ -124,4 +124,4 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "search": _search,
     "continual": _continual,
 }
-"""How the report of each kind of folder is written."""
+"""The function that writes the report, by kind of folder."""

@@ -37,10 +37,10 @@ def study(
         qfolio study us.csv eu=europe.csv --lags 2 --costs-bps 20,50
 
     Args:
-        sets: CSV or Parquet files with prices, a table each, as qfolio backtest reads them; NAME=
-            names a table (default: the file's name).
-        lags: Lags at which everything is trained and tested again, beside --lag (default: none).
-        costs_bps: Costs in basis points, likewise, beside --cost-bps; every lag is combined with
+        sets: CSV or Parquet files with prices, one table each, as qfolio backtest reads them;
+            NAME= names a table (default: the file's name).
+        lags: Further lags, besides --lag, at which to train and test everything (default: none).
+        costs_bps: Further costs in basis points, besides --cost-bps; every lag is combined with
             every cost (default: none).
         after: Folders of earlier studies; their looks at the same tables are counted (default:
             none).

@@ -56,14 +56,14 @@ class Reading:
         return {name: getattr(self, name) for name in names}
 
     def like(self, table: "Prices") -> "Reading":
-        """The same with a table's features and columns, unless others are chosen."""
+        """These options with a table's features and columns, unless others are chosen."""
         features, columns = table.feature_names, table.market_names
         return dataclasses.replace(
             self, features=self.features or features, columns=self.columns or columns
         )
 
     def load(self, file: Path | None) -> "Prices":
-        """A price table; the 20 US stocks without a file."""
+        """Reads a price table; without a file, the 20 US stocks that come with skfolio."""
         from qfolio.portfolio.prices.table import load
 
         return load(file, **self.reading)

@@ -65,23 +65,23 @@ def train(
             ppo, ddpg, td3, sac or mbpo; for numbered states q-learning, sarsa, expected-sarsa,
             double-q or dyna-q; for markets pathwise; or your own as module:Name.
         preset: Preset of the agent (default: fast). DQN on the pendulum also has best, categorical,
-            rainbow and report, the run that qfolio grew out of.
-        episodes: Training episodes of each seed (default: the preset's number). Those of fast and
-            best are short: 28 and 40 steps.
+            rainbow and report (the settings of the report that qfolio grew out of).
+        episodes: Training episodes of each seed (default: the preset's number). Episodes of DQN's
+            presets fast and best are short: 28 and 40 steps.
         steps: Environment steps of each seed, instead of episodes.
         seeds: Number of seeds trained side by side (default: the preset's number).
         seed: First seed; the others follow it (default: 0).
         out: New folder for the run (default: one in runs/).
-        assignments: Settings of agent and task, for example --set discount=0.98 hidden=256,256; a
-            report and docs/algorithms/dqn.md list them.
-        resume: Folder of a run to resume, up to --episodes or --steps if given.
+        assignments: Settings of agent and task, for example --set discount=0.98 hidden=256,256;
+            every report lists them, and docs/algorithms/dqn.md explains those of DQN.
+        resume: Folder of a run to resume; --episodes or --steps may set a new total.
         on: Where seeds train: here, processes:4 (or another number), ray or ray://HOST:10001.
         track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
             module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
-        compare: Train two more agents with one thing changed, for the report (DQN: double DQN; in
-            markets: one action at a time instead of all at once).
-        live: Show an episode in a window now and then while training.
+        compare: Train two more agents with one thing changed, for the report (for DQN, double
+            DQN; in markets, learning from one action at a time instead of all at once).
+        live: Show an episode in a window at each point of the learning curve.
     """
     from qfolio.core import devices
 
@@ -241,7 +241,7 @@ def _train(
     executor: "Executor",
     show: Callable[["Run"], None] | None = None,
 ) -> None:
-    """Trains with live progress; in this process, beside the optimum."""
+    """Trains with live progress; in this process, the lines also show the optimum."""
     from qfolio.commands import console
     from qfolio.commands.progress import JobsProgress, RunProgress
     from qfolio.core.evaluation import start_keys

@@ -1,4 +1,4 @@
-"""The command that searches hyperparameters and reports which of them matter."""
+"""The command that searches hyperparameters and reports which ones matter."""
 
 import datetime
 import re
@@ -49,7 +49,7 @@ def tune(
     track: Trackers = (),
     trust: Modules = (),
 ) -> Document:
-    """Search an agent's hyperparameters and report which of them matter.
+    """Search an agent's hyperparameters and report which ones matter.
 
     Examples:
         qfolio tune --trials 32
@@ -58,25 +58,25 @@ def tune(
     Args:
         task: Task to learn, any that qfolio train knows (default: pendulum).
         agent: Algorithm, or your own as module:Name (default: the first with presets for the task).
-        preset: Preset to start from; it also sets the settings that are not searched
+        preset: Preset to start from, which also gives the settings that are not searched
             (default: fast).
-        trials: Configurations to try in all (default: 64).
-        seeds: Seeds to train each configuration with (default: 2).
+        trials: Total number of configurations to try (default: 64).
+        seeds: Number of seeds of each configuration (default: 2).
         episodes: Training episodes of each agent (default: the preset's). learning_rate_steps
             changes in proportion, unless it is set.
         steps: Environment steps of each agent, in place of episodes.
-        batch: Configurations to train at once (default: 16).
+        batch: Number of configurations to train at once (default: 16).
         search: Settings to search, for example --search learning_rate=1e-4..1e-2
             hidden=64,64|128,128 (default: those that usually matter, from a tenth to ten times the
             preset's value). A range is searched on a logarithmic scale if its ends are a factor of
             10 apart, or a factor of 10 apart in their distance from 1; log:, near-one: or linear:
             before the range chooses another scale, as in discount=linear:0.9..0.99.
-        assignments: Settings to fix at other values than the preset's.
-        out: New folder for the search (default: runs/…).
-        join: Folder of a search to continue, also while other processes work on it; --trials
-            raises its number of trials.
+        assignments: Settings to fix at values other than the preset's.
+        out: New folder for the search (default: one in runs/).
+        join: Folder of a search to continue, even while other processes work on it; --trials
+            raises its total number of trials.
         on: Where configurations train: here, processes:4 (or another number), ray or
-            ray://HOST:10001. A batch should have several for each worker.
+            ray://HOST:10001. A batch should have several configurations for each worker.
         track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
             module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).

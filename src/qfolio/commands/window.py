@@ -52,7 +52,10 @@ class Window:
             self._pygame.display.set_caption(text)
 
     def show(self, states: np.ndarray, torques: np.ndarray) -> bool:
-        """Shows an episode: states (time + 1, 2), torques (time,); False once it is closed."""
+        """Shows an episode in real time; returns whether the window is still open.
+
+        states: angle and velocity, of shape (time + 1, 2). torques: of shape (time,).
+        """
         pendulum = self._env.unwrapped
         for state, torque in zip(states[1:], torques, strict=True):
             if not self._open:
