@@ -99,13 +99,13 @@ def test_weights_within_the_limits_stay_to_the_bit():
     limits = Limits(np.zeros(3), np.full(3, 0.4), np.ones((1, 3)), np.ones(1), 1.0, 0.5)
     held = jnp.array([0.3, 0.3, 0.3])
     for wanted in ([0.3, 0.3, 0.4], [0.2, 0.4, 0.1], [0.3, 0.3, 0.3]):
-        found = nearest(jnp.array(wanted), held, Limits(*map(jnp.asarray, limits)))
+        found = nearest(jnp.array(wanted), held, jax.tree.map(jnp.asarray, limits))
         np.testing.assert_array_equal(found, jnp.array(wanted))
 
 
 def test_turnover_yields_to_the_other_limits_as_far_as_it_must():
     limits = Limits(np.zeros(3), np.full(3, 0.4), -np.ones((1, 3)), np.array([-0.8]), 1.0, 0.2)
-    found = nearest(jnp.array([0.4, 0.4, 0.2]), jnp.zeros(3), Limits(*map(jnp.asarray, limits)))
+    found = nearest(jnp.array([0.4, 0.4, 0.2]), jnp.zeros(3), jax.tree.map(jnp.asarray, limits))
     np.testing.assert_allclose(found.sum(), 0.8, atol=1e-5)
 
 
@@ -114,7 +114,7 @@ def test_without_other_limits_it_is_the_capped_simplex():
     caps = np.array([0.4, 0.0, 0.7])
     limits = Limits(np.zeros(3), caps, np.ones((1, 3)), np.ones(1), np.inf, np.inf)
     wanted = rng.dirichlet(np.ones(4), 50)[:, 1:].astype(np.float32)
-    found = jax.vmap(lambda x: nearest(x, x, Limits(*map(jnp.asarray, limits))))(wanted)
+    found = jax.vmap(lambda x: nearest(x, x, jax.tree.map(jnp.asarray, limits)))(wanted)
     np.testing.assert_array_equal(found, np.minimum(wanted, caps.astype(np.float32)))
 
 

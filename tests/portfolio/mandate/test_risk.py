@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cvxpy
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,11 +30,15 @@ def portfolio(prices: Prices, risk: dict, **limits) -> Portfolio:
     return Portfolio.of(prices, mandate={"risk": risk, **limits}, window=10, horizon=20)
 
 
+def annual_returns(prices: Prices, row: int, past: int = 252) -> np.ndarray:
+    """The last that are known, scaled: the norm of their product with weights is volatility."""
+    known = prices.values[max(0, row - past) : row + 1]
+    return (known[1:] / known[:-1] - 1) * np.sqrt(prices.periods_per_year / (len(known) - 1))
+
+
 def volatility(prices: Prices, row: int, weights: np.ndarray, past: int = 252) -> float:
     """Annual, from the last returns that are known."""
-    known = prices.values[max(0, row - past) : row + 1]
-    returns = known[1:] / known[:-1] - 1
-    return float(np.sqrt(prices.periods_per_year * ((returns @ weights) ** 2).mean()))
+    return float(np.linalg.norm(annual_returns(prices, row, past) @ weights))
 
 
 @pytest.mark.parametrize("past", [20, 252])
@@ -46,25 +51,46 @@ def test_an_order_is_as_risky_as_it_may_be(past):
         wanted = rng.dirichlet(np.full(6, 0.5))
         capped = np.minimum(wanted[1:], 0.6)
         found = np.asarray(order(jnp.array(row), jnp.asarray(wanted, jnp.float32)), float)
-        risk = volatility(prices, row, capped, past)
-        share = min(1.0, 0.12 / risk)
-        np.testing.assert_allclose(found[1:], share * capped, rtol=2e-5, atol=1e-6)
-        bound += share < 1
+        if volatility(prices, row, capped, past) < 0.12:
+            np.testing.assert_allclose(found[1:], capped, atol=1e-6)
+        else:
+            assert volatility(prices, row, found[1:], past) == pytest.approx(0.12, rel=3e-5)
+            bound += 1
     assert 20 < bound < 60
 
 
-def test_active_weights_shrink_to_the_tracking_error():
-    prices, rng = table(), np.random.default_rng(2)
-    task = portfolio(prices, {"tracking_error": 0.03}, assets={"cap": 0.6})
-    equal = np.full(5, 0.2)
-    for row in rng.integers(20, ROWS, 30):
-        wanted = rng.dirichlet(np.full(6, 0.5))
-        active = np.minimum(wanted[1:], 0.6) - equal
-        share = min(1.0, 0.03 / volatility(prices, row, active))
-        held = rng.dirichlet(np.ones(6))
-        allowed = task.feasible_at(jnp.array(row))
-        found = exactly(allowed, wanted, held)
-        np.testing.assert_allclose(found[1:], equal + share * active, rtol=1e-5, atol=1e-6)
+@pytest.mark.parametrize(
+    ("risk", "mean", "worst"),
+    [
+        ({"volatility": 0.12}, 1.01, 1.06),
+        ({"tracking_error": 0.03}, 1.06, 1.3),
+        ({"volatility": 0.12, "tracking_error": 0.06}, 1.08, 1.45),
+    ],
+)
+def test_no_order_is_much_nearer(risk, mean, worst):
+    """Ratios of its distance from what is wanted to the least, which a conic solver finds."""
+    prices, rng, equal = table(), np.random.default_rng(5), np.full(5, 0.2)
+    task = portfolio(prices, risk, assets={"cap": 0.6})
+    ratios = []
+    for row in rng.integers(20, ROWS, 300):
+        wanted, held = rng.dirichlet(np.full(6, 0.5)), rng.dirichlet(np.ones(6))
+        found = exactly(task.feasible_at(jnp.array(row)), wanted, held)[1:]
+        assert min(found.min(), 1 - found.sum(), 0.6 - found.max()) >= -1e-7
+        nearest = cvxpy.Variable(5)
+        conditions = [nearest >= 0, cvxpy.sum(nearest) <= 1, nearest <= 0.6]
+        centers = {"volatility": 0 * equal, "tracking_error": equal}
+        for name, most in risk.items():
+            assert volatility(prices, row, found - centers[name]) <= most * (1 + 1e-6)
+            returns = annual_returns(prices, row)
+            conditions.append(cvxpy.norm(returns @ (nearest - centers[name])) <= most)
+        away = cvxpy.sum_squares(nearest - wanted[1:])
+        least = cvxpy.Problem(cvxpy.Minimize(away), conditions).solve(cvxpy.CLARABEL) ** 0.5
+        if least > 1e-3:
+            ratios.append(np.linalg.norm(found - wanted[1:]) / least)
+    assert len(ratios) > 200
+    assert min(ratios) > 1 - 1e-4
+    assert np.mean(ratios) < mean
+    assert max(ratios) < worst
 
 
 def test_other_limits_hold_and_both_risks_are_met_where_they_can_be():

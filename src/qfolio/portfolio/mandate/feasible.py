@@ -18,13 +18,14 @@ from qfolio.core.market import SEARCHED
 from qfolio.portfolio.mandate.projection import (
     Limits,
     approximate,
+    below,
     excess,
     nearest,
     none_binds,
     search,
     solution,
 )
-from qfolio.portfolio.mandate.risk import TINY, Risk
+from qfolio.portfolio.mandate.risk import Risk
 
 Multipliers = Float[Array, " condition"]
 
@@ -105,8 +106,8 @@ class Mandated(Feasible):
     assets; cash is the rest. With a number of holdings, the largest weights of that point are kept,
     and the others are 0. Changes below the smallest trade are not made, unless a limit needs them.
     If turnover clashes with other limits, as after a fall in prices, it gives way to them. If that
-    point is too risky, the order goes from it towards the benchmark, or towards cash where tracking
-    error has no limit, as far as it must (see ``risk.py``).
+    point is too risky, the order is a point near the nearest of those that are not (see
+    ``risk.py``).
     """
 
     limits: Limits
@@ -155,7 +156,7 @@ class Mandated(Feasible):
             found = checkpoint_name(search(aim, now, limits), SEARCHED)
         weights = solution(found, aim, now, within)
         if self.limits_risk and self.risk is not None:
-            weights = self._safer(weights, now, limits, self.risk)
+            weights = self._safer(weights, aim, now, limits, within, self.risk)
         if self.long:  # rounding may leave no cash, and less
             weights /= jnp.maximum(weights.sum(), 1.0)
         return simplex.with_rest(weights)
@@ -163,29 +164,42 @@ class Mandated(Feasible):
     def _safer(
         self,
         weights: Float[Array, " asset"],
+        wanted: Float[Array, " asset"],
         held: Float[Array, " asset"],
         limits: Limits,
+        within: Limits,
         risk: Risk,
     ) -> Float[Array, " asset"]:
-        """The weights moved towards safe ones within the limits, as far as they are too risky.
+        """Weights near those wanted that are not too risky, if there are any within the limits.
 
-        The benchmark is the safe portfolio, with as much cash as its own volatility needs; where
-        tracking error has no limit, cash is.
+        The weights go towards a safe portfolio until their risk is allowed. The tangent planes of
+        the limits of risk there are conditions of one more projection, and what this leaves too
+        risky goes towards the safe portfolio again. This is the benchmark, with as much cash as
+        gives both limits the same room; where tracking error has no limit, it is cash.
+
+        within: the limits without the assets that stay as they are held.
         """
         risk = jax.tree.map(lambda x: jnp.asarray(x, weights.dtype), risk)
-        aim = jnp.zeros_like(weights)
+        cash = jnp.zeros_like(weights)
+        centers = ((cash, self.volatility), (risk.benchmark, self.tracking_error))
+        limited = [(center, most) for center, most in centers if most < float("inf")]
+        aim = cash
         if self.tracking_error < float("inf"):
             own = risk.of(risk.benchmark)
-            aim = risk.benchmark * jnp.minimum(1.0, self.volatility / jnp.maximum(own, TINY))
+            room = self.volatility - self.tracking_error + own
+            aim = risk.benchmark * jnp.clip(room / (2 * own), 0.0, 1.0)
         found = checkpoint_name(search(aim, held, limits), SEARCHED)
         safe = solution(found, aim, held, limits)
-        change = weights - safe
-        shares = [jnp.ones((), weights.dtype)]
-        if self.volatility < float("inf"):
-            shares.append(risk.share(safe, change, self.volatility))
-        if self.tracking_error < float("inf"):
-            shares.append(risk.share(safe - risk.benchmark, change, self.tracking_error))
-        return safe + jnp.stack(shares).min() * change
+
+        def allowed(weights: Array) -> Array:
+            change = weights - safe
+            shares = [risk.share(safe - center, change, most) for center, most in limited]
+            return safe + jnp.stack(shares).min() * change
+
+        near = allowed(weights)
+        cut = below(within, [risk.tangent(near, center, most) for center, most in limited])
+        found = checkpoint_name(search(wanted, held, cut), SEARCHED)
+        return allowed(solution(found, wanted, held, cut))
 
     def _fewer(self, wanted: Float[Array, " asset"], held: Float[Array, " asset"]) -> Limits:
         """Limits that keep all but the largest weights at 0.
@@ -253,7 +267,7 @@ class Mandated(Feasible):
     def violations(self, weights: Any, held: Any = None) -> dict[str, Any]:
         """As in ``Feasible``; given the weights held, also for turnover and the smallest trade."""
         xp = weights.__array_namespace__()
-        low, high, rows, most, gross, turnover = (xp.asarray(x) for x in self.limits)
+        low, high, rows, most, gross, turnover = (xp.asarray(x) for x in self.limits[:6])
         assets = weights[..., 1:]
         found = {
             "the sum is off 1 by": abs(weights.sum(-1) - 1),

@@ -17,9 +17,10 @@ from jaxtyping import Array, Float
 
 from qfolio.core import symmetric
 
-LARGEST, OF_TURNOVER = 100.0, 10.0
-"""Bounds of the multipliers. That of turnover is the lower one: where the other limits contradict
-it, turnover is exceeded by as little as they require (an exact penalty)."""
+LARGEST, OF_TURNOVER, OF_PLANES = 100.0, 10.0, 1.0
+"""Bounds of the multipliers. That of turnover is lower than that of the other limits: where these
+contradict it, turnover is exceeded by as little as they require (an exact penalty). Planes (see
+``below``) yield to all limits."""
 
 ITERATIONS = 60
 LENGTHS, SHORTENING = 8, 4.0
@@ -39,6 +40,7 @@ class Limits(NamedTuple):
     most: Any  # (row,)
     gross: Any  # ()
     turnover: Any  # ()
+    penalty: Any = None  # (row,), bounds of the multipliers (default: LARGEST)
 
 
 class _Found(NamedTuple):
@@ -134,6 +136,17 @@ def _search_many(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
 
     found = _search(*jax.tree.map(joined, given, tuple(batched)))
     return jnp.moveaxis(found.reshape(-1, size, paths), 1, 0), True
+
+
+def below(limits: Limits, planes: list[tuple[Array, Array]]) -> Limits:
+    """The limits and, as further rows that yield to them, planes: rows and most."""
+    rows, most = (jnp.stack(list(each)) for each in zip(*planes, strict=True))
+    penalty = jnp.full(len(limits.most), LARGEST, most.dtype)
+    return limits._replace(
+        rows=jnp.concatenate([limits.rows, rows]),
+        most=jnp.concatenate([limits.most, most]),
+        penalty=jnp.concatenate([penalty, jnp.full_like(most, OF_PLANES)]),
+    )
 
 
 def none_binds(limits: Limits) -> Float[Array, " condition"]:
@@ -234,12 +247,13 @@ def _error(multipliers: Array, over: Array, largest: Array) -> Array:
 
 
 def _largest(limits: Limits) -> Array:
-    most = jnp.concatenate([limits.most, jnp.stack([limits.gross, limits.turnover])])
-    return jnp.full_like(most, LARGEST).at[-1].set(OF_TURNOVER)
+    rows = jnp.full_like(limits.most, LARGEST) if limits.penalty is None else limits.penalty
+    others = jnp.stack([jnp.full_like(limits.gross, x) for x in (LARGEST, OF_TURNOVER)])
+    return jnp.concatenate([rows, others])
 
 
 def _arrays(limits: Limits, like: Array) -> Limits:
-    return Limits(*(jnp.asarray(x, like.dtype) for x in limits))
+    return jax.tree.map(lambda x: jnp.asarray(x, like.dtype), limits)
 
 
 def _choose(first: Array, one: _Found, other: _Found) -> _Found:

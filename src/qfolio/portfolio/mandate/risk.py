@@ -1,8 +1,12 @@
-"""Limits on volatility and tracking error: how far towards a safer portfolio an order must go.
+"""Limits on volatility and tracking error.
 
 Both are estimated from the last returns, of which squares are averaged: a mean of returns is lost
-in the noise of so few. An order that is too risky moves along a straight line, which stays within
-all convex limits, so that one number has to be found: the root of a quadratic equation.
+in the noise of so few.
+
+Weights with so little risk form an ellipsoid. To find its nearest point within all other limits
+takes too long for training. Two steps are cheap and lead near that point: a tangent plane of the
+ellipsoid is one more row of linear limits, and a line to a safe portfolio stays within all convex
+limits and meets the ellipsoid at the root of a quadratic equation.
 """
 
 from typing import NamedTuple
@@ -47,7 +51,7 @@ class Risk(NamedTuple):
 
     def of(self, weights: Float[Array, " asset"]) -> Float[Array, ""]:
         """The annual volatility of weights."""
-        return jnp.sqrt(jnp.maximum(self.between(weights, weights), 0.0))
+        return jnp.sqrt(jnp.maximum(self.between(weights, weights), TINY))
 
     def between(
         self, one: Float[Array, " asset"], other: Float[Array, " asset"]
@@ -71,3 +75,17 @@ class Risk(NamedTuple):
         root = jnp.sqrt(jnp.where(inside > 0, inside, 1.0))
         found = (jnp.where(inside > 0, root, 0.0) - cross) / square
         return jnp.clip(found, 0.0, 1.0)
+
+    def tangent(
+        self, weights: Float[Array, " asset"], center: Float[Array, " asset"], most: float
+    ) -> tuple[Float[Array, " asset"], Float[Array, ""]]:
+        """A row, and what its product with weights is at most if their risk is.
+
+        Risk is the volatility of weights less the center's, at most ``most``. These weights form an
+        ellipsoid; the plane touches it in the direction of the given weights.
+        """
+        active = weights - center
+        slope = self.covariance @ active
+        size = jnp.maximum(lax.stop_gradient(abs(slope).max()), TINY)
+        row = slope / size
+        return row, most * self.of(active) / size + row @ center
