@@ -166,6 +166,12 @@ def test_bash_completes_commands_and_options(monkeypatch, tmp_path):
         assert completed in found.stdout.split()
 
 
+def test_a_pipe_folds_nothing(capsys):
+    row = ("a strategy with a long name", *["-123,456.78%"] * 12)
+    console.print_table(("strategy", *["numbers"] * 12), [row])
+    assert capsys.readouterr().out.splitlines()[1].split("  ") == [row[0], *row[1:]]
+
+
 def test_a_narrow_terminal_folds_names_and_cuts_no_number(monkeypatch, capsys):
     narrow = Console(width=50, force_terminal=True, color_system=None)
     monkeypatch.setattr(console, "console", narrow)

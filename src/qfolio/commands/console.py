@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 console = Console(highlight=False)
 
+unfolded = Console(highlight=False, width=10_000)
+"""For tables in files and pipes, which have no width."""
+
 
 def say(text: str) -> None:
     """Prints lines; control characters are escaped."""
@@ -87,7 +90,8 @@ def print_table(
     for row in rows:
         cells = (Text(printable(cell)) for cell in row)
         table.add_row(*cells, style="bold" if row[0] in bold else None)
-    console.print(table)
+    shown = console if console.is_terminal else unfolded
+    shown.print(table)
 
 
 def describe_run(run: "Run", budget: "Budget") -> str:
