@@ -359,9 +359,9 @@ def noted(tmp_path, first, second, steps=1000):
 def test_tasks_that_differ_are_checked(tmp_path):
     same = noted(tmp_path / "1", Regime(menu="grid:2"), Regime(menu="grid:10"))
     assert same == [
-        "The task is not quite the same for all: menu is grid:2 for a, grid:10 for b. Their start "
-        "states, lengths of episodes and exact optima are the same (this was checked): results "
-        "compare."
+        "Task settings differ between agents: menu is grid:2 for a, grid:10 for b. Their start "
+        "states, lengths of episodes and exact optima are the same (this was checked), so results "
+        "are comparable."
     ]
     (other,) = noted(tmp_path / "2", Pendulum(horizon=20), Pendulum(horizon=20, mass=2.0))
     assert "Their exact optima differ, too: each regret is a share of the agent's own" in other
@@ -449,7 +449,7 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
     ("options", "message"),
     [
         (["--agents", "dqn,dqx"], "no agent 'dqx'"), (["--agents", "dqn:fst,dqn"], "preset 'fst'"),
-        (["--agents", "dqn"], "two agents or more"), ([], "two agents or more"),
+        (["--agents", "dqn"], "two or more agents"), ([], "two or more agents"),
         (["--agents", "dqn,dqn:fast"], "the preset fast twice: dqn, dqn:fast"),
         (["--agents", "dqn,pathwise"], "pathwise has no preset for pendulum"),
         (["pendulm", "--agents", "dqn,dqn:bold"], "no task 'pendulm'"),

@@ -90,7 +90,7 @@ def test_a_stopped_run_asks_for_what_is_missing(task, agent, tmp_path, folder):
         assert logged(tmp_path / "run", "end")[-1]["state"] == "stopped"
         assert Run.open(tmp_path / "run" / "seeds" / "0").episodes == EPISODES
         run = Run.open(tmp_path / "run")
-    with pytest.raises(QfolioError, match="trained for 300 steps, and not for 500; finish"):
+    with pytest.raises(QfolioError, match="trained for 300 steps, not for 500; finish"):
         run.train(Budget(20), executor=Elsewhere())
     told = []
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Budget:
-    """The training of each member: a number of episodes, or of steps of all its environments.
+    """The length of each member's training: in episodes, or in steps of all its environments.
 
     Raises QfolioError unless exactly one of the two is given, from 1 to 2³¹ − 1.
     """
@@ -21,7 +21,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         if (self.episodes is None) == (self.steps is None):
-            raise QfolioError("give either episodes or steps, the length of each agent's training.")
+            raise QfolioError("give each agent's training budget in either episodes or steps.")
         _require(self.unit, self.amount, 1, 2**31 - 1)
 
     @property
@@ -41,7 +41,7 @@ class Budget:
         return {self.unit: self.amount}
 
     def planned(self, population: "Population") -> int:
-        """Final steps of all environments of a member, rounded up to whole rollouts."""
+        """Total steps of all environments of a member, rounded up to whole rollouts."""
         length = population.agent.rollout_steps
         left = -(-self.left(population) // length) * length
         return (population.steps + left) * population.agent.num_envs
@@ -52,7 +52,7 @@ class Budget:
 
 
 def seed_range(seeds: int, seed: int) -> range:
-    """``seeds`` seeds from ``seed``; raises QfolioError if they do not fit in 32 bits."""
+    """``seeds`` consecutive seeds from ``seed``; raises QfolioError if one exceeds 32 bits."""
     _require("seeds", seeds, 1, 2**20)
     _require("seed", seed, 0, 2**32 - seeds)
     return range(seed, seed + seeds)

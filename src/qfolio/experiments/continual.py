@@ -1,6 +1,6 @@
 """Continual learning: adaptation to a world that changes after training.
 
-A task's numbers (such as the mass of a pendulum) change when training is over. Four ways to go on
+A task's numbers (such as the mass of a pendulum) change when training is over. Four ways to adapt
 are compared in the changed world, against its own exact optimum: the policy as it is; continued
 learning with the same replay buffer; renewed learning, which keeps the weights, empties the buffer
 and restarts the schedules; and a fresh agent. Forgetting is measured in the old world.
@@ -41,7 +41,7 @@ from qfolio.learning.optimizer import Optimizer
 FILE, LEARNED = "continual.json", "learned.safetensors"
 
 POINTS = 24
-"""Approximate number of points on a learning curve after the change, also of the renewed agent."""
+"""Approximate number of points on each learning curve after the change."""
 
 WITHIN = 0.1
 """A seed has recovered when its regret in the changed world stays below this."""
@@ -51,7 +51,7 @@ WITHIN = 0.1
 class Plan:
     """The experiment: ``agent`` learns ``task``, which then becomes ``changed``.
 
-    rate: share of the initial learning rate with which an agent goes on. renewal: length of a
+    rate: learning rate after the change, as a share of the initial one. renewal: length of a
     renewed agent's training, as a share of the first. epsilon: the renewed agent's initial
     exploration, if it explores ε-greedily.
     """
@@ -79,7 +79,9 @@ class Plan:
                 f"those of {type(self.task).__name__} are {', '.join(_numbers(self.task))}."
             )
         if not self.changes:
-            raise QfolioError("nothing changes; name one of the task's numbers, as in mass=2.")
+            raise QfolioError(
+                "nothing changes; give one of the task's numbers a new value, as in mass=2."
+            )
         if any(task.optimum() is None for task in (self.task, self.changed)):
             raise QfolioError(
                 f"recovery is measured against an exact optimum, but {type(self.task).__name__} "
@@ -88,7 +90,7 @@ class Plan:
 
     @property
     def changes(self) -> dict[str, tuple[Any, Any]]:
-        """Settings of the task before and after."""
+        """The settings that change: their values before and after, by name."""
         before, after = settings.describe(self.task), settings.describe(self.changed)
         return {k: (v, after[k]) for k, v in before.items() if v != after[k]}
 
@@ -115,7 +117,7 @@ def _setting(agent: Agent, name: str) -> float:
     value = getattr(agent, f"learning_rate_{name}", None)
     if not isinstance(value, float):
         raise QfolioError(
-            f"{type(agent).__name__} has no learning-rate schedule, which going on requires; use "
+            f"{type(agent).__name__} has no learning-rate schedule, which continuing requires; use "
             "an agent with a network, such as dqn."
         )
     return value
@@ -126,11 +128,11 @@ def _numbers(task: Task) -> list[str]:
 
 
 class Course(msgspec.Struct):
-    """The results of the seeds in one way to go on.
+    """The results of all seeds for one way to adapt.
 
-    steps: since the change, of all environments of a seed. curve: regrets (point, seed) on the
+    steps: environment steps of a seed since the change. curve: regrets (point, seed) on the
     first start states. final: regrets (seed,) on all of them; other: the same in the other world
-    (after the change, the old one). seconds: time of learning, all seeds together.
+    (after the change, the old one). seconds: time spent learning, all seeds together.
     """
 
     steps: list[int]
@@ -198,7 +200,7 @@ class ContinualConfig(Config, frozen=True):
         )
 
     def plan(self) -> Plan:
-        """The plan that it describes."""
+        """The plan that this configuration describes."""
         after = {name: new for name, (_, new) in self.changes.items()}
         return Plan(
             task_of(self.task, self.task_settings),
@@ -214,7 +216,7 @@ class ContinualConfig(Config, frozen=True):
 
 
 def create(plan: Plan, folder: Path, command: str = "") -> None:
-    """Makes the new or empty folder that ``compare`` works in.
+    """Creates the folder that ``compare`` works in; an empty one may exist already.
 
     command: the command that started it, for the report.
     """
@@ -224,15 +226,15 @@ def create(plan: Plan, folder: Path, command: str = "") -> None:
 
 
 def compare(folder: Path, listen: Callable[[str], Listener] | None = None) -> dict[str, Any] | None:
-    """Trains, changes the world and goes on in every way; returns the report's data as JSON values.
+    """Trains, changes the world and adapts in every way; returns the report's data as JSON values.
 
-    Results that the folder already holds are not computed again. None if Ctrl-C stopped it. Raises
-    QfolioError if a loss is not finite.
+    Results that the folder already holds are not computed again. Returns None if Ctrl-C stopped it.
+    Raises QfolioError if a loss is not finite.
 
     listen: called with the name of each training; returns its listener.
     """
     if not (folder / FILE).is_file():
-        read_config(folder / FILE, ContinualConfig)  # raises: this is not such a folder
+        read_config(folder / FILE, ContinualConfig)  # raises if this is no such folder
     with locked(folder):
         state = read_config(folder / FILE, ContinualConfig)
         about = {"kind": state.kind, "task": state.task, "agents": [state.agent]}
@@ -292,9 +294,10 @@ def _compare(
 
 
 def recovery(course: Course) -> dict[str, Any]:
-    """Environment steps from the change until a seed's regret stays within ``WITHIN``.
+    """Environment steps from the change until each seed's regret stays within ``WITHIN``.
 
-    middle: the interquartile mean; None if more than a quarter of the seeds never do.
+    per_seed: None if it never does. middle: the interquartile mean; None if more than a quarter of
+    the seeds never do.
     """
     steps = steps_within(course.steps, np.array(course.curve), WITHIN)
     return {"per_seed": steps, "middle": middle_steps(steps)}
@@ -367,9 +370,9 @@ def _learn(
     job: JobLog,
     listeners: list[Listener],
 ) -> Course | None:
-    """Learns ``episodes`` more, with regular grading; None if Ctrl-C stopped it.
+    """Learns for ``episodes`` more, with regular grading; None if Ctrl-C stopped it.
 
-    worlds: this one and the other one.
+    worlds: the world learned in, and the other one.
     """
     here, there = worlds
     curve = _Curve(here, job)

@@ -8,7 +8,7 @@ from qfolio.core.registry import build, name_of
 
 
 def describe(task: Task, agent: Agent) -> dict[str, Any]:
-    """A task and an agent by name and settings, with the configurations' keys."""
+    """A task and an agent by name and settings, under the keys of configurations."""
     return {
         "task": name_of(task),
         "task_settings": settings.describe(task),

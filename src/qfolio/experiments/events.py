@@ -1,15 +1,15 @@
-"""events.jsonl: what happens in an experiment, a JSON object a line, appended as it happens.
+"""events.jsonl, the log of an experiment: one JSON object per line, appended as events happen.
 
 One log serves every reader: ``qfolio board`` and trackers such as TensorBoard. Events are
 
 - ``start`` and ``end`` of a process's work in the folder, with what it does and how it ended,
-- ``queued``: jobs that wait; ``running``, ``done``, ``stopped``, ``failed``: the state of a job
+- ``queued``: the jobs that wait; ``running``, ``done``, ``stopped``, ``failed``: the state of a job
   (the only one of a single run is called ""), and the worker that runs it,
-- ``record``: the means of each member's episodes since the record before, and how far the job is,
+- ``record``: means over each member's episodes since the previous record, and the job's progress,
 - ``result``: the measures of what has been trained, by name.
 
-A job that begins again, from a checkpoint or on another worker, says at which step; a reader drops
-its later records, so that nothing counts twice. While a process works, it touches the file every
+A job that restarts, from a checkpoint or on another worker, logs its step; readers drop the records
+after that step, so that nothing counts twice. While a process works, it touches the file every
 ``BEAT`` seconds: if a log without an ``end`` is not touched for ``SILENT`` seconds, the process was
 killed.
 """
@@ -28,9 +28,9 @@ Event = dict[str, Any]
 
 
 def read(path: Path, offset: int = 0) -> tuple[list[Event], int]:
-    """The events from an offset on, and the offset of what follows.
+    """Reads the events from a byte offset; also returns the offset from which to continue.
 
-    A last line that is not complete yet is left for the next time; damaged lines are skipped.
+    An incomplete last line is left for the next call; damaged lines are skipped.
     """
     with path.open("rb") as file:
         file.seek(offset)

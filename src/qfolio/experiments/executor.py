@@ -14,7 +14,7 @@ from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
 
 AT_ONCE = 32
-"""Members of a job if they advance in lockstep."""
+"""Number of members in a job if they advance in lockstep."""
 
 R_co = TypeVar("R_co", covariant=True)
 R = TypeVar("R")
@@ -22,7 +22,7 @@ R = TypeVar("R")
 
 @runtime_checkable
 class Job(Protocol[R_co]):
-    """Work as a value: its result depends only on its fields.
+    """A unit of work whose result depends only on its fields.
 
     A job may therefore run twice, anywhere, and in any order.
     """
@@ -53,7 +53,7 @@ class Executor(Protocol):
 
     @property
     def devices(self) -> int:
-        """Devices of one worker."""
+        """Number of devices of one worker."""
         ...
 
     @property
@@ -64,9 +64,10 @@ class Executor(Protocol):
     def map(
         self, jobs: Iterable[Job[R] | None], listen: Callable[[Job[R]], Sequence[Listener]]
     ) -> Generator[tuple[Job[R], R], None, None]:
-        """Each finished job with its result; ``listen`` returns the listeners of a job.
+        """Yields each finished job with its result; ``listen`` returns the listeners of a job.
 
-        ``jobs`` are taken one by one, when a worker is free; None if there is none at present.
+        ``jobs`` are taken one by one, when a worker is free; a None means that there is no job at
+        present.
         """
         ...
 
@@ -94,7 +95,7 @@ class Here:
 
 
 def at_once(executor: Executor, in_lockstep: int = AT_ONCE) -> int:
-    """How many members fill a worker; in_lockstep: how many if its device steps them together."""
+    """Number of members that fill a worker; in_lockstep: the number on a device in lockstep."""
     return max(executor.devices, in_lockstep if executor.lockstep else 1)
 
 
@@ -110,10 +111,10 @@ def carry_out(
     store: Callable[[Any, Any], None],
     log: Log,
 ) -> bool:
-    """Runs jobs; returns whether Ctrl-C stopped it.
+    """Runs jobs; returns whether Ctrl-C stopped them.
 
-    store: called with each finished job and its result. log: of the experiment; its listener of a
-    job is the first.
+    store: called with each finished job and its result. log: the experiment's log; its listener
+    comes first in each job.
     """
     done = 0
     log.queue([job.name for job in jobs])
@@ -134,7 +135,7 @@ def carry_out(
 
 
 class _Kept:
-    """An executor whose workers stay from one ``map`` to the next."""
+    """An executor that keeps its workers from one ``map`` to the next."""
 
     def __init__(self, executor: Executor) -> None:
         self.devices, self.lockstep = executor.devices, executor.lockstep
@@ -161,7 +162,7 @@ class _Kept:
 
 @contextlib.contextmanager
 def kept(executor: Executor) -> Iterator[Executor]:
-    """An executor whose workers stay from one ``map`` to the next; ``Here`` has none to keep."""
+    """Keeps the workers of an executor from one ``map`` to the next; ``Here`` has none to keep."""
     if isinstance(executor, Here):
         yield executor
         return

@@ -26,15 +26,15 @@ class Training:
     """A training in progress, as its listeners see it.
 
     Attributes:
-        population: The population that is trained.
+        population: The population in training.
         budget: The budget of each member.
         config: The configuration, for listeners that record it.
         begun: Steps of each environment before this training.
         left: Remaining steps of each environment.
-        seconds: Time spent on training, without compiling.
-        members: The member of each row of the last chunk.
-        interrupted: Whether Ctrl-C asked it to stop.
-        where: The worker that it runs on; empty in this process.
+        seconds: Time spent on training, excluding compilation.
+        members: The member that each row of the last chunk belongs to.
+        interrupted: Whether Ctrl-C asked the training to stop.
+        where: The worker that the training runs on; empty in this process.
     """
 
     population: Population
@@ -46,7 +46,7 @@ class Training:
     members: Sequence[int] = ()
     interrupted: bool = False
     where: str = ""
-    _learned: int = 0  # steps of each environment that learned, and their time
+    _learned: int = 0  # steps of each environment since learning began, and their time
     _learning_seconds: float = 0.0
 
     @property
@@ -67,13 +67,13 @@ class Training:
 
     @property
     def steps_per_second(self) -> float:
-        """Environment steps of all members; once learning has begun, of steps that learn."""
+        """Environment steps of all members per second; once learning has begun, since then."""
         per_step = self.population.agent.num_envs * len(self.population.seeds)
         return self._rate * per_step
 
     @property
     def seconds_left(self) -> float:
-        """NaN before learning has begun, because the warm-up has another speed."""
+        """Estimated time left; NaN before learning begins, as the warm-up has another speed."""
         return self.left / self._rate if self._learned or self.finished else math.nan
 
     @property
@@ -135,7 +135,7 @@ def fit(
         budget: The budget of each member, including earlier training.
         listeners: Called after every chunk, in their order.
         config: The configuration, for listeners that record it.
-        chunk: Most steps of a chunk, if fewer than the population's own.
+        chunk: Maximum number of steps of a chunk, if below the population's own.
         strict: Whether a loss that is not finite raises QfolioError; otherwise the other members
             continue.
     """

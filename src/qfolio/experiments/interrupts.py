@@ -1,4 +1,4 @@
-"""Ctrl-C: the first one stops a training after its current chunk, a second one stops at once.
+"""Handling of Ctrl-C: the first stops a training after its current chunk, a second at once.
 
 jax computes in the main thread, sometimes for seconds, and Python cannot interrupt it there: an
 exception would come too late, end inside one of jax's callbacks, or crash the process at its exit.
@@ -70,11 +70,11 @@ def _leave() -> None:
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Keeps Python from raising KeyboardInterrupt: the thread acts on the signal."""
+    """Does nothing, so that Python raises no KeyboardInterrupt: the thread acts on the signal."""
 
 
 def _first(stop: threading.Event) -> bool:
-    """Asks a training to stop; false if it has been asked already."""
+    """Asks the training to stop; false if it has been asked already."""
     asked = stop.is_set()
     stop.set()
     return not asked

@@ -21,30 +21,35 @@ from qfolio.experiments.events import BEAT, EVENTS
 from qfolio.experiments.fit import Listener, Row, Training
 
 SHARE, SHORTEST, LONGEST = 0.05, 0.05, 1.0
-"""Records are so far apart, as a share of the training so far; and at least and at most so many
-seconds."""
+"""Time between two records: a share of the training time so far, within limits in seconds."""
 
 PARTS = 50
-"""Least records of a training, if it has so many episodes: long chunks are split."""
+"""Minimum number of records of a training with enough episodes; long chunks are split."""
 
 RECENT = 500
-"""A record's means are those of at most so many episodes, or four a member: the latest ones."""
+"""Maximum number of latest episodes in a record's means; four per member if that is more."""
 
 
 class Tracker:
-    """Something that follows a log, such as TensorBoard; a tracker overrides what it needs."""
+    """A follower of a log, such as TensorBoard; subclasses override the methods that they need."""
 
     def start(self, folder: Path | None, about: Mapping[str, Any]) -> None:
-        """Work begins in a folder, or in none; about: what the ``start`` event says."""
+        """Called when work begins.
+
+        folder: of the experiment; None if it has none. about: the content of the ``start`` event.
+        """
 
     def log(self, values: Mapping[str, float], step: int) -> None:
-        """Numbers by name, ``job/metric`` if there are several jobs; step: of the job's members."""
+        """Called with numbers by name; with several jobs, the names are ``job/metric``.
+
+        step: environment steps of each of the job's members.
+        """
 
     def event(self, event: Mapping[str, Any]) -> None:
-        """Every event after the start, as the log has it; ``log`` is told of records besides."""
+        """Called with every event after the start, as logged; records also go to ``log``."""
 
     def finish(self) -> None:
-        """The work has ended, in whatever way."""
+        """Called when the work has ended, for whatever reason."""
 
 
 _trackers: ContextVar[tuple[Tracker, ...]] = ContextVar("trackers", default=())
@@ -52,7 +57,7 @@ _trackers: ContextVar[tuple[Tracker, ...]] = ContextVar("trackers", default=())
 
 @contextlib.contextmanager
 def tracked(*trackers: Tracker) -> Iterator[None]:
-    """Trackers that follow all work that begins in this block."""
+    """Has trackers follow all work that begins in this block."""
     token = _trackers.set((*_trackers.get(), *trackers))
     try:
         yield
@@ -63,7 +68,7 @@ def tracked(*trackers: Tracker) -> Iterator[None]:
 class Log:
     """The log of an experiment; use it within ``opened``.
 
-    folder: of the experiment; without one, only trackers hear of it.
+    folder: the experiment's folder; without one, events go to trackers only.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -73,7 +78,7 @@ class Log:
 
     @contextlib.contextmanager
     def opened(self, **about: Any) -> Iterator["Log"]:
-        """Logs the start, and the end however it comes; about: what is done."""
+        """Logs the start, and the end for whatever reason; about: a description of the work."""
         trackers = _trackers.get()
         with contextlib.ExitStack() as stack:
             if self.folder is not None:
@@ -96,27 +101,27 @@ class Log:
             self.write("end", state=self.state, **here)
 
     def write(self, event: str, **values: Any) -> None:
-        """Appends an event in one piece, so that several processes may share a log."""
+        """Appends an event in one write, so that several processes can share a log."""
         content = {"event": event, "time": round(time.time(), 3), **values}
         if self._file >= 0:
             os.write(self._file, msgspec.json.encode(content) + b"\n")
         self._tell(lambda tracker: tracker.event(content))
 
     def settle(self, finished: bool) -> None:
-        """Says whether the work is finished, or was stopped before."""
+        """Sets how the work ends: finished, or stopped early."""
         self.state = "done" if finished else "stopped"
 
     def queue(self, jobs: Sequence[str]) -> None:
-        """Jobs that will run."""
+        """Logs the jobs that will run."""
         if jobs:
             self.write("queued", jobs=list(jobs))
 
     def job(self, name: str = "", members: Sequence[str] = ()) -> "JobLog":
-        """The listener of a job's training; members: their names, such as seeds."""
+        """The listener that logs a job's training; members: their names, such as seeds."""
         return JobLog(self, name, members)
 
     def track(self, job: str, step: int, values: Mapping[str, Sequence[float | None]]) -> None:
-        """Tells trackers the means over members."""
+        """Passes the means over members to the trackers."""
         if self._trackers:
             prefix = f"{job}/" if job else ""
             known = {
@@ -127,7 +132,7 @@ class Log:
             self._tell(lambda tracker: tracker.log(means, step))
 
     def _tell(self, tell: Callable[[Tracker], None]) -> None:
-        """Tells all trackers; one that fails is no reason to lose a training."""
+        """Calls all trackers; one that fails is dropped with a warning, and training goes on."""
         for tracker in list(self._trackers):
             try:
                 tell(tracker)
@@ -149,7 +154,7 @@ class JobLog(Listener):
         self._rows: list[Row] = []
         self._of: list[int] = []  # the member of each row
         self._due = 0.0
-        self._step, self._share = 0, 0.0  # of the record before
+        self._step, self._share = 0, 0.0  # of the previous record
 
     def on_start(self, training: Training) -> None:
         self._step, self._share = training.steps, training.share
@@ -206,7 +211,7 @@ def means(rows: Sequence[Row], members: Sequence[int], count: int) -> dict[str, 
     for name in rows[-1]:
         if name != "seed":
             column = np.array([row.get(name, np.nan) for row in rows], float)
-            known = np.isfinite(column)  # before learning begins, its numbers are not
+            known = np.isfinite(column)  # metrics of learning are NaN before it begins
             weights = np.bincount(of[known], minlength=count)
             if name == "episode":  # counted from 1, in order
                 mean = np.zeros(count)
@@ -221,12 +226,12 @@ def means(rows: Sequence[Row], members: Sequence[int], count: int) -> dict[str, 
 
 
 def seed_names(seeds: Iterable[int]) -> list[str]:
-    """The members of a population of seeds."""
+    """The names of the members of a population of seeds."""
     return [f"seed {seed}" for seed in seeds]
 
 
 def add_result(folder: Path | None, values: Mapping[str, Mapping[str, float | None]]) -> None:
-    """Appends the measures of what was trained, by name, to a folder's log if it has one."""
+    """Appends the measures of trained agents, by name, to a folder's log if it has one."""
     if folder is not None and (folder / EVENTS).exists():
         log = Log(folder)
         log._file = _open(folder / EVENTS)
@@ -237,7 +242,7 @@ def add_result(folder: Path | None, values: Mapping[str, Mapping[str, float | No
 
 
 def _open(path: Path) -> int:
-    """Opens a log to append; ends a line that a killed process left."""
+    """Opens a log for appending; ends an incomplete line that a killed process left."""
     file = os.open(path, os.O_APPEND | os.O_CREAT | os.O_RDWR | getattr(os, "O_BINARY", 0), 0o666)
     if os.fstat(file).st_size:
         os.lseek(file, -1, os.SEEK_END)

@@ -39,21 +39,21 @@ class Run:
     """Seeds of one agent on one task; make it with ``Run.create``, ``Run.open`` or ``train``.
 
     metrics: a row for each finished training episode. evaluations: a row for each seed and point of
-    the learning curve. interrupted: whether Ctrl-C stopped the last training. groups: of the seeds,
-    for executors that train them as jobs.
+    the learning curve. interrupted: whether Ctrl-C stopped the last training. groups: the groups
+    of seeds that executors train as jobs.
     """
 
     def __init__(
         self, task: Task, agent: Agent, config: RunConfig, folder: RunFolder | None, room: int = 0
     ) -> None:
-        """room: seeds of the largest run that shares the programs, if more than its own."""
+        """room: seeds of the largest run that shares the programs, if more than this run's."""
         self.task, self.agent, self.config, self._folder = task, agent, config, folder
         self.population: Population = population_of(task, agent, config.seed_range, room)
         self.metrics: list[Row] = []
         self.evaluations: list[Row] = []
         self.seconds_train = 0.0
         self.interrupted = False
-        self._log: JobLog | None = None  # while it trains
+        self._log: JobLog | None = None  # only during training
         self.groups = SeedGroups(self)
 
     @classmethod
@@ -76,9 +76,9 @@ class Run:
             task, agent: The task, and the agent that learns it.
             budget: The budget of each seed, unless one of the next two is given.
             episodes, steps: One of the two. Steps are those of all environments of a seed.
-            seeds, seed: How many agents, and the first one's seed; the others have the next ones.
-            preset: The name of the settings, for readers.
-            out: A new or empty folder; without it nothing is written.
+            seeds, seed: Number of agents, and the first one's seed; the others follow it.
+            preset: Name of the preset, for readers.
+            out: A new or empty folder; without it, nothing is written.
         """
         budget = budget or Budget(episodes, steps)
         config = RunConfig(
@@ -107,8 +107,8 @@ class Run:
     ) -> "Run":
         """A run as its last checkpoint left it.
 
-        task, agent: needed only if the folder alone cannot make them: they hold arrays, or are a
-        user's own and their module has not been imported.
+        task, agent: needed only if the folder cannot restore them, because they hold arrays or
+        are a user's own and their module has not been imported.
         """
         files = RunFolder(Path(folder))
         config = files.read_config()
@@ -152,7 +152,7 @@ class Run:
 
     @property
     def episodes(self) -> int:
-        """Finished episodes of the seed that has finished fewest."""
+        """Number of finished episodes of the seed with the fewest."""
         return self.population.episodes
 
     @property
@@ -226,7 +226,7 @@ class Run:
 
     @property
     def _about(self) -> dict[str, Any]:
-        """What the log says of the run."""
+        """The description of the run in the log."""
         config = self.config
         return {
             "kind": "run",
@@ -238,7 +238,7 @@ class Run:
         }
 
     def aim_at(self, budget: Budget) -> None:
-        """Makes a budget the configured one, before its training begins."""
+        """Sets the configured budget, before its training begins."""
         self.config = msgspec.structs.replace(
             self.config, episodes=budget.episodes, steps=budget.steps
         )
@@ -249,7 +249,7 @@ class Run:
             self._folder.tidy({METRICS: self.metrics, EVALUATION: self.evaluations})
 
     def adopt(self, trained: TrainedSeeds) -> None:
-        """Makes training that was done elsewhere, from this run's state, its own."""
+        """Takes over the results of training done elsewhere from this run's state."""
         before = self.done("steps")
         self.population.restore(trained.state["training"])
         self.population.seconds_compile += trained.seconds_compile
@@ -333,7 +333,7 @@ class Run:
         self.evaluations = [row for rows in whole for row in rows]
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint holds, with a leading seed axis."""
+        """The content of a checkpoint: arrays with a leading seed axis."""
         return {"training": self.population.fetch(), "seconds_train": np.array(self.seconds_train)}
 
 

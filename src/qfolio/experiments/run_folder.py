@@ -3,7 +3,7 @@
 It holds config.json (settings), metrics.csv and evaluation.csv (appended), checkpoint.safetensors
 (the whole training state, replaced atomically), policy.safetensors (weights) and, at the end,
 summary.json. The checkpoint is authoritative: rows ahead of it are dropped when a run is resumed,
-and then recomputed, identical to the last digit.
+and then recomputed bit for bit.
 """
 
 import contextlib
@@ -66,14 +66,14 @@ class RunFolder:
         write_config(self.path / CONFIG, config)
 
     def read_config(self) -> RunConfig:
-        """Raises QfolioError if the folder holds no run of this version."""
+        """Reads config.json; raises QfolioError if the folder holds no run of this version."""
         return read_config(self.path / CONFIG, RunConfig)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         write_json(self.path / SUMMARY, summary)
 
     def write_checkpoint(self, state: Any, weights: Any) -> None:
-        """Writes the policy first: the checkpoint marks the run's progress."""
+        """Writes policy and checkpoint; the checkpoint comes last because it marks the progress."""
         write_tree(self.path / POLICY, weights)
         write_tree(self.path / CHECKPOINT, state)
 
@@ -88,9 +88,9 @@ class RunFolder:
                 file.write(_csv(rows, header=file.tell() == 0))
 
     def rows(self, name: str, episodes: dict[int, int], steps: int) -> list[Row]:
-        """The rows of a table up to a checkpoint, without one that a crash cut short.
+        """The rows of a table up to a checkpoint; skips a last row that a crash cut short.
 
-        episodes: of each seed, at the checkpoint. steps: of each seed's environments.
+        episodes: number of episodes at the checkpoint, by seed. steps: of each seed's environments.
         """
         path = self.path / name
         if not path.exists():
@@ -121,7 +121,7 @@ class RunFolder:
 
 
 def curve_point(rows: Sequence[Row]) -> dict[str, list[float]]:
-    """What the log says of one point of the learning curve, a row of evaluation.csv each seed."""
+    """The log's values for a point of the learning curve; rows: of evaluation.csv, one per seed."""
     names = {"greedy return": "return", "overestimation": "overestimation"}
     return {name: [row[key] for row in rows] for name, key in names.items()}
 

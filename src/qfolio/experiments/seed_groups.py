@@ -1,7 +1,7 @@
 """Training the seeds of a run in groups: each group is a job, wherever it runs.
 
-The groups that are finished wait in the folder seeds/ of the run, each a run folder of its own,
-until the last one is there and all of them become the run.
+Finished groups wait in the run's folder seeds/, each in a run folder of its own. When the last one
+is finished, all are joined into the run.
 """
 
 import shutil
@@ -35,7 +35,7 @@ FOLDER = "seeds"
 class TrainedSeeds(NamedTuple):
     """Seeds that have been trained.
 
-    config: of these seeds alone. state: what a checkpoint holds of them, with a leading seed axis.
+    config: for these seeds alone. state: their checkpoint, with a leading seed axis.
     """
 
     config: RunConfig
@@ -49,8 +49,9 @@ class TrainedSeeds(NamedTuple):
 class SeedsJob:
     """Trains some seeds of a run, as one population.
 
-    label: of the run. config: of these seeds alone. most: seeds of the run's largest group; all
-    share its programs. start: the states to continue from (default: before the first step).
+    label: of the run. config: for these seeds alone. most: number of seeds of the run's largest
+    group, whose programs all share. start: the states to continue from (default: those before the
+    first step).
     """
 
     label: str
@@ -70,7 +71,7 @@ class SeedsJob:
 
     def run(self, listeners: Sequence[Listener]) -> TrainedSeeds | QfolioError | None:
         """The trained seeds, or why they could not be trained; None if Ctrl-C stopped it."""
-        from qfolio.experiments.run import Run  # which makes these jobs
+        from qfolio.experiments.run import Run  # imported here, as run.py makes these jobs
 
         try:
             run = Run(self.task, self.agent, self.config, None, self.most)
@@ -94,18 +95,18 @@ class SeedGroups:
 
     @property
     def begun(self) -> bool:
-        """Whether there are finished groups that are not in the run yet."""
+        """Whether some groups are finished but not yet joined into the run."""
         return bool(self._done) or (self._place is not None and self._place.exists())
 
     def jobs(
         self, executor: Executor, budget: Budget | None = None, label: str | None = None
     ) -> list[SeedsJob]:
-        """The groups that are missing; each goes to ``store``.
+        """The jobs of the groups that are missing; pass each result to ``store``.
 
-        Each seed takes as many steps as its episodes would if none ended early, so that it does not
-        depend on seeds of other groups.
+        Each seed takes as many steps as its episodes would if none ended early, so that its result
+        does not depend on seeds of other groups.
 
-        budget: of each seed (default: the run's). label: begins the names of the jobs (default: the
+        budget: of each seed (default: the run's). label: prefix of the jobs' names (default: the
         agent's name).
         """
         run, budget = self._run, budget or self._run.budget
@@ -118,8 +119,8 @@ class SeedGroups:
         for part in self._done.values():
             if part.config.steps != steps:
                 raise QfolioError(
-                    f"Some seeds of the run have been trained for {part.config.steps:,} steps, and "
-                    f"not for {steps:,}; finish the training that was begun first."
+                    f"Some seeds of the run have been trained for {part.config.steps:,} steps, not "
+                    f"for {steps:,}; finish that training first."
                 )
         run.aim_at(budget)
         if not (missing := self.missing):
@@ -141,9 +142,9 @@ class SeedGroups:
         ]
 
     def store(self, job: SeedsJob, trained: TrainedSeeds | QfolioError, log: Log) -> None:
-        """Keeps what a job has trained; after the last one, all of them become the run.
+        """Stores the result of a job; after the last one, joins all groups into the run.
 
-        Raises QfolioError if the job could not train its seeds. log: hears of its learning curve.
+        Raises QfolioError if the job could not train its seeds. log: receives its learning curve.
         """
         if isinstance(trained, QfolioError):
             raise trained
@@ -158,7 +159,7 @@ class SeedGroups:
 
     @property
     def missing(self) -> list[int]:
-        """The seeds of which no group is there."""
+        """The seeds that are in no finished group."""
         there = {seed for part in self._done.values() for seed in part.config.seed_range}
         return [seed for seed in self._run.config.seed_range if seed not in there]
 
@@ -177,7 +178,7 @@ class SeedGroups:
 
 
 def _groups(seeds: Sequence[int], executor: Executor) -> list[range]:
-    """Ascending seeds in groups of consecutive ones that fill a worker's devices."""
+    """Groups of consecutive seeds, each of which fills a worker's devices; seeds: ascending."""
     size = at_once(executor)
     groups: list[range] = []
     for seed in seeds:
@@ -189,9 +190,9 @@ def _groups(seeds: Sequence[int], executor: Executor) -> list[range]:
 
 
 def _joined(parts: Sequence[TrainedSeeds], run: "Run") -> TrainedSeeds:
-    """All seeds in one; times are added up.
+    """Joins the groups of seeds into one; their times are added up.
 
-    Rows come as those of one population do: by time, then by seed.
+    Rows are ordered as in one population: by time, then by seed.
     """
     parts = sorted(parts, key=lambda part: part.config.seed)
     states = [part.state["training"] for part in parts]
@@ -230,7 +231,7 @@ def _write(place: Path, part: TrainedSeeds, agent: Agent) -> None:
 
 
 def _read(place: Path, state: PyTree) -> Iterator[TrainedSeeds]:
-    """The finished seeds in such a folder; state: that of the whole run, as a template."""
+    """Reads the finished seeds in such a folder; state: a template, the whole run's state."""
     for path in place.glob("[0-9]*"):
         files = RunFolder(path)
         config = files.read_config()

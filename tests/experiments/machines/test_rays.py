@@ -155,7 +155,7 @@ class TestRay:
         busy: Any = nodes.ray.remote(num_cpus=1)(Busy)
         others = [busy.remote() for _ in nodes.nodes]
         assert all(nodes.ray.get([other.ready.remote() for other in others]))
-        message = "No worker has got a place for 3 seconds: each asks for 1 core, and of the Ray "
+        message = "No worker got a place within 3 seconds: each asks for 1 core, and of the Ray "
         with pytest.raises(QfolioError, match=f"{message}cluster's 3 cores 0 are free; end"):
             list(on("ray").map([Add("a", 1.0)], silent))
         for other in others:

@@ -41,7 +41,7 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
 def result_of(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:
     """An agent's final regret or return as text.
 
-    ``interval`` adds its 95% interval, or the seeds' range if there are too few for one.
+    ``interval`` adds its 95% interval, or the range of the seeds if they are too few for one.
     """
     write = share if ranking["measure"] == "regret" else amount
     final = ranking["agents"][name]["final"]
@@ -75,7 +75,7 @@ def span(seconds: float) -> str:
 
 
 def _quickest(ranking: dict[str, Any]) -> str:
-    """The agents that come near the optimum, or the best return, in fewest steps and least time."""
+    """A sentence on which agents come near the goal in the fewest steps and the least time."""
     goal = "the optimum" if ranking["measure"] == "regret" else "the best return"
     near = f"within {HEADLINE:.0%} of {goal}"
     arrived = {

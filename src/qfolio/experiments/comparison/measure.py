@@ -1,4 +1,4 @@
-"""What a comparison measures of a finished run: its grades, its curve and its cost."""
+"""The measures of a finished run in a comparison: its grades, its learning curve and its cost."""
 
 from functools import partial
 from typing import Any
@@ -18,7 +18,8 @@ from qfolio.experiments.run import Run
 def measure(run: Run, devices: int) -> Result:
     """Grades a run and measures its cost.
 
-    devices: number of devices that trained its seeds side by side."""
+    devices: number of devices that trained its seeds side by side.
+    """
     summary = run.summary()
     seeds = len(run.population.seeds)
     solution, curve_optimum = run.task.optimum(), None

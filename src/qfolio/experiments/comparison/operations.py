@@ -1,4 +1,4 @@
-"""An agent's arithmetic operations, counted in its program, not measured on a machine."""
+"""An agent's arithmetic operations, counted in its program instead of measured."""
 
 import math
 from functools import partial
@@ -13,10 +13,10 @@ from qfolio.core.training import advance, begin
 
 
 def operations_per_step(task: Task, agent: Agent) -> float | None:
-    """Operations in products of matrices for each environment step, counted in the program.
+    """Floating-point operations in matrix products per environment step, counted in the program.
 
-    A product of (n, k) and (k, m) counts 2nkm, as processors are rated; all else is left out. None
-    if the task is not part of the program.
+    A product of (n, k) and (k, m) counts 2nkm, the usual convention; all else is left out. None if
+    the task is not part of the program.
     """
     state = jax.eval_shape(partial(begin, task, agent), jnp.uint32(0))
     learn = partial(advance, task, agent, learning=True)

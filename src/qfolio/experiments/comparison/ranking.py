@@ -3,9 +3,9 @@
 A result is graded by its regret, the share of the exact optimum's return that it misses, or by its
 return if no optimum is known. Intervals are bootstraps over seeds (``qfolio.core.statistics``).
 Agents are told apart if an exact rank test of their seeds rejects equality, with Holm's correction
-for the number of pairs: intervals of few seeds are too narrow, and one of many pairs is easily
-lucky. Seeds of two agents count as independent; if they share some luck (such as initial weights),
-the test is conservative.
+for the number of pairs: intervals from few seeds are too narrow, and among many pairs one easily
+differs by chance. Seeds of two agents count as independent; if they share random numbers (such as
+initial weights), the test is conservative.
 """
 
 import math
@@ -28,13 +28,13 @@ from qfolio.core.statistics import (
 )
 
 THRESHOLDS = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
-"""Regrets that a learning curve may reach."""
+"""Regret thresholds at which learning curves are compared."""
 
 HEADLINE = 0.1
-"""The threshold of tables and sentences."""
+"""The threshold that tables and sentences use."""
 
 LEVEL = 0.05
-"""Probability that the comparison of all pairs tells equal agents apart."""
+"""Family-wise error rate: probability that the tests tell any two equal agents apart."""
 
 
 @dataclass(frozen=True)
@@ -44,15 +44,15 @@ class Result:
     Attributes:
         returns: Mean return of each seed's final policy on the fixed starts.
         optimum: The exact optimum on the same starts; None if it is unknown.
-        starts, curve_starts: Number of start states, finally and along the learning curve.
+        starts, curve_starts: Number of start states in the final grades and on the learning curve.
         curve_steps: Environment steps of a seed at each point of the learning curve.
         curve_returns: Greedy returns there, a row for each point.
         curve_optimum: The exact optimum on the starts of the curve.
         episodes, env_steps: Training episodes and steps of each seed.
-        seconds_train, seconds_compile: For all seeds, side by side.
+        seconds_train, seconds_compile: Time for all seeds, side by side.
         seconds_per_seed: Training time, on one core or as a share of its device.
         steps_per_second: Environment steps of all seeds.
-        operations_per_step: Multiplications and additions in products of matrices for each
+        operations_per_step: Multiplications and additions in matrix products for each
             environment step, learning included; None if nothing is compiled.
         state_bytes: A seed's training state: weights, optimizer, replay, environments.
         policy_bytes, parameters: The size of the policy, in bytes and in numbers.
@@ -78,9 +78,9 @@ class Result:
 
 
 def rank(results: dict[str, Result]) -> dict[str, Any]:
-    """The ranking of two agents or more, as JSON values.
+    """The ranking of two or more agents, as JSON values.
 
-    "measure" is "regret" (a share of the optimum, small is good) or "return"; "order" names the
+    "measure" is "regret" (a share of the optimum, lower is better) or "return"; "order" names the
     agents, best first; "agents" holds the measures of each, "pairs" the tests of all pairs.
     "common_steps" is the shortest training, up to which "area" averages the learning curves.
     """
@@ -107,7 +107,7 @@ def rank(results: dict[str, Result]) -> dict[str, Any]:
 
 
 def curve(result: Result, measure: str) -> Floats:
-    """The learning curve of each seed in the measure of the ranking, shape (point, seed)."""
+    """The learning curve of each seed in the ranking's measure, of shape (point, seed)."""
     if measure == "return":
         return np.asarray(result.curve_returns, dtype=float)
     assert result.curve_optimum is not None
@@ -117,7 +117,7 @@ def curve(result: Result, measure: str) -> Floats:
 def steps_within(steps: Sequence[int], regrets: Floats, threshold: float) -> list[int | None]:
     """For each seed, the steps after which its regret stays within the threshold; None if never.
 
-    steps: of the points. regrets: of shape (point, seed).
+    steps: environment steps at the points. regrets: of shape (point, seed).
     """
     outside = ~(regrets <= threshold)
     # The first point after the last one outside.
@@ -127,19 +127,19 @@ def steps_within(steps: Sequence[int], regrets: Floats, threshold: float) -> lis
 
 
 def middle_steps(steps: Sequence[int | None]) -> float | None:
-    """The interquartile mean; seeds that never arrived count as slower than all others.
+    """The interquartile mean of steps; seeds that never arrive count as slower than all others.
 
     None if one of these lies in the middle half.
     """
     arrived = [float(count) for count in steps if count is not None]
     if len(arrived) < 0.75 * len(steps):
         return None
-    late = [max(arrived)] * (len(steps) - len(arrived))  # beyond the middle half, without weight
+    late = [max(arrived)] * (len(steps) - len(arrived))  # outside the middle half
     return float(interquartile_mean(arrived + late))
 
 
 def area(steps: Sequence[int], values: Floats, until: int) -> Floats:
-    """Mean of curves from the first step to ``until``, for values of shape (point, seed)."""
+    """Mean of each curve up to step ``until``, for values of shape (point, seed)."""
     ends = np.append([x for x in steps if x < until], until)
     heights = np.stack([np.interp(ends, steps, column) for column in values.T])
     return np.asarray(np.trapezoid(heights, ends, axis=-1) / (ends[-1] - ends[0]))
@@ -160,7 +160,10 @@ def _final(result: Result, graded: bool) -> Floats:
 def _measures(
     result: Result, final: Floats, graded: bool, goal: float, common: int
 ) -> dict[str, Any]:
-    """final: regrets or returns of the seeds. goal: the best return, if no optimum is known."""
+    """The measures of one agent, as JSON values.
+
+    final: regrets or returns of the seeds. goal: the best return, if no optimum is known.
+    """
     returns = np.asarray(result.curve_returns, dtype=float)
     optimum = result.curve_optimum if graded and result.curve_optimum else goal
     heights = curve(result, "regret" if graded else "return")

@@ -42,14 +42,14 @@ from qfolio.experiments.seed_groups import SeedsJob, TrainedSeeds
 FILE = "comparison.json"
 
 COARSE = 10
-"""With fewer points, it is uncertain when a learning curve came near the goal."""
+"""Learning curves with fewer points only roughly show when an agent came near the goal."""
 
 
 @dataclass(frozen=True)
 class Entrant:
     """An agent with its variant of the task and its training budget.
 
-    preset: the name of the settings, for readers.
+    preset: the preset's name, for readers.
     """
 
     task: Task
@@ -145,20 +145,20 @@ class Comparison:
         note: str = "",
         out: Path | str,
     ) -> "Comparison":
-        """A comparison before its first agent.
+        """Creates a comparison in which no agent has been trained yet.
 
-        Raises QfolioError if an agent does not fit the task or the memory.
+        Raises QfolioError if an agent does not fit the task or into memory.
 
         Args:
-            entrants: Two agents or more, by name.
-            seeds: Number of seeds of each, from ``seed``.
+            entrants: Two or more agents, by name.
+            seeds: Number of seeds of each agent, from ``seed``.
             command: The command that started it, for the report.
-            note: A remark for the report, in a sentence.
+            note: A remark for the report, as a sentence.
             out: A new or empty folder.
         """
         if len(entrants) < 2:
             raise QfolioError(
-                "A comparison needs two agents or more; name them with --agents, for example "
+                "A comparison needs two or more agents; name them with --agents, for example "
                 "--agents dqn:fast,dqn:report."
             )
         seed_range(seeds, seed)
@@ -235,7 +235,7 @@ class Comparison:
 
     @property
     def _about(self) -> dict[str, Any]:
-        """What the log says of the comparison."""
+        """The description of the comparison in the log."""
         config = self.config
         return {
             "kind": "comparison",
@@ -281,7 +281,7 @@ class Comparison:
                 runs[name] = self._open(name)
                 stack.enter_context(locked(self.place(name)))
                 jobs += runs[name].groups.jobs(executor, label=name)
-                keep_if_finished(name)  # if nothing but the result was missing
+                keep_if_finished(name)  # all seeds may be trained, with only the result missing
             return carry_out(executor, jobs, listen, store, log)
 
     def _fail(self, job: Job, name: str, error: QfolioError, log: Log) -> None:
@@ -310,7 +310,7 @@ class Comparison:
         differing = [_differing(key, tasks) for key in next(iter(tasks.values()))]
         if any(differing):
             said = "; ".join(filter(None, differing))
-            notes.append(f"The task is not quite the same for all: {said}. {self._comparable()}")
+            notes.append(f"Task settings differ between agents: {said}. {self._comparable()}")
         steps = {name: self.results[name].env_steps for name in entrants}
         most, least = max(steps, key=lambda n: steps[n]), min(steps, key=lambda n: steps[n])
         if steps[most] > 1.05 * steps[least]:
@@ -328,7 +328,7 @@ class Comparison:
         return notes
 
     def _comparable(self) -> str:
-        """Whether start states, lengths and optima are equal, by comparing them."""
+        """A sentence on whether start states, episode lengths and optima are the same."""
         tasks = [entrant.task for name, entrant in self.entrants.items() if name in self.results]
         starts = [jax.vmap(task.reset)(start_keys()) for task in tasks]
         optima = [result.optimum for result in self.results.values()]
@@ -340,11 +340,14 @@ class Comparison:
         if known:
             alike["exact optima"] = bool(np.allclose(known, known[0], rtol=1e-4))
         if all(alike.values()):
-            return f"Their {listed(list(alike))} are the same (this was checked): results compare."
+            return (
+                f"Their {listed(list(alike))} are the same (this was checked), so results are "
+                "comparable."
+            )
         differ = listed([name for name, same in alike.items() if not same])
         if len(known) == len(optima):
             return f"Their {differ} differ, too: each regret is a share of the agent's own optimum."
-        return f"Their {differ} differ, too: returns do not compare."
+        return f"Their {differ} differ, too: returns are not comparable."
 
     def _open(self, name: str) -> Run:
         """The agent's run, from its last checkpoint if there is one."""
@@ -379,7 +382,7 @@ def _folder_name(name: str) -> str:
 
 
 def _require_fit(name: str, entrant: Entrant, seeds: int) -> None:
-    """Raises QfolioError if an agent cannot learn the task; traces without computing."""
+    """Raises QfolioError if an agent cannot learn the task; traces programs, runs none."""
     try:
         state = jax.eval_shape(partial(begin, entrant.task, entrant.agent), jnp.uint32(0))
         devices.require_memory(state, seeds)
@@ -397,7 +400,7 @@ def _entrant(task: str, entry: EntrantConfig) -> Entrant:
 
 
 def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
-    """The agents of each value of a task's setting; None if all have the same."""
+    """The values of a task's setting and the agents that have them; None if all are the same."""
     values: dict[str, list[str]] = {}
     for name, entry in tasks.items():
         value = entry[key]
@@ -407,7 +410,7 @@ def _differing(key: str, tasks: dict[str, dict[str, Any]]) -> str | None:
 
 
 def _measures(result: Result) -> dict[str, float | None]:
-    """What the log says of a result."""
+    """The measures of a result in the log."""
     final, optimum = float(np.mean(result.returns)), result.optimum
     missed = None if optimum is None else float(regret(final, optimum))
     return {"return": final, "optimum": optimum, "regret": missed}

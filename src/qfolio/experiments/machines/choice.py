@@ -12,8 +12,11 @@ def on(text: str) -> Executor:
 
     Args:
         text: "here" for this process, "processes:4" for four processes of this machine, "ray" for
-            the Ray cluster of this machine (started if there is none), "ray://HOST:10001" for the
-            one behind a Ray Client.
+            the Ray cluster of this machine (started if there is none), "ray://HOST:10001" for a
+            cluster reached through Ray Client.
+
+    Raises:
+        QfolioError: The text names no executor, or the number of processes is out of range.
     """
     kind, _, rest = text.partition(":")
     if text == "here":

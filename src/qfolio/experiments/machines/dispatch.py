@@ -1,4 +1,4 @@
-"""The driver's side: workers get jobs, listeners hear of them, results come out.
+"""The driver's side: gives jobs to workers, calls listeners and yields results.
 
 A thread of its own talks to the workers, so that they get their next job while the main thread
 writes files or a report.
@@ -30,12 +30,12 @@ from qfolio.experiments.machines.schedule import Schedule
 R = TypeVar("R")
 
 PATIENCE = 0.2
-"""Seconds until a thread looks up to see whether it should stop."""
+"""Seconds between a thread's checks of whether it should stop."""
 
 
 @runtime_checkable
 class Workers(Protocol):
-    """Places for workers, by number. All calls come from one thread; closing ends every worker."""
+    """Numbered places for workers; closing ends every worker. All calls come from one thread."""
 
     @property
     def count(self) -> int: ...
@@ -45,16 +45,16 @@ class Workers(Protocol):
         ...
 
     def send(self, worker: int, job: Job) -> None:
-        """Gives a worker a job; a ``Done`` or ``Failed`` follows, and ``Report``s before it."""
+        """Gives a worker a job; ``Report``s follow, and then a ``Done`` or ``Failed``."""
         ...
 
     def receive(self, seconds: float) -> list[tuple[int, Message]]:
-        """What workers have said, each message with its worker; waits at most ``seconds``."""
+        """Messages from workers, each with its worker's number; waits at most ``seconds``."""
         ...
 
 
 class _Began(NamedTuple):
-    """A worker begins a job."""
+    """A worker has begun a job."""
 
 
 class _Ended(NamedTuple):
@@ -124,9 +124,9 @@ def drive(
     tell: Callable[[Job[R], News], None],
     stop: threading.Event,
 ) -> None:
-    """Gives every job to a worker, and again if the worker is lost, until all are done.
+    """Gives every job to a worker, and to another if that worker is lost, until all are done.
 
-    tell: called with a job that a worker begins, and with what the worker says of it.
+    tell: called with each job that a worker begins, and with each of the worker's messages on it.
 
     Raises:
         QfolioError: A job failed or lost too many workers, or no worker starts.
@@ -170,7 +170,7 @@ def drive(
 
 
 def _require_same(ready: Ready, wanted: dict[str, str]) -> None:
-    """Raises QfolioError if a worker has other versions than the driver."""
+    """Raises QfolioError if a worker's software versions differ from the driver's."""
     for name, version in wanted.items():
         if (other := ready.versions.get(name)) != version:
             raise QfolioError(

@@ -1,4 +1,4 @@
-"""What a worker tells the driver. Nothing here imports jax, which a worker sets up first."""
+"""Messages from a worker to the driver. Nothing here imports jax, which a worker configures."""
 
 import os
 import platform
@@ -18,7 +18,7 @@ class Ready(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What the listeners of a training hear, as values."""
+    """The progress of a training, for its listeners in the driver."""
 
     hook: Literal["on_start", "on_chunk", "on_end"]
     where: str  # the worker
@@ -42,7 +42,7 @@ class Done(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """A job raised an error, which would be the same on any worker.
+    """A job raised an error, which would recur on any worker.
 
     plain: whether it is a QfolioError; otherwise ``error`` is a traceback.
     """
@@ -52,7 +52,7 @@ class Failed(NamedTuple):
 
 
 class Lost(NamedTuple):
-    """A worker is gone; why: in a few words."""
+    """A worker is lost; why: the cause in a few words."""
 
     why: str
 
@@ -61,7 +61,7 @@ Message = Ready | Report | Done | Failed | Lost
 
 
 def versions() -> dict[str, str]:
-    """What a worker and the driver must have in common, so that results are equal to the bit."""
+    """Versions that worker and driver must share for results to be equal bit for bit."""
     python = ".".join(platform.python_version_tuple()[:2])
     return {"qfolio": __version__, "jax": version("jax"), "Python": python}
 

@@ -1,6 +1,6 @@
-"""Jobs as bytes.
+"""Serialization of jobs.
 
-Large arrays, such as prices, travel beside the jobs, so that a worker gets each of them once.
+Large arrays, such as prices, are sent apart from the jobs, so that a worker gets each only once.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ from qfolio.core.registry import trust, trusted
 class Parcel(NamedTuple):
     """A job without its large arrays.
 
-    arrays: their digests. modules: a user's own, which the job names.
+    arrays: the digests of these arrays. modules: the user's own modules that the job names.
     """
 
     job: bytes
@@ -28,9 +28,9 @@ class Parcel(NamedTuple):
 
 
 class Packer:
-    """Packs jobs; ``arrays`` holds each large array of all of them, as bytes, by its digest.
+    """Packs jobs; ``arrays`` holds the bytes of all their large arrays by digest.
 
-    These bytes are read by the driver's own workers only; no file holds any.
+    Only the driver's own workers read these bytes; they are never written to a file.
     """
 
     def __init__(self) -> None:
@@ -63,24 +63,24 @@ class Packer:
 
 
 def _names(pickled: bytes, module: str) -> bool:
-    """Whether a pickle has ``module:Name`` in a text, or the module as a whole text."""
+    """Whether a string in a pickle is the module's name or contains ``module:Name``."""
     name = module.encode()
     whole = pickle.SHORT_BINUNICODE + bytes([len(name) % 256]) + name
     return name + b":" in pickled or whole in pickled
 
 
 class Unpacker:
-    """Unpacks parcels; keeps the arrays, so that jobs share them as they did in the driver."""
+    """Unpacks parcels; keeps the arrays, so that jobs share them as in the driver."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, Any] = {}
 
     def keep(self, arrays: Mapping[str, bytes]) -> None:
-        """Keeps arrays that came beside a parcel."""
+        """Keeps arrays that were sent with a parcel."""
         self._arrays |= {digest: pickle.loads(content) for digest, content in arrays.items()}
 
     def lacks(self, parcel: Parcel) -> list[str]:
-        """The digests of arrays that have not come yet."""
+        """The digests of arrays that have not arrived yet."""
         return [digest for digest in parcel.arrays if digest not in self._arrays]
 
     def unpack(self, parcel: Parcel) -> Any:

@@ -1,7 +1,7 @@
 """Workers that are processes of this machine.
 
 They are spawned, because a fork of a process in which jax has started threads may deadlock. Each
-has a share of the cores to itself, and ends when the driver does, however that ends.
+has its own share of the cores and ends when the driver does, even if the driver is killed.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from qfolio.experiments.machines.worker import environment, serve
 R = TypeVar("R")
 
 ENDING = 1.0
-"""Seconds that a process which has closed its pipe has for its end."""
+"""Seconds that a process may take to end after closing its pipe."""
 
 _SPAWN = multiprocessing.get_context("spawn")
 
@@ -41,7 +41,7 @@ class Processes:
     In a script of your own, put the call that runs them under ``if __name__ == "__main__":``,
     because each process imports the script.
 
-    cores: of each process (default: an equal share).
+    cores: number of cores of each process (default: an equal share).
     """
 
     count: int
@@ -81,7 +81,7 @@ class _Pool:
         mine = [cores[i % len(cores)] for i in range(first, first + self._devices)]
         process = _SPAWN.Process(target=serve, args=(theirs, mine, self._environment), daemon=True)
         process.start()
-        theirs.close()  # the worker's copy alone is left, so that its end is the pipe's
+        theirs.close()  # only the worker's copy is left, so the pipe closes when it ends
         self._processes[worker], self._pipes[worker] = process, ours
 
     def send(self, worker: int, job: Job) -> None:
@@ -89,7 +89,7 @@ class _Pool:
         new = [digest for digest in parcel.arrays if digest not in self._sent[worker]]
         self._sent[worker].update(new)
         content = (parcel, {digest: self._packer.arrays[digest] for digest in new})
-        with contextlib.suppress(OSError):  # a worker that is gone is noticed when it is heard
+        with contextlib.suppress(OSError):  # receive() notices a lost worker
             self._pipes[worker].send_bytes(pickle.dumps(content, protocol=5))
 
     def receive(self, seconds: float) -> list[tuple[int, Message]]:
@@ -108,7 +108,7 @@ class _Pool:
     def close(self) -> None:
         """Ends all processes."""
         for process in self._processes.values():
-            process.kill()  # whatever they compute is not wanted any more
+            process.kill()  # their results are no longer wanted
         for worker in list(self._processes):
             self._bury(worker)
 
@@ -151,7 +151,7 @@ def _cores() -> list[int]:
 
 
 def _require_cores() -> None:
-    """Raises QfolioError if jax computes on something that processes cannot share out."""
+    """Raises QfolioError unless jax computes on the CPU, whose cores processes can share."""
     if (platform := jax.devices()[0].platform) in LOCKSTEP:
         raise QfolioError(
             f"Processes share out cores, but jax computes on a {platform} here; use --on ray, or "

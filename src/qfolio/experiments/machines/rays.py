@@ -1,6 +1,6 @@
-"""Workers that are actors of a Ray cluster: one for each GPU, or one for so many cores.
+"""Workers that are actors of a Ray cluster: one per GPU, or one per group of cores.
 
-Actors live as long as the run, because a task of Ray on a GPU gets a new process, which compiles
+Actors live as long as the run, because a Ray task on a GPU gets a new process, which compiles
 everything again.
 """
 
@@ -26,7 +26,7 @@ from qfolio.experiments.machines.worker import Actor, environment
 R = TypeVar("R")
 
 PLACE = 30.0
-"""Seconds in which a first worker has to get a place, if the cluster seemed to have room for it."""
+"""Seconds that the first worker may wait for a place, if the cluster seemed to have room."""
 
 
 class Ray:
@@ -54,7 +54,7 @@ class Ray:
         kind, asked = ("GPU", 1) if self.lockstep else ("CPU", max(cpus, 1))
         room = sum(int(node.get(kind, 0)) // asked for node in there)
         self.workers, self.cpus = room if workers is None else workers, cpus
-        self.waits = workers is not None  # for machines that come later
+        self.waits = workers is not None  # for machines that join later
         if self.workers < 1 or cpus < 1:
             what = "GPU" if self.lockstep else f"node with {_cores(max(cpus, 1))}"
             raise QfolioError(
@@ -89,7 +89,7 @@ class _Actors:
         self._packer = Packer()
         self._stored: dict[str, Any] = {}  # references to arrays in the cluster's store
         self._actors: dict[int, Any] = {}
-        self._answers: dict[Any, int] = {}  # that are awaited, and whose
+        self._answers: dict[Any, int] = {}  # awaited answers, with their workers
 
     def start(self, worker: int) -> None:
         self._actors[worker] = self._actor.remote(self._environment)
@@ -142,7 +142,7 @@ class _Actors:
         there = int(self._ray.cluster_resources().get(kind, 0))
         asked = "a GPU" if self._executor.lockstep else _cores(self._executor.cpus)
         return QfolioError(
-            f"No worker has got a place for {PLACE:.0f} seconds: each asks for {asked}, and of the "
+            f"No worker got a place within {PLACE:.0f} seconds: each asks for {asked}, and of the "
             f"Ray cluster's {there} {what} {free} are free; end what else runs there, or add a "
             "machine."
         )
@@ -188,7 +188,7 @@ def _connected(address: str | None) -> Any:
 
 def _connect(ray: Any, address: str | None) -> None:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what matters becomes an exception
+        warnings.simplefilter("ignore")  # real problems raise an exception
         ray.init(address, logging_level=logging.ERROR, log_to_driver=False)
 
 
@@ -197,7 +197,7 @@ def _cores(count: int) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """Why an actor is gone; raises QfolioError if its machine lacks a module, as others will."""
+    """Why an actor is lost; raises QfolioError if its machine lacks a module."""
     text = str(error)
     if missing := re.search(r"No module named '([\w.]+)'", text):
         raise QfolioError(

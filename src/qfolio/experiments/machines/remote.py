@@ -9,11 +9,11 @@ from qfolio.experiments.fit import Listener, Row, Training
 from qfolio.experiments.machines.messages import Report, place
 
 EVERY = 0.5
-"""Seconds between two reports: chunks may be shorter, and workers many."""
+"""Minimum number of seconds between two reports, since many workers may have short chunks."""
 
 
 class Reporter(Listener):
-    """Reports a training to the driver, at its start, at its end and now and then between."""
+    """Reports a training to the driver: at its start, at its end and at intervals in between."""
 
     def __init__(self, send: Callable[[Report], None]) -> None:
         self.send, self.sent = send, 0.0
@@ -55,7 +55,7 @@ class Reporter(Listener):
 
 
 class RemoteTraining(Training):
-    """A training on a worker, as it was last reported; its population is not here."""
+    """A training on a worker, as last reported; its population stays on the worker."""
 
     def __init__(self, report: Report) -> None:
         self.budget, self.config, self.begun = report.budget, report.config, report.begun
@@ -89,7 +89,7 @@ class RemoteTraining(Training):
 
 
 def hear(report: Report, listener: Listener) -> None:
-    """Has a listener hear what a worker reported."""
+    """Passes a worker's report to a listener."""
     training = RemoteTraining(report)
     if report.hook == "on_chunk":
         listener.on_chunk(training, report.rows)

@@ -1,4 +1,4 @@
-"""Which worker gets which job. Pure bookkeeping: no processes, no clock, no network."""
+"""The assignment of jobs to workers. Pure bookkeeping: no processes, no clock, no network."""
 
 from collections import Counter, deque
 from collections.abc import Iterable
@@ -8,16 +8,16 @@ from qfolio.core.errors import QfolioError
 from qfolio.experiments.executor import Job
 
 ATTEMPTS = 3
-"""Workers that may be lost to one job, and starts in a row that may fail in one place."""
+"""Maximum number of workers lost on one job, and of failed starts in a row in one place."""
 
 R = TypeVar("R")
 
 
 class Schedule(Generic[R]):
-    """Gives jobs to workers in their order; the job of a lost worker is given out again, first.
+    """Gives jobs to workers in order; the job of a lost worker comes first again.
 
-    jobs: taken one by one, when a worker is free; None if there is none at present. Workers are
-    numbers.
+    jobs: taken one by one, when a worker is free; a None means that there is no job at present.
+    Workers are numbers.
     """
 
     def __init__(self, jobs: Iterable[Job[R] | None]) -> None:
@@ -46,19 +46,19 @@ class Schedule(Generic[R]):
         return self._exhausted and not (self._running or self._again)
 
     def of(self, worker: int) -> Job[R]:
-        """The job that a worker runs."""
+        """The job that a worker is running."""
         return self._running[worker]
 
     def start(self, worker: int) -> None:
-        """A worker has started."""
+        """Records that a worker has started."""
         self._failed_starts[worker] = 0
 
     def finish(self, worker: int) -> Job[R]:
-        """A worker has finished its job, which is returned."""
+        """Records that a worker has finished its job; returns the job."""
         return self._running.pop(worker)
 
     def lose(self, worker: int, why: str) -> bool:
-        """A worker is gone; whether to start another one in its place.
+        """Records that a worker is lost; returns whether to start another in its place.
 
         Raises QfolioError if its job has lost too many workers.
         """

@@ -1,6 +1,6 @@
 """The worker's side: a process (``serve``) or an actor of Ray (``Actor``).
 
-jax is imported when cores and environment have been set.
+jax is imported after cores and environment have been set.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ def prepare(environment: Mapping[str, str]) -> Ready:
 
 
 def environment(cores: int) -> dict[str, str]:
-    """The flags of this process, for a worker with so many cores."""
+    """XLA's flags of this process, adapted to a worker with ``cores`` cores."""
     flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if _COUNT not in flag]
     return {"XLA_FLAGS": " ".join([*flags, f"{_COUNT}={cores}"])}
 
@@ -42,7 +42,7 @@ def work(unpacker: "Unpacker", parcel: "Parcel", send: Callable[[Message], None]
     """Runs a job, and sends its reports and its result."""
     from qfolio.experiments.machines.remote import Reporter
 
-    try:  # also the sending, which fails if a result cannot be pickled
+    try:  # includes sending, which fails if a result cannot be pickled
         send(Done(unpacker.unpack(parcel).run([Reporter(send)])))
     except QfolioError as error:
         send(Failed(str(error), plain=True))
@@ -51,7 +51,7 @@ def work(unpacker: "Unpacker", parcel: "Parcel", send: Callable[[Message], None]
 
 
 def serve(pipe: connection.Connection, cores: list[int], environment: dict[str, str]) -> None:
-    """The life of a process: jobs come through the pipe, until it is closed."""
+    """The main function of a process: runs jobs from the pipe until it is closed."""
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, cores)
@@ -71,7 +71,7 @@ def serve(pipe: connection.Connection, cores: list[int], environment: dict[str, 
 
 
 def _end_with_the_driver() -> None:
-    """Waits for the driver's end, also in the middle of a job."""
+    """Ends this process when the driver ends, even in the middle of a job."""
     driver = multiprocessing.parent_process()
     assert driver is not None
     connection.wait([driver.sentinel])
@@ -85,7 +85,7 @@ class Actor:
         self._environment, self._said = environment, SimpleQueue[Message]()
 
     def placed(self) -> bytes:
-        """Nothing, as soon as the actor has a place in the cluster."""
+        """No messages; answered as soon as the actor has a place in the cluster."""
         return pickle.dumps([])
 
     def ready(self) -> bytes:
@@ -96,11 +96,11 @@ class Actor:
         return pickle.dumps([ready])
 
     def begin(self, parcel: bytes, arrays: dict[str, Any]) -> None:
-        """Begins a job, which runs beside ``listen``; arrays: references to those that it needs."""
+        """Begins a job in the background; arrays: references to the arrays that it needs."""
         threading.Thread(target=self._run, args=(pickle.loads(parcel), arrays)).start()
 
     def listen(self) -> bytes:
-        """What has been said; waits until there is something."""
+        """The messages so far, as bytes; waits until there is one."""
         said = [self._said.get()]
         with contextlib.suppress(Empty):
             while True:
