@@ -28,7 +28,7 @@ PRESETS: Presets = {
 
 
 def default_agent(task: str) -> str:
-    """The first agent that has presets for a task, or a default; the task need not exist."""
+    """The first agent with presets for a task, or a default agent; accepts unknown tasks."""
     default = "dqn" if task in (*TASKS, "portfolio") else "ppo"
     return next((agent for name, agent in PRESETS if name == task), default)
 
@@ -54,7 +54,7 @@ def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
         agent: A name that ``qfolio train`` knows.
 
     Raises:
-        QfolioError: There is no such preset; the message says what there is.
+        QfolioError: There is no such preset; the message lists those that exist.
     """
     presets = presets_of(task, agent)
     if not presets:
@@ -67,7 +67,7 @@ def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
 
 
 def _fitting(task: str, agent: str) -> str:
-    """What to use instead of a task and an agent that do not go together."""
+    """Advice on what to use instead of a task and an agent that do not fit together."""
     suited = [other for other, name in PRESETS if name == agent]
     twins = [other for other in suited if other.partition("/")[0] == task.partition("/")[0]]
     others = f"on {task} use {listed([name for other, name in PRESETS if other == task], 'or')}"
@@ -79,10 +79,10 @@ def _fitting(task: str, agent: str) -> str:
 
 
 def changes(config: RunConfig, task: type[Task]) -> tuple[str, dict[str, tuple[Any, Any]]] | None:
-    """The preset of a run, and the settings that differ from it: their values, and the preset's.
+    """The preset of a run, and the settings that differ from it: the run's value and the preset's.
 
     A run without a preset is compared with the first one; None if there is none.
-    task: The class of the run's task.
+    task: the class of the run's task.
     """
     known = presets_of(config.task, config.agent)
     if not known:

@@ -1,4 +1,4 @@
-"""Presets for tables: finite processes and the pendulum on a grid."""
+"""Presets for tabular agents: finite processes and the pendulum on a grid."""
 
 from typing import Any
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from qfolio.experiments.presets.preset import Preset, Presets
 
-# Small inputs matter (input_gain), and the rare bad ends must propagate fast (n_steps).
+# Small inputs matter (input_gain), and rare failures must propagate fast (n_steps).
 _DQN = {
     "hidden": (128, 128),
     "input_gain": 3.0,
@@ -107,9 +107,9 @@ def _sac(id: str, steps: int, **changes: Any) -> dict[str, Preset]:
 def _falling(
     id: str, agent: str, steps: int, updates: float, settings: dict[str, Any]
 ) -> dict[str, Preset]:
-    """The preset ``fast``, whose learning rate has fallen to zero at the end.
+    """The preset ``fast``, with a learning rate that falls to zero at the end.
 
-    updates: gradient steps a step.
+    updates: gradient steps per environment step.
     """
     end = {"learning_rate_final": 0.0, "learning_rate_steps": float(int(steps * updates))}
     return {"fast": _preset(id, agent, steps, **{**settings, **end})}

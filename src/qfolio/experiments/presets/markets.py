@@ -85,8 +85,8 @@ PRESETS: Presets = {
     ("market/ar1", "dqn"): _all_actions(
         8192, "grid:10", batch_size=1024, learning_rate_steps=2016.0
     ),
-    # A trade pays off over years, which at daily steps are thousands of steps: the slopes carry its
-    # worth beyond the rollout. All gradients are cut, so that the long first ones, far from the
+    # A trade pays off over years, that is, thousands of daily steps: the slopes carry its value
+    # beyond the rollout. All gradients are clipped, so that the large first ones, far from the
     # region, do not outweigh the later ones in Adam's mean of squares.
     ("market/no-trade", "pathwise"): _pathwise(
         6400,
@@ -107,7 +107,7 @@ PRESETS: Presets = {
     ("market/liquidation", "pathwise"): _pathwise(
         25_600, num_envs=64, rollout_length=5, learning_rate_steps=400.0
     ),
-    # The critics see how the value curves in the position only if exploration reaches around it.
+    # The critics learn the value's curvature in the position only if exploration reaches around it.
     ("market/liquidation", "sac"): {
         "fast": Preset(
             "sac",

@@ -15,7 +15,7 @@ SIGNALS = (
 
 
 SHORT_SIGNALS = "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,moving-average:10"
-"""Signals that pay off within days: values of single moves are too noisy for slower ones."""
+"""Signals that pay off within days; for slower ones, values of single trades are too noisy."""
 
 
 _ON_ANCHOR = {"window": 1, "horizon": 84, "signals": SIGNALS, "anchor": "equal-weight"}
@@ -45,7 +45,7 @@ _ON_SIGNALS = {
 }
 
 
-# The values of actions differ by little, next to the noise of a day's returns: hence large batches,
+# The values of actions differ little relative to the noise of daily returns: hence large batches,
 # linear values of positions, and actions that have to be better by standard errors.
 _DQN = {
     "network": "positions",

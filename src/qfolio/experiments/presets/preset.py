@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Preset(NamedTuple):
-    """An agent's settings, with the default budget and number of seeds.
+    """An agent's settings, with its default budget and number of seeds.
 
     The budget is in episodes, or in steps of all environments if episodes may end early.
     """

@@ -25,7 +25,7 @@ from optuna.trial import TrialState
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.tuning.search import Dimension, Value
 
-optuna.logging.set_verbosity(optuna.logging.WARNING)  # otherwise it prints a line for every trial
+optuna.logging.set_verbosity(optuna.logging.WARNING)  # otherwise it logs every trial
 
 _KNOWN = (TrialState.COMPLETE, TrialState.PRUNED)
 _HELD = (*_KNOWN, TrialState.RUNNING)
@@ -36,14 +36,14 @@ class Trial(NamedTuple):
 
     number: int
     values: dict[str, Value]  # of the searched settings
-    returns: tuple[float | None, ...]  # greedy, by seed; None if the loss was not finite
+    returns: tuple[float | None, ...]  # greedy return of each seed; None if the loss was not finite
     is_preset: bool
     at_random: bool  # drawn from the whole space, not chosen by the sampler
     seconds: float  # its share of its batch's time, compiling included
 
     @property
     def value(self) -> float:
-        """The mean over seeds; NaN if one of them diverged."""
+        """The mean return over seeds; NaN if one of them diverged."""
         return float(np.mean([math.nan if x is None else x for x in self.returns]))
 
 
@@ -92,12 +92,12 @@ class Journal:
         return found
 
     def in_hand(self) -> int:
-        """Number of trials that are being trained, in all processes."""
+        """Number of trials in training, over all processes."""
         return len(self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
 
     @contextlib.contextmanager
     def at_work(self) -> Iterator[None]:
-        """Shows other processes that this one is alive."""
+        """Shows other processes that this one is alive, by a lock on its file."""
         place = self.folder / "processes" / self._process
         place.parent.mkdir(exist_ok=True)
         try:
@@ -128,7 +128,7 @@ class Journal:
             return asked
 
     def tell(self, asked: Asked, returns: Sequence[float], seconds: float) -> None:
-        """Records the returns of a trial by seed; with a NaN it ranks below all others."""
+        """Records the returns of a trial by seed; a trial with a NaN ranks below all others."""
         trial = asked.trial
         trial.set_user_attr("returns", [x if math.isfinite(x) else None for x in returns])
         trial.set_user_attr("seconds", round(seconds, 3))
@@ -139,13 +139,13 @@ class Journal:
             self._study.tell(trial, state=TrialState.PRUNED)
 
     def give_up(self, asked: Asked) -> None:
-        """Records that a trial was not finished; it will be proposed again."""
+        """Records that a trial was not finished, so that it is proposed again."""
         self._study.tell(asked.trial, state=TrialState.FAIL)
 
     def _sampler(self, known: int, in_hand: int) -> optuna.samplers.TPESampler:
         """A sampler for one trial, seeded by the numbers of finished and running trials.
 
-        A sampler that was reused would have random state that a resumed search lacks.
+        A reused sampler would have a random state that a resumed search lacks.
         """
         return optuna.samplers.TPESampler(
             seed=int(np.random.SeedSequence((known, in_hand)).generate_state(1)[0]),
@@ -180,7 +180,7 @@ class Journal:
 
 
 def best_of(trials: Sequence[Trial]) -> Trial | None:
-    """The trial with the highest mean return; None if none kept a finite loss."""
+    """The trial with the highest mean return; None if every trial diverged."""
     finite = [trial for trial in trials if math.isfinite(trial.value)]
     return max(finite, key=lambda trial: trial.value, default=None)
 

@@ -46,7 +46,7 @@ STARTS = 256
 """Start states on which configurations are compared."""
 
 FRESH = 1000
-"""First of the fresh seeds with which the best configuration is retrained at the end."""
+"""First of the fresh seeds that retrain the best configuration at the end."""
 
 RANDOM = 0.5
 """Share of the trials that are drawn at random before Optuna's sampler takes over; the sampler's
@@ -65,7 +65,7 @@ def tuning_keys(n: int = STARTS) -> Key[Array, " start"]:
 class Progress:
     """Progress of a search, after each batch."""
 
-    done: int  # trials of all processes
+    done: int  # finished trials of all processes
     total: int
     diverged: int
     best: Trial | None
@@ -78,7 +78,7 @@ class Progress:
 class _Share(Listener):
     """Reports the finished share of jobs that may run side by side.
 
-    shares: what each job has done of all work. share: of this job.
+    shares: the share of all work that each job has done. share: this job's share of all work.
     """
 
     def __init__(
@@ -151,17 +151,17 @@ class Tuning:
         preset: str,
         out: Path | str,
     ) -> "Tuning":
-        """A search before its first trial.
+        """Creates a search without trials.
 
         Args:
             task: The task to learn.
             agent: The agent of ``preset``, with the settings that are not searched.
             space: The searched settings.
-            trials: Number of configurations in all.
-            seeds: Seeds of each configuration.
+            trials: Total number of configurations.
+            seeds: Number of seeds of each configuration.
             budget: The budget of each agent.
-            batch: Configurations trained at once.
-            fresh_seeds: Seeds of the final comparison, which the search never uses.
+            batch: Number of configurations trained at once.
+            fresh_seeds: Number of seeds of the final comparison, which the search never uses.
             preset: The name of the preset, for readers.
             out: A new or empty folder.
         """
@@ -189,9 +189,9 @@ class Tuning:
     def open(
         cls, folder: Path | str, *, trials: int | None = None, batch: int | None = None
     ) -> "Tuning":
-        """A search from its folder, to join or to continue.
+        """Opens a search in its folder, to join or to continue it.
 
-        trials: a new number of configurations in all. batch: of this process alone.
+        trials: a new total number of configurations. batch: for this process alone.
         """
         folder = Path(folder)
         config = read_config(folder / STUDY, Study)
@@ -215,7 +215,7 @@ class Tuning:
         chunk_listener: Callable[[float], None] | None = None,
         executor: Executor | None = None,
     ) -> None:
-        """Trains batch after batch until the configured number of trials is reached.
+        """Trains one batch after another until the configured number of trials is reached.
 
         Ctrl-C stops after the current chunk and sets ``interrupted``; an unfinished batch is
         proposed again when the search is resumed. chunk_listener: called with the finished share of
@@ -254,12 +254,12 @@ class Tuning:
         listener: Callable[[float], None] | None = None,
         executor: Executor | None = None,
     ) -> tuple[Float[np.ndarray, "agent seed"], float]:
-        """Mean greedy returns of each agent and seed, NaN if the loss did not stay finite.
+        """Trains agents; returns mean greedy returns by agent and seed, NaN if the loss diverged.
 
         Also returns the seconds spent on compiling. Raises KeyboardInterrupt if Ctrl-C stops it
         before the end.
 
-        agents: by the names that the log has for them.
+        agents: by their names in the log.
         """
         executor, config = executor or Here(), self.config
         starts = np.asarray(jax.random.key_data(keys))

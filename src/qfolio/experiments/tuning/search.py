@@ -1,4 +1,4 @@
-"""The space of a hyperparameter search: which settings, over what range, on what scale."""
+"""The space of a hyperparameter search: its settings, their ranges and their scales."""
 
 import dataclasses
 import itertools
@@ -39,10 +39,10 @@ USUAL = {
 value; these ranges apply if that value is 0, 1 or infinite and so gives no scale."""
 
 AROUND = 10.0
-"""A default range spans the agent's own value divided by this and multiplied by it."""
+"""A default range goes from the agent's value divided by this to the value times this."""
 
 PROGRAMS = 64
-"""Most combinations of settings that shape the program; each is compiled separately."""
+"""Maximum number of combinations of settings that shape the program, each compiled separately."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Dimension:
 
     @property
     def key(self) -> str:
-        """Its name in the journal."""
+        """The setting's name in the journal."""
         return f"1-{self.name}" if self.scale == "near-one" else self.name
 
     def distribution(self) -> "BaseDistribution":
@@ -119,8 +119,8 @@ class Dimension:
         return self.low <= value <= self.high
 
     def around(self, value: float) -> "Dimension":
-        """The dimension with a range around a value, unless that value gives no scale."""
-        whole = 1.0 if self.high <= 1 else math.inf  # shares stay at most 1
+        """The dimension with a range around a value; unchanged if that value gives no scale."""
+        whole = 1.0 if self.high <= 1 else math.inf  # shares do not exceed 1
         if self.scale == "near-one" and 0 < value < 1:
             missing = _missing(value)
             ends = (_missing(min(missing * AROUND, 1 - 1e-3)), _missing(missing / AROUND))
@@ -192,7 +192,7 @@ def usual(agent: "Agent") -> list[Dimension]:
 
 
 def numbers(kind: type["Agent"]) -> list[str]:
-    """Settings that are inputs of the program, in which members of a population may differ."""
+    """Settings that are program inputs, so that members of a population may differ in them."""
     hints = typing.get_type_hints(kind)
     fields = dataclasses.fields(kind)
     return [f.name for f in fields if hints[f.name] is float and not f.metadata.get("static")]
@@ -201,7 +201,7 @@ def numbers(kind: type["Agent"]) -> list[str]:
 def require_buildable(
     kind: type["Agent"], base: Mapping[str, Any], space: Sequence[Dimension]
 ) -> None:
-    """Raises QfolioError if the end of a range or a choice is not a valid setting."""
+    """Raises QfolioError if an end of a range or a choice is not a valid setting."""
     if not space:
         raise QfolioError(
             f"{kind.__name__} has no setting that is searched by default; name some with --search."
@@ -213,8 +213,8 @@ def require_buildable(
     programs = math.prod(len(dim.choices) for dim in shaping)
     if programs > PROGRAMS:
         raise QfolioError(
-            f"{' × '.join(dim.name for dim in shaping)} make {programs} programs to compile; name "
-            f"fewer choices, {PROGRAMS} combinations at most."
+            f"{' × '.join(dim.name for dim in shaping)} make {programs} programs to compile; give "
+            f"fewer choices, at most {PROGRAMS} combinations."
         )
     for choices in itertools.product(*(dim.choices for dim in shaping)):
         chosen = {dim.name: choice for dim, choice in zip(shaping, choices, strict=True)}
@@ -238,7 +238,7 @@ def positions(space: Sequence[Dimension], values: Mapping[str, Value]) -> np.nda
 
 
 def _scale(low: float, high: float) -> str:
-    """Logarithmic if the ends, or their distances from 1, are a factor of 10 apart."""
+    """The scale of a range: logarithmic if its ends, or 1 minus them, are a factor of 10 apart."""
     if low > 0 and high / low >= 10:
         return "log"
     if high < 1 and _missing(low) / _missing(high) >= 10:
@@ -247,7 +247,7 @@ def _scale(low: float, high: float) -> str:
 
 
 def _missing(share: float) -> float:
-    """1 minus a share, without rounding digits."""
+    """1 minus a share, without floating-point noise in its digits."""
     return float(f"{1 - share:.10g}")
 
 

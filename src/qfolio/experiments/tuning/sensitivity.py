@@ -21,13 +21,13 @@ from qfolio.experiments.tuning.search import Dimension, positions
 Floats = NDArray[np.float64]
 
 TOLERANCE = 0.05
-"""Loss that a robust value may incur, as a share of the optimum (or of the best return)."""
+"""Tolerated loss of a robust value, as a share of the optimum (or of the best return)."""
 
 ENOUGH = 12
 """Fewest trials from which effects are estimated."""
 
 MOST = 400
-"""Most trials that the model is fitted to, evenly spaced: its cost grows with their cube."""
+"""Maximum number of trials for the model, evenly spaced: its cost grows with their cube."""
 
 POINTS = 41
 """Points on the scale of each setting at which its effect is estimated."""
@@ -58,7 +58,7 @@ class Outcome:
 
     @property
     def tolerance(self) -> str:
-        """The loss that a robust value may incur, in words."""
+        """The tolerated loss of a robust value, in words."""
         share = f"{100 * TOLERANCE:.0f}"
         if self.optimum is None:
             return f"{share}% of the best return"
@@ -85,14 +85,14 @@ class Effect:
     """The effect of one setting."""
 
     dimension: Dimension
-    share: float  # of the variation that it explains by itself
+    share: float  # share of the variation that it explains by itself
     places: Floats  # on its scale: POINTS of them, or one for each choice
-    heights: Floats  # predicted there, with all else as in the best quarter
+    heights: Floats  # predicted there, with all other settings as in the best quarter
     robust: NDArray[np.bool_]  # whether the expectation is within the tolerance of its best
 
     @property
     def range(self) -> tuple[float, float]:
-        """The ends of the robust stretch around the best place."""
+        """The ends of the robust range around the best place."""
         low = high = int(self.heights.argmax())
         while low > 0 and self.robust[low - 1]:
             low -= 1
@@ -191,7 +191,7 @@ class _Model:
         kernel += WhiteKernel(0.1, (1e-4, 1.0))
         self._process = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # a bound of a length was reached
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a length scale reached its bound
             self._process.fit(inputs, heights)
         # Leave-one-out predictions (Rasmussen & Williams 2006, eq. 5.12).
         inverse = np.linalg.inv(self._process.kernel_(inputs))
@@ -262,7 +262,7 @@ def percent(share: float) -> str:
 
 
 def short(value: float) -> str:
-    """Two significant digits of a setting; near 1, of its distance from 1."""
+    """A setting with two significant digits; near 1, those of its distance from 1."""
     if 0.9 < value < 1:
         return f"{value:.{1 - math.floor(math.log10(1 - value))}f}".rstrip("0")
     return f"{float(f'{value:.2g}'):g}"

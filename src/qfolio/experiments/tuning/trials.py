@@ -1,4 +1,4 @@
-"""Training configurations: some of them with all their seeds are one job."""
+"""Training of configurations in jobs: each job has some of them, with all their seeds."""
 
 import math
 from collections import defaultdict
@@ -19,7 +19,7 @@ from qfolio.experiments.fit import Listener, fit
 
 
 class TrainedTrials(NamedTuple):
-    """Mean greedy returns of each configuration and seed, NaN if a loss did not stay finite."""
+    """Mean greedy returns by configuration and seed, NaN where the loss diverged."""
 
     returns: Float[np.ndarray, "configuration seed"]
     seconds_compile: float
@@ -32,8 +32,8 @@ class TrialsJob:
     All members take as many steps as the episodes would if none ended early, so that a
     configuration's result does not depend on the others.
 
-    names: of the configurations. starts: data of the keys of the start states for their grades.
-    most: configurations of the largest job; all share its programs.
+    names: of the configurations. starts: key data of the start states for grading. most: number of
+    configurations of the largest job, whose programs all share.
     """
 
     names: tuple[str, ...]
@@ -54,7 +54,7 @@ class TrialsJob:
         return [f"{name}, seed {seed}" for name in self.names for seed in self.seeds]
 
     def run(self, listeners: Sequence[Listener]) -> TrainedTrials | None:
-        """None if Ctrl-C stopped it before the end."""
+        """The results of the configurations; None if Ctrl-C stopped the training."""
         count = len(self.seeds)
         members = [agent for agent in self.agents for _ in self.seeds]
         population = population_of(
@@ -81,7 +81,7 @@ def trials_jobs(
     starts: np.ndarray,
     executor: Executor,
 ) -> list[TrialsJob]:
-    """The jobs of these configurations, as large as possible here, else to fill a worker."""
+    """The jobs of these configurations: as large as possible in this process, else worker-sized."""
     groups = defaultdict(list)
     for name, agent in agents.items():
         groups[jax.tree.structure(agent)].append(name)
