@@ -23,4 +23,4 @@ def test_the_command_says_where_the_board_is_and_ends_with_ctrl_c(tmp_path):
 
 def test_a_folder_that_is_none_is_refused_in_a_sentence(monkeypatch, capsys, tmp_path):
     assert qfolio(monkeypatch, "board", tmp_path / "none", "--no-open") == 2
-    assert "is no folder; name the one that holds your runs" in capsys.readouterr().err
+    assert "is not a folder; give the one that holds your runs" in capsys.readouterr().err

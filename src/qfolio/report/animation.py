@@ -32,7 +32,7 @@ def pendulum_gif(
     rewards: ArrayLike,
     dt: float = 0.05,
 ) -> None:
-    """Save an episode of T steps as a GIF in real time that repeats for ever.
+    """Save an episode of T steps as a GIF that plays in real time and repeats forever.
 
     The last frame is held for a moment and then fades into the first one: T + 1 + FADE_FRAMES
     frames in all.
@@ -46,7 +46,7 @@ def pendulum_gif(
         dt: Seconds per step.
 
     Raises:
-        ValueError: The shapes do not fit together.
+        ValueError: The shapes do not match.
     """
     frames = pendulum_frames(states, torques, rewards, dt)
     step = round(1000 * dt)
@@ -87,7 +87,7 @@ def pendulum_frames(
 def _checked(
     states: ArrayLike, torques: ArrayLike, rewards: ArrayLike
 ) -> tuple[list[float], list[float], list[float]]:
-    """Return angles, torques and returns so far, each with one number per frame."""
+    """Return angles, torques and cumulative returns, each with one number per frame."""
     state, torque, reward = (np.asarray(a, dtype=float) for a in (states, torques, rewards))
     steps = len(torque)
     if state.shape != (steps + 1, 2) or torque.shape != (steps,) or reward.shape != (steps,):

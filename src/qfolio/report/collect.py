@@ -47,7 +47,7 @@ _HELD = 201
 """Number of weights or positions at which a policy is drawn."""
 
 EPISODE_START = 53
-"""The fixed start of the animation: one that hangs and must be swung up."""
+"""Index of the animation's fixed start state: the pendulum hangs and must be swung up."""
 
 
 def report_data(
@@ -60,7 +60,7 @@ def report_data(
         optimum = float(solution.returns(start_keys())[: run.population.curve_starts].mean())
     pendulum = run.task if isinstance(run.task, Pendulum) else None
     known = solution if isinstance(solution, FollowedOptimum) else None
-    # In a market, training episodes have other random paths: their returns do not compare.
+    # In a market, training episodes have other random paths, so their returns are not comparable.
     whole = known is None and episode_steps(run.task, run.agent) == run.task.horizon
     rows = run.metrics if whole else []
     variant = contrast_of(run.agent)
@@ -142,7 +142,7 @@ def backtest_data(
 
 
 def _costs(simulation: Simulation, year: float) -> dict[str, float]:
-    """Costs a year by kind; what interest, fees and carry earned is a negative one."""
+    """Costs per year by kind, as shares of the wealth; interest or carry earned is negative."""
     costs = {kind: year * float(paid.mean()) for kind, paid in simulation.costs.items()}
     if simulation.financing is not None:
         costs["interest and carry"] = -year * float(simulation.financing.mean())
@@ -150,7 +150,7 @@ def _costs(simulation: Simulation, year: float) -> dict[str, float]:
 
 
 def _moves(backtest: Backtest) -> Floats:
-    """Simple returns of the assets on the days of the test; 0 before an asset's start."""
+    """Simple returns of the assets on the days of the test, 0 before an asset's first price."""
     begin = backtest.folds[0].decisions.start + backtest.config.lag
     values = backtest.prices.values[begin : begin + 1 + len(backtest.dates)]
     return np.nan_to_num(values[1:] / values[:-1] - 1)
@@ -189,7 +189,7 @@ def _done(run: Run, unit: str, episodes: Floats) -> Floats:
 
 
 def _changes(run: Run) -> tuple[str | None, dict[str, tuple[Any, Any]]]:
-    """The preset of a run, and its budget, seeds and settings that differ from it."""
+    """The preset of a run, and the budget, seeds and settings that differ from it."""
     config = run.config
     found = changes(config, type(run.task))
     if found is None:
@@ -246,7 +246,7 @@ def constant_weights(rule: dict[str, Any]) -> Weights:
 def responses(
     task: Synthetic, agent: Agent, members: PyTree, best: Policy, scene: str = "{}"
 ) -> Responses:
-    """Targets of the learned policies and the best one in a market's scenes, by the holding.
+    """Targets of the learned policies and the best one by holding, in each scene of a market.
 
     members: weights of the agents, with a leading axis. scene: format of a scene's name.
     """

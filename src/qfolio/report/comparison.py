@@ -1,6 +1,6 @@
 """The report of a comparison: one self-contained page without scripts, and its curves.
 
-All data is in comparison.json, so that the report can be written again from it.
+All data is in comparison.json, so the report can be rewritten from it.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Look:
     """The line style of an agent, the same in every figure."""
 
     color: str  # a key of palette.LIGHT and palette.DARK
-    dash: str  # lengths as in SVG; '' is solid
-    symbol: int  # place among the markers
+    dash: str  # dash lengths as in SVG; '' is solid
+    symbol: int  # index of the marker
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class ComparisonData:
 
 
 def comparison_data(content: dict[str, Any]) -> ComparisonData:
-    """From the content of comparison.json."""
+    """The figures' data, from the content of comparison.json."""
     order = content["ranking"]["order"]
     looks = {
         name: Look(
@@ -152,7 +152,7 @@ def render_comparison(data: ComparisonData) -> str:
     )
 
 
-# What is drawn -------------------------------------------------------------------------------
+# Figures -------------------------------------------------------------------------------------
 
 
 def draw_curves(data: ComparisonData, width: float) -> Figure:
@@ -259,7 +259,7 @@ def _draw_curve(axes: Axes, data: ComparisonData, name: str, pace: float, log: b
 
 
 def _goal_line(axes: Axes, data: ComparisonData) -> None:
-    """Draw the threshold that counts as near: a share of the optimum, or of the best return."""
+    """Draw the threshold for being near the goal: a share of the optimum or of the best return."""
     if _logarithmic(data):
         axes.set_yscale("log")
         axes.set_ylim(bottom=_floor(data))
@@ -289,11 +289,11 @@ def _middles(data: ComparisonData) -> Floats:
     return np.concatenate([interquartile_mean(curve(x, measure)) for x in data.results.values()])
 
 
-# What is said --------------------------------------------------------------------------------
+# Text ----------------------------------------------------------------------------------------
 
 
 def tidy(text: str) -> str:
-    """A sentence with true minus signs and apostrophes, as in the page's numbers."""
+    """A sentence with typographic minus signs and apostrophes, as elsewhere on the page."""
     text = re.sub(r"(?<![\w.])-(?=\d)", "\N{MINUS SIGN}", text.replace("'", "’"))
     return re.sub(r"(?<=\d) (?=s\b)", THIN_SPACE, text)
 
@@ -333,7 +333,7 @@ def _headline(data: ComparisonData, name: str) -> dict[str, Any]:
 
 
 def _reached(data: ComparisonData, name: str) -> list[tuple[str, str]]:
-    """An agent's results: values, each with a remark."""
+    """An agent's results: pairs of a value and a remark."""
     agent = data.ranking["agents"][name]
     final, near = agent["final"], _headline(data, name)
     seeds = len(data.results[name].returns)
@@ -381,7 +381,7 @@ def _scaled(value: float, units: tuple[str, ...]) -> str:
 
 
 def _within(data: ComparisonData, name: str) -> list[tuple[str, str]]:
-    """For each threshold, the steps until it was kept, and the number of seeds."""
+    """For each threshold, the steps until an agent stays within it, and how many seeds do."""
     seeds = len(data.results[name].returns)
     return [
         ("–" if entry["steps"] is None else rendering.amount(entry["steps"]),
@@ -413,7 +413,7 @@ def _cell(probability: float, ends: list[float], told_apart: bool) -> dict[str, 
 
 
 def _settings(data: ComparisonData, name: str) -> tuple[str, list[Any]]:
-    """An agent's training in a line, and all its settings by group."""
+    """A line on an agent's training, and all its settings by group."""
     entry, result = data.content["agents"][name], data.results[name]
     preset = f"preset {entry['preset']}, " if entry["preset"] else ""
     line = f"{entry['agent']}, {preset}{rendering.amount(result.episodes)} episodes a seed"

@@ -1,6 +1,6 @@
-"""The report of a change in the world: one self-contained page and its figure.
+"""The report on adaptation to a changed task: one self-contained page and its figure.
 
-All data is in continual.json, so that the report can be written again from it.
+All data is in continual.json, so the report can be rewritten from it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Content = dict[str, Any]
-"""The content of continual.json."""
+"""The type of continual.json's content."""
 
 COLORS = dict(zip(WAYS, ("muted", "agent-3", "agent-1", "agent-2"), strict=True))
 """The color of each way, as keys of palette.LIGHT and palette.DARK."""
@@ -103,7 +103,7 @@ def _facts(content: Content) -> list[tuple[str, str, str]]:
 
 
 def _row(content: Content, way: str) -> list[tuple[str, str]]:
-    """The results of a way, each with a remark."""
+    """The results of one way to adapt: pairs of a value and a remark."""
     course, recovery = content["courses"][way], content["recovery"][way]
     reached = sum(step is not None for step in recovery["per_seed"])
     middle = recovery["middle"]

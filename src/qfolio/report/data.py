@@ -12,7 +12,7 @@ Numbers = NDArray[np.floating[Any]] | NDArray[np.integer[Any]]
 
 
 def decimals(size: float, figures: int = 4, least: int = 1) -> int:
-    """Return the decimals that show ``figures`` significant digits of a number of this size."""
+    """Return the decimals that give a number of this size ``figures`` significant digits."""
     if not math.isfinite(size) or size == 0:
         return least
     return min(max(least, figures - 1 - math.floor(math.log10(abs(size)))), 9)
@@ -20,7 +20,7 @@ def decimals(size: float, figures: int = 4, least: int = 1) -> int:
 
 @dataclass(frozen=True)
 class Curve:
-    """One training run of S seeds, evaluated P times on the way.
+    """One training run of S seeds, evaluated P times during training.
 
     Attributes:
         label: Name of the variant, for example 'double DQN'.
@@ -78,7 +78,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Responses:
-    """The targets of each seed's policy, by the holding, in some scenes of a market.
+    """The targets of each seed's policy by holding, in some scenes of a market.
 
     Attributes:
         scenes: Names of the c scenes.
@@ -152,11 +152,11 @@ class ReportData:
             policy, "exact" and "per_seed".
         config: All settings, a nested dictionary.
         curve: The reported run.
-        comparison: The same run with one thing changed, or None.
+        comparison: The same run with one setting changed, or None.
         training_done: Training of its seed up to each finished episode of every seed, in the
             budget's unit, shape (R,).
-        training_returns: Return of those episodes, shape (R,); none if they do not compare with
-            the curve.
+        training_returns: Return of those episodes, shape (R,); empty if they are not comparable
+            with the curve.
         optimum: Mean return of the exact optimum on the evaluation starts of the curve; NaN if
             unknown, when summary's optimum and regrets are None.
         maps: Solutions over the state space, or None for tasks without a 2-D state.
@@ -164,7 +164,7 @@ class ReportData:
         market: The description of a market, or None for other tasks.
         unit: The unit of the training budget, "episodes" or "steps".
         preset: The preset that the run is compared with, or None if there is none.
-        changes: What differs from the preset: the run's value and the preset's, by name.
+        changes: Settings that differ from the preset: the run's value and the preset's, by name.
     """
 
     title: str

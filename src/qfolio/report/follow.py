@@ -1,4 +1,4 @@
-"""The page of a ledger that is followed: live wealth beside the backtest's band, and evidence."""
+"""The page of ``qfolio follow``: live wealth, the backtest's band, and evidence against it."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ WIDTH = 8.6
 
 @dataclass(frozen=True)
 class LiveRows:
-    """What the page draws; an entry for each row, growth over the start.
+    """The data of the page's figures: an entry for each row, growth relative to the start.
 
-    band: 2.5%, 50% and 97.5%, of shape (3, rows). alarm: the evidence that raises it.
+    band: quantiles at 2.5%, 50% and 97.5%, of shape (3, rows). alarm: level of evidence that
+    raises the alarm.
     """
 
     dates: np.ndarray
@@ -44,9 +45,9 @@ def render_following(
 
     Args:
         title: Its heading.
-        sentences: What is to be said; the first stand at the top.
-        rows: What to draw; at least one.
-        measures: Growth, growth a year, volatility, Sharpe ratio and drawdown, by name; may be
+        sentences: The findings; the first ones appear at the top.
+        rows: The data to draw; at least one row.
+        measures: Growth, growth per year, volatility, Sharpe ratio and drawdown, by name; may be
             empty for a name with too few rows.
     """
     table = [
@@ -62,7 +63,7 @@ def render_following(
 
 
 def draw_following(rows: LiveRows, width: float) -> Figure:
-    """Wealth with the band above, evidence with the alarm below, on a logarithmic axis."""
+    """Draw wealth with its band above; below, evidence with its alarm level on a log axis."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
     few = width < 5

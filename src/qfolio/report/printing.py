@@ -1,4 +1,4 @@
-"""Pages as PDF, printed by headless Chromium or Chrome."""
+"""Printing of pages as PDF, by headless Chromium or Chrome."""
 
 import os
 import shutil
@@ -25,7 +25,7 @@ def find_browser() -> str | None:
 
 
 def print_pdf(page: Path, target: Path) -> None:
-    """Print a page with its print style.
+    """Print a page as PDF with its print style.
 
     Args:
         page: The HTML file.
@@ -37,8 +37,8 @@ def print_pdf(page: Path, target: Path) -> None:
     browser = find_browser()
     if browser is None:
         raise QfolioError(
-            "A PDF is printed by Chromium or Chrome, and neither was found; install one, or name "
-            "its program in QFOLIO_CHROMIUM."
+            "Printing a PDF needs Chromium or Chrome, and neither was found; install one, or set "
+            "QFOLIO_CHROMIUM to its program."
         )
     with tempfile.TemporaryDirectory() as place:
         printed = Path(place) / "report.pdf"

@@ -1,4 +1,4 @@
-"""Shared by the pages: templates, their style, and the format of numbers and settings."""
+"""Rendering shared by all pages: templates, styles, and the format of numbers and settings."""
 
 import json
 import math
@@ -40,7 +40,7 @@ def render(template: str, **context: Any) -> str:
 
 
 def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
-    """Return a number with a true minus sign and commas between thousands."""
+    """Return a number with a typographic minus sign and commas between thousands."""
     if math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -63,7 +63,7 @@ def over_seeds(
     interval: Sequence[float] | None,
     write: Callable[[float], str],
 ) -> str:
-    """Return the spread of results over seeds: their 95% interval, or the range of a few."""
+    """Return the spread of results over seeds: a 95% interval, or the range if seeds are few."""
     if len(values) == 1:
         return "one seed"
     if interval is None:
@@ -111,7 +111,7 @@ def setting_groups(config: dict[str, Any]) -> list[tuple[str, list[tuple[str, st
 
 
 def changed_settings(changes: dict[str, tuple[Any, Any]]) -> list[tuple[str, str]]:
-    """Return settings that differ from others: their name, and their value instead of which."""
+    """Return changed settings as pairs: the name, and the text "value instead of old value"."""
     now, other = (_flat({name: pair[i] for name, pair in changes.items()}) for i in (0, 1))
     return [
         (name, f"{text} instead of {before}")

@@ -1,4 +1,4 @@
-"""The few numbers that describe learned policies, beside those of the exact one."""
+"""The numbers that describe learned policies, compared with those of the exact policy."""
 
 from typing import Any, NamedTuple
 

@@ -1,6 +1,6 @@
 """The report of a study: one self-contained page without scripts.
 
-All of its numbers are in study.json, so that the report can be written again from it.
+All of its numbers are in study.json, so the report can be rewritten from it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from qfolio.report.backtest.verdicts import ticks_around
 from qfolio.report.rendering import THIN_SPACE, counted, number, render, setting_groups
 
 REACH = 1.6
-"""The axis reaches this many times as far as the estimates; intervals beyond it are cut."""
+"""The axis extends this many times beyond the estimates; longer intervals are cut off."""
 
 HIDDEN = ("prices", "assets", "feature_names", "command", "lag", "cost", "trials")
 """Settings of a backtest that differ between tables or are shown elsewhere."""
@@ -82,7 +82,7 @@ def render_study(
         config: The study.
         result: Its pooled evidence.
         settings: Settings of its backtests, to list them.
-        links: Where the reports of tables are, as far as they exist, by table.
+        links: Links to the reports that exist, by table.
     """
     main, agents = result.variants[0], " and ".join(config.agents)
     tables = len(config.tables)

@@ -41,7 +41,7 @@ def write_report(folder: Path, data: ReportData) -> None:
 
     Raises:
         OSError: A file cannot be written.
-        ValueError: The shapes of the episode do not fit together.
+        ValueError: The shapes of the episode do not match.
     """
     folder.mkdir(parents=True, exist_ok=True)
     curves.learning_curve(folder / "learning_curve.png", data)
@@ -172,13 +172,13 @@ def _facts(
 
 
 def _settings(data: ReportData) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return all settings by group, before them those that differ from the preset."""
+    """Return all settings by group; those that differ from the preset come first."""
     changed = [("changed", changed_settings(data.changes))] if data.changes else []
     return changed + setting_groups(data.config)
 
 
 def _order(data: ReportData) -> str:
-    """Return what settings are compared with, in a sentence."""
+    """Return a sentence on the preset that settings are compared with."""
     if data.preset is None:
         return ""
     if not data.changes:
@@ -211,7 +211,7 @@ def _rule(rule: dict[str, Any] | None) -> list[tuple[str, str, str, str]]:
 
 
 def _signed(text: str) -> str:
-    """Return a text with true minus signs before its numbers."""
+    """Return a text with typographic minus signs before its numbers."""
     return re.sub(r"-(?=\d)", "\N{MINUS SIGN}", text)
 
 

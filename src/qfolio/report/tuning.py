@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from qfolio.experiments.tuning.run import Tuning
 
 TOP = 10
-"""Rows of the table of the best trials."""
+"""Number of rows in the table of the best trials."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Sweep:
     space: list[Dimension]
     trials: list[Trial]
     own: dict[str, Value]  # the preset's values
-    summary: dict[str, Any]  # of the final comparison
+    summary: dict[str, Any]  # the results of the final comparison
     found: Sensitivity | None
     command: str
 
@@ -218,7 +218,7 @@ def _finals(data: Sweep) -> list[tuple[str, list[str]]]:
 
 
 def _top(data: Sweep) -> list[tuple[str, str, list[str]]]:
-    """Return the best trials, and the preset at any rank: rank, return and settings."""
+    """Return rank, return and settings of the best trials, and of the preset at any rank."""
     ranked = sorted(data.trials, key=lambda trial: -np.nan_to_num(trial.value, nan=-np.inf))
     digits = decimals(data.summary["optimum_tuned_on"] or ranked[0].value)
     rows = []

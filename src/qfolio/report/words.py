@@ -8,7 +8,7 @@ from qfolio.core.registry import GYM, short
 class Words(NamedTuple):
     where: str  # for the title: "DQN on the pendulum"
     about: str = ""
-    meaning: str = ""  # of a return, if it is more than the sum of rewards
+    meaning: str = ""  # definition of a return, unless it is the plain sum of rewards
     rule: str = ""  # the meaning of its rule's numbers
     scene: str = "{}"  # format of a scene's name
 
@@ -120,10 +120,10 @@ AGENTS = {
 
 
 def words_of(task: str) -> Words:
-    """The texts of a task; of one that is not registered, its name alone."""
+    """The texts of a task; for one that is not registered, only its name."""
     return TASKS.get(task, Words(f"on {short(task.removeprefix(GYM))}"))
 
 
 def agent_name(agent: str) -> str:
-    """An agent's name in reports; of one that is not qfolio's, the name of its class."""
+    """An agent's name in reports; for one that is not qfolio's, the name of its class."""
     return AGENTS.get(agent, short(agent))

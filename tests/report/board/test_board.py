@@ -259,7 +259,7 @@ def test_a_number_that_is_none_is_the_beginning(board):
 
 
 def test_a_folder_that_is_none_and_a_port_that_is_taken(board, tmp_path):
-    with pytest.raises(QfolioError, match="is no folder"):
+    with pytest.raises(QfolioError, match="is not a folder"):
         Board(Path("/nowhere"), 0)
     with pytest.raises(QfolioError, match="choose another one with --port"):
         Board(tmp_path, board.server_port)

@@ -24,13 +24,13 @@ from qfolio.report.backtest.paths import (
 from qfolio.report.rendering import number, percent
 
 POINTS = 1500
-"""Most points of a line; longer tests are thinned evenly."""
+"""Maximum number of points of a line; longer tests are thinned evenly."""
 
 
 def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> dict[str, Any]:
     """Return the data of the page's script, in the order of the names."""
     days = len(data.dates)
-    # The last day of every block; the start comes before them.
+    # The last day of every block, preceded by the start.
     ends = np.arange(days - 1, -1, -days_per_point(days))[::-1]
     start = data.dates[:1] - min(np.timedelta64(1, "D"), *np.diff(data.dates[:2]))
     months, firsts = np.unique(data.dates.astype("datetime64[M]"), return_index=True)
@@ -56,7 +56,7 @@ def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> 
 
 
 def rolling_window(data: BacktestData) -> int:
-    """Periods of a year for rolling figures; 0 if the test is shorter than a year and a half."""
+    """Rolling window of a year, in periods; 0 if the test is shorter than a year and a half."""
     year = max(2, round(data.assessment.periods_per_year))
     return year if 2 * len(data.dates) >= 3 * year else 0
 
@@ -64,7 +64,7 @@ def rolling_window(data: BacktestData) -> int:
 def _rolling(
     name: str, data: BacktestData, ends: NDArray[np.intp], window: int
 ) -> dict[str, list[float | None]]:
-    """Rolling Sharpe ratio and beta to the reference, means over the seeds."""
+    """Rolling Sharpe ratio and beta to the reference, averaged over the seeds."""
     returns, year = data.strategies[name].returns, data.assessment.periods_per_year
     reference = data.strategies[data.assessment.reference].returns[0]
     both = rolling_sharpe(returns, window, year), rolling_beta(returns, reference, window)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS = 20
-"""Points of a curve: the training's episodes in order of time, in parts of equal length."""
+"""Number of points of a curve: means over equally long, consecutive parts of the training."""
 
 EVIDENCE = 2.0
 """Standard errors by which returns must rise to count as rising."""
@@ -50,7 +50,7 @@ class FoldTraining:
 
 
 def convergence_sentences(training: Mapping[str, Sequence[FoldTraining]]) -> list[str]:
-    """For each agent, in how many folds its returns were still rising at the end."""
+    """A sentence per agent: in how many folds its returns were still rising at the end."""
     sentences = []
     for name, folds in training.items():
         rising = sum(fold.rising for fold in folds)

@@ -26,9 +26,10 @@ class StrategySeries:
         returns: Simple returns net of costs, shape (S, D).
         turnover: Value bought plus value sold as a share of the wealth, shape (S, D).
         cost: Cost of each day's trade as a share of the wealth, shape (S, D).
-        weights: Weights after the trade, cash first, the mean over the seeds, shape (D, N + 1);
+        weights: Weights after the trade, cash first, mean over the seeds, shape (D, N + 1);
             NaN, like turnover and cost, where only returns are known.
-        costs: Costs a year by kind, shares of the wealth, means over the seeds; negative ones earn.
+        costs: Costs per year by kind, as shares of the wealth, means over the seeds; income is
+            negative.
     """
 
     kind: str
@@ -62,8 +63,8 @@ class BacktestData:
             rows), cap, train, test (lengths) and expanding, the page also says them in words.
         folds: For each fold name, train_first, train_last, test_first and test_last (ISO dates).
         notes: Problems of the backtest, in sentences.
-        training: The training of each fold, by agent; none if records are missing.
-        why: What explains the agents' returns; without it, the page has no such section.
+        training: The training of each fold, by agent; empty if records are missing.
+        why: The attribution of the agents' returns; without it, the page has no such section.
         moves: Simple returns of the assets on these days, shape (D, N), 0 before an asset's start;
             without them, the page does not say what each asset contributed.
         capacity: Growth by capital, if costs depend on it.
@@ -86,7 +87,7 @@ class BacktestData:
 
 
 def require_fit(data: BacktestData) -> None:
-    """Raise QfolioError if strategies, assessment, dates and assets do not fit together."""
+    """Raise QfolioError if strategies, assessment, dates and assets do not match."""
     explained = set() if data.why is None else set(data.why.agents)
     if set(data.strategies) != set(data.assessment.strategies) or explained - set(data.strategies):
         raise QfolioError(
@@ -113,7 +114,7 @@ def followed_names(data: BacktestData) -> list[str]:
 
 
 def main_names(data: BacktestData) -> list[str]:
-    """Agents and ensembles, and what they are compared with."""
+    """Agents and ensembles, and the strategies that they are compared with."""
     test = data.assessment
     agents = [name for name, series in data.strategies.items() if series.kind in JUDGED]
     return list(dict.fromkeys([*agents, test.reference, test.rebalanced, test.best_baseline]))

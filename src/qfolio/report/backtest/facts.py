@@ -1,4 +1,4 @@
-"""Key facts of a test, and its settings, seeds and trials in words."""
+"""The key facts of a test, with its settings, seeds and trials, in words."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from qfolio.report.rendering import THIN_SPACE, number
 
 
 def key_facts(data: BacktestData) -> list[str]:
-    """What was tested on what, in a few words each."""
+    """The test's dates, assets, costs and other key facts, in a few words each."""
     test, settings, unit = data.assessment, data.config, unit_of(data.assessment.periods_per_year)
     years = number(test.periods / test.periods_per_year)
     facts = [
@@ -69,7 +69,7 @@ PLAIN = (None, "proportional")
 
 
 def account(data: BacktestData) -> dict[str, Any]:
-    """Return the settings for the description of the test; None for those that are unknown."""
+    """Return the settings that describe the test; None for those that are unknown."""
     test, settings = data.assessment, data.config
     return {
         "cost": _basis_points(settings["cost"]) if "cost" in settings else None,
@@ -83,7 +83,7 @@ def account(data: BacktestData) -> dict[str, Any]:
 
 
 def _limits(mandate: dict[str, Any], place: str = "") -> list[str]:
-    """A mandate's keys as its file has them, without the assets of groups."""
+    """A mandate's entries as its file writes them, without the assets of groups."""
     said = []
     for key, value in mandate.items():
         if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""The end of a backtest: what it found, in its folder."""
+"""The last step of a backtest: its results, written to its folder."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from qfolio.report.collect import backtest_data
 
 
 class Finished(NamedTuple):
-    """What a backtest found."""
+    """The results of a backtest."""
 
     entries: dict[str, Entry]  # the replay of each strategy
     assessment: Assessment  # their statistics and verdicts
-    why: Why  # what explains the agents
+    why: Why  # the attribution of the agents' returns
 
 
 def finish(backtest: Backtest) -> Finished:
-    """Replay all strategies, and write what ``qfolio backtest`` leaves in its folder.
+    """Replay all strategies, and write the results of ``qfolio backtest`` to its folder.
 
     These are returns.csv, weights.csv, summary.json, which ``qfolio allocate`` reads, why.json and
     the report.

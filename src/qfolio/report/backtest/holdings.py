@@ -1,4 +1,4 @@
-"""The data of the picture of holdings: weights against the reference over time."""
+"""The data of the holdings chart: weights relative to the reference over time."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from qfolio.report.backtest.paths import compact, texts
 from qfolio.report.data import Floats
 
 BLOCKS = 200
-"""Most points in time; each is a mean over consecutive days."""
+"""Maximum number of points in time; each is a mean over consecutive days."""
 
 NAMED = 12
-"""How many assets have a row of their own; the others are added up."""
+"""Number of assets with a row of their own; the others are added up."""
 
 
 def holdings(names: list[str], data: BacktestData) -> dict[str, Any]:
     """Return, for each strategy, its weights by block of days: cash, the largest, and the rest.
 
     The largest assets are those whose weights differ most from the reference's, on average. The
-    reference itself is shown without comparison, and so are all if its weights are not known. There
-    is nothing (None) for a strategy without weights.
+    reference itself is shown in absolute weights, as are all strategies if its weights are unknown.
+    A strategy without weights has None.
     """
     days = len(data.dates)
     blocks = np.arange(0, days, math.ceil(days / BLOCKS))

@@ -20,7 +20,7 @@ class Look:
     color: str  # a key of palette.LIGHT and palette.DARK
     width: float
     dash: str  # lengths as in SVG; '' is solid
-    symbol: int | None  # place in SYMBOLS; none for baselines
+    symbol: int | None  # index in SYMBOLS; None for baselines
 
 
 def looks_of(names: list[str], data: BacktestData) -> dict[str, Look]:

@@ -1,4 +1,4 @@
-"""The first screen: one conclusion, the figures of one agent, and a line of verdicts for each."""
+"""The top of the page: a conclusion, the figures of one agent, and each agent's verdicts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORDS: dict[Standing, str] = {
     "none": "no evidence",
     "worse": "worse",
 }
-"""Verdicts of one measure in words."""
+"""Verdicts on one measure, in words."""
 
 TILES = {
     "growth": "Growth a year",
@@ -29,7 +29,7 @@ TILES = {
     "turnover": "Turnover a year",
     "cost_drag": "Cost a year",
 }
-"""The figures that lead the page, by measure."""
+"""Names of the figures at the top of the page, by measure."""
 
 
 def standing(entry: StrategyAssessment, key: Measured) -> Standing:
@@ -45,9 +45,9 @@ def standing(entry: StrategyAssessment, key: Measured) -> Standing:
 
 
 def lead_name(data: BacktestData) -> str | None:
-    """The agent that opens the page: the first with the best verdict; none if none was tested.
+    """The agent at the top of the page: the first with the best verdict; None without agents.
 
-    Growth over the test does not choose it, or luck would.
+    It is not chosen by growth over the test, which would favor luck.
     """
     ranks = {"better": 0, "mixed": 1, "none": 2, "worse": 3}
 
@@ -121,7 +121,7 @@ def best_sentence(data: BacktestData) -> str:
 
 
 def tiles(data: BacktestData) -> list[dict[str, str]]:
-    """The leading figures of the agent that opens the page, or of the reference alone."""
+    """The main figures of the agent at the top of the page, or of the reference without agents."""
     test, lead = data.assessment, lead_name(data)
     shown = test.reference if lead is None else lead
     own, other = (test.strategies[name].measures for name in (shown, test.reference))

@@ -60,7 +60,7 @@ def statistics_rows(name: str, data: BacktestData) -> list[dict[str, Any]]:
 
 
 def relative_rows(name: str, data: BacktestData) -> list[dict[str, Any]]:
-    """Its figures beside the reference, likewise; dashes for the reference itself."""
+    """A strategy's figures relative to the reference, likewise; dashes for the reference itself."""
     return [
         _cell(data.assessment.strategies[name].relative, key, "relative", data)
         for key in RELATIVE_HEADINGS
@@ -117,7 +117,7 @@ def _over_seeds(measure: Measure) -> tuple[float, ...]:
 
 
 def difference_headings(data: BacktestData) -> list[str]:
-    """What the columns of ``difference_rows`` show."""
+    """The column headings of ``difference_rows``."""
     test = data.assessment
     return [
         f"{_MEASURED[key]} less {name}{remark}"
@@ -156,7 +156,7 @@ def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None
 
 
 def _comparisons(test: Assessment) -> list[tuple[str, str, str, tuple[Measured, ...]]]:
-    """The field of each comparison, with whom, a remark, and the measures shown."""
+    """For each comparison: its field, the other strategy, a remark, and the measures shown."""
     found = [("to_reference", test.reference, "", MEASURED)]
     if any(entry.to_rebalanced is not None for entry in test.strategies.values()):
         found.append(("to_rebalanced", test.rebalanced, " (best rebalancing)", MEASURED))
@@ -166,7 +166,7 @@ def _comparisons(test: Assessment) -> list[tuple[str, str, str, tuple[Measured, 
 
 
 def rebalancing_rows(data: BacktestData) -> list[dict[str, Any]]:
-    """The reference at each speed of rebalancing, if others than its own were replayed."""
+    """The reference at each rebalancing frequency, if others than its own were replayed."""
     test = data.assessment
     names = [name for name, entry in test.strategies.items() if entry.kind == "rebalancing"]
     keys = ("growth", "volatility", "sharpe", "turnover", "cost_drag")
@@ -192,7 +192,7 @@ def cost_kinds(data: BacktestData) -> list[str]:
 
 
 def cost_rows(names: list[str], data: BacktestData) -> list[tuple[str, list[str]]]:
-    """Costs a year of each strategy by kind, and their sum; those that earn are negative."""
+    """Costs per year of each strategy by kind, and their sum; income is negative."""
     rows, kinds = [], cost_kinds(data)
     for name in names:
         costs = data.strategies[name].costs
@@ -203,7 +203,7 @@ def cost_rows(names: list[str], data: BacktestData) -> list[tuple[str, list[str]
 
 
 def capacity_table(data: BacktestData) -> tuple[list[str], list[tuple[str, list[str]]]] | None:
-    """Capitals as headings, and growth at each by strategy; None if no cost depends on them."""
+    """Amounts of capital as headings, and growth at each; None if no cost depends on capital."""
     if data.capacity is None:
         return None
     headings = [number(capital, 0) for capital in data.capacity.capitals]
@@ -212,7 +212,7 @@ def capacity_table(data: BacktestData) -> tuple[list[str], list[tuple[str, list[
 
 
 def _telling(value: float, digits: int) -> int:
-    """The decimals, at least ``digits``, with which a small number does not round to 0."""
+    """The number of decimals, at least ``digits``, that keeps a small number from rounding to 0."""
     if value == 0 or not math.isfinite(value):
         return digits
     return next((d for d in range(digits, 6) if round(value, d)), digits)

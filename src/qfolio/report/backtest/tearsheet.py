@@ -21,13 +21,13 @@ from qfolio.report.data import Floats
 from qfolio.report.rendering import number, percent
 
 DRAWDOWNS = 5
-"""Drawdowns that are listed."""
+"""Number of drawdowns listed."""
 
 LISTED = 12
-"""Assets whose contributions are listed; those of the others are added up."""
+"""Number of assets whose contributions are listed; those of the others are added up."""
 
 BINS = 41
-"""Bars of a histogram; the outermost hold all returns beyond."""
+"""Number of bars of a histogram; the outermost ones hold all returns beyond."""
 
 PERIODS = {"day": "daily", "week": "weekly", "month": "monthly"}
 """Units as adjectives."""
@@ -186,7 +186,7 @@ def _histogram(returns: Floats, reference: Floats, edges: Floats) -> dict[str, A
 
 
 def _assets(series: StrategySeries, data: BacktestData, year: float) -> list[dict[str, Any]]:
-    """Contributions to the mean return a year, largest first, then the rest and the sum."""
+    """Contributions to the mean return per year, largest first, then the rest and the sum."""
     if data.moves is None:
         return []
     parts, rest = contributions(series.returns, series.weights, data.moves, year)

@@ -26,7 +26,7 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
     low, high = min(ends, default=0.0), max(ends, default=0.0)
     ticks, digits = ticks_around(low, high)
     low, high = min(low, ticks[0]), max(high, ticks[-1])
-    margin = 0.04 * (high - low) or 1.0  # any, if there is nothing to show
+    margin = 0.04 * (high - low) or 1.0  # any positive width, if there is nothing to show
 
     def place(value: float) -> float:
         share = (value - low + margin) / (high - low + 2 * margin)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def draw_wealth(data: BacktestData, width: float) -> Figure:
     """Draw wealth on a log axis and the drawdown below it, in the light scheme.
 
-    Without the other baselines if they are too many to be told apart.
+    The other baselines are left out if they are too many to tell apart.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentFormatter
 

@@ -1,6 +1,6 @@
-"""The page's section about why agents earned what they earned: sentences, and places of its marks.
+"""The page's section that attributes the agents' returns: sentences, and positions of its marks.
 
-Bars and lines are plain HTML and SVG: places are in percent of their track or panel, and names
+Bars and lines are plain HTML and SVG: positions are in percent of their track or panel, and names
 stand beside them as text.
 """
 
@@ -20,14 +20,14 @@ from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import number, percent
 
 LISTED = 20
-"""Assets, beside cash, whose parts of the return are listed; the others are added up."""
+"""Number of assets, besides cash, whose parts of the return are listed; the rest is added up."""
 
 SIGNIFICANT = 1.96
-"""The t-statistic beyond which a figure is in bold: 5% of those without any meaning."""
+"""The t-statistic beyond which a figure is bold: 5% of those with no true effect exceed it."""
 
 
 def why_sections(data: BacktestData) -> list[dict[str, Any]]:
-    """What the page shows of each agent that is explained."""
+    """The section's content for each agent that has an attribution."""
     if data.why is None:
         return []
     return [
@@ -56,7 +56,7 @@ def diagnoses(data: BacktestData) -> list[str]:
 
 
 def headline(name: str, parts: Decomposition) -> str:
-    """Where the return came from, in words that add up."""
+    """A sentence on the sources of the return, which add up."""
     digits = _digits([parts.tilts, parts.timing, parts.cost])
     said = {
         key: percent(value, digits, sign=key in ("tilts", "timing"))
@@ -79,7 +79,7 @@ def _digits(values: Sequence[float]) -> int:
 
 
 def _parts(parts: Decomposition) -> list[dict[str, Any]]:
-    """Bars of what the agent earned beyond equal weights."""
+    """Bars of the parts of the agent's return over equal weights."""
     digits = _digits([parts.tilts, parts.timing, parts.cost])
     between = percent(parts.between, digits, sign=True)
     rows = [
@@ -112,7 +112,7 @@ def _folds(parts: Decomposition) -> list[dict[str, Any]]:
 
 
 def _assets(parts: Decomposition) -> list[dict[str, Any]]:
-    """Cash and the assets in order; of very many, those with the largest parts and the rest."""
+    """Cash and the assets in order; with many assets, those with the largest parts and the rest."""
     cash, *assets = parts.assets
     rest: list[AssetPart] = []
     if len(assets) > LISTED + 1:  # a single other would need a row as well
@@ -150,7 +150,7 @@ def _exposures(found: Exposures | None, reference: str) -> dict[str, Any] | None
 
 
 def _signals(why: AgentWhy) -> list[dict[str, Any]]:
-    """A row for each channel: its worth, how far it moves weights, and its place in the rule."""
+    """A row for each channel: its value, its effect on weights, and its coefficient in the rule."""
     worth = [*why.importance.signals, why.importance.everything]
     order = [*sorted(worth[:-1], key=lambda each: -each.lost), worth[-1]]
     places = bars([each.lost for each in order], [(each.low, each.high) for each in order])
@@ -216,7 +216,7 @@ def _told(why: AgentWhy) -> list[str]:
 
 
 def _panels(slices: Slices) -> dict[str, Any]:
-    """The small multiples; the signals' panels share one scale of weights."""
+    """The panels of small multiples; those of the signals share one scale of weights."""
     values = [y for each in slices.signals for line in (*each.lines, *each.above) for y in line]
     ends = _range(values)
     held = slices.holding
@@ -228,7 +228,7 @@ def _panels(slices: Slices) -> dict[str, Any]:
 
 
 def _range(values: Sequence[float]) -> tuple[float, float]:
-    """The ends of an axis, which is at least a thousandth of a percent wide."""
+    """The ends of an axis, at least a thousandth of a percent apart."""
     low, high = min(values, default=0.0), max(values, default=1.0)
     margin = max(0.06 * (high - low), 5e-6)
     return max(0.0, low - margin), min(1.0, high + margin)
@@ -269,7 +269,7 @@ def _tick(value: float, width: float) -> str:
 def bars(
     values: Sequence[float], whiskers: Sequence[tuple[float, float]] = ()
 ) -> list[dict[str, Any]]:
-    """Places of bars from a common zero, in percent of their track."""
+    """Positions of bars from a common zero, in percent of their track."""
     ends = [*values, *(end for pair in whiskers for end in pair), 0.0]
     low, high = min(ends), max(ends)
     width = (high - low) or 1.0

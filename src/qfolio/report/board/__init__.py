@@ -1,1 +1,1 @@
-"""The board: a local page that shows what is trained in a folder, as it happens."""
+"""The board: a local page that shows the training runs of a folder, live."""

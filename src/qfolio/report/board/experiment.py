@@ -1,6 +1,6 @@
-"""What the log of one experiment says, kept small however long the log grows.
+"""The state of one experiment, read from its log and kept small however long the log grows.
 
-A log may come from a stranger: events of another form than ``log.py`` writes are skipped.
+Logs are untrusted: events that do not have the form that ``log.py`` writes are skipped.
 """
 
 import math
@@ -14,10 +14,10 @@ import msgspec
 from qfolio.experiments.events import SILENT, Event, read
 
 POINTS = 400
-"""Most points of a curve; then every other one is dropped, and from then on every other record."""
+"""Maximum number of points of a curve; beyond it, every other point and record is dropped."""
 
 JOBS = 20_000
-"""Most jobs of an experiment that are kept."""
+"""Maximum number of jobs kept of an experiment."""
 
 REPORT = "report.html"
 
@@ -80,7 +80,7 @@ KINDS: dict[str, type[msgspec.Struct]] = {
 
 
 class Curve:
-    """A number over a job's steps: the mean, the lowest and the highest of its members."""
+    """A metric over a job's steps: the mean, lowest and highest value over its members."""
 
     def __init__(self) -> None:
         self.points: list[tuple[float, float, float, float]] = []
@@ -102,7 +102,7 @@ class Curve:
 
 
 class Job:
-    """A job's state and curves. version: of the board when it last changed."""
+    """A job's state and curves. version: the board's version when the job last changed."""
 
     def __init__(self) -> None:
         self.state: State = "queued"
@@ -146,7 +146,7 @@ class Job:
 
 
 class Experiment:
-    """A folder with a log. version: of the board when anything changed."""
+    """A folder with a log. version: the board's version when anything last changed."""
 
     def __init__(self, name: str, log: Path) -> None:
         self.name, self.log, self.version = name, log, 0
@@ -164,7 +164,7 @@ class Experiment:
         self._seen: tuple[Any, ...] = ()
 
     def refresh(self, version: int) -> None:
-        """Reads what the log says since the last time; changes get this version."""
+        """Reads the new events of the log; what they change gets this version."""
         try:
             status = self.log.stat()
             if status.st_ino != self._inode or status.st_size < self._offset:
@@ -226,11 +226,11 @@ class Experiment:
 
     @property
     def share(self) -> float:
-        """Of all jobs that it knows of, what is done."""
+        """The finished share of all known jobs."""
         return sum(job.share for job in self.jobs.values()) / max(len(self.jobs), 1)
 
     def summary(self, key: str) -> dict[str, Any]:
-        """A line of the list of experiments; key: how the page asks for it."""
+        """The entry in the list of experiments; key: the page's key for the experiment."""
         states = [job.state for job in self.jobs.values()]
         running = [job for job in self.jobs.values() if job.state == "running"]
         first = next((job for job in self.jobs.values() if job.curves), None)
@@ -255,6 +255,6 @@ class Experiment:
 
 
 def _spark(job: Job) -> list[float]:
-    """About 40 means of the curve that says most."""
+    """About 40 means of the most informative curve."""
     curve = job.curves.get("return") or next(iter(job.curves.values()))
     return [point[1] for point in curve.points[:: max(1, len(curve.points) // 40)]]

@@ -1,4 +1,4 @@
-"""The board's server: this machine only, read-only, and only for its own page.
+"""The board's server: read-only, for this machine only, and only for its own page.
 
 It listens on the loopback address and answers only requests that name it as their host, so that
 no other site can reach it through a name of its own (DNS rebinding). It sends no CORS headers, so
@@ -33,7 +33,7 @@ REPORT_POLICY = (
 
 
 class Board(ThreadingHTTPServer):
-    """Serves the experiments below a folder; port 0 takes any that is free.
+    """Serves the experiments below a folder; port 0 chooses a free port.
 
     Raises:
         QfolioError: The folder does not exist, or the port is taken.
@@ -44,7 +44,7 @@ class Board(ThreadingHTTPServer):
 
     def __init__(self, root: Path, port: int) -> None:
         if not root.is_dir():
-            raise QfolioError(f"{root} is no folder; name the one that holds your runs.")
+            raise QfolioError(f"{root} is not a folder; give the one that holds your runs.")
         self.shelf = Shelf(root)
         try:
             super().__init__((ADDRESS, port), Handler)
@@ -60,7 +60,7 @@ class Board(ThreadingHTTPServer):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answers GET and HEAD; nothing that is asked for becomes a path."""
+    """Answers GET and HEAD; nothing from a request becomes a path."""
 
     server: Board
     server_version, sys_version = "qfolio", ""
@@ -108,7 +108,7 @@ class Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def log_message(self, format: str, *args: object) -> None:
-        """The terminal stays quiet."""
+        """Logs nothing, to keep the terminal quiet."""
 
 
 @functools.cache

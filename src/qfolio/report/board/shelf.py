@@ -1,4 +1,4 @@
-"""All experiments below a folder, found and read again when the page asks."""
+"""All experiments below a folder, searched and read again at the page's requests."""
 
 import hashlib
 import os
@@ -15,13 +15,13 @@ DEPTH = 4
 """How deep folders are searched; what lies within an experiment belongs to it."""
 
 FRESH = 0.3
-"""Seconds for which what was read serves further requests."""
+"""Seconds for which further requests are answered without reading again."""
 
 
 class Shelf:
-    """The experiments below a folder by key, which says nothing about where they lie.
+    """The experiments below a folder by key; keys reveal nothing about paths.
 
-    Each answer has a version; a page that names the last one it saw gets what has changed since.
+    Each answer has a version; a page that sends the last version it saw gets the changes since.
     """
 
     def __init__(self, root: Path) -> None:
@@ -46,7 +46,7 @@ class Shelf:
             }
 
     def run(self, key: str, since: int) -> dict[str, Any] | None:
-        """The jobs of an experiment that have changed; None if there is none of this key."""
+        """The changed jobs of an experiment; None if no experiment has this key."""
         with self._lock:
             self._refresh()
             experiment = self._experiments.get(key)
@@ -57,7 +57,7 @@ class Shelf:
     def report(self, key: str, name: str) -> bytes | None:
         """A report in an experiment's folder: its own, or that of one of its parts.
 
-        ``name`` is compared with the names of those that there are, and never becomes a path.
+        ``name`` is compared with the names of existing reports and never becomes a path.
         """
         with self._lock:
             experiment = self._experiments.get(key)
@@ -88,7 +88,7 @@ class Shelf:
 
 
 def _logs(folder: str, depth: int) -> Iterator[str]:
-    """The logs below a folder; links are not followed."""
+    """Paths of the logs below a folder; links are not followed."""
     try:
         with os.scandir(folder) as entries:
             inside = [entry for entry in entries if not entry.name.startswith(".")]

@@ -34,10 +34,10 @@ from qfolio.report.figures.style import (
 )
 
 LEAST_REGRET = 1e-4
-"""Regret that counts as none: logarithmic scales end there."""
+"""Regret that counts as zero: logarithmic scales end there."""
 
 DECADES = 5
-"""Most powers of ten on a scale of regrets; what is worse is off the scale."""
+"""Maximum number of decades on a scale of regrets; larger regrets are off the scale."""
 
 
 def learning_curve(target: Target, data: ReportData) -> None:
@@ -53,7 +53,7 @@ def overestimation(target: Target, data: ReportData) -> None:
 def draw_learning_curve(data: ReportData, width: float) -> Figure:
     """Draw the greedy return over training, and its regret if the optimum is known.
 
-    In a market, the comparison is drawn instead of training returns.
+    In a market, the comparison run is drawn instead of training returns.
     """
     panels = 2 if np.isfinite(data.optimum) and data.optimum else 1
     figure = new_figure(width, 3.7 if width > NARROW or panels == 1 else 6.4)
@@ -132,7 +132,7 @@ def _draw_runs(
 ) -> None:
     """Draw runs of shape (P, S): a thin line per seed, the interquartile mean, its band.
 
-    What is below ``least`` is drawn there.
+    Values below ``least`` are drawn at ``least``.
     """
     points, seeds = runs.shape
     marker = "o" if points == 1 else None
@@ -205,7 +205,7 @@ def _cut_beginning(axes: Axes, optimum: float) -> None:
 
 
 def _draw_regret(axes: Axes, data: ReportData, curves: list[tuple[Curve, str]]) -> None:
-    """Draw the share of the optimum that is missed, on a logarithmic scale."""
+    """Draw the regret, as a share of the optimum, on a logarithmic scale."""
     _line_axes(axes, "Regret, on a logarithmic scale", data)
     regrets = [regret(curve.returns, data.optimum) for curve, _ in curves]
     for (curve, color), missed in zip(curves, regrets, strict=True):

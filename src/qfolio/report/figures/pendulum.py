@@ -33,7 +33,7 @@ def value(target: Target, data: ReportData) -> None:
 
 
 def draw_value(data: ReportData, width: float) -> Figure:
-    """Draw the learned and the exact policy, and value if there is one, over the states."""
+    """Draw the learned and the exact policy, and the values if there are any, over the states."""
     maps = data.maps
     if maps is None:
         raise ValueError("the value figure needs maps of the state space")

@@ -1,4 +1,4 @@
-"""Targets of the learned policies and the best one in a market."""
+"""Figures of a market: targets of the learned policies and the best one."""
 
 from __future__ import annotations
 

@@ -84,9 +84,9 @@ def inline_svg(draw: Callable[[T, float], Figure], data: T, width: float) -> str
     (see palette.CSS_VARIABLES), and the element has no fixed size.
 
     Args:
-        draw: One of the draw_ functions of this module.
+        draw: One of the draw_ functions.
         data: The data to draw.
-        width: Width in inches at which letters have their natural size.
+        width: Width in inches at which text has its natural size.
     """
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))

@@ -39,7 +39,7 @@ _SHADES = [_mix(share) for share in _SHARES]
 
 
 def draw_sensitivity(data: Sweep, width: float) -> Figure:
-    """Draw every trial over each of its settings, and the model's prediction along it."""
+    """Draw every trial against each setting, and the model's prediction along that setting."""
     assert data.found is not None
     effects = data.found.effects
     most = 4 if len(effects) in (4, 7, 8) else 3
@@ -62,7 +62,7 @@ def draw_sensitivity(data: Sweep, width: float) -> Figure:
 
 
 def draw_pair(data: Sweep, width: float) -> Figure:
-    """Draw the trials over the two most important settings, shaded by rank."""
+    """Draw the trials in the plane of the two most important settings, shaded by rank."""
     assert data.found is not None
     across, up = (effect.dimension for effect in data.found.effects[:2])
     figure = new_figure(width, 0.78 * width if width > NARROW else 1.05 * width)
@@ -90,7 +90,7 @@ def draw_pair(data: Sweep, width: float) -> Figure:
 
 
 def draw_progress(data: Sweep, width: float) -> Figure:
-    """Draw the trials in their order, and the best result up to each."""
+    """Draw the trials in order, and the best result so far at each."""
     from matplotlib.ticker import MaxNLocator
 
     figure = new_figure(width, 3.9 if width > NARROW else 3.6)
@@ -151,7 +151,7 @@ def _legend(figure: Figure, marks: dict[str, Any], columns: int) -> None:
 def _draw_effect(
     axes: Axes, data: Sweep, effect: Effect, heights: NDArray[np.float64]
 ) -> dict[str, Any]:
-    """Draw one setting; return the marks by name."""
+    """Draw the effect of one setting; return the marks by name."""
     dim = effect.dimension
     axes.grid(axis="y")
     half = 0.5 / len(dim.choices) if dim.choices else 0.0
