@@ -32,9 +32,8 @@ if TYPE_CHECKING:
     from qfolio.portfolio.study.run import Study
 
 console = Console(highlight=False)
-
-unfolded = Console(highlight=False, width=10_000)
-"""For tables in files and pipes, which have no width."""
+if not console.is_terminal:
+    console.width = 10_000  # files and pipes have no width: nothing is folded there
 
 
 def say(text: str) -> None:
@@ -90,8 +89,7 @@ def print_table(
     for row in rows:
         cells = (Text(printable(cell)) for cell in row)
         table.add_row(*cells, style="bold" if row[0] in bold else None)
-    shown = console if console.is_terminal else unfolded
-    shown.print(table)
+    console.print(table)
 
 
 def describe_run(run: "Run", budget: "Budget") -> str:
