@@ -31,7 +31,7 @@ def portfolio(prices: Prices, risk: dict, **limits) -> Portfolio:
 
 
 def annual_returns(prices: Prices, row: int, past: int = 252) -> np.ndarray:
-    """The last that are known, scaled: the norm of their product with weights is volatility."""
+    """The last known returns, scaled so that the norm of ``returns @ weights`` is volatility."""
     known = prices.values[max(0, row - past) : row + 1]
     return (known[1:] / known[:-1] - 1) * np.sqrt(prices.periods_per_year / (len(known) - 1))
 
@@ -155,6 +155,15 @@ def test_its_derivative_is_that_of_finite_differences():
         off = np.asarray(abs(slope - (ahead - back) / (2 * step)))
         assert np.median(off) < 1e-6
         assert np.mean(off < 1e-4) >= 0.9  # but at kinks
+
+
+def test_its_derivative_is_finite_at_the_benchmark():
+    """An anchored policy starts there, without any tracking error."""
+    task = portfolio(table(), {"tracking_error": 0.05})
+    allowed, equal = task.feasible_at(jnp.array(300)), jnp.array([0.0, *[0.2] * 5])
+    score = jnp.arange(6.0)
+    slope = jax.jit(jax.grad(lambda wanted: (allowed.project(wanted, equal) * score).sum()))(equal)
+    assert jnp.isfinite(slope).all()
 
 
 def test_what_it_is_measured_against_must_be_known():

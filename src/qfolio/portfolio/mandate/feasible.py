@@ -172,12 +172,13 @@ class Mandated(Feasible):
     ) -> Float[Array, " asset"]:
         """Weights near those wanted that are not too risky, if there are any within the limits.
 
-        The weights go towards a safe portfolio until their risk is allowed. The tangent planes of
-        the limits of risk there are conditions of one more projection, and what this leaves too
-        risky goes towards the safe portfolio again. This is the benchmark, with as much cash as
-        gives both limits the same room; where tracking error has no limit, it is cash.
+        The weights move towards a safe portfolio until their risk is allowed. The tangent planes of
+        the risk limits at that point become conditions of one more projection. Weights that are
+        still too risky then move towards the safe portfolio again. The safe portfolio is the
+        benchmark, with as much cash as gives both limits the same room, or cash if tracking error
+        has no limit.
 
-        within: the limits without the assets that stay as they are held.
+        within: the limits, with assets that are not traded fixed at the weights held.
         """
         risk = jax.tree.map(lambda x: jnp.asarray(x, weights.dtype), risk)
         cash = jnp.zeros_like(weights)

@@ -139,7 +139,7 @@ def _search_many(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
 
 
 def below(limits: Limits, planes: list[tuple[Array, Array]]) -> Limits:
-    """The limits and, as further rows that yield to them, planes: rows and most."""
+    """The limits and, as further rows, planes: pairs of a row and its limit. Planes yield."""
     rows, most = (jnp.stack(list(each)) for each in zip(*planes, strict=True))
     penalty = jnp.full(len(limits.most), LARGEST, most.dtype)
     return limits._replace(

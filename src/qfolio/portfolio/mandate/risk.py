@@ -50,7 +50,7 @@ class Risk(NamedTuple):
         return Risk(year / jnp.maximum(known.sum(), 1) * (returns.T @ returns), weights)
 
     def of(self, weights: Float[Array, " asset"]) -> Float[Array, ""]:
-        """The annual volatility of weights."""
+        """The annual volatility of weights; at least 1e-6, so that its derivative is finite."""
         return jnp.sqrt(jnp.maximum(self.between(weights, weights), TINY))
 
     def between(
@@ -79,10 +79,10 @@ class Risk(NamedTuple):
     def tangent(
         self, weights: Float[Array, " asset"], center: Float[Array, " asset"], most: float
     ) -> tuple[Float[Array, " asset"], Float[Array, ""]]:
-        """A row, and what its product with weights is at most if their risk is.
+        """A tangent plane of the ellipsoid of weights with at most ``most`` risk: a row, its limit.
 
-        Risk is the volatility of weights less the center's, at most ``most``. These weights form an
-        ellipsoid; the plane touches it in the direction of the given weights.
+        Risk is the volatility of weights minus the center. The plane touches the ellipsoid in the
+        direction from the center to the given weights; row · w ≤ limit for all w in the ellipsoid.
         """
         active = weights - center
         slope = self.covariance @ active
