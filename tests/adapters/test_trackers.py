@@ -118,7 +118,7 @@ def test_a_tracker_that_fails_is_left_out(tmp_path):
     failing = Failing()
     with tracked(failing), Log(tmp_path).opened() as log:
         log.job().record(1, {"loss": [1.0]})
-        with pytest.warns(UserWarning, match=r"Failing is left out: .*no network"):
+        with pytest.warns(UserWarning, match=r"The tracker Failing is left out: .*no network"):
             log.job().record(2, {"loss": [1.0]})
         log.job().record(3, {"loss": [1.0]})
     assert failing.logged == 2

@@ -9,6 +9,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.following import begin, follow, on_table
+from qfolio.portfolio.mandate.feasible import exactly
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -61,3 +62,25 @@ def test_targets_that_are_not_numbers_are_no_silent_holding(policy, prices):
         QfolioError, match=r"Diverged gives target weights at row 30 .* off 1 by nan"
     ):
         follow(task, agent, policy.members, 30, begin(task, np.eye(4)[:2]), 2)
+
+
+class Wants(Pathwise):
+    """Wants the same weights at each row."""
+
+    wish: tuple[float, ...] = (0.1, 0.6, 0.3, 0.0)
+
+    def policy(self, weights, observation):
+        return jnp.broadcast_to(jnp.array(self.wish), super().policy(weights, observation).shape)
+
+
+def test_orders_are_the_nearest_under_limits_on_risk(policy, prices):
+    """Training may stop at an order that is only near them."""
+    agent = Wants(rollout_length=10, num_envs=2, hidden=(4, 4))
+    mandate = {"risk": {"volatility": 0.2, "tracking_error": 0.1}, "assets": {"cap": 0.5}}
+    task = Portfolio.of(prices, mandate=mandate, window=5, horizon=10)
+    targets, _ = follow(task, agent, policy.members, 30, begin(task, np.eye(4)[:2]), 8)
+    wanted = np.array(agent.wish)
+    nearest = [exactly(task.feasible_at(jnp.array(row)), wanted, wanted) for row in range(30, 38)]
+    # Near the nearest point, distances hardly change.
+    np.testing.assert_allclose(targets[0], nearest, atol=1e-3)
+    assert np.abs(targets[0] - wanted).max(-1).min() > 0.05

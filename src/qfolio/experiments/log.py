@@ -139,7 +139,7 @@ class Log:
             except Exception as error:
                 self._trackers.remove(tracker)
                 name = type(tracker).__name__
-                warnings.warn(f"{name} is left out: {one_line(error)}", stacklevel=2)
+                warnings.warn(f"The tracker {name} is left out: {one_line(error)}", stacklevel=2)
 
     def _close(self) -> None:
         os.close(self._file)

@@ -56,7 +56,7 @@ def follow(
         QfolioError: Targets are not numbers, or not feasible.
     """
     portfolios = jax.tree.map(lambda x: x[None] if together else x[:, None], members)
-    found = paths(task, agent, portfolios, jnp.array(first, jnp.int32), held, count)
+    found = paths(task.exact, agent, portfolios, jnp.array(first, jnp.int32), held, count)
     wanted, targets, after = jax.tree.map(np.asarray, found)
     _require_feasible(task, agent, wanted, first)
     return targets, after

@@ -240,6 +240,12 @@ class Portfolio(Market):
             1 / margin if margin else np.inf,
         )
 
+    @property
+    def exact(self) -> "Portfolio":
+        """The same task, whose orders are nearest also with limits on risk; no derivatives."""
+        allowed = self.allowed
+        return self if allowed is None else eqx.tree_at(lambda t: t.allowed, self, allowed.exact)
+
     def filling(self, rows: int) -> "Portfolio":
         """The same task with orders filled over a given number of rows."""
         if self.terms.fill == rows:

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from numpy.typing import NDArray
 
 from qfolio.core import simplex
@@ -34,6 +34,20 @@ ROUNDS = 3
 
 BARELY = 5e-6
 """Excesses of a limit up to this are rounding errors in float32."""
+
+PLANES, KEPT = 32, 4
+"""Most projections of an order that is too risky, and the planes of a limit that they keep."""
+
+
+class _Order(NamedTuple):
+    """Where the search for an order that is not too risky is."""
+
+    step: Int[Array, ""]
+    weights: Float[Array, " asset"]  # the nearest below the planes
+    best: Float[Array, " asset"]  # the nearest so far that is not too risky
+    rows: Float[Array, "plane limit asset"]
+    most: Float[Array, "plane limit"]  # infinity for a plane that is not there
+    found: Multipliers
 
 
 class Feasible(eqx.Module):
@@ -106,8 +120,8 @@ class Mandated(Feasible):
     assets; cash is the rest. With a number of holdings, the largest weights of that point are kept,
     and the others are 0. Changes below the smallest trade are not made, unless a limit needs them.
     If turnover clashes with other limits, as after a fall in prices, it gives way to them. If that
-    point is too risky, the order is a point near the nearest of those that are not (see
-    ``risk.py``).
+    point is too risky, the order is the nearest that is not: in training near it, after one
+    projection below tangent planes, and in the set ``exact`` after as many as it takes.
     """
 
     limits: Limits
@@ -118,6 +132,7 @@ class Mandated(Feasible):
     long: bool = eqx.field(static=True, default=True)
     volatility: float = eqx.field(static=True, default=float("inf"))  # a year, at most
     tracking_error: float = eqx.field(static=True, default=float("inf"))  # a year, at most
+    planes: int = eqx.field(static=True, default=1)  # projections of an order that is too risky
     risk: Risk | None = None  # as known at a row, if there is such a limit
 
     @property
@@ -128,6 +143,11 @@ class Mandated(Feasible):
     def knowing(self, risk: Risk) -> "Mandated":
         """The set at a row where so much is known of risk."""
         return dataclasses.replace(self, risk=risk)
+
+    @property
+    def exact(self) -> "Mandated":
+        """The set whose orders are the nearest also with limits on risk; without derivatives."""
+        return dataclasses.replace(self, planes=PLANES) if self.limits_risk else self
 
     def spending(self, turnover: Any) -> "Mandated":
         """The set of orders with at most some turnover."""
@@ -173,8 +193,8 @@ class Mandated(Feasible):
         """Weights near those wanted that are not too risky, if there are any within the limits.
 
         The weights move towards a safe portfolio until their risk is allowed. The tangent planes of
-        the risk limits at that point become conditions of one more projection. Weights that are
-        still too risky then move towards the safe portfolio again. The safe portfolio is the
+        the risk limits at that point become conditions of one more projection, which may be too
+        risky again, but less so (cutting planes, Veinott 1967). The safe portfolio is the
         benchmark, with as much cash as gives both limits the same room, or cash if tracking error
         has no limit.
 
@@ -197,10 +217,43 @@ class Mandated(Feasible):
             shares = [risk.share(safe - center, change, most) for center, most in limited]
             return safe + jnp.stack(shares).min() * change
 
-        near = allowed(weights)
-        cut = below(within, [risk.tangent(near, center, most) for center, most in limited])
-        found = checkpoint_name(search(wanted, held, cut), SEARCHED)
-        return allowed(solution(found, wanted, held, cut))
+        def share(weights: Array) -> Array:
+            """The largest risk, as a share of its limit."""
+            risks = [risk.of(weights - center) / most for center, most in limited]
+            return jnp.stack(risks).max()
+
+        first = allowed(weights)
+        reach = jnp.maximum(excess(first, held, within).max(), 0.0) + BARELY  # turnover may yield
+        bound = len(within.most)
+
+        def closer(order: _Order) -> _Order:
+            """One more projection, below one more tangent plane of each limit."""
+            worth = order.found[bound:-2].reshape(order.most.shape)
+            rows, most = order.rows, order.most
+            for i, (center, at_most) in enumerate(limited):
+                slot = worth[:, i].argmin()  # a plane that does not bind is replaced
+                row, limit = risk.tangent(allowed(order.weights), center, at_most)
+                rows, most = rows.at[slot, i].set(row), most.at[slot, i].set(limit)
+            cut = below(within, rows.reshape(-1, len(weights)), most.reshape(-1))
+            found = checkpoint_name(search(wanted, held, cut, order.found), SEARCHED)
+            weights_below = solution(found, wanted, held, cut)
+            new = allowed(weights_below)
+            nearer = ((new - wanted) ** 2).sum() < ((order.best - wanted) ** 2).sum()
+            safer, met = share(new) < share(order.best), 1 + 20 * BARELY
+            better = jnp.where(share(order.best) > met, safer, nearer & (share(new) <= met))
+            better &= excess(new, held, within).max() <= reach
+            best = jnp.where(better, new, order.best)
+            return _Order(order.step + 1, weights_below, best, rows, most, found)
+
+        def going(order: _Order) -> Array:
+            return (order.step < self.planes) & (share(order.weights) > 1 + BARELY)
+
+        rows = jnp.zeros((min(self.planes, KEPT), len(limited), len(weights)), weights.dtype)
+        most = jnp.full(rows.shape[:2], jnp.inf, weights.dtype)
+        none = none_binds(below(within, rows.reshape(-1, len(weights)), most.reshape(-1)))
+        order = _Order(jnp.array(0, jnp.int32), weights, first, rows, most, none)
+        order = closer(order) if self.planes == 1 else lax.while_loop(going, closer, order)
+        return order.best
 
     def _fewer(self, wanted: Float[Array, " asset"], held: Float[Array, " asset"]) -> Limits:
         """Limits that keep all but the largest weights at 0.
@@ -292,7 +345,8 @@ class Mandated(Feasible):
 def exactly(
     feasible: Feasible, wanted: NDArray[np.float64], held: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The projection in float64; all weights have shape (entry,)."""
+    """The nearest weights, in float64; all weights have shape (entry,)."""
+    feasible = feasible.exact if isinstance(feasible, Mandated) else feasible
     with jax.enable_x64(True):
         found = np.array(_projected(jax.tree.map(jnp.asarray, feasible), wanted, held))
     if feasible.long_only:

@@ -138,9 +138,11 @@ def _search_many(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
     return jnp.moveaxis(found.reshape(-1, size, paths), 1, 0), True
 
 
-def below(limits: Limits, planes: list[tuple[Array, Array]]) -> Limits:
-    """The limits and, as further rows, planes: pairs of a row and its limit. Planes yield."""
-    rows, most = (jnp.stack(list(each)) for each in zip(*planes, strict=True))
+def below(
+    limits: Limits, rows: Float[Array, "plane asset"], most: Float[Array, " plane"]
+) -> Limits:
+    """The limits and, as further rows, planes. Planes yield."""
+    limits = _arrays(limits, most)
     penalty = jnp.full(len(limits.most), LARGEST, most.dtype)
     return limits._replace(
         rows=jnp.concatenate([limits.rows, rows]),

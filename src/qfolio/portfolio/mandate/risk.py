@@ -3,10 +3,10 @@
 Both are estimated from the last returns, of which squares are averaged: a mean of returns is lost
 in the noise of so few.
 
-Weights with so little risk form an ellipsoid. To find its nearest point within all other limits
-takes too long for training. Two steps are cheap and lead near that point: a tangent plane of the
-ellipsoid is one more row of linear limits, and a line to a safe portfolio stays within all convex
-limits and meets the ellipsoid at the root of a quadratic equation.
+Weights with so little risk form an ellipsoid. A tangent plane of it is one more row of linear
+limits, and a line to a safe portfolio stays within all convex limits and meets the ellipsoid at the
+root of a quadratic equation. Repeated, the two lead to the nearest point of the ellipsoid within
+all other limits (cutting planes, Veinott 1967); once is enough for training.
 """
 
 from typing import NamedTuple
