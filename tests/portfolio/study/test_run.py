@@ -105,6 +105,15 @@ def test_a_study_writes_typed_finite_numbers(finished):
     assert "4 of 4 backtests finished" in repr(finished)
 
 
+def test_a_study_shows_itself_in_a_notebook(finished, tmp_path):
+    pooled = finished.config.result.variants[0].agents["pathwise"].to_reference
+    shown = finished._repr_html_()
+    assert "Study of pathwise" in shown
+    assert "4 of 4 backtests finished" in shown
+    assert f"<td>{pooled.z:+.2f}</td>".replace("-", "−") in shown
+    assert "0 of 2 backtests finished" in create(tmp_path / "new")._repr_html_()
+
+
 def test_each_table_is_an_ordinary_backtest(finished):
     backtest = finished.backtest("two", Variant(1, 0.005))
     assert backtest.config.cost == 0.005

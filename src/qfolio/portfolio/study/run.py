@@ -18,6 +18,7 @@ from qfolio.core import devices
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
+from qfolio.core.notebook import card
 from qfolio.core.statistics import holm
 from qfolio.core.text import amount, near
 from qfolio.experiments.executor import Executor, Here
@@ -46,7 +47,7 @@ from qfolio.portfolio.study.folder import (
 )
 from qfolio.portfolio.study.pooling import AGAINST, Finding, Pooled, Pools, TableReturns, pool
 from qfolio.portfolio.study.training import Listen, Trainings, of_table
-from qfolio.portfolio.study.verdict import verdicts
+from qfolio.portfolio.study.verdict import decimal, percent, verdicts
 
 Report = Callable[[Backtest, dict[str, Entry], Assessment, list[str], Why | None], None]
 
@@ -156,6 +157,21 @@ class Study:
         tables = amount(len(self.config.tables), "table")
         done = f"{len(self.config.looks)} of {len(self.places)} backtests finished"
         return f"<Study: {', '.join(self.config.agents)} on {tables}, {done}, in {self.folder}>"
+
+    def _repr_html_(self) -> str:
+        config = self.config
+        agents = config.result.variants[0].agents if config.result else {}
+        rows = [
+            (name, percent(each.growth), decimal(each.z), each.finding or "")
+            for name, each in ((name, pools.to_reference) for name, pools in agents.items())
+        ]
+        facts = [
+            amount(len(config.tables), "table"),
+            f"{len(config.looks)} of {amount(len(self.places), 'backtest')} finished",
+            str(self.folder),
+        ]
+        header = ("pooled, a year, net", "less the reference", "z", "")
+        return card(f"Study of {' and '.join(config.agents)}", facts, header, rows)
 
     @property
     def places(self) -> list[tuple[str, Variant]]:
