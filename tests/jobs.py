@@ -29,6 +29,19 @@ class Add:
 
 
 @dataclass(frozen=True)
+class Meet(Add):
+    """Adds when another worker has begun to, too."""
+
+    folder: Path = Path()
+
+    def run(self, listeners):
+        (self.folder / str(os.getpid())).touch()
+        while len(list(self.folder.iterdir())) < 2:
+            time.sleep(0.05)
+        return super().run(listeners)
+
+
+@dataclass(frozen=True)
 class Fail:
     """Raises an error."""
 

@@ -26,7 +26,7 @@ from qfolio.experiments.machines.schedule import ATTEMPTS
 from qfolio.experiments.run import Run
 
 import jobs
-from jobs import Add, Die, Fail, Sleep, alive
+from jobs import Add, Die, Fail, Meet, Sleep, alive
 
 pytestmark = [
     pytest.mark.filterwarnings("default"),  # Ray's own
@@ -82,13 +82,13 @@ def nodes():
 class TestRay:
     pytestmark = needs_ray
 
-    def test_large_arrays_reach_each_worker_once(self, nodes):
+    def test_large_arrays_reach_each_worker_once(self, nodes, tmp_path):
         executor = on("ray")
         assert isinstance(executor, Executor)
         assert isinstance(executor, Ray)
         assert (executor.workers, executor.devices, executor.lockstep) == (3, 1, False)
         table = np.arange(4000.0)
-        work = [Add(str(i), i, table) for i in range(60)]
+        work = [Meet(str(i), i, table, tmp_path) for i in range(60)]
         results = {job.name: result for job, result in executor.map(work, silent)}
         for i in range(60):
             np.testing.assert_array_equal(results[str(i)]["sum"], table + i)
