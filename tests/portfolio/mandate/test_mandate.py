@@ -147,6 +147,12 @@ GROUP = {"assets": ["XLE", "XOM"]}
          "exposure of 200% would break a margin of 60%, which allows 166.667%"),
         ({"cash": {"max": 0.1}, "exposure": {"gross": 0.5}},
          "cash of at most 10% and gross exposure of at most 50% clash"),
+        ({"assets": {"floor": {"SPY": 0.2}, "forbidden": ["TLT", "SPY"]}},
+         "the floor of SPY, 20%, and assets.forbidden, which names SPY, clash; change one of them"),
+        ({"assets": {"cap": {"SPY": -0.1}, "floor": -0.3, "forbidden": ["SPY"]}},
+         "the cap of SPY, -10%, and assets.forbidden"),
+        ({"groups": {"theme": {"oil": {"assets": ["XLE", "XMO"], "cap": 0.1}}}},
+         "group theme oil names 'XMO', which is no asset of the table; did you mean XOM?"),
     ],
 )  # fmt: skip
 def test_limits_that_clash_are_refused_with_their_names(mandate, message):
@@ -162,6 +168,19 @@ def test_what_is_unusual_is_said():
     notes = checks.require(settled(bound, ASSETS), ALL)
     assert "no choice for s E: its floor, 20%" in notes[1]
     assert checks.require(settled({"cash": {"max": 0.1}}, ASSETS), ALL) == []
+
+
+def test_a_floor_for_all_assets_is_for_those_that_may_be_held():
+    text = settled({"assets": {"floor": 0.1, "forbidden": ["TLT"]}}, ASSETS)
+    assert checks.require(text, ALL) == []
+    np.testing.assert_allclose(feasible(text, ALL).limits.low, [0.1, 0, 0.1, 0.1])
+
+
+def test_a_file_of_groups_may_name_assets_of_other_tables(tmp_path):
+    mandate = Mandate.read(written(tmp_path)).changed(["cash.max=1.0"])
+    assert "other" in mandate.groups["sector"]["Energy"].assets
+    notes = checks.require(settled(mandate, ASSETS), ALL)
+    assert notes == ["The mandate forces at least 20% cash: caps allow no more."]
 
 
 def test_floors_yield_where_assets_cannot_be_traded():

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import near, quote
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.mandate import feasible, parse
 from qfolio.portfolio.mandate.projection import Limits
@@ -19,9 +20,10 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
     """What is unusual about a mandate, a sentence each; arguments as for ``mandate.feasible``.
 
     Raises QfolioError with limits that clash, if no weights obey it: without any one of those that
-    it names, the others could be met.
+    it names, the others could be met, or an asset of a group that the table does not have.
     """
     made = feasible(text, usable, most)
+    _require_members(text)
     _require_each(text, made.limits)
     said = _said(text, made, most)
     clash = list(range(len(said)))
@@ -133,8 +135,28 @@ def _most_held(made: Mandated) -> float:
     return float(held)
 
 
+def _require_members(text: str) -> None:
+    assets, mandate = parse(text)
+    for column, value, group in mandate.every_group:
+        for name in () if group.ignore_unknown else group.assets:
+            if name not in assets:
+                raise QfolioError(
+                    f"The mandate's group {column} {value} names {quote(name)}, which is no asset "
+                    f"of the table; {near(name, assets)}"
+                )
+
+
 def _require_each(text: str, limits: Limits) -> None:
     assets, mandate = parse(text)
+    signed = (("floor", mandate.assets.floor, 1), ("cap", mandate.assets.cap, -1))
+    for name in mandate.assets.forbidden:
+        for said, of_each, sign in signed:
+            bound = of_each.get(name, 0.0) if isinstance(of_each, dict) else 0.0
+            if sign * bound > 0:
+                raise QfolioError(
+                    f"The mandate cannot be met: the {said} of {name}, {_percent(bound)}, and "
+                    f"assets.forbidden, which names {name}, clash; change one of them."
+                )
     for name, low, high in zip(assets, limits.low, limits.high, strict=True):
         if low > high:
             raise QfolioError(

@@ -73,11 +73,15 @@ class Assets(Section, frozen=True):
 
 
 class Group(Section, frozen=True):
-    """Limits of the sum of some assets' weights."""
+    """Limits of the sum of some assets' weights.
+
+    ignore_unknown: whether it may name assets that a table does not have, as a file of groups may.
+    """
 
     cap: Weight | None = None
     floor: Weight | None = None
     assets: tuple[str, ...] = ()
+    ignore_unknown: bool = False
 
 
 class Cash(Section, frozen=True):
@@ -408,7 +412,7 @@ def _with_members(mandate: Mandate, file: Path, source: str) -> Mandate:
                 f"{source}: no asset of {file} has the {column} {quote(value)}; "
                 f"{near(value, values)}"
             )
-        given = msgspec.structs.replace(group, assets=members)
+        given = msgspec.structs.replace(group, assets=members, ignore_unknown=True)
         groups.setdefault(column, {})[value] = given
     return msgspec.structs.replace(mandate, groups=groups)
 
