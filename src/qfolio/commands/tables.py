@@ -33,7 +33,7 @@ class Reading:
             0 or 1 for each asset, or the columns asset, from and to (default: all).
         features: Columns that hold features for agents instead of prices.
         columns: Columns that hold a number for the whole market, such as a cash rate, which costs
-            may use and agents do not see.
+            may use and agents do not see; NAME=FILE reads one from a file of dates and numbers.
         returns: Unit of the table's numbers, if they are returns over the row before; they are
             cumulated to prices that start at 100 (default: they are prices).
         date: Column of dates (default: found by its name).

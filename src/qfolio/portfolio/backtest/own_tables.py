@@ -13,12 +13,12 @@ from qfolio.core.text import hint, quote
 from qfolio.portfolio.backtest.measures import Floats
 from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.desk.holdings import ASSET_NAMES, CASH, SHARES_NAMES
-from qfolio.portfolio.prices.cells import is_missing, label, not_a_number, numbers
+from qfolio.portfolio.prices.cells import is_missing, label
 from qfolio.portfolio.prices.columns import text_columns
-from qfolio.portfolio.prices.dates import read_dates
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
+from qfolio.portfolio.prices.records import dates_of, in_order, numbers_of
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.prices.vocabulary import DATE_NAMES, plain
 
@@ -98,9 +98,9 @@ def _from_table(source: Any, prices: Prices) -> Own:
     if not unknown:
         return _wide_weights(table, when, others, prices)
     if len(others) == 1 and names[others[0]] in RETURN_NAMES:
-        rows = _dates(table, when)
-        order = _increasing(rows, table)
-        return Own("returns", rows[order], _numbers(table, others[0], rows)[order])
+        rows = dates_of(table, when)
+        order = in_order(rows, table)
+        return Own("returns", rows[order], numbers_of(table, others[0], rows)[order])
     return _levels(source, table, others, unknown, prices)
 
 
@@ -123,19 +123,19 @@ def _levels(
 
 
 def _wide_weights(table: Table, when: int, others: list[int], prices: Prices) -> Own:
-    rows = _dates(table, when)
+    rows = dates_of(table, when)
     weights, cash = np.zeros((len(rows), len(prices.assets))), None
     seen = dict.fromkeys(table.names[j] for j in others)
     if len(seen) < len(others):
         raise QfolioError("two columns have the same name; give every asset one column.")
     blank = np.all([[is_missing(c) for c in table.columns[j].tolist()] for j in others], axis=0)
     for j in others:
-        found = _numbers(table, j, rows, blank)
+        found = numbers_of(table, j, rows, blank)
         if (place := _asset(table.names[j], prices)) == -1:
             cash = found
         elif place is not None:
             weights[:, place] = found
-    order = _increasing(rows, table)
+    order = in_order(rows, table)
     order = order[~blank[order]]
     if not order.size:
         raise QfolioError("the table has no row of weights.")
@@ -145,7 +145,7 @@ def _wide_weights(table: Table, when: int, others: list[int], prices: Prices) ->
 
 
 def _long_weights(table: Table, when: int, asset: int, weight: int, prices: Prices) -> Own:
-    rows, found = _dates(table, when), _numbers(table, weight, _dates(table, when))
+    rows, found = dates_of(table, when), numbers_of(table, weight, dates_of(table, when))
     moments, place = np.unique(rows, return_inverse=True)
     weights = np.full((len(moments), len(prices.assets) + 1), np.nan)
     for i, cell in enumerate(table.columns[asset].tolist()):
@@ -173,8 +173,8 @@ def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Pric
     Shares are valued at the close of the row that decides; the effects of costs and of the lag are
     not known yet.
     """
-    dates = _dates(table, when)
-    traded = _numbers(table, shares, dates)
+    dates = dates_of(table, when)
+    traded = numbers_of(table, shares, dates)
     rows, _ = rows_at("It", dates, prices)
     holding, cash = np.zeros(len(prices.assets)), 0.0
     moments: list[np.datetime64] = []
@@ -221,45 +221,6 @@ def _asset(name: str, prices: Prices) -> int | None:
     if name in prices.assets:
         return prices.assets.index(name)
     return -1 if plain(name) == CASH else None
-
-
-def _dates(table: Table, column: int) -> np.ndarray:
-    moments, complaints, _ = read_dates(table.columns[column])
-    for row, complaint in complaints.items():
-        raise QfolioError(f"row {table.first_row + row}: {complaint}; write dates as 2020-01-31.")
-    if not len(moments):
-        raise QfolioError("the table has no rows.")
-    return moments
-
-
-def _numbers(
-    table: Table, column: int, rows: np.ndarray, blank: np.ndarray | None = None
-) -> Floats:
-    """The numbers of a column; none may be missing, except where a whole row is blank."""
-    cells = table.columns[column]
-    values, wrong = numbers(cells, table.decimal)
-    missing = np.isnan(values) & ~wrong
-    bad = wrong | (missing if blank is None else missing & ~blank)
-    if bad.any():
-        row = int(bad.argmax())
-        reason = not_a_number(cells[row], table.decimal) if wrong[row] else "it is missing"
-        raise QfolioError(
-            f"row {table.first_row + row} ({day(rows[row])}), column {quote(table.names[column])}: "
-            f"{reason}; give a number, 0 for nothing."
-        )
-    return values
-
-
-def _increasing(rows: np.ndarray, table: Table) -> np.ndarray:
-    """The order of rows by date; raises QfolioError if a date appears twice."""
-    order = np.argsort(rows, kind="stable")
-    again = np.flatnonzero(rows[order][1:] == rows[order][:-1])
-    if again.size:
-        row = int(order[again[0] + 1])
-        raise QfolioError(
-            f"row {table.first_row + row}: {day(rows[row])} appears twice; keep one row per date."
-        )
-    return order
 
 
 def _with_cash(weights: Floats, cash: Floats | None, spelled: list[str]) -> Floats:

@@ -21,6 +21,9 @@ MISSING = ("error", "drop-asset", "forward-fill")
 LATE = ("error", "drop-asset", "trim", "join")
 ENDED = ("gap", "cash-out")
 
+SEPARATOR = "="
+"""Between the name of a column and the file that it is in."""
+
 
 @dataclass(frozen=True)
 class Choices:
@@ -53,11 +56,22 @@ class Choices:
             names = (given,) if isinstance(given, str) else tuple(given)
             object.__setattr__(self, name, names)
 
+    @property
+    def own_columns(self) -> tuple[str, ...]:
+        """Those of ``columns`` that are in the table itself."""
+        return tuple(name for name in self.columns if SEPARATOR not in name)
+
+    @property
+    def series(self) -> dict[str, str]:
+        """The files of those of ``columns`` that have one, by name."""
+        pairs = (text.split(SEPARATOR, 1) for text in self.columns if SEPARATOR in text)
+        return {name: file for name, file in pairs}
+
 
 def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Finding]]:
     """The arguments of ``Prices`` (none if the table has errors), and all findings."""
     findings = Findings()
-    features, shared = tuple(choices.features), tuple(choices.columns)
+    features, shared = tuple(choices.features), choices.own_columns
     columns = find_columns(table, features + shared, choices.date, findings)
     grid = None if columns is None else arrange(table, columns, findings)
     if grid is None:

@@ -22,6 +22,7 @@ from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.findings import Finding, day
 from qfolio.portfolio.prices.frequency import periods_per_year
 from qfolio.portfolio.prices.members import membership
+from qfolio.portfolio.prices.series import series
 
 DEFAULT_SOURCE = "skfolio: 20 US stocks"
 DEFAULT_NOTE = (
@@ -260,7 +261,8 @@ def load(
             in a wide table one for the whole market, or, under a header on two levels, a kind such
             as Volume, which has a column per asset.
         columns: Columns that hold one number for the whole market, such as a cash rate; agents do
-            not see them.
+            not see them. "NAME=FILE" reads one from a file with a column of dates and one of
+            numbers, each of which holds until the next.
         returns: "percent" or "fraction" if the table holds simple returns from the row before;
             they are cumulated to prices that start at 100 (default: it holds prices).
         date: Column of dates (default: found by its name).
@@ -311,6 +313,7 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
     if joined := isinstance(source, str | Path) and os.path.isdir(source):
         label = Path(source).resolve().name
         alone = {name: value for name, value in choices.items() if name not in OF_ALL}
+        alone["columns"] = chosen.own_columns
         source = folder.join(Path(source), lambda file: load(file, **alone))
         chosen = replace(chosen, returns=None, date="date")
     table = reading.read(source, lambda names: text_columns(names, chosen.date))
@@ -319,6 +322,10 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
         findings = [replace(finding, row=None) for finding in findings]
     if not content:
         return None, findings
+    for name, file in chosen.series.items():
+        numbers = series(file, name, content["dates"])
+        content["market"] = np.column_stack([content["market"], numbers])
+        content["market_names"] += (name,)
     prices = Prices(**content, source=label or table.source, note=note)
     if chosen.members is not None:
         prices = replace(prices, members=membership(chosen.members, prices.dates, prices.assets))

@@ -1,0 +1,48 @@
+"""A number for the whole market in a file of its own, such as the rate of treasury bills."""
+
+from typing import Any
+
+import numpy as np
+
+from qfolio.core.errors import QfolioError
+from qfolio.core.text import quote
+from qfolio.portfolio.prices.findings import day, listing
+from qfolio.portfolio.prices.reading import read
+from qfolio.portfolio.prices.records import dates_of, in_order, numbers_of
+
+
+def series(source: Any, name: str, dates: np.ndarray) -> np.ndarray:
+    """The latest number known at each date, float64 of shape (rows,).
+
+    Args:
+        source: A file or a data frame, with a column of dates and one of numbers. Of several, that
+            called ``name`` is read. A number holds from its date until the next one.
+        name: Name of the series.
+        dates: Dates of the price table, ascending, of shape (rows,).
+
+    Raises:
+        QfolioError: The source cannot be read, lacks the column, or begins after the prices.
+    """
+    table = read(source, lambda names: {0})
+    try:
+        if len(table.names) == 2:
+            column = 1
+        elif name in table.names[1:]:
+            column = table.names.index(name)
+        else:
+            raise QfolioError(
+                f"it has the columns {listing(table.names)}; keep dates and one of numbers, or "
+                f"call a column {quote(name)}."
+            )
+        since = dates_of(table, 0)
+        values = numbers_of(table, column, since)
+        order = in_order(since, table)
+        latest = np.searchsorted(since[order], dates, side="right") - 1
+        if latest[0] < 0:
+            raise QfolioError(
+                f"it begins on {day(since[order[0]])}, after the prices ({day(dates[0])}); give "
+                "earlier rows."
+            )
+    except QfolioError as error:
+        raise QfolioError(f"The column {quote(name)} from {quote(table.source)}: {error}") from None
+    return np.asarray(values[order][latest])
