@@ -59,7 +59,9 @@ def test_allocate_on_newer_prices(folder, monkeypatch, capsys, tmp_path):
     ("options", "message"),
     [
         (["--capital", 1], "stale"), ([*AS_OF], "nothing to allocate"),
-        ([*AS_OF, "--capital", -1], "at least 0"), ([*AS_OF, "--agent", "dqn"], "no agent 'dqn'"),
+        ([*AS_OF, "--agent", "dqn"], "no agent, baseline or strategy 'dqn'; choose from"),
+        ([*AS_OF, "--agent", "equal-weigh"], "did you mean equal-weight?"),
+        ([*AS_OF, "--capital", -1], "at least 0"),
         (["--as-of", "soon"], "must be a date"), (["--as-of", "2020-01-05"], "after 2020-01-05"),
     ],
 )  # fmt: skip
@@ -244,7 +246,7 @@ def test_a_baseline_is_followed(folder, monkeypatch, capsys):
     assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *momentum) == 0
     assert "Baseline: momentum.\nIn its backtest: A baseline" in capsys.readouterr().out
     assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *momentum, "--update") == 2
-    assert "which learns nothing; leave out --update" in capsys.readouterr().err
+    assert "momentum learns nothing; leave out --update" in capsys.readouterr().err
 
 
 def test_a_baseline_that_gives_no_order_leaves_the_holding(folder, monkeypatch, capsys, tmp_path):

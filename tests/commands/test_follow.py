@@ -117,4 +117,4 @@ def test_a_baseline_is_followed_without_training(folder, monkeypatch, capsys, tm
     of = ["--as-of", "2020-09-16", "--capital", 1000, "--agent", "equal-weight"]
     assert qfolio(monkeypatch, "allocate", copy, *of) == 0
     assert qfolio(monkeypatch, "follow", copy, "--prices", prices) == 0
-    assert "equal-weight is a baseline, so there is nothing to train." in capsys.readouterr().out
+    assert "equal-weight learns nothing, so there is nothing to train." in capsys.readouterr().out

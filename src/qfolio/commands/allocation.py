@@ -60,8 +60,8 @@ def allocate(
             quantity, qty); a row "cash" holds money (default: all is cash). Shares sold short and
             loans are negative, where the mandate allows them.
         capital: Cash to invest, unless the holdings include a cash row.
-        agent: Agent to follow, or a baseline such as equal-weight (default: the first agent of the
-            backtest).
+        agent: Agent to follow; or a baseline such as equal-weight, the benchmark or a strategy of
+            your own, if the backtest has it (default: the first agent of the backtest).
         anyway: Allocate even if the backtest is not finished, or found the agent worse than the
             benchmark.
         whole_shares: Trade whole shares only.
@@ -123,8 +123,7 @@ def allocate(
             )
         return _reproduce(desk, reproduce, prices, holdings, capital)
     name = next(iter(desk.run.agents)) if agent is None else agent
-    learned = name not in desk.run.baselines
-    standing = Standing.of(folder, name, learned=learned)
+    standing = Standing.of(folder, name, desk.kind(name))
     if not anyway:
         standing.require_sound(folder, named=agent is not None)
     followed = desk.followed(name)
@@ -138,7 +137,7 @@ def allocate(
     shares, cash, gone = cashed_out(*held, table)
     if update:
         if not isinstance(followed, Policy):
-            raise QfolioError(f"{name} is a baseline, which learns nothing; leave out --update.")
+            raise QfolioError(f"{name} learns nothing; leave out --update.")
         followed = followed.update(table)
     spent = desk.spent(followed, table)
     allocation = Allocation.of(
@@ -154,14 +153,16 @@ def allocate(
     if orders is not None and rows is not None:
         write_csv(orders, *rows)
         said += f" {orders} has {amount(len(rows[1]), 'order')}."
-    trained, why = None, []
+    trained, why, notes = None, [], []
     if isinstance(followed, Policy):
         why = reasons(followed, table, allocation)
         trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
+    else:
+        notes = followed.notes(table)
     console.print_allocation(allocation, standing, trained)
     for reason in why:
         console.tell(f"Why {sentence(reason)}")
-    for line in (*gone, *desk.terms(followed, allocation, spent), said):
+    for line in (*gone, *notes, *desk.terms(followed, allocation, spent), said):
         console.tell(line)
     return {
         "agent": name,

@@ -338,7 +338,7 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
 
     trained: the date of the last row that the policy has learned from, if it has.
     """
-    kind = "Agent" if standing.learned else "Baseline"
+    kind = standing.kind.capitalize()
     say(f"{kind}: {standing.agent}" + (f", trained on prices up to {trained}." if trained else "."))
     found = f"In its backtest: {standing.verdict or 'not finished, so there is no verdict.'}"
     if standing.worse:

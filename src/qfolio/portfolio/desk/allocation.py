@@ -27,7 +27,7 @@ NOISE = 1e-6
 
 @runtime_checkable
 class Followed(Protocol):
-    """What can be followed: a learned policy or a baseline."""
+    """What can be followed: a learned policy, or a strategy that learns nothing."""
 
     @property
     def costs(self) -> CostModel: ...
@@ -68,7 +68,7 @@ class Allocation:
         the trades never need more money than there is.
 
         Args:
-            policy: The policy or baseline to follow.
+            policy: The policy or other strategy to follow.
             prices: Prices up to the row after which to trade.
             shares: Shares held now, of shape (assets,).
             cash: Cash held now, in money.

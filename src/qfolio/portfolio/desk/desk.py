@@ -3,6 +3,7 @@
 import datetime
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,12 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import near, quote
 from qfolio.core.version import __version__
 from qfolio.portfolio.backtest.folder import BacktestFolder
+from qfolio.portfolio.backtest.own import Own
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
-from qfolio.portfolio.desk.rule import Rule
+from qfolio.portfolio.desk.rule import Kind, Ordered, Rule, Untrained
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices, load
 
@@ -26,7 +28,7 @@ SAME = 1e-6
 
 @dataclass
 class Desk:
-    """A run whose agents and baselines are followed.
+    """A run whose agents, baselines and strategies of the user's own are followed.
 
     load: how prices are read, from the options of the command line.
     """
@@ -55,25 +57,47 @@ class Desk:
         """Whether its mandate lets assets be sold short or cash be borrowed."""
         return not next(iter(self.run.tasks.values())).feasible.long_only
 
-    def followed(self, name: str, stored: str | None = None) -> Policy | Rule:
-        """An agent's policy (default: the newest), or a baseline."""
-        if name in self.run.agents:
-            return self.run.policy(name, stored)
-        if name in self.run.baselines:
-            config, task = self.run.config, next(iter(self.run.tasks.values()))
-            return Rule(
-                name,
-                self.run.baselines[name],
-                self.run.prices.assets,
-                task,
-                train=config.train,
-                expanding=config.expanding,
-                cap=config.cap,
-            )
-        known = near(name, (*self.run.agents, *self.run.baselines))
-        raise QfolioError(f"The backtest has no agent or baseline {quote(name)}; {known}")
+    @cached_property
+    def own(self) -> dict[str, Own]:
+        """The user's own strategies, and the benchmark if it is a file or an asset."""
+        return BacktestFolder(self.folder).read_own(self.run.config)
 
-    def table(self, followed: Policy | Rule, prices: Path | None) -> Prices:
+    def kind(self, name: str) -> Kind:
+        """What a name stands for; raises QfolioError if the backtest has no such strategy."""
+        known: dict[Kind, Any] = {
+            "agent": self.run.agents, "baseline": self.run.baselines, "strategy": self.own,
+        }  # fmt: skip
+        for kind, names in known.items():
+            if name in names:
+                return kind
+        names = [name for names in known.values() for name in names]
+        raise QfolioError(
+            f"The backtest has no agent, baseline or strategy {quote(name)}; {near(name, names)}"
+        )
+
+    def followed(self, name: str, stored: str | None = None) -> Policy | Untrained:
+        """An agent's policy (default: the newest), a baseline, or a strategy of the user's own.
+
+        Raises QfolioError if there is none of this name, or its weights are not known.
+        """
+        kind = self.kind(name)
+        if kind == "agent":
+            return self.run.policy(name, stored)
+        config, assets = self.run.config, self.run.prices.assets
+        task = next(iter(self.run.tasks.values()))
+        if kind == "strategy":
+            return Ordered(name, self.own[name], assets, task, config.cap)
+        return Rule(
+            name,
+            self.run.baselines[name],
+            assets,
+            task,
+            train=config.train,
+            expanding=config.expanding,
+            cap=config.cap,
+        )
+
+    def table(self, followed: Policy | Untrained, prices: Path | None) -> Prices:
         """The prices to decide on (default: those of the backtest)."""
         if prices is None:
             return self.run.prices
@@ -85,7 +109,9 @@ class Desk:
             )
         return followed.table(table)
 
-    def spent(self, followed: Policy | Rule, table: Prices, before: int | None = None) -> float:
+    def spent(
+        self, followed: Policy | Untrained, table: Prices, before: int | None = None
+    ) -> float:
         """The ledger's turnover since the calendar year of a table's last row began.
 
         It is 0 if the mandate does not limit turnover. before: as for ``Ledger.spent``.
@@ -93,7 +119,9 @@ class Desk:
         limited = followed.task.written.trading.turnover_a_year is not None
         return self.ledger.spent(table.dates[-1], before) if limited else 0.0
 
-    def terms(self, followed: Policy | Rule, allocation: Allocation, spent: float) -> list[str]:
+    def terms(
+        self, followed: Policy | Untrained, allocation: Allocation, spent: float
+    ) -> list[str]:
         """Sentences on how the mandate requires an allocation to be traded."""
         trading, said = followed.task.written.trading, []
         if trading.fill > 1:
@@ -111,7 +139,7 @@ class Desk:
     def record(
         self, name: str, allocation: Allocation, prices: Prices, whole_shares: bool
     ) -> tuple[Record, str]:
-        """Appends an allocation by the newest policy of an agent, or by a baseline.
+        """Appends an allocation by the newest policy of an agent, or by another strategy.
 
         Returns the record, and a sentence that says what was done.
         """

@@ -32,7 +32,7 @@ class Following:
     benchmark: name of the backtest's benchmark. reference: its live net returns. note: a remark on
     these, or "". band: growth of wealth that the backtest leads one to expect, shape (3, rows).
     evidence: evidence against the backtest. learned: date of the last row that the policy learned
-    from; None for a baseline. overdue: whether that is a test length ago or more. test: the test
+    from; None without one. overdue: whether that is a test length ago or more. test: the test
     length.
     """
 
@@ -104,7 +104,7 @@ class Following:
 
     def _retrain(self) -> str:
         if self.learned is None:
-            return f"{self.agent} is a baseline, so there is nothing to train."
+            return f"{self.agent} learns nothing, so there is nothing to train."
         why = ["the alarm"] * (self.alarm is not None)
         why += [f"its age of {self.test} or more, the backtest's test length"] * self.overdue
         until = f"The policy has learned from prices up to {day(self.learned)}"

@@ -29,8 +29,8 @@ PolicyName = Annotated[str, msgspec.Meta(pattern=r"^latest(-[0-9]+)?$")]
 class Record(msgspec.Struct, kw_only=True, frozen=True):
     """An allocation on record; lists are by asset, weights have cash first.
 
-    digests: SHA-256 of "prices" (the table as used), "policy" (its file; absent for a baseline),
-    "settings" (config.json of the run) and "holdings".
+    digests: SHA-256 of "prices" (the table as used), "policy" (its file; absent if nothing
+    learned), "settings" (config.json of the run) and "holdings".
     """
 
     number: Annotated[int, msgspec.Meta(ge=1)]
@@ -38,7 +38,7 @@ class Record(msgspec.Struct, kw_only=True, frozen=True):
     made: str  # when the record was written
     version: str  # of qfolio
     agent: str
-    policy: PolicyName | None  # name of the agent's policy; None for a baseline
+    policy: PolicyName | None  # name of the agent's policy; None if nothing learned
     digests: dict[str, str]
     whole_shares: bool
     assets: list[str]

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.folds import latest
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.own_tables import read_own
@@ -37,7 +36,7 @@ def reference(
         QfolioError: A source is given for a baseline, cannot be read, or is not known on all rows.
     """
     run, name = desk.run, desk.run.config.benchmark
-    own = BacktestFolder(desk.folder).read_own(run.config)
+    own = desk.own
     if source is not None and name not in own:
         raise QfolioError(
             f"The benchmark {name} is a baseline, which needs no table; leave out --benchmark."

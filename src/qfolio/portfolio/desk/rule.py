@@ -1,7 +1,11 @@
-"""A baseline of a backtest, which gives tomorrow's weights as a learned policy does."""
+"""Strategies that learn nothing, and give tomorrow's weights as a learned policy does.
 
+These are the baselines of a backtest and the strategies of the user's own.
+"""
+
+import abc
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,33 +13,25 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.folds import latest
-from qfolio.portfolio.backtest.orders import obeying
+from qfolio.portfolio.backtest.orders import TOLERANCE, obeying
+from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.mandate import feasible, largest_weight
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 
+Kind = Literal["agent", "baseline", "strategy"]
 
-class Rule:
-    """A baseline's orders after the last row of a table; of its calendar, only a band applies.
 
-    The baseline learns from the training window that ends there: all rows, or the last ``train``.
-    """
+class Untrained(abc.ABC):
+    """A strategy of a backtest that learns nothing, under the terms of any agent's task."""
 
-    def __init__(
-        self,
-        name: str,
-        baseline: Baseline,
-        assets: tuple[str, ...],
-        task: Portfolio,
-        *,
-        train: str,
-        expanding: bool,
-        cap: float,
-    ) -> None:
-        self.name, self.baseline, self.assets = name, baseline, assets
-        self.train, self.expanding, self.cap = train, expanding, cap
+    kind: ClassVar[Kind]
+
+    def __init__(self, name: str, assets: tuple[str, ...], task: Portfolio, cap: float) -> None:
+        self.name, self.assets, self.cap = name, assets, cap
         self.task = dataclasses.replace(task, signals="", anchor="", menu="")
 
     @property
@@ -57,12 +53,43 @@ class Rule:
             )
         return table.select(self.assets)
 
+    @abc.abstractmethod
     def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:
-        """Target weights by asset, with "cash" first; the holdings if the baseline gives no order.
+        """Target weights by asset after the last row, with "cash" first.
 
         spent: turnover since the calendar year began, for a mandate that limits it. Raises
-        QfolioError if the table's assets are not the backtest's, or none can be traded.
+        QfolioError if the table's assets are not the backtest's, or there is nothing to order.
         """
+
+    def notes(self, prices: Any) -> list[str]:
+        """Sentences on the order after the last row."""
+        return []
+
+
+class Rule(Untrained):
+    """A baseline's orders after the last row of a table; of its calendar, only a band applies.
+
+    The baseline learns from the training window that ends there: all rows, or the last ``train``.
+    """
+
+    kind = "baseline"
+
+    def __init__(
+        self,
+        name: str,
+        baseline: Baseline,
+        assets: tuple[str, ...],
+        task: Portfolio,
+        *,
+        train: str,
+        expanding: bool,
+        cap: float,
+    ) -> None:
+        super().__init__(name, assets, task, cap)
+        self.baseline, self.train, self.expanding = baseline, train, expanding
+
+    def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:
+        """The baseline's target, or the holdings if it gives no order."""
         table = self.table(prices)
         held = np.array([(holdings or {"cash": 1.0}).get(n, 0.0) for n in ("cash", *self.assets)])
         fold = latest("latest", table.dates, self.train, self.expanding).complete(table.values)
@@ -93,3 +120,67 @@ class Rule:
             target = obeying(self.name, wanted, held, history, mandated)
             target = target if terms.beyond(held, target) else held
         return dict(zip(("cash", *self.assets), target.tolist(), strict=True))
+
+
+class Ordered(Untrained):
+    """A strategy of the user's own: its latest order up to the last row of a table.
+
+    As in the backtest, its orders are carried out even if they break the mandate or the cap.
+    """
+
+    kind = "strategy"
+
+    def __init__(
+        self, name: str, own: Own, assets: tuple[str, ...], task: Portfolio, cap: float
+    ) -> None:
+        """Raises QfolioError if the strategy has returns or levels only."""
+        if own.kind != "weights":
+            raise QfolioError(
+                f"The backtest knows only the {own.kind} of {name}, not its weights, so that it "
+                "cannot be followed; follow another strategy, or run a backtest with its weights."
+            )
+        super().__init__(name, assets, task, cap)
+        self.own = own
+
+    def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:
+        """The weights of the latest order; those of delisted assets are in cash."""
+        table = self.table(prices)
+        target = self.own.values[self._latest(table)]
+        if table.listed is not None:
+            target = cashed(target, table.listed[-1])
+        unpriced = (target[1:] != 0) & np.isnan(table.values[-1])
+        if unpriced.any():
+            raise QfolioError(
+                f"{self.name} orders {self.assets[int(unpriced.argmax())]}, which has no price on "
+                f"{day(table.dates[-1])}; give prices of it."
+            )
+        return dict(zip(("cash", *self.assets), target.tolist(), strict=True))
+
+    def notes(self, prices: Any) -> list[str]:
+        """Says of which date the order is, and where it breaks the mandate."""
+        table = self.table(prices)
+        latest, last = self._latest(table), day(table.dates[-1])
+        ordered = day(self.own.dates[latest])
+        said = [f"These are the weights of {self.name} of {ordered}, its latest up to {last}."]
+        if self.mandate:
+            there = ~np.isnan(table.values[-1])
+            mandated, _ = checks.relaxed(feasible(self.mandate, there, self.cap))
+            found = mandated.violations(self.own.values[latest])
+            broken = [f"{what} {by:.2g}" for what, by in found.items() if by > TOLERANCE]
+            if broken:
+                said.append(
+                    f"They break the mandate ({', '.join(broken)}), and are carried out all the "
+                    "same, as in the backtest."
+                )
+        return said
+
+    def _latest(self, table: Prices) -> int:
+        """Number of the latest order; one on a day without a row counts at the next row."""
+        rows, _ = rows_at(self.name, self.own.dates, table)
+        known = int((rows < len(table)).sum())
+        if not known:
+            raise QfolioError(
+                f"{self.name} has no order up to {day(table.dates[-1])}; its first is of "
+                f"{day(self.own.dates[0])}."
+            )
+        return known - 1

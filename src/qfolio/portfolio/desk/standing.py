@@ -1,48 +1,46 @@
-"""What a finished backtest found about an agent or a baseline, for those who follow it."""
+"""What a finished backtest found about an agent or another strategy, for those who follow it."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json
-from qfolio.core.text import figure, near
+from qfolio.core.text import figure
 from qfolio.portfolio.backtest.folder import followed
+from qfolio.portfolio.desk.rule import Kind
 
 
 @dataclass(frozen=True)
 class Standing:
-    """The verdict of a backtest on the policy that ``allocate`` follows, all seeds together.
+    """The verdict of a backtest on what ``allocate`` follows, all seeds of an agent together.
 
-    agent: its name, or that of a baseline.
-    verdict: the sentence of the report, or the measures of a baseline; empty if the backtest is not
-    finished.
+    agent: its name, or that of a baseline or a strategy of the user's own.
+    verdict: the sentence of the report, or the measures of what is no agent; empty if the backtest
+    is not finished.
     worse: whether an agent grows more slowly than the benchmark, or than its best rebalancing.
-    learned: whether it is an agent, not a baseline.
     """
 
     agent: str
     verdict: str
     worse: bool
-    learned: bool = True
+    kind: Kind = "agent"
 
     @staticmethod
-    def of(folder: Path, agent: str, *, learned: bool = True) -> "Standing":
-        """The standing of an agent or a baseline, from summary.json in the folder of its backtest.
+    def of(folder: Path, agent: str, kind: Kind = "agent") -> "Standing":
+        """The standing of a strategy, from summary.json in the folder of its backtest.
 
         Raises:
-            QfolioError: The file is damaged or does not contain the agent.
+            QfolioError: The file is damaged or does not contain the strategy.
         """
         path = folder / "summary.json"
         if not path.exists():
-            return Standing(agent, "", False, learned)
+            return Standing(agent, "", False, kind)
         summary = read_json(path)
         strategies = summary.get("strategies", {})
         try:
-            if not learned:
-                return Standing(agent, _measured(strategies[agent]["measures"]), False, learned)
-            agents = [name for name, entry in strategies.items() if entry["kind"] == "agent"]
-            if agent not in agents:
-                raise QfolioError(f"The backtest has no agent {agent!r}; {near(agent, agents)}")
+            if kind != "agent":
+                measured = _measured(kind, strategies[agent]["measures"])
+                return Standing(agent, measured, False, kind)
             name = followed(agent, strategies)
             worse = any(
                 strategies[name][key] is not None
@@ -62,7 +60,7 @@ class Standing:
             folder: The backtest's folder, for the message.
             named: Whether the user named this agent.
         """
-        if not self.learned:
+        if self.kind != "agent":
             return
         if not self.verdict:
             raise QfolioError(
@@ -77,10 +75,10 @@ class Standing:
             )
 
 
-def _measured(measures: dict[str, dict[str, float]]) -> str:
+def _measured(kind: Kind, measures: dict[str, dict[str, float]]) -> str:
     growth, sharpe, turnover = (measures[k]["mean"] for k in ("growth", "sharpe", "turnover"))
     return (
-        f"A baseline, which learned nothing: it grew by {figure(growth, '.1%')} a year after "
+        f"A {kind}, which learned nothing: it grew by {figure(growth, '.1%')} a year after "
         f"costs, with a Sharpe ratio of {figure(sharpe, '.2f')} and a "
-        f"turnover of {turnover:.1f} a year."
+        f"turnover of {figure(turnover, '.1f')} a year."
     )

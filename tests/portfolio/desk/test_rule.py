@@ -1,0 +1,132 @@
+"""A backtest's own strategies and its benchmark, followed without any training."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.presets import Preset
+from qfolio.portfolio.backtest.folder import BacktestFolder
+from qfolio.portfolio.backtest.folds import spell_all
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.desk import Desk
+from qfolio.portfolio.desk.follow import follow
+from qfolio.portfolio.desk.standing import Standing
+from qfolio.portfolio.prices.table import Prices
+
+AGENTS = {
+    "pathwise": Preset(
+        "pathwise", {"rollout_length": 10, "num_envs": 2, "hidden": (4,)},
+        episodes=4, seeds=1, task={"window": 5, "horizon": 20},
+    )
+}  # fmt: skip
+NAMES = ("cash", "A", "B", "C")
+
+
+def table():
+    rng = np.random.default_rng(0)
+    values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (160, 3)), axis=0))
+    dates = np.datetime64("2020-01-01", "s") + np.arange(160) * np.timedelta64(1, "D")
+    return Prices(dates, NAMES[1:], values)
+
+
+def days(rows):
+    return table().dates[rows].astype("datetime64[D]").astype(str)
+
+
+WEIGHTS = pd.DataFrame({"date": days([40, 110, 130]), "A": [0.6, 0.2, 0.5], "B": [0.4, 0.7, 0.1]})
+SHARES = pd.DataFrame(
+    {"date": days([40, 40, 120]), "asset": ["cash", "A", "B"], "shares": [1000.0, 5.0, 3.0]}
+)
+RETURNS = pd.DataFrame({"date": days(slice(160)), "return": np.full(160, 1e-3)})
+INDEX = pd.DataFrame({"date": days(slice(160)), "level": np.exp(np.arange(160) * 1e-3)})
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """Of a backtest that is not trained; its benchmark is an asset."""
+    out = tmp_path_factory.mktemp("rule") / "run"
+    Backtest.create(
+        table(), AGENTS, out=out, train="100d", test="60d", seeds=1, baselines=["momentum"], lag=0,
+        strategies={"60/40": WEIGHTS, "traded": SHARES, "fund": RETURNS, "index": INDEX},
+        benchmark="C", mandate={"assets": {"cap": 0.55}},
+    )  # fmt: skip
+    return Desk.open(out)
+
+
+def ordered(desk, name, rows):
+    weights = desk.followed(name).weights(table().between(0, rows))
+    return [weights[each] for each in NAMES]
+
+
+def test_the_latest_weights_up_to_the_last_row_are_ordered(desk):
+    for rows, expected in (
+        (41, [0, 0.6, 0.4, 0]), (110, [0, 0.6, 0.4, 0]), (111, [0.1, 0.2, 0.7, 0]),
+        (160, [0.4, 0.5, 0.1, 0]),
+    ):  # fmt: skip
+        assert ordered(desk, "60/40", rows) == pytest.approx(expected)
+    with pytest.raises(QfolioError, match="60/40 has no order up to 2020-02-09; its first is of"):
+        ordered(desk, "60/40", 40)
+
+
+def test_orders_in_shares_count_at_the_prices_of_their_day(desk):
+    close = table().values[120]
+    worth = np.array([1000 - 5 * table().values[40, 0] - 3 * close[1], 5 * close[0], 3 * close[1]])
+    assert ordered(desk, "traded", 160)[:3] == pytest.approx(worth / worth.sum())
+
+
+def test_an_asset_as_benchmark_gets_everything(desk):
+    assert ordered(desk, "C", 160) == [0, 0, 0, 1]
+    (dated, broken) = desk.followed("C").notes(table())
+    assert dated == "These are the weights of C of 2020-01-01, its latest up to 2020-06-08."
+    assert broken == (
+        "They break the mandate (a weight is above its cap by 0.45), and are carried out all the "
+        "same, as in the backtest."
+    )
+    assert len(desk.followed("60/40").notes(table())) == 1
+
+
+@pytest.mark.parametrize(("name", "kind"), [("fund", "returns"), ("index", "levels")])
+def test_a_strategy_without_weights_is_refused(desk, name, kind):
+    with pytest.raises(QfolioError, match=f"knows only the {kind} of {name}, not its weights"):
+        desk.followed(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("equal-weigh", "did you mean equal-weight?"), ("60-40", "did you mean 60/40?"),
+        ("pathwis", "did you mean pathwise?"),
+        ("x", "choose from pathwise, equal-weight, momentum, 60/40, traded, fund, index, C."),
+    ],
+)  # fmt: skip
+def test_an_unknown_name_gets_the_near_ones(desk, name, said):
+    with pytest.raises(QfolioError) as error:
+        desk.followed(name)
+    assert str(error.value) == f"The backtest has no agent, baseline or strategy '{name}'; {said}"
+
+
+def test_an_asset_without_a_price_is_refused(desk):
+    values = table().values.copy()
+    values[:, 2] = np.nan
+    prices = Prices(table().dates, NAMES[1:], values)
+    with pytest.raises(QfolioError, match="C orders C, which has no price on 2020-06-08"):
+        desk.followed("C").weights(prices)
+
+
+def test_the_ledger_of_a_strategy_is_followed_and_reproduced(desk):
+    run, start = desk.run, table().between(0, 131)
+    assert Standing.of(desk.folder, "60/40", desk.kind("60/40")).kind == "strategy"
+    allocation = Allocation.of(desk.followed("60/40"), start, np.zeros(3), 1000.0)
+    record, _ = desk.record("60/40", allocation, start, False)
+    assert record.policy is None
+    assert desk.reproduce(record.date)[1].weights == pytest.approx([0.4, 0.5, 0.1, 0])
+    entries, _ = run.replay.others(run.baselines, run._own, "C")
+    returns = {name: entries[name].simulation.returns[0] for name in ("60/40", "C")}
+    BacktestFolder(desk.folder).write_returns(spell_all(run.dates, run.dates), returns)
+    found = follow(desk)
+    # Its last order is of this day; after the cost of the trade, it goes on as in the backtest.
+    assert len(found.live.returns) == 160 - 131
+    np.testing.assert_allclose(found.live.returns[1:], returns["60/40"][132 - 160 :], atol=1e-12)
+    assert "60/40 learns nothing, so there is nothing to train." in found.sentences()
