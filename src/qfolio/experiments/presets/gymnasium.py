@@ -40,10 +40,11 @@ _PPO: dict[str, Any] = {
 
 # Observations and rewards in any units; small steps from many environments.
 _NORMALIZED_PPO: dict[str, Any] = {
-    "num_envs": 16,
-    "rollout_length": 256,
+    "num_envs": 32,
+    "rollout_length": 128,
     "batch_size": 256,
     "epochs": 4,
+    "gae_lambda": 0.98,
     "activation": "tanh",
     "learning_rate": 1e-3,
     "normalize_observations": True,
@@ -119,7 +120,7 @@ PRESETS: Presets = {
     ("gym:CartPole-v1", "dqn"): _dqn("CartPole-v1", 120_000, discount=0.98, epsilon_end=0.05),
     ("gym:CartPole-v1", "ppo"): {"fast": _preset("CartPole-v1", "ppo", 100_000, **_PPO)},
     ("gym:Acrobot-v1", "dqn"): _dqn("Acrobot-v1", 60_000),
-    ("gym:Acrobot-v1", "ppo"): _ppo("Acrobot-v1", 500_000, gae_lambda=0.94),
+    ("gym:Acrobot-v1", "ppo"): _ppo("Acrobot-v1", 3_000_000),
     # The goal is hardly ever found by chance. Persistent pushes reach it; and untried actions keep
     # their initial value of about 0, above all tried ones, unless multi-step returns, a stream for
     # V or a flat first layer lower it.
@@ -135,14 +136,12 @@ PRESETS: Presets = {
         persistence=0.9,
         reward_scale=0.03,
     ),
-    ("gym:MountainCar-v0", "ppo"): _ppo(
-        "MountainCar-v0", 600_000, rollout_length=32, batch_size=128, gae_lambda=0.98
-    ),
+    ("gym:MountainCar-v0", "ppo"): _ppo("MountainCar-v0", 2_000_000),
     # Independent noise never reaches the goal; noise that pushes one way for 30 steps does. Each
     # push costs, so a high initial temperature would drown what the first goals pay.
     ("gym:MountainCarContinuous-v0", "sac"): _sac(
         "MountainCarContinuous-v0",
-        30_000,
+        40_000,
         noise_theta=0.03,
         input_gain=3.0,
         tau=0.01,
@@ -159,6 +158,14 @@ PRESETS: Presets = {
         tau=0.02,
         learning_rate=2e-3,
         actor_learning_rate_ratio=0.5,
+    ),
+    ("gym:LunarLander-v3", "ppo"): _ppo(
+        "LunarLander-v3",
+        1_000_000,
+        num_envs=16,
+        rollout_length=256,
+        discount=0.999,
+        entropy_coef=0.01,
     ),
     ("gym:LunarLander-v3", "dqn"): _dqn(
         "LunarLander-v3",
