@@ -73,7 +73,7 @@ def test_the_corrected_p_value_decides(assessment: Assessment) -> None:
 def test_claims_are_plain(assessment: Assessment) -> None:
     better, worse, none = contrast("better"), contrast("worse", -0.01), about()
     both = about(growth=better, sharpe=better)
-    assert claims_of(assessment, both, both) == [
+    assert claims_of(assessment, about("slow", growth=better, sharpe=better), both) == [
         "dqn beats equal weight, however it is rebalanced, in growth and Sharpe ratio after costs",
         "dqn beats equal weight in growth and Sharpe ratio after costs",
     ]
@@ -135,8 +135,47 @@ def test_growing_less_is_said_first(assessment: Assessment) -> None:
 def test_digits_tell_an_end_from_zero(assessment: Assessment) -> None:
     near = about(growth=Contrast(0.008, (0.00004, 0.02), 0.01, 0.01, "better"))
     assert "+0.800% (95% interval +0.004% to +2.000%;" in said(assessment, None, near)[0]
-    ruin = about(growth=Contrast(-math.inf, (-math.inf, math.inf), 1.0, 1.0, "none"))
-    assert "-∞% (95% interval -∞% to +∞%;" in said(assessment, None, ruin)[0]
+
+
+UNKNOWN = Contrast(-math.inf, (-math.inf, math.inf), 1.0, 1.0, "none")
+
+
+def test_a_total_loss_is_said_without_numbers(assessment: Assessment) -> None:
+    entry, lost = assessment.strategies["dqn"], about(growth=UNKNOWN)
+
+    def said_of(*growth: float) -> list[str]:
+        measure = dataclasses.replace(entry.measures["growth"], per_seed=growth)
+        strategies = {
+            **assessment.strategies,
+            "dqn": dataclasses.replace(entry, measures={**entry.measures, "growth": measure}),
+        }
+        return said(dataclasses.replace(assessment, strategies=strategies), lost, lost)
+
+    assert said_of(-1.0) == ["dqn was wiped out: it lost everything."]
+    assert said_of(0.1, -1.0, -1.0) == ["dqn was wiped out with 2 of 3 seeds: it lost everything."]
+    other = about("equal weight", growth=dataclasses.replace(UNKNOWN, value=math.inf))
+    assert said(assessment, None, other) == ["equal weight was wiped out, and dqn was not."]
+
+
+def test_nothing_is_times_as_volatile_as_cash(assessment: Assessment) -> None:
+    wild = about("cash", growth=contrast("better"), volatility=contrast("worse", 5.4))
+    (sentence,) = said(assessment, None, wild)
+    assert sentence.startswith("dqn beats equal weight in growth after costs, and fluctuates more:")
+    assert sentence.endswith(
+        "and in Sharpe ratio 0.00 (95% interval -0.10 to +0.10; corrected p = 1.00); cash hardly "
+        "fluctuates."
+    )
+    twice = about("cash", volatility=contrast("worse", math.log(2)))
+    assert "in volatility +100.0%" in said(assessment, None, twice)[0]
+
+
+def test_one_reference_needs_one_sentence(assessment: Assessment) -> None:
+    """As when the reference grows as much as its best rebalancing."""
+    both = about(growth=contrast("better"))
+    near = about(growth=contrast("better", p=0.01))
+    assert claims_of(assessment, both, near) == [
+        "dqn beats equal weight, however it is rebalanced, in growth after costs"
+    ]
 
 
 def test_the_bound_is_said_as_a_bound(assessment: Assessment) -> None:

@@ -11,10 +11,12 @@ from qfolio.report.backtest.opening import (
     best_sentence,
     conclusion,
     lead_name,
+    rival_name,
     standing,
     tiles,
     verdict_lines,
 )
+from qfolio.report.backtest.page import render_backtest
 from qfolio.report.rendering import number, percent
 
 from backtests import make_data, usual
@@ -64,45 +66,118 @@ def test_the_conclusion_says_who_beats_the_reference(plain: BacktestData) -> Non
     data = found(plain, pathwise=("better", "better"))
     assert lead_name(data) == "pathwise"
     assert conclusion(data) == (
-        "pathwise beats equal weight in growth and Sharpe ratio: it grew "
-        f"{growth(data, 'pathwise')} a year after costs, equal weight "
-        f"{growth(data, 'equal weight')}."
+        "pathwise beats equal weight, however it is rebalanced, in growth and Sharpe ratio: it "
+        f"grew {growth(data, 'pathwise')} a year after costs, never {growth(data, 'never')}."
     )
     both = found(plain, pathwise=("better", "none"), DQN=("better", "none"))
     assert conclusion(both).startswith(
-        "DQN-together and pathwise beat equal weight in growth: DQN-together grew "
+        "DQN-together and pathwise beat equal weight, however it is rebalanced, in growth: "
+        "DQN-together grew "
     )
     risk = found(plain, DQN=("none", "better"))
     assert conclusion(risk).startswith(
-        "DQN-together beats equal weight in return for the risk, but not in growth: it grew"
+        "DQN-together beats equal weight, however it is rebalanced, in return for the risk, but "
+        "not in growth: it grew"
     )
 
 
 def test_the_conclusion_says_that_nobody_does(plain: BacktestData) -> None:
     data = found(plain, pathwise=("worse", "none"))
     assert lead_name(data) == "DQN-together"  # not the one that grew most: that may be luck
-    assert conclusion(data).startswith("No agent clearly beats equal weight: DQN-together grew")
+    assert conclusion(data).startswith(
+        "No agent clearly beats the best rebalancing of equal weight: DQN-together grew"
+    )
     worse = found(plain, pathwise=("worse", "worse"), DQN=("worse", "none"))
-    assert conclusion(worse).startswith("All agents fall short of equal weight: ")
+    assert conclusion(worse).startswith(
+        "All agents fall short of the best rebalancing of equal weight: "
+    )
+
+
+def with_findings(data: BacktestData, alone: Finding, rebalanced: Finding) -> BacktestData:
+    """Pathwise with other findings of growth: to the reference, and to its best rebalancing."""
+    changed = found(data, pathwise=(alone, "none"))
+    entry = changed.assessment.strategies["pathwise"]
+    assert entry.to_rebalanced is not None
+    slower = replace(
+        entry.to_rebalanced, growth=replace(entry.to_rebalanced.growth, finding=rebalanced)
+    )
+    strategies = {
+        **changed.assessment.strategies,
+        "pathwise": replace(entry, to_rebalanced=slower),
+    }
+    return replace(changed, assessment=replace(changed.assessment, strategies=strategies))
+
+
+def line_of(name: str, data: BacktestData) -> tuple[str, list[dict[str, Any]]]:
+    lines = verdict_lines(data)["agents"]
+    return next((other, cells) for each, other, cells in lines if each == name)
 
 
 def test_better_than_the_reference_only_as_it_was_rebalanced(plain: BacktestData) -> None:
-    entry = found(plain, DQN=("better", "better")).assessment.strategies["DQN-together"]
+    data = with_findings(plain, "better", "none")
+    lines = verdict_lines(data)
+    assert standing("pathwise", "growth", data.assessment) == "none"
+    assert lines["mixed"] == ["pathwise in growth"]
+    assert lines["slower"]
+    assert not verdict_lines(found(plain, pathwise=("better", "none")))["mixed"]
+
+
+def test_all_stand_beside_the_reference_of_the_verdict(plain: BacktestData) -> None:
+    """Headline, figures and intervals, though the agent beats what the verdict is not about."""
+    test = plain.assessment
+    assert (test.reference, test.rebalanced) == ("equal weight", "never")
+    entry = test.strategies["pathwise"]
+    assert entry.to_reference is not None
     assert entry.to_rebalanced is not None
-    slower = replace(
-        entry.to_rebalanced, growth=replace(entry.to_rebalanced.growth, finding="none")
-    )
-    assert standing(replace(entry, to_rebalanced=slower), "growth") == "mixed"
-    assert standing(replace(entry, to_rebalanced=slower), "sharpe") == "better"
-    assert standing(replace(entry, to_rebalanced=None), "growth") == "better"
+    for alone, rebalanced, other, to in (
+        ("none", "worse", "never", entry.to_rebalanced),
+        ("none", "none", "never", entry.to_rebalanced),
+        ("worse", "none", "equal weight", entry.to_reference),
+    ):
+        data = with_findings(plain, alone, rebalanced)  # type: ignore[arg-type]
+        cell = line_of("pathwise", data)[1][0]
+        assert cell["value"] == percent(to.growth.value, sign=True)
+        assert rival_name(found(plain)) == "never"
+        alone_tested = replace(
+            data, strategies={n: s for n, s in data.strategies.items() if "DQN" not in n}
+        )
+        assert rival_name(alone_tested) == other
+        assert conclusion(alone_tested).endswith(f", {other} {growth(plain, other)}.")
+        assert all(tile["other"].startswith(other) for tile in tiles(alone_tested))
+    # Where the others are not the same, each line names its own.
+    assert verdict_lines(data)["against"] == ""
+    assert line_of("pathwise", data)[0] == "equal weight"
+    assert line_of("DQN", data)[0] == "never"
+    assert verdict_lines(plain)["against"] == "never"
+
+
+def test_a_bar_that_excludes_zero_without_evidence_is_explained(plain: BacktestData) -> None:
+    data = found(plain, pathwise=("better", "better"), DQN=("none", "none"))
+    assert not verdict_lines(data)["apart"]
+    assert verdict_lines(found(plain))["apart"]  # pathwise grew much more
+
+
+def test_a_total_loss_leads_to_no_numbers(plain: BacktestData) -> None:
+    series = {n: s for n, s in plain.strategies.items() if n != "pathwise" and "DQN" not in n}
+    lost = plain.strategies["pathwise"].returns.copy()
+    lost[:, 100] = -1
+    lost[:, 101:] = 0
+    series["pathwise"] = replace(plain.strategies["pathwise"], returns=lost)
+    data = make_data(series, plain.dates, plain.assets)
+    assert conclusion(data) == "pathwise was wiped out: it lost everything."
+    (cell, _) = line_of("pathwise", data)[1]
+    assert (cell["word"], cell["value"], cell["span"]) == ("lost everything", "–", None)
+    page = render_backtest(data).split("</header>")[0]
+    assert "∞" not in page
+    assert "pathwise was wiped out: it lost everything.</p>" in page
 
 
 def test_tiles_stand_beside_the_reference(plain: BacktestData) -> None:
     data = found(plain, pathwise=("better", "none"))
     shown = {tile["name"]: tile for tile in tiles(data)}
-    own, other = (data.assessment.strategies[n].measures for n in ("pathwise", "equal weight"))
+    own, other = (data.assessment.strategies[n].measures for n in ("pathwise", "never"))
     assert shown["Sharpe ratio"]["value"] == number(own["sharpe"].mean, 2)
-    assert shown["Sharpe ratio"]["other"] == number(other["sharpe"].mean, 2)
+    assert shown["Sharpe ratio"]["other"] == f"never {number(other['sharpe'].mean, 2)}"
     assert shown["Deepest drawdown"]["value"] == percent(own["drawdown"].mean)
     assert shown["Turnover a year"]["value"] == f"{number(own['turnover'].mean)} ×"
     assert [tile["side"] for tile in shown.values()] == ["better", "none", "", "", ""]
@@ -110,8 +185,8 @@ def test_tiles_stand_beside_the_reference(plain: BacktestData) -> None:
 
 def test_each_agent_has_one_line_of_two_verdicts(plain: BacktestData) -> None:
     lines = verdict_lines(found(plain, pathwise=("better", "none")))
-    assert [name for name, _ in lines["agents"]] == ["DQN", "DQN-together", "pathwise"]
-    pathwise = lines["agents"][2][1]
+    assert [name for name, *_ in lines["agents"]] == ["DQN", "DQN-together", "pathwise"]
+    pathwise = lines["agents"][2][2]
     assert [cell["word"] for cell in pathwise] == ["better", "no evidence"]
     left, width, middle = pathwise[0]["span"]
     assert lines["zeros"][0] < left < middle < left + width <= 100

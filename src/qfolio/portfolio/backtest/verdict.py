@@ -18,12 +18,16 @@ _MEASURES: dict[Measured, str] = {
 _MOVES = {"better": "less", "worse": "more"}
 """Volatility in words, by finding."""
 
+STEADY = 10.0
+"""A strategy this many times as volatile as another is not compared with it: as with cash, whose
+interest alone fluctuates, the ratio would say nothing."""
+
 
 def verdicts(assessment: Assessment) -> dict[str, list[str]]:
     """The verdicts on every agent and ensemble, by name; the first is against the reference."""
     return {
         name: [
-            f"{claim}: {evidence(difference, assessment)}."
+            f"{': '.join(filter(None, (claim, evidence(difference, assessment))))}."
             for claim, difference in claims(name, assessment)
         ]
         for name, strategy in assessment.strategies.items()
@@ -35,7 +39,8 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
     """What was found about an agent, without numbers, and the difference of each claim.
 
     Claims against the reference come first, and of these, one that says the agent grew less. If the
-    agent does not beat the reference at every speed of rebalancing, a claim says so.
+    agent does not beat the reference at every speed of rebalancing, a claim says so. After a total
+    loss there is only one claim, which says so.
     """
     entry, reference, best = (
         assessment.strategies[name],
@@ -49,16 +54,39 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
     else:
         main, at_any = rebalanced, f"{reference}, however it is rebalanced,"
         at_best = f"the best rebalancing of {reference}"
+    if wiped_out(entry) or main.growth.value == math.inf:
+        return [(_ruin(name, entry, main), main)]
     claim = _claim(name, main, at_any, at_best)
     if claim and not main.found("better"):
         claim += ", and beats it in nothing"
     said = [(claim or _nothing(name, main, at_any if _gains(alone) else reference), main)]
-    if rebalanced is not None:
+    if rebalanced is not None and not _alike(alone, rebalanced):
         said.append((_claim(name, alone, reference, reference), alone))
     said.sort(key=lambda each: each[1].growth.finding != "worse")
     if entry.to_best_baseline is not None:
         said.append((_claim(name, entry.to_best_baseline, best, best), entry.to_best_baseline))
     return [(claim, difference) for claim, difference in said if claim]
+
+
+def wiped_out(strategy: StrategyAssessment) -> bool:
+    """Whether a strategy lost everything, with any of its seeds."""
+    return -1 in strategy.measures["growth"].per_seed
+
+
+def _ruin(name: str, strategy: StrategyAssessment, difference: Difference) -> str:
+    """That a strategy, or the one it is compared with, lost everything."""
+    if not wiped_out(strategy):
+        return f"{difference.reference} was wiped out, and {name} was not"
+    growth = strategy.measures["growth"].per_seed
+    lost = growth.count(-1)
+    seeds = "" if lost == len(growth) else f" with {lost} of {len(growth)} seeds"
+    return f"{name} was wiped out{seeds}: it lost everything"
+
+
+def _alike(one: Difference, other: Difference) -> bool:
+    """Whether two differences are from the same strategy, with the same findings."""
+    both = [[each.finding for each in d.contrasts().values()] for d in (one, other)]
+    return one.reference == other.reference and both[0] == both[1]
 
 
 def _claim(name: str, difference: Difference, better: str, worse: str) -> str:
@@ -99,16 +127,31 @@ def _gains(difference: Difference, finding: Finding = "better") -> list[Measured
 def evidence(difference: Difference, assessment: Assessment) -> str:
     """The numbers of a verdict: each tested difference, its interval and the p-value that decides.
 
-    Holm's correction over all comparisons of the backtest decides on a claim.
+    Holm's correction over all comparisons of the backtest decides on a claim. Differences that are
+    not ``comparable`` are left out; without any growth there are no numbers.
     """
+    if not comparable("growth", difference.growth):
+        return ""
     lead = f"the difference in annual growth to {difference.reference} is"
     tested = {key: each for key, each in difference.contrasts().items() if each.p is not None}
     p = "corrected p" if assessment.comparisons > 1 else "p"
     texts = [
         f"{lead if key == 'growth' else 'in ' + _MEASURES[key]} {_numbers(key, each, p)}"
         for key, each in (tested or {"growth": difference.growth}).items()
+        if comparable(key, each)
     ]
-    return _joined(texts, "and")
+    steady = "volatility" in tested and difference.volatility.value > math.log(STEADY)
+    return _joined(texts, "and") + (f"; {difference.reference} hardly fluctuates" if steady else "")
+
+
+def comparable(key: Measured, contrast: Contrast) -> bool:
+    """Whether a difference says something as a number.
+
+    It does not after a total loss, nor in volatility if the other strategy hardly fluctuates.
+    """
+    return math.isfinite(contrast.value) and not (
+        key == "volatility" and contrast.value > math.log(STEADY)
+    )
 
 
 def shown(key: Measured, contrast: Contrast) -> tuple[float, float, float]:

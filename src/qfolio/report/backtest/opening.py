@@ -1,4 +1,7 @@
-"""The top of the page: a conclusion, the figures of one agent, and each agent's verdicts."""
+"""The top of the page: a conclusion, the figures of one agent, and each agent's verdicts.
+
+All of it compares an agent with one other strategy: the one of its first verdict.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,21 @@ import math
 from typing import Any, Literal
 
 from qfolio.core.text import listed
-from qfolio.portfolio.backtest.assessment import JUDGED, StrategyAssessment
+from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
+from qfolio.portfolio.backtest.differences import Difference
 from qfolio.portfolio.backtest.estimates import Measured
+from qfolio.portfolio.backtest.verdict import claims, comparable, wiped_out
 from qfolio.report.backtest.data import BacktestData, followed_names, shown_order
 from qfolio.report.backtest.verdicts import ticks_around
 from qfolio.report.rendering import number, percent
 
-Standing = Literal["better", "mixed", "none", "worse"]
+Standing = Literal["better", "none", "worse", "ruined"]
 
 WORDS: dict[Standing, str] = {
     "better": "better",
-    "mixed": "better, not at every speed",
     "none": "no evidence",
     "worse": "worse",
+    "ruined": "lost everything",
 }
 """Verdicts on one measure, in words."""
 
@@ -32,16 +37,20 @@ TILES = {
 """Names of the figures at the top of the page, by measure."""
 
 
-def standing(entry: StrategyAssessment, key: Measured) -> Standing:
-    """The verdict on an agent in one measure, against the reference at every speed."""
-    assert entry.to_reference is not None  # only the reference itself has none
-    alone = entry.to_reference.contrasts()[key].finding
-    main = (entry.to_rebalanced or entry.to_reference).contrasts()[key].finding
-    if "worse" in (alone, main):
-        return "worse"
-    if main == "better":
-        return "better"
-    return "mixed" if alone == "better" else "none"
+MEASURES: dict[Measured, str] = {"growth": "growth", "sharpe": "Sharpe ratio"}
+"""Measures whose verdicts have a column."""
+
+
+def against(name: str, test: Assessment) -> Difference:
+    """The difference of an agent's first verdict, to the reference or its best rebalancing."""
+    return claims(name, test)[0][1]
+
+
+def standing(name: str, key: Measured, test: Assessment) -> Standing:
+    """The verdict on an agent in one measure."""
+    if wiped_out(test.strategies[name]):
+        return "ruined"
+    return against(name, test).contrasts()[key].finding or "none"
 
 
 def lead_name(data: BacktestData) -> str | None:
@@ -49,54 +58,66 @@ def lead_name(data: BacktestData) -> str | None:
 
     It is not chosen by growth over the test, which would favor luck.
     """
-    ranks = {"better": 0, "mixed": 1, "none": 2, "worse": 3}
+    ranks = list(WORDS)
 
     def rank(name: str) -> tuple[int, int]:
-        entry = data.assessment.strategies[name]
-        growth, sharpe = (ranks[standing(entry, key)] for key in ("growth", "sharpe"))
+        growth, sharpe = (ranks.index(standing(name, key, data.assessment)) for key in MEASURES)
         return growth, sharpe
 
     return min(followed_names(data), key=rank, default=None)
 
 
+def rival_name(data: BacktestData) -> str:
+    """The strategy beside the agent at the top of the page."""
+    lead, test = lead_name(data), data.assessment
+    return test.reference if lead is None else against(lead, test).reference
+
+
 def conclusion(data: BacktestData) -> str:
     """The result of the backtest in one sentence."""
-    lead, reference = lead_name(data), data.assessment.reference
+    lead, test, names = lead_name(data), data.assessment, followed_names(data)
     if lead is None:
         return "No agent was tested; these are the baselines alone."
-    entries, names = data.assessment.strategies, followed_names(data)
-    found = {
-        key: {name: standing(entries[name], key) for name in names} for key in ("growth", "sharpe")
-    }
+    claim, difference = claims(lead, test)[0]
+    if not comparable("growth", difference.growth):
+        return f"{claim}."
 
-    def which(key: str, verdict: Standing) -> list[str]:
-        return [name for name in names if found[key][name] == verdict]
-
-    own, other = entries[lead].measures, entries[reference].measures
+    def which(key: Measured, *found: Standing) -> list[str]:
+        return [name for name in names if standing(name, key, test) in found]
 
     def told(subject: str) -> str:
-        who = "it" if subject == lead else lead
-        return (
-            f"{who} grew {percent(own['growth'].mean)} a year after costs, {reference} "
-            f"{percent(other['growth'].mean)}"
-        )
+        who, other = "it" if subject == lead else lead, difference.reference
+        own, theirs = (test.strategies[name].measures["growth"].mean for name in (lead, other))
+        return f"{who} grew {percent(own)} a year after costs, {other} {percent(theirs)}"
 
     if winners := which("growth", "better"):
         verb = "beats" if len(winners) == 1 else "beat"
         also = " and Sharpe ratio" if winners == which("sharpe", "better") else ""
-        return f"{listed(winners)} {verb} {reference} in growth{also}: {told(listed(winners))}."
+        other = _others(winners, test, better=True)
+        return f"{listed(winners)} {verb} {other} in growth{also}: {told(listed(winners))}."
     if winners := which("sharpe", "better"):
         verb = "beats" if len(winners) == 1 else "beat"
         return (
-            f"{listed(winners)} {verb} {reference} in return for the risk, but not in growth: "
-            f"{told(listed(winners))}."
+            f"{listed(winners)} {verb} {_others(winners, test, better=True)} in return for the "
+            f"risk, but not in growth: {told(listed(winners))}."
         )
     subject = lead if len(names) == 1 else ""
-    if len(which("growth", "worse")) == len(names):
+    if len(which("growth", "worse", "ruined")) == len(names):
         who = f"{lead} falls" if len(names) == 1 else "All agents fall"
-        return f"{who} short of {reference}: {told(subject)}."
+        return f"{who} short of {_others(names, test)}: {told(subject)}."
     who = f"{lead} does not clearly beat" if len(names) == 1 else "No agent clearly beats"
-    return f"{who} {reference}: {told(subject)}."
+    return f"{who} {_others([lead], test)}: {told(subject)}."
+
+
+def _others(names: list[str], test: Assessment, better: bool = False) -> str:
+    """What the first verdicts on some agents compare them with, in words."""
+    at_any = f"{test.reference}, however it is rebalanced,"
+    slower = at_any if better else f"the best rebalancing of {test.reference}"
+    said = [
+        slower if against(name, test) is test.strategies[name].to_rebalanced else test.reference
+        for name in names
+    ]
+    return " or ".join(dict.fromkeys(said))
 
 
 def best_sentence(data: BacktestData) -> str:
@@ -122,9 +143,8 @@ def best_sentence(data: BacktestData) -> str:
 
 def tiles(data: BacktestData) -> list[dict[str, str]]:
     """The main figures of the agent at the top of the page, or of the reference without agents."""
-    test, lead = data.assessment, lead_name(data)
-    shown = test.reference if lead is None else lead
-    own, other = (test.strategies[name].measures for name in (shown, test.reference))
+    test, lead, rival = data.assessment, lead_name(data), rival_name(data)
+    own, other = (test.strategies[name].measures for name in (lead or rival, rival))
 
     def written(key: str, value: float) -> str:
         if key == "turnover" and not math.isnan(value):
@@ -133,15 +153,12 @@ def tiles(data: BacktestData) -> list[dict[str, str]]:
             return percent(value, 2)
         return number(value, 2) if key == "sharpe" else percent(value)
 
-    side = {
-        key: "" if lead is None else standing(test.strategies[lead], key)
-        for key in ("growth", "sharpe")
-    }
+    side: dict[str, str] = {key: standing(lead, key, test) for key in MEASURES if lead}
     return [
         {
             "name": name,
             "value": written(key, own[key].mean),
-            "other": "" if lead is None else written(key, other[key].mean),
+            "other": "" if lead is None else f"{rival} {written(key, other[key].mean)}",
             "side": side.get(key, ""),
         }
         for key, name in TILES.items()
@@ -149,24 +166,55 @@ def tiles(data: BacktestData) -> list[dict[str, str]]:
 
 
 def verdict_lines(data: BacktestData) -> dict[str, Any]:
-    """For each agent, the verdicts on growth and Sharpe ratio, with intervals on two axes."""
+    """For each agent, the verdicts on growth and Sharpe ratio, with intervals on two axes.
+
+    Intervals are those of the differences that the verdicts are about: ``against`` names the other
+    strategy, or is empty if it is not the same for all agents, whose lines then name it.
+    """
     test = data.assessment
     names = [name for name in shown_order(data) if test.strategies[name].kind in JUDGED]
-    columns = [_column(key, names, data) for key in ("growth", "sharpe")]
+    columns = [_column(key, names, data) for key in MEASURES]
+    others = [against(name, test).reference for name in names]
+    same = len(set(others)) == 1
     return {
-        "mixed": any(cell["side"] == "mixed" for column in columns for cell in column["cells"]),
+        "against": others[0] if same else "",
+        "slower": any(other != test.reference for other in others),
+        "mixed": [said for name in names if (said := _only_here(name, test))],
+        "apart": any(cell["apart"] for column in columns for cell in column["cells"]),
         "zeros": [column["zero"] for column in columns],
         "agents": [
-            (name, [column["cells"][place] for column in columns])
-            for place, name in enumerate(names)
+            (name, "" if same else other, [column["cells"][place] for column in columns])
+            for place, (name, other) in enumerate(zip(names, others, strict=True))
         ],
     }
 
 
+def _only_here(name: str, test: Assessment) -> str:
+    """The measures in which an agent beats the reference as it is, but not at every speed."""
+    alone = test.strategies[name].to_reference
+    assert alone is not None  # only the reference itself has none
+    found = [
+        word
+        for key, word in MEASURES.items()
+        if alone.contrasts()[key].finding == "better" and standing(name, key, test) == "none"
+    ]
+    return f"{name} in {listed(found)}" if found else ""
+
+
 def _column(key: Measured, names: list[str], data: BacktestData) -> dict[str, Any]:
-    entries = [data.assessment.strategies[name] for name in names]
-    contrasts = [entry.to_reference.contrasts()[key] for entry in entries if entry.to_reference]
-    ends = [e for c in contrasts for e in (c.value, *c.interval) if math.isfinite(e)]
+    test = data.assessment
+    verdicts = [standing(name, key, test) for name in names]
+    contrasts = [against(name, test).contrasts()[key] for name in names]
+    known = [
+        verdict != "ruined" and all(map(math.isfinite, (each.value, *each.interval)))
+        for verdict, each in zip(verdicts, contrasts, strict=True)
+    ]
+    ends = [
+        end
+        for each, shown in zip(contrasts, known, strict=True)
+        if shown
+        for end in (each.value, *each.interval)
+    ]
     ticks, _ = ticks_around(min(ends, default=0.0), max(ends, default=0.0))
     low, high = min(*ends, *ticks, 0.0), max(*ends, *ticks, 0.0)
     width = (high - low) or 1.0
@@ -177,19 +225,19 @@ def _column(key: Measured, names: list[str], data: BacktestData) -> dict[str, An
     def written(value: float) -> str:
         return number(value, 2, sign=True) if key == "sharpe" else percent(value, sign=True)
 
-    cells = []
-    for entry, contrast in zip(entries, contrasts, strict=True):
-        verdict = standing(entry, key)
+    cells: list[dict[str, Any]] = []
+    for verdict, contrast, shown in zip(verdicts, contrasts, known, strict=True):
+        cell = {"side": verdict, "word": WORDS[verdict], "apart": False}
+        if not shown:
+            cells.append({**cell, "value": "–", "span": None, "label": WORDS[verdict]})
+            continue
         left, right = contrast.interval
-        known = all(map(math.isfinite, (contrast.value, left, right)))
         cells.append(
             {
-                "side": verdict,
-                "word": WORDS[verdict],
+                **cell,
+                "apart": verdict == "none" and not left <= 0 <= right,
                 "value": written(contrast.value),
-                "span": (place(left), round(place(right) - place(left), 2), place(contrast.value))
-                if known
-                else None,
+                "span": (place(left), round(place(right) - place(left), 2), place(contrast.value)),
                 "label": f"{written(contrast.value)}, 95% interval "
                 f"{written(left)} to {written(right)}",
             }

@@ -34,6 +34,7 @@ from qfolio.report.backtest.opening import (
     best_sentence,
     conclusion,
     lead_name,
+    rival_name,
     tiles,
     verdict_lines,
 )
@@ -107,6 +108,7 @@ def render_backtest(data: BacktestData) -> str:
         conclusion=conclusion(data),
         best=best_sentence(data),
         leading=(leading := lead_name(data)),
+        rival=rival_name(data),
         start=names.index(leading or data.assessment.reference),
         tiles=tiles(data),
         lines=verdict_lines(data),

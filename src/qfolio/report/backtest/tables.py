@@ -13,7 +13,7 @@ from qfolio.portfolio.backtest.differences import Difference
 from qfolio.portfolio.backtest.estimates import MEASURED, Measured
 from qfolio.portfolio.backtest.measures import monthly
 from qfolio.portfolio.backtest.sampled import Measure
-from qfolio.portfolio.backtest.verdict import luck, shown
+from qfolio.portfolio.backtest.verdict import comparable, luck, shown, wiped_out
 from qfolio.report.backtest.data import BacktestData, main_names
 from qfolio.report.rendering import number, percent
 
@@ -127,7 +127,10 @@ def difference_headings(data: BacktestData) -> list[str]:
 
 
 def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None]:
-    """Differences to the reference, to its best rebalancing, and to the best baseline."""
+    """Differences to the reference, to its best rebalancing, and to the best baseline.
+
+    None where there is nothing to compare, or nothing that says something; see ``comparable``.
+    """
     entry = data.assessment.strategies[name]
     cells: list[dict[str, str] | None] = []
     for field, _, _, keys in _comparisons(data.assessment):
@@ -137,6 +140,9 @@ def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None
                 cells.append(None)
                 continue
             contrast = difference.contrasts()[key]
+            if not comparable(key, contrast):
+                cells.append(None)
+                continue
             write, scale, digits = (number, 1, 2) if key == "sharpe" else (percent, 100, 1)
             value, *interval = shown(key, contrast)
             ends = (write(end, _telling(scale * end, digits), sign=True) for end in interval)
@@ -231,7 +237,9 @@ def luck_rows(names: list[str], data: BacktestData) -> list[dict[str, Any]]:
         rows.append(
             {
                 "name": name,
-                "sentence": luck(name, entry) if entry.kind in JUDGED else None,
+                "sentence": luck(name, entry)
+                if entry.kind in JUDGED and not wiped_out(entry)
+                else None,
                 "sharpe": number(entry.measures["sharpe"].mean, 2),
                 "certain": certain,
                 "threshold": number(test.threshold, 2),

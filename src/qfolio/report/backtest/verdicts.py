@@ -38,7 +38,7 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
         known = all(map(math.isfinite, (growth, *interval)))
         return {
             "finding": claim,
-            "numbers": f"{evidence(each, test)}.",
+            "numbers": f"{numbers}." if (numbers := evidence(each, test)) else "",
             "span": (left, round(right - left, 2), place(growth)) if known else None,
             "label": f"{percent(growth, sign=True)}, 95% interval "
             + " to ".join(percent(end, sign=True) for end in interval),
