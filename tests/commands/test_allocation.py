@@ -337,3 +337,21 @@ def test_a_budget_of_the_year_is_that_of_the_ledger(tmp_path, monkeypatch, capsy
     assert qfolio(monkeypatch, "allocate", run, "--reproduce", second["date"], "--json") == 0
     assert json.loads(capsys.readouterr().out)["assets"] == second["assets"]
     assert qfolio(monkeypatch, "follow", run, "--prices", newer) == 0
+
+
+def test_an_allocation_in_hindsight_is_not_recorded(copy, monkeypatch, capsys, tmp_path):
+    """Its policy has learned from prices up to 2020-09-16."""
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    earlier = write_table(tmp_path / "earlier.csv", rows=250)
+    options = ["--prices", earlier, "--as-of", "2020-09-06", "--capital", 1000]
+    assert qfolio(monkeypatch, "allocate", copy, *options, "--agent", "pathwise") == 2
+    hindsight = "learned from prices up to 2020-09-16, which were not known on 2020-09-06"
+    printed = capsys.readouterr().err
+    assert f"{hindsight}; give later prices, or add --anyway" in printed
+    assert qfolio(monkeypatch, "allocate", copy, *options, "--anyway", "--json") == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["record"] is None
+    assert f"{hindsight}, so that nothing is recorded." in " ".join(printed.err.split())
+    assert not (copy / "ledger").exists()
+    assert qfolio(monkeypatch, "allocate", copy, *options, "--agent", "equal-weight") == 0
+    assert len(records(copy)) == 1  # a baseline has learned nothing

@@ -63,7 +63,7 @@ def allocate(
         agent: Agent to follow; or a baseline such as equal-weight, the benchmark or a strategy of
             your own, if the backtest has it (default: the first agent of the backtest).
         anyway: Allocate even if the backtest is not finished, or found the agent worse than the
-            benchmark.
+            benchmark, or (without a record) if the policy has learned from later prices.
         whole_shares: Trade whole shares only.
         as_of: Day of the allocation; prices may be up to a week older (default: today).
         update: Update the policy on the new rows first, and store the new version beside the
@@ -139,13 +139,20 @@ def allocate(
         if not isinstance(followed, Policy):
             raise QfolioError(f"{name} learns nothing; leave out --update.")
         followed = followed.update(table)
+    hindsight = desk.hindsight(followed, table)
+    if hindsight and not anyway:
+        raise QfolioError(
+            f"{hindsight}; give later prices, or add --anyway, which then records nothing."
+        )
     spent = desk.spent(followed, table)
     allocation = Allocation.of(
         followed, table, shares, cash, whole_shares=whole_shares, spent=spent
     )
     rows = None if orders is None else order_rows(allocation, layout, currency)
     said, number = "A dry run: nothing is recorded.", None
-    if not dry_run:
+    if hindsight:
+        said = f"{hindsight}, so that nothing is recorded."
+    elif not dry_run:
         if update and isinstance(followed, Policy):
             desk.run.keep(name, followed)
         record, said = desk.record(name, allocation, table, whole_shares)

@@ -20,6 +20,7 @@ from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
 from qfolio.portfolio.desk.rule import Kind, Ordered, Rule, Untrained
 from qfolio.portfolio.policy import Policy
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
 
 SAME = 1e-6
@@ -108,6 +109,16 @@ class Desk:
                 "memberships with --members."
             )
         return followed.table(table)
+
+    def hindsight(self, followed: Policy | Untrained, table: Prices) -> str:
+        """Says so if a policy has learned from later rows than a table's last one; else ""."""
+        last = table.dates[-1]
+        if not isinstance(followed, Policy) or not followed.learned > last:
+            return ""
+        return (
+            f"The policy has learned from prices up to {day(followed.learned)}, which were not "
+            f"known on {day(last)}"
+        )
 
     def spent(
         self, followed: Policy | Untrained, table: Prices, before: int | None = None
