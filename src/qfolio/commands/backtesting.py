@@ -46,7 +46,8 @@ class Options(Reading):
         train: Length of the first training window: 5y, 6m, 8w or 500d (d counts rows).
         test: Length of a fold, after which agents are retrained.
         rolling: Train on a window of fixed length instead of all rows so far.
-        cap: Largest weight of one asset, from 0 to 1.
+        cap: Largest weight of one asset, from 0 to 1; a mandate that allows loans or short sales
+            may set a cap above 1 instead.
         mandate: File with the limits of all orders (TOML; see docs/guides/mandate.md).
         limits: Keys of a mandate with their values, such as assets.cap=0.2 trading.turnover=0.3;
             they take precedence over the file.

@@ -28,7 +28,14 @@ from qfolio.portfolio.costs import cashed
 from qfolio.portfolio.execution import Plan, Terms
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import CappedSimplex, Feasible, Mandated
-from qfolio.portfolio.mandate.mandate import Mandate, feasible, largest_weight, parse, settled
+from qfolio.portfolio.mandate.mandate import (
+    Mandate,
+    feasible,
+    largest_weight,
+    parse,
+    reach,
+    settled,
+)
 from qfolio.portfolio.mandate.risk import Risk
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
@@ -310,9 +317,9 @@ class Portfolio(Market):
         """The allocations of the menu; without one, all weights up to the largest."""
         if self.menu:
             return super().actions
-        most = largest_weight(self.mandate) if self.mandate else 1.0
         if not self.feasible.long_only:  # the weights of the assets; cash is the rest
-            return Box(self.limits.shape[0], most)
+            return Box(self.limits.shape[0], reach(self.mandate, self.max_weight))
+        most = largest_weight(self.mandate) if self.mandate else 1.0
         return Simplex(self.limits.shape[0], min(self.max_weight, most))
 
     @property

@@ -2,10 +2,12 @@
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.mdp import Box
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk
@@ -156,6 +158,24 @@ def test_floors_yield_to_assets_that_start_late():
     held = entries["pathwise"].decisions[:, :, 4]
     assert (held[:, :50] == 0).all()
     assert (held[:, 50:] >= 0.1 - 1e-5).all()
+
+
+LEVERED = {"assets": {"cap": 2}, "cash": {"min": -1, "max": -0.5}, "exposure": {"gross": 2}}
+
+
+def test_caps_above_1_hold_for_agents_and_baselines():
+    agents, own = {"pathwise": AGENTS["pathwise"]}, np.tile([-0.5, 1.5, 0, 0, 0, 0], (200, 1))
+    backtest = create(LEVERED, agents=agents, strategies={"own": own})
+    task = backtest.tasks["pathwise"]
+    assert isinstance(task.actions, Box)
+    assert task.actions.bound == 2
+    held, wanted = jnp.eye(6)[0], jnp.array([2.0, 0, 0, 0, 0])
+    order = task.wanted(task.first_decision, task.hold(held), wanted)
+    np.testing.assert_allclose(order, [-1, 2, 0, 0, 0, 0], atol=1e-6)
+    entries, notes = backtest.replay.others(backtest.baselines, backtest._own, "equal-weight")
+    weights = entries["minimum-variance"].simulation.weights[0]
+    assert weights[:, 1:].sum(1).min() > 1.3
+    assert not any("more than the cap" in note for note in notes)
 
 
 def test_a_mandate_that_cannot_be_met_is_refused_before_anything_is_written(tmp_path):

@@ -5,7 +5,15 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate import checks
-from qfolio.portfolio.mandate.mandate import Mandate, feasible, lots, parse, settled
+from qfolio.portfolio.mandate.mandate import (
+    Mandate,
+    feasible,
+    largest_weight,
+    lots,
+    parse,
+    reach,
+    settled,
+)
 
 ASSETS = ["SPY", "TLT", "XLE", "XOM"]
 ALL = np.ones(4, bool)
@@ -142,6 +150,8 @@ GROUP = {"assets": ["XLE", "XOM"]}
         ({"cash": {"min": 0.3, "max": 0.2}}, "minimum of cash, 30%, is above its maximum, 20%"),
         ({"assets": {"cap": 0.3}, "trading": {"holdings": 2}, "cash": {"max": 0.1}},
          "2 holdings at their caps leave 40% in cash"),
+        ({"assets": {"cap": 2}, "cash": {"min": -3, "max": -2}, "exposure": {"gross": 2}},
+         "cash of at most -200% and gross exposure of at most 200% clash"),
         ({"assets": {"floor": 0.1}, "trading": {"holdings": 3}}, "4 assets have a floor"),
         ({"assets": {"cap": 2.0}, "cash": {"min": -1.0}, "exposure": {"gross": 2.0, "margin": 0.6}},
          "exposure of 200% would break a margin of 60%, which allows 166.667%"),
@@ -181,6 +191,24 @@ def test_a_file_of_groups_may_name_assets_of_other_tables(tmp_path):
     assert "other" in mandate.groups["sector"]["Energy"].assets
     notes = checks.require(settled(mandate, ASSETS), ALL)
     assert notes == ["The mandate forces at least 20% cash: caps allow no more."]
+
+
+@pytest.mark.parametrize(
+    ("mandate", "most", "high", "size"),
+    [
+        ({"assets": {"cap": 2}, "cash": {"min": -1}}, 1.0, 2, 2),
+        ({"assets": {"cap": 2}, "cash": {"min": -1}}, 0.4, 0.4, 0.4),
+        ({"assets": {"cap": 2, "floor": -3}}, 1.0, 2, 3),
+        ({"assets": {"cap": 0.4, "floor": -0.1}}, 1.0, 0.4, 0.4),
+        ({"cash": {"min": -1}}, 1.0, 1, 1),
+        ({"assets": {"cap": 2}}, 1.0, 1, 1),  # which nothing can reach without a loan
+    ],
+)
+def test_a_cap_above_1_holds_where_there_are_loans_or_shorts(mandate, most, high, size):
+    text = settled(mandate, ASSETS)
+    np.testing.assert_allclose(feasible(text, ALL, most).limits.high, high)
+    assert reach(text, most) == size
+    assert largest_weight(text) <= 1  # of baselines, which have neither
 
 
 def test_floors_yield_where_assets_cannot_be_traded():

@@ -39,7 +39,7 @@ from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
 from qfolio.portfolio.mandate import checks
-from qfolio.portfolio.mandate.mandate import Mandate, settled
+from qfolio.portfolio.mandate.mandate import Mandate, reach, settled
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
@@ -103,8 +103,9 @@ class Backtest:
             )
         task = next(iter(self.tasks.values()))
         days = slice(self.folds[0].decisions.start, self.folds[-1].decisions.stop)
+        most = config.cap if task.feasible.long_only else reach(task.mandate, config.cap)
         self._own = {
-            name: place(name, each, prices, days, task, config.cap)
+            name: place(name, each, prices, days, task, most)
             for name, each in self._given_own.items()
         }
         self.interrupted = False
@@ -151,7 +152,8 @@ class Backtest:
                 its start.
             lag: Rows from a decision to its execution.
             cost: One-way trading cost, as a fraction of the value traded.
-            cap: Largest weight of one asset.
+            cap: Largest weight of one asset; with 1, a mandate that allows loans or short sales
+                may set a cap above it.
             mandate: Limits that all orders obey, of agents and of baselines: a ``Mandate``, the
                 path of a file, or a dictionary of its sections. Its costs, calendar and benchmark
                 apply where the arguments of these names have their defaults.

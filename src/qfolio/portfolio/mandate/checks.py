@@ -178,7 +178,7 @@ def _require_each(text: str, limits: Limits) -> None:
 def _said(text: str, made: Mandated, most: float) -> list[str]:
     """The limits in words: caps and floors of assets, then the rows, then gross exposure."""
     _, mandate = parse(text)
-    said = [f"the caps of assets{_spelled(mandate.assets.cap, most)}"]
+    said = [f"the caps of assets{_spelled(mandate.assets.cap, most if most < 1 else np.inf)}"]
     said.append(f"the floors of assets{_spelled(mandate.assets.floor)}")
     for name, row, bound in zip(made.names, made.limits.rows, made.limits.most, strict=True):
         what, falls = name.partition(" is ")[0], row.min() < 0

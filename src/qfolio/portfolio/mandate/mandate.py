@@ -278,11 +278,13 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
     """The set of weights that a mandate allows, in float64.
 
     usable: assets that can be traded; the others have weight 0, and no floor. most: the largest
-    weight of each asset, beside its cap.
+    weight of each asset, beside its cap; 1 limits none that the mandate lets be above it.
     """
     assets, mandate = parse(text)
     can = usable & ~np.isin(assets, mandate.assets.forbidden)
     cap, floor = (_by_asset(x, assets, default) for x, default in _bounds(mandate.assets))
+    long = mandate.cash.min >= 0 and bool(floor.min() >= 0)
+    most = most if long or most < 1 else np.inf
     high, low = np.where(can, np.minimum(cap, most), 0.0), np.where(can, floor, 0.0)
     rows, limits, names = [], [], []
 
@@ -302,7 +304,6 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
         if group.floor is not None:
             limit(-members, -group.floor, f"{column} {value} is below its floor by")
     trading, exposure = mandate.trading, mandate.exposure.gross
-    long = mandate.cash.min >= 0 and bool(floor.min() >= 0)
     most_gross = float(np.maximum(abs(cap), abs(floor)).sum())
     return Mandated(
         Limits(
@@ -331,9 +332,15 @@ def lots(text: str) -> Float[np.ndarray, " asset"] | None:
 
 
 def largest_weight(text: str) -> float:
-    """The highest cap of an asset, at most 1."""
+    """The highest cap of an asset, at most 1, for those that neither borrow nor sell short."""
     assets, mandate = parse(text)
     return min(1.0, float(_by_asset(mandate.assets.cap, assets, 1.0).max()))
+
+
+def reach(text: str, most: float = 1.0) -> float:
+    """The largest size of an asset's weight, of either sign; most: as for ``feasible``."""
+    low, high, *_ = feasible(text, np.ones(len(parse(text)[0]), bool), most).limits
+    return float(abs(np.array([low, high])).max())
 
 
 def _bounds(assets: Assets) -> tuple[tuple[float | dict[str, float], float], ...]:

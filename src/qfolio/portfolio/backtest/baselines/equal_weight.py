@@ -52,7 +52,8 @@ class EqualWeightAt(Baseline):
         if self.speed == 0:
             return None
         wanted = weights + self.speed * (target - weights)
-        if wanted.max() > history.cap:  # a holding may have drifted above it, an order may not be
+        # A holding may have drifted above the cap, or a mandate forced it into debt or short sales.
+        if wanted.max() > history.cap or wanted.min() < 0 or wanted.sum() > 1 + 1e-9:
             wanted = nearest(wanted, 0, history.cap)
         return with_cash(wanted, history)
 
