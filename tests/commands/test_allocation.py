@@ -310,6 +310,9 @@ def test_nothing_to_trade_is_an_empty_file_of_orders(folder, monkeypatch, capsys
     of = ["--agent", "buy-and-hold", "--holdings", holdings, "--orders", path]
     allocation(folder, monkeypatch, capsys, *of)
     assert len(path.read_text().splitlines()) == 1
+    path.unlink()
+    assert allocation(folder, monkeypatch, capsys, *of, "--dry-run")["record"] is None
+    assert not path.exists()  # a dry run writes nothing
 
 
 @pytest.mark.slow

@@ -72,7 +72,7 @@ def allocate(
         layout: Columns of that file: generic, ib for a basket of Interactive Brokers, or alpaca or
             schwab for the fields of an order in their APIs.
         currency: Currency in that file, where the layout names one.
-        dry_run: Write nothing: neither a record in the ledger nor an updated policy.
+        dry_run: Write nothing: no record in the ledger, no updated policy and no file of orders.
         reproduce: Recompute the allocation that the ledger records for this date and compare the
             two, with the inputs stored there or, if given, --prices and --holdings.
         trust: Modules of your own code that the folder may name (default: none).
@@ -149,7 +149,7 @@ def allocate(
         followed, table, shares, cash, whole_shares=whole_shares, spent=spent
     )
     rows = None if orders is None else order_rows(allocation, layout, currency)
-    said, number = "A dry run: nothing is recorded.", None
+    said, number = "A dry run: nothing is written.", None
     if hindsight:
         said = f"{hindsight}, so that nothing is recorded."
     elif not dry_run:
@@ -157,7 +157,7 @@ def allocate(
             desk.run.keep(name, followed)
         record, said = desk.record(name, allocation, table, whole_shares)
         number = record.number
-    if orders is not None and rows is not None:
+    if orders is not None and rows is not None and not dry_run:
         write_csv(orders, *rows)
         said += f" {orders} has {amount(len(rows[1]), 'order')}."
     trained, why, notes = None, [], []

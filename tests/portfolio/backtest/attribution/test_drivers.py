@@ -4,8 +4,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.attribution.drivers import Driver, Reason, reasons, sentence
+from qfolio.core.text import figure
+from qfolio.portfolio.backtest.attribution.drivers import (
+    Driver,
+    Reason,
+    _bounds,
+    reasons,
+    sentence,
+)
 from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.mandate.feasible import CappedSimplex
+from qfolio.portfolio.mandate.mandate import feasible, settled
 from qfolio.portfolio.policy import Policy
 
 from planted import ASSETS, Known, four_folds, planted
@@ -43,3 +52,43 @@ def test_the_largest_trades_are_explained_exactly(plan):
     assert (
         sentence(none) == "A +10.00%: no signal moves it, so that it is the same on a typical day."
     )
+
+
+def test_limits_are_a_reason_where_what_is_held_or_wanted_breaks_them():
+    """60% of A and 40% of cash are held; the best asset is wanted at 25%. All have a cap of 20%."""
+    prices = planted()
+    stretch = four_folds(prices, mandate={"assets": {"cap": 0.2}})[-1]
+    policy = Policy(stretch.task, Known("momentum"), jnp.array([0.4, 0.6]), prices.assets)
+    shares = np.eye(ASSETS)[0] * 600 / prices.values[-1]
+    allocation = Allocation.of(policy, prices, shares, 400.0)
+    largest, *others = reasons(policy, prices, allocation)
+    assert largest.asset == "A"
+    assert largest.required == pytest.approx(-0.4, abs=1e-6)
+    assert sentence(largest).startswith(
+        f"A {figure(largest.change, '+.2%')}: the mandate's limits require \N{MINUS SIGN}40.00%;"
+    )
+    capped = next(each for each in others if each.bounds)
+    assert (capped.required, capped.bounds) == (pytest.approx(0, abs=1e-6), ("its cap of 20.00%",))
+    assert capped.change == pytest.approx(0.2, abs=1e-6)
+    assert sentence(capped).endswith(". The target is at its cap of 20.00%.")
+
+
+def test_the_limits_that_a_target_reaches_are_named():
+    mandate = {
+        "assets": {"cap": 0.4, "floor": {"B": 0.1}},
+        "groups": {"theme": {"metals": {"assets": ["C", "D"], "cap": 0.3}}},
+        "cash": {"max": 0.2},
+    }
+    allowed = feasible(settled(mandate, "ABCD"), np.ones(4, bool))
+    weights = np.array([0.2, 0.4, 0.1, 0.2, 0.1])
+    metals = ("the cap of theme metals",)
+    assert _bounds(allowed, weights, weights) == [
+        ("its cap of 40.00%",), ("its floor of 10.00%",), metals, metals,
+    ]  # fmt: skip
+    weights = np.array([0.1, 0.3, 0.35, 0.15, 0.1])
+    assert _bounds(allowed, weights, weights) == [()] * 4
+    trading = feasible(settled({"trading": {"turnover": 0.3}}, "ABCD"), np.ones(4, bool))
+    held = np.array([0.4, 0.3, 0.2, 0.05, 0.05])
+    assert _bounds(trading, weights, held) == [("the limit of turnover",)] * 4
+    simplex = CappedSimplex(jnp.array([0.35, 1.0, 0.15, 1.0]))
+    assert _bounds(simplex, weights, held) == [(), (), ("its cap of 15.00%",), ()]

@@ -3,20 +3,26 @@
 The integrated gradients of ``gradients.py`` at the latest row say it. An asset's change of weight
 is the sum of what each channel contributes, relative to a typical observation (the mean in
 training), and of a rest: the change from the weight held to the target of a typical observation.
+Where the weights held break the limits of the mandate, the rest begins with what these require: the
+change to the nearest weights that are allowed.
 """
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
 
 from qfolio.core.mdp import Discrete
-from qfolio.core.text import figure
+from qfolio.core.text import figure, listed
 from qfolio.portfolio.backtest.attribution.gradients import integrated
 from qfolio.portfolio.backtest.attribution.replays import channel_names
 from qfolio.portfolio.desk.allocation import NOISE, Allocation
 from qfolio.portfolio.following import on_table
+from qfolio.portfolio.mandate.feasible import Feasible, Mandated
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
 
 TRADES = 3
 """Number of largest trades that are explained."""
@@ -43,6 +49,8 @@ class Reason(msgspec.Struct, frozen=True):
     change: float  # target weight minus the weight held
     drivers: list[Driver]  # every channel, the largest first
     rest: float  # with a typical observation, the weight would change by this
+    required: float = 0.0  # part of the rest that the limits on weights require
+    bounds: tuple[str, ...] = ()  # the limits that the target reaches
 
 
 def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reason]:
@@ -59,6 +67,9 @@ def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reas
     held = jnp.asarray(allocation.held[None], jnp.float32)
     row = jnp.array([len(prices) - 1], jnp.int32)
     task = on_table(policy.task, prices)
+    allowed, nearest = _allowed(task.exact, row[0], held[0])
+    required = (np.asarray(nearest, float) - allocation.held)[1:]
+    bounds = _bounds(allowed, allocation.weights, allocation.held)
     moved = np.asarray(integrated(task, policy.agent, policy.members, row, held)[0])[0]
     names = channel_names(policy.task, policy.features)
     found = []
@@ -66,21 +77,59 @@ def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reas
         if abs(change[i]) > NOISE:
             drivers = [Driver(names[c], float(moved[c, i])) for c in np.argsort(-abs(moved[:, i]))]
             rest = float(change[i] - moved[:, i].sum())
-            found.append(Reason(allocation.assets[i], float(change[i]), drivers, rest))
+            asset, by, needs = allocation.assets[i], float(change[i]), float(required[i])
+            found.append(Reason(asset, by, drivers, rest, needs, bounds[i]))
     return found
 
 
+@eqx.filter_jit
+def _allowed(task: Portfolio, row: jax.Array, held: jax.Array) -> tuple[Feasible, jax.Array]:
+    """The weights that may be ordered at a row, and the nearest of them to those held."""
+    allowed = task.feasible_at(row)
+    return allowed, allowed.project(held, held)
+
+
+def _bounds(allowed: Feasible, weights: np.ndarray, held: np.ndarray) -> list[tuple[str, ...]]:
+    """The limits that each asset's target reaches; all weights of shape (entry,), cash first."""
+    limits = jax.tree.map(np.asarray, allowed.limits)  # type: ignore[attr-defined]
+    assets = weights[1:]
+    low, high = (limits.low, limits.high) if isinstance(allowed, Mandated) else (0.0, limits)
+    ends = (np.broadcast_to(bound, assets.shape).tolist() for bound in (low, high))
+    found: list[list[str]] = [[] for _ in assets]
+    for each, weight, low, high in zip(found, assets.tolist(), *ends, strict=True):
+        if weight >= high - VISIBLE and high < 1:
+            each.append(f"its cap of {figure(high, '.2%')}")
+        elif weight <= low + VISIBLE and low != 0:
+            each.append(f"its floor of {figure(low, '.2%')}")
+    if isinstance(allowed, Mandated):
+        over = allowed.violations(weights, held)
+        for name, members in zip(allowed.names, limits.rows != 0, strict=True):
+            if over[name] >= -VISIBLE and not name.startswith("cash is"):
+                group, _, side = name.rpartition(" is ")
+                side = "cap" if side.startswith("above") else "floor"
+                for member in np.flatnonzero(members):
+                    found[member].append(f"the {side} of {group}")
+        for said in ("gross exposure", "turnover"):
+            if over[f"{said} is too high by"] >= -VISIBLE:
+                for each in found:
+                    each.append(f"the limit of {said}")
+    return [tuple(each) for each in found]
+
+
 def sentence(reason: Reason) -> str:
-    """A reason in words, with its largest drivers."""
+    """A reason in words: what the limits require, the largest drivers, and the limits reached."""
     moving = [each for each in reason.drivers if abs(each.weight) >= VISIBLE]
+    change = f"{reason.asset} {figure(reason.change, '+.2%')}:"
+    if abs(reason.required) >= VISIBLE:
+        change += f" the mandate's limits require {figure(reason.required, '+.2%')};"
+    reached = f" The target is at {listed(reason.bounds)}." if reason.bounds else ""
     if not moving:
-        change = f"{reason.asset} {figure(reason.change, '+.2%')}"
-        return f"{change}: no signal moves it, so that it is the same on a typical day."
+        return f"{change} no signal moves it, so that it is the same on a typical day.{reached}"
     shown = [f"{each.name} {figure(each.weight, '+.2%')}" for each in moving[:SHOWN]]
     if len(moving) > SHOWN:
         others = sum(each.weight for each in moving[SHOWN:])
         shown.append(f"other signals {figure(others, '+.2%')}")
     return (
-        f"{reason.asset} {figure(reason.change, '+.2%')}: {', '.join(shown)}; on a typical day it "
-        f"would be {figure(reason.rest, '+.2%')}."
+        f"{change} {', '.join(shown)}; on a typical day it would be "
+        f"{figure(reason.rest, '+.2%')}.{reached}"
     )
