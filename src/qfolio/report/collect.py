@@ -23,6 +23,7 @@ from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import Simulation
 from qfolio.portfolio.market import Market
+from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.base import OneAsset, Synthetic
 from qfolio.portfolio.synthetic.no_trade import NoTrade
@@ -117,7 +118,7 @@ def backtest_data(
             )
             for name, entry in entries.items()
         },
-        prices=config.prices,
+        prices={**config.prices, **universe(backtest.prices)},
         config={
             key: value
             for key, value in msgspec.to_builtins(config).items()
@@ -139,6 +140,27 @@ def backtest_data(
         moves=_moves(backtest),
         capacity=capacity(backtest.replay, entries, assessment.reference),
     )
+
+
+def universe(prices: Prices) -> dict[str, Any]:
+    """How assets of a table enter and leave it: numbers of those that do, and the haircut.
+
+    The haircut is the share of a holding that is lost when its asset ends, found from the payout;
+    None if no asset ends.
+    """
+    listed, rows = prices.listed, len(prices)
+    found = {
+        "late_assets": int((prices.first_rows > 0).sum()),
+        "delisted_assets": 0,
+        "haircut": None,
+        "has_members": prices.members is not None,
+    }
+    if listed is None or listed[-1].all():
+        return found
+    ended = np.flatnonzero(~listed[-1] & listed.any(axis=0))
+    last = rows - 1 - listed[::-1, ended].argmax(axis=0)
+    paid = prices.values[last + 1, ended] / prices.values[last, ended]
+    return {**found, "delisted_assets": len(ended), "haircut": round(float(1 - paid.min()), 8)}
 
 
 def _costs(simulation: Simulation, year: float) -> dict[str, float]:

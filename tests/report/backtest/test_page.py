@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -13,8 +14,10 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.differences import Contrast
 from qfolio.portfolio.backtest.verdict import verdicts
+from qfolio.portfolio.prices.table import load
 from qfolio.report.backtest.data import BacktestData, StrategySeries, shown_order
 from qfolio.report.backtest.page import render_backtest
+from qfolio.report.collect import universe
 from qfolio.report.rendering import number, percent
 
 from backtests import Page, make_data, of_returns_alone, usual
@@ -57,6 +60,35 @@ def test_says_what_the_test_is(page: Page) -> None:
     ):
         assert sentence in page.text, sentence
     assert "Exceptions" not in page.text
+
+
+def test_says_how_assets_enter_and_leave_the_table(data: BacktestData, page: Page) -> None:
+    assert "A table of assets that still trade" in page.text
+    known = {"late_assets": 2, "delisted_assets": 1, "haircut": 0.3, "has_members": True}
+    text = Page(render_backtest(replace(data, prices={**data.prices, **known}))).text
+    for said in (
+        "2 joined late",
+        "1 delisted, a haircut of 30%",
+        "bought only while members",
+        "2 assets joined after the first row. 1 asset ended before the last row, and holdings "
+        "became cash at the last price, with a haircut of 30%. An asset may be bought only while "
+        "its membership lasts.",
+    ):
+        assert said in text, said
+    assert "A table of assets that still trade" not in text
+
+
+def test_the_haircut_is_found_from_the_payout() -> None:
+    frame = pd.DataFrame(
+        {"date": ["2020-01-01", "2020-01-02", "2020-01-03", "2020-01-06"], "A": [1, 2, 3, 4.0],
+         "B": [10, 20, None, None], "C": [None, 1, 2, 3.0]}
+    )  # fmt: skip
+    prices = load(frame, late="join", ended="cash-out", delisting_haircut=0.3)
+    assert universe(prices) == {
+        "late_assets": 1, "delisted_assets": 1, "haircut": 0.3, "has_members": False,
+    }  # fmt: skip
+    whole = universe(load(frame[["date", "A"]]))
+    assert (whole["delisted_assets"], whole["haircut"]) == (0, None)
 
 
 def test_table_has_every_figure_with_its_intervals(data: BacktestData) -> None:

@@ -58,7 +58,9 @@ class BacktestData:
         strategies: The strategies, by the same names as in the assessment.
         prices: The origin of the prices: source, rows, assets, first and last (dates), note (a
             caveat to show with every result on them, such as survivorship; may be empty) and
-            digest.
+            digest; where they are known, also late_assets and delisted_assets (numbers of those
+            that start or end within the table), haircut (the share of a holding that is lost when
+            its asset ends) and has_members.
         config: All settings, a nested dictionary. If it has cost (one way, a fraction), lag (in
             rows), cap, train, test (lengths) and expanding, the page also says them in words.
         folds: For each fold name, train_first, train_last, test_first and test_last (ISO dates).

@@ -20,6 +20,7 @@ def key_facts(data: BacktestData) -> list[str]:
         str(data.prices["source"]),
         f"{test.first_date} to {test.last_date} ({years} years)",
         f"{_counted(len(data.assets), 'asset')} and cash",
+        *_universe(data.prices),
     ]
     if "cost" in settings:
         facts.append(f"{_basis_points(settings['cost'])} a trade")
@@ -28,6 +29,41 @@ def key_facts(data: BacktestData) -> list[str]:
     if data.folds:
         facts.append(_counted(len(data.folds), "fold"))
     return [*facts, _counted(test.trials, "trial")]
+
+
+def _universe(prices: dict[str, Any]) -> list[str]:
+    """Which assets of a table enter or leave it, in a few words each."""
+    facts = []
+    if late := prices.get("late_assets"):
+        facts.append(f"{number(late, 0)} joined late")
+    if ended := prices.get("delisted_assets"):
+        facts.append(f"{number(ended, 0)} delisted, {_haircut(prices)}")
+    return [*facts, "bought only while members"] if prices.get("has_members") else facts
+
+
+def universe(prices: dict[str, Any]) -> list[str]:
+    """How assets enter and leave a table, in sentences; else that those that left are missing."""
+    said = []
+    if late := prices.get("late_assets"):
+        said.append(f"{_counted(late, 'asset')} joined after the first row.")
+    if ended := prices.get("delisted_assets"):
+        said.append(
+            f"{_counted(ended, 'asset')} ended before the last row, and holdings became cash at "
+            f"the last price, with {_haircut(prices)}."
+        )
+    if prices.get("has_members"):
+        said.append("An asset may be bought only while its membership lasts.")
+    if not ended:
+        said.append(
+            "A table of assets that still trade is chosen with hindsight (survivorship): assets "
+            "that stopped trading would have made every result worse."
+        )
+    return said
+
+
+def _haircut(prices: dict[str, Any]) -> str:
+    lost = prices.get("haircut") or 0.0
+    return f"a haircut of {100 * lost:.4g}%" if lost else "no haircut"
 
 
 def _counted(count: int, noun: str) -> str:
@@ -77,6 +113,7 @@ def account(data: BacktestData) -> dict[str, Any]:
         "mandate": "; ".join(_limits(settings.get("mandate") or {})),
         "model": None if settings.get("cost_model") in PLAIN else settings["cost_model"],
         "calendar": settings.get("calendar") or None,
+        "universe": " ".join(universe(data.prices)),
         "trials": _counts(test),
         "earlier": test.earlier_trials,
     }
