@@ -7,12 +7,17 @@ import pytest
 
 from qfolio.portfolio.backtest.tearsheet import (
     Fall,
+    alpha,
     contributions,
     effective_number,
     falls,
     figures,
+    kelly,
+    leverage,
+    longest_run,
     rolling_beta,
     rolling_sharpe,
+    stability,
     value_at_risk,
 )
 
@@ -61,6 +66,42 @@ def test_effective_number_of_assets() -> None:
     np.testing.assert_allclose(effective_number(weights), [2, 1, 0, 1.6])
 
 
+def test_leverage_of_long_and_short_positions() -> None:
+    gross, net = leverage([[0.5, 0.9, -0.4], [0.0, 1.0, 0.0]])
+    assert gross == pytest.approx((1.3 + 1.0) / 2)
+    assert net == pytest.approx((0.5 + 1.0) / 2)
+
+
+def test_alpha_is_what_a_reference_leaves() -> None:
+    market = np.array([0.01, -0.02, 0.03, 0.0])
+    assert alpha(2 * market + 0.001, market, 250) == pytest.approx(0.25)
+    # Both are one point above or below their means, .01 and .02, so the slope is 1.
+    assert alpha([0.0, 0.02], [0.01, 0.03], 100) == pytest.approx(-1.0)
+    assert math.isnan(alpha(market, np.full(4, 0.001), 250))
+
+
+def test_stability_of_a_straight_line() -> None:
+    assert stability(np.expm1([0.01, 0.01, 0.01])) == pytest.approx(1)
+    # Log wealth 1, 0, 1 over times 0, 1, 2 has no slope; 0, 0, 1 has R² = 1² / (2 × ⅔).
+    assert stability(np.expm1([1, -1, 1])) == pytest.approx(0, abs=1e-12)
+    assert stability(np.expm1([0, 0, 1])) == pytest.approx(0.75)
+    assert stability([0.0, 0.0]) == 0
+    assert math.isnan(stability([0.1, -1.0]))
+
+
+def test_kelly_fraction() -> None:
+    assert kelly([0.2, 0.2, -0.1, 0.0]) == pytest.approx(2 / 3 - 1 / 3 / 2)
+    assert kelly([0.1, -0.1, -0.1]) == pytest.approx(1 / 3 - 2 / 3)
+    assert kelly([0.1, 0.3]) == 1
+    assert math.isnan(kelly([0.0, -0.1]))
+
+
+def test_longest_run() -> None:
+    assert longest_run([True, True, False, True, True, True]) == 3
+    assert longest_run([False, False]) == longest_run([]) == 0
+    assert longest_run([True]) == 1
+
+
 def test_contributions_add_up_to_the_mean_return() -> None:
     weights = [[0.5, 0.5, 0.0], [0.0, 0.25, 0.75]]
     moves = [[0.02, 0.5], [-0.04, 0.08]]
@@ -86,6 +127,9 @@ def test_figures_of_a_short_record() -> None:
     assert found["tail_ratio"] == pytest.approx(0.2125 / 0.425)
     assert found["hit_rate"] == pytest.approx(3 / 5)
     assert found["hit_rate_month"] == pytest.approx(1 / 3)
+    assert found["gain_to_pain"] == pytest.approx((-0.12 + 0.375 - 0.5) / (0.12 + 0.5))
+    assert found["kelly"] == pytest.approx(3 / 5 - 2 / 5 * 0.35 / 0.15)
+    assert (found["winning"], found["losing"]) == (2, 1)
     assert found["payoff"] == pytest.approx(0.15 / 0.35)
     assert (found["best"], found["worst"]) == (0.25, -0.5)
     assert found["best_month"] == pytest.approx(0.375)  # 1.25 × 1.1 − 1, in February

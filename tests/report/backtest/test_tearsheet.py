@@ -9,7 +9,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.tearsheet import contributions
 from qfolio.report.backtest.page import render_backtest
 from qfolio.report.backtest.tearsheet import BINS, LISTED, tear_sheet
-from qfolio.report.rendering import percent
+from qfolio.report.rendering import number, percent
 
 from backtests import Page, make_data, make_series, usual, weekdays
 
@@ -26,7 +26,27 @@ def test_figures_are_means_over_seeds() -> None:
     assert rows["Value at risk, 95%, daily"][1] == percent(
         -float(np.quantile(data.strategies["equal weight"].returns, 0.05)), 2
     )
-    assert len(rows) == 27
+    assert rows["Sharpe ratio"][0] == number(
+        data.assessment.strategies["DQN"].measures["sharpe"].mean, 2
+    )
+    assert rows["Alpha a year, beside equal weight"][1] == "0.00%"
+    assert rows["Gross leverage"][0] == number(
+        float((1 - data.strategies["DQN"].weights[:, 0]).mean()), 2
+    )
+    assert len(rows) == 34  # without net exposure, as nothing is sold short
+
+
+def test_net_exposure_of_short_positions() -> None:
+    data = usual(300)
+    series = data.strategies["DQN"]
+    short = series.weights.copy()
+    short[:, :3] = [1.0, 0.6, -0.6]
+    short[:, 3:] = 0
+    data = replace(data, strategies={**data.strategies, "DQN": replace(series, weights=short)})
+    sheet = tear_sheet(["DQN", "equal weight"], data)
+    rows = {name: cells for _, group in sheet["groups"] for name, cells in group}
+    assert (rows["Gross leverage"][0], rows["Net exposure"][0]) == ("1.20", "0.00")
+    assert rows["Net exposure"][1] == rows["Gross leverage"][1]
 
 
 def test_drawdowns_have_dates() -> None:

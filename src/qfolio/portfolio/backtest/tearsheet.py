@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from qfolio.portfolio.backtest.measures import (
     Floats,
     checked_dates,
+    deviations,
     drawdown,
     log_growth,
     monthly,
@@ -108,6 +109,69 @@ def effective_number(weights: ArrayLike) -> Floats:
         return np.where(invested > 1e-9, invested**2 / (risky**2).sum(axis=-1), 0.0)
 
 
+def leverage(weights: ArrayLike) -> tuple[float, float]:
+    """Return the gross leverage and the net exposure, means over time.
+
+    They are the sums of the sizes of an account's positions, and of the positions themselves, over
+    its value; cash is none.
+
+    Args:
+        weights: Weights of shape (periods, assets + 1), cash first.
+    """
+    risky = np.asarray(weights, dtype=float)[:, 1:]
+    return float(np.abs(risky).sum(axis=1).mean()), float(risky.sum(axis=1).mean())
+
+
+def alpha(returns: ArrayLike, reference: ArrayLike, periods_per_year: float) -> float:
+    """Return the annual mean return that the regression on a reference leaves.
+
+    NaN if the reference did not move.
+
+    Args:
+        returns: Simple returns of shape (periods,).
+        reference: Simple returns of the reference, same shape.
+        periods_per_year: For example 252 for trading days.
+    """
+    ours, theirs = np.asarray(returns, dtype=float), np.asarray(reference, dtype=float)
+    moved = deviations(theirs)
+    if not moved.any():
+        return math.nan
+    beta = float(moved @ deviations(ours) / (moved @ moved))
+    return periods_per_year * float(ours.mean() - beta * theirs.mean())
+
+
+def stability(returns: ArrayLike) -> float:
+    """Return the R² of the regression of log wealth on time.
+
+    It is 1 for steady growth or decline, 0 if there is neither, and NaN after a total loss.
+    """
+    wealth = np.cumsum(log_growth(np.asarray(returns, dtype=float)))
+    if len(wealth) < 2 or not np.isfinite(wealth).all():
+        return math.nan
+    time, moved = deviations(np.arange(len(wealth), dtype=float)), deviations(wealth)
+    return float(ratio_or_zero((time @ moved) ** 2, (time @ time) * (moved @ moved)))
+
+
+def kelly(returns: ArrayLike) -> float:
+    """Return Kelly's fraction of two outcomes, the mean gain and the mean loss.
+
+    It is p − q/b, where p and q are the shares of gains and losses among the periods that moved,
+    and b is the mean gain over the mean loss. NaN without any gain.
+    """
+    values = np.asarray(returns, dtype=float)
+    gains, losses = values[values > 0], -values[values < 0]
+    if not len(gains):
+        return math.nan
+    share = len(gains) / (len(gains) + len(losses))
+    return share - (1 - share) * (float(losses.mean() / gains.mean()) if len(losses) else 0.0)
+
+
+def longest_run(flags: ArrayLike) -> int:
+    """Return the length of the longest run of true values in a row of flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], np.asarray(flags, bool), [False]])))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
 def contributions(
     returns: ArrayLike, weights: ArrayLike, moves: ArrayLike, periods_per_year: float
 ) -> tuple[Floats, float]:
@@ -138,8 +202,10 @@ def figures(returns: ArrayLike, dates: ArrayLike, periods_per_year: float) -> di
     ``growth`` is the compound annual rate (CAGR), ``kurtosis`` is 3 for a normal distribution,
     ``longest`` is the longest drawdown in years, ``time_below`` the share of the time below a peak,
     ``tail_ratio`` the 95% quantile over the size of the 5% quantile, ``omega`` the sum of gains
-    over that of losses, ``payoff`` the mean gain over the mean loss, ``hit_rate`` the share of
-    periods with a gain among those that moved, ``ulcer`` the root mean square of drawdowns.
+    over that of losses, ``gain_to_pain`` the sum of monthly returns over that of monthly losses,
+    ``payoff`` the mean gain over the mean loss, ``hit_rate`` the share of periods with a gain among
+    those that moved, ``winning`` and ``losing`` the most periods in a row with a gain or a loss,
+    ``ulcer`` the root mean square of drawdowns; ``stability`` and ``kelly`` are as above.
 
     Args:
         returns: Simple net returns, of shape (periods,).
@@ -172,7 +238,12 @@ def figures(returns: ArrayLike, dates: ArrayLike, periods_per_year: float) -> di
         "sharpe": annual * over(float(values.mean()), spread),
         "sortino": annual * over(float(values.mean()), downside),
         "calmar": over(growth, float(depth.max())),
+        "stability": stability(values),
         "omega": over(float(gains.sum()), abs(float(losses.sum()))),
+        "gain_to_pain": over(float(months.sum()), abs(float(months[months < 0].sum()))),
+        "kelly": kelly(values),
+        "winning": longest_run(values > 0),
+        "losing": longest_run(values < 0),
         "drawdown": float(depth.max()),
         "longest": longest / periods_per_year,
         "time_below": float((depth > 0).mean()),

@@ -9,9 +9,11 @@ import numpy as np
 
 from qfolio.core.text import plural
 from qfolio.portfolio.backtest.tearsheet import (
+    alpha,
     contributions,
     falls,
     figures,
+    leverage,
     value_at_risk,
 )
 from qfolio.report.backtest.data import BacktestData, StrategySeries
@@ -36,12 +38,12 @@ PERIODS = {"day": "daily", "week": "weekly", "month": "monthly"}
 def tear_sheet(names: list[str], data: BacktestData) -> dict[str, Any]:
     """Return the tear sheet of some strategies; means over the seeds, where there are several."""
     year, unit = data.assessment.periods_per_year, unit_of(data.assessment.periods_per_year)
-    found = [_means(data.strategies[name], data, year) for name in names]
+    found = [_means(name, data, year) for name in names]
     edges = _edges([data.strategies[name].returns for name in names])
     reference = data.strategies[data.assessment.reference].returns
     return {
         "names": names,
-        "groups": _groups(found, unit),
+        "groups": _groups(found, unit, data.assessment.reference),
         "every": PERIODS.get(unit, "single"),
         "each": [
             {
@@ -55,13 +57,29 @@ def tear_sheet(names: list[str], data: BacktestData) -> dict[str, Any]:
     }
 
 
-def _means(series: StrategySeries, data: BacktestData, year: float) -> dict[str, float]:
-    each = [figures(row, data.dates, year) for row in series.returns]
-    return {key: float(np.mean([found[key] for found in each])) for key in each[0]}
+def _means(name: str, data: BacktestData, year: float) -> dict[str, float]:
+    """Figures of a strategy; ratios over what cash earns are those of its assessment."""
+    series, test = data.strategies[name], data.assessment
+    reference = data.strategies[test.reference].returns.mean(axis=0)
+    each = [
+        {**figures(row, data.dates, year), "alpha": alpha(row, reference, year)}
+        for row in series.returns
+    ]
+    gross, net = leverage(series.weights)
+    return {
+        **{key: float(np.mean([found[key] for found in each])) for key in each[0]},
+        **{key: test.strategies[name].measures[key].mean for key in ("sharpe", "sortino")},
+        "gross": gross,
+        "net": net,
+    }
 
 
-def _groups(found: list[dict[str, float]], unit: str) -> list[tuple[str, list[Any]]]:
+def _groups(
+    found: list[dict[str, float]], unit: str, reference: str
+) -> list[tuple[str, list[Any]]]:
     """Groups of rows: a name, and a cell for each strategy."""
+    # Without short positions, the net exposure is the gross one.
+    short = any(each["gross"] - each["net"] > 1e-6 for each in found)
     every = PERIODS.get(unit, "of a period")
 
     def row(name: str, key: str, form: str) -> tuple[str, list[str]]:
@@ -81,6 +99,8 @@ def _groups(found: list[dict[str, float]], unit: str) -> list[tuple[str, list[An
                 row("Worst year", "worst_year", "+%"),
                 row(f"{unit.capitalize()}s with a gain", "hit_rate", "%"),
                 row("Months with a gain", "hit_rate_month", "%"),
+                row(f"Longest winning streak, {unit}s", "winning", "0"),
+                row(f"Longest losing streak, {unit}s", "losing", "0"),
             ],
         ),
         (
@@ -97,6 +117,8 @@ def _groups(found: list[dict[str, float]], unit: str) -> list[tuple[str, list[An
                 row("CVaR, 95%, monthly", "cvar_month", "%"),
                 row("Skewness", "skewness", "2"),
                 row("Kurtosis (normal: 3)", "kurtosis", "1"),
+                row("Gross leverage", "gross", "2"),
+                *([row("Net exposure", "net", "2")] if short else []),
             ],
         ),
         (
@@ -105,9 +127,13 @@ def _groups(found: list[dict[str, float]], unit: str) -> list[tuple[str, list[An
                 row("Sharpe ratio", "sharpe", "2"),
                 row("Sortino ratio", "sortino", "2"),
                 row("Calmar ratio", "calmar", "2"),
-                row("Omega ratio", "omega", "2"),
+                row(f"Alpha a year, beside {reference}", "alpha", "+%2"),
+                row("Stability (R²)", "stability", "2"),
+                row("Profit factor (omega ratio)", "omega", "2"),
+                row("Gain-to-pain ratio, monthly", "gain_to_pain", "2"),
                 row("Tail ratio", "tail_ratio", "2"),
                 row("Payoff (mean gain over mean loss)", "payoff", "2"),
+                row("Kelly fraction", "kelly", "2"),
             ],
         ),
     ]
