@@ -92,6 +92,8 @@ def backtest(
             "with more rows."
         )
     console.say(console.describe_backtest(run))
+    for note in run.replay.mandated():
+        console.tell(note)
     with console.bar("compiling") as update, tracked(*following):
         run.run(JobsProgress(update), executor)
     if run.interrupted:

@@ -191,3 +191,6 @@ def test_without_a_mandate_the_program_is_as_before():
     task = backtest.tasks["pathwise"]
     assert task.allowed is None
     assert type(task.feasible).__name__ == "CappedSimplex"
+    assert backtest.replay.mandated() == []
+    capped = create(None, agents={"pathwise": AGENTS["pathwise"]}, cap=0.15).replay
+    assert capped.mandated() == ["The cap of 15% for each of 5 assets forces at least 25% cash."]

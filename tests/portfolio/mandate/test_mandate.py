@@ -178,6 +178,9 @@ def test_what_is_unusual_is_said():
     notes = checks.require(settled(bound, ASSETS), ALL)
     assert "no choice for s E: its floor, 20%" in notes[1]
     assert checks.require(settled({"cash": {"max": 0.1}}, ASSETS), ALL) == []
+    [note] = checks.unusual("", np.ones(15, bool), 0.05)
+    assert note == "The cap of 5% for each of 15 assets forces at least 25% cash."
+    assert checks.unusual("", ALL, 0.25) == checks.unusual("", ALL) == []
 
 
 def test_a_floor_for_all_assets_is_for_those_that_may_be_held():

@@ -136,11 +136,11 @@ class Replay:
         ]
 
     def mandated(self) -> list[str]:
-        """Notes on what is unusual about the mandate, and on what a fold cannot meet."""
-        if not self.task.mandate:
-            return []
+        """Notes on what is unusual about caps and the mandate, and on what a fold cannot meet."""
         every = np.ones(len(self.prices.assets), bool)
-        notes = checks.require(self.task.mandate, every, self.cap)
+        notes = checks.unusual(self.task.mandate, every, self.cap)
+        if not self.task.mandate:
+            return notes
         if self._patterns is not None and (yields := self._patterns[1]):
             said = ", ".join(yields)
             notes.append(f"The mandate is relaxed to fit the assets that can be traded: {said}.")

@@ -53,7 +53,36 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
             f"The mandate cannot be met: {floors} assets have a floor, and trading.holdings is "
             f"{made.holdings}; change one of them."
         )
-    return _unusual(made, left, cash.min)
+    return unusual(text, usable, most)
+
+
+def unusual(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> list[str]:
+    """What is unusual about caps, or about a mandate that can be met, a sentence each.
+
+    Arguments are as for ``mandate.feasible``; the text is empty without a mandate.
+    """
+    if not text:
+        count = int(usable.sum())
+        left = 1 - most * count
+        said = f"The cap of {_percent(most)} for each of {count} assets"
+        return [f"{said} forces at least {_percent(left)} cash."] if left > TINY else []
+    made, notes = feasible(text, usable, most), []
+    limits = made.limits
+    left = 1 - _most_held(made)
+    if left > max(parse(text)[1].cash.min, 0.0) + TINY:
+        notes.append(f"The mandate forces at least {_percent(left)} cash: caps allow no more.")
+    for name, row, bound in zip(made.names, limits.rows, limits.most, strict=True):
+        what = name.partition(" is ")[0]
+        if row.min() < 0 and what != "cash":
+            found = _found(limits, value=-row)
+            assert found is not None
+            count = limits.low.size
+            if -row @ (found[:count] - found[count : 2 * count]) <= -bound + TINY:
+                notes.append(
+                    f"The mandate leaves no choice for {what}: its floor, {_percent(-bound)}, is "
+                    "also the most that the other limits allow."
+                )
+    return notes
 
 
 def relaxed(made: Mandated) -> tuple[Mandated, list[str]]:
@@ -197,25 +226,6 @@ def _cash(bound: float, falls: bool) -> float:
 
 def _spelled(given: float | dict[str, float], most: float = np.inf) -> str:
     return "" if isinstance(given, dict) else f" ({_percent(min(given, most))})"
-
-
-def _unusual(made: Mandated, left: float, least: float) -> list[str]:
-    limits = made.limits
-    notes = []
-    if left > max(least, 0.0) + TINY:
-        notes.append(f"The mandate forces at least {_percent(left)} cash: caps allow no more.")
-    for name, row, bound in zip(made.names, limits.rows, limits.most, strict=True):
-        what = name.partition(" is ")[0]
-        if row.min() < 0 and what != "cash":
-            found = _found(limits, value=-row)
-            assert found is not None
-            count = limits.low.size
-            if -row @ (found[:count] - found[count : 2 * count]) <= -bound + TINY:
-                notes.append(
-                    f"The mandate leaves no choice for {what}: its floor, {_percent(-bound)}, is "
-                    "also the most that the other limits allow."
-                )
-    return notes
 
 
 def _percent(share: float) -> str:
