@@ -17,6 +17,7 @@ import qfolio
 from qfolio.cli import commands
 from qfolio.commands import console
 from qfolio.commands.parsing import Document, Failed, description, example, grouped
+from qfolio.core.registry import TASKS
 
 from shell import qfolio as typed
 from tables import write_table
@@ -53,6 +54,11 @@ def test_every_command_has_examples_of_itself(name, monkeypatch, capsys):
     assert all(f"  {line}\n" in page for line in lines)
     assert max(map(len, page.splitlines())) <= 80
     assert description(EVERY[name]) in page
+
+
+def test_the_help_of_training_names_every_task():
+    said = dict((option.name, text) for option, text in helped(EVERY["train"]))["task"]
+    assert set(TASKS) <= set(re.findall(r"[\w/-]+", said))
 
 
 def test_options_are_in_groups(monkeypatch, capsys):

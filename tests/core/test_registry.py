@@ -66,6 +66,11 @@ def test_a_class_in_the_current_directory(own):
         ("task", "elsewhere:Mine", "a module elsewhere is neither installed nor in this folder"),
         ("task", "broken_parts:Mine", r"broken_parts cannot be imported: AttributeError: .*"
                                       r"\(broken_parts.py, line 3\)"),
+        ("task", "market/kely", r"did you mean market/kelly\?"),
+        ("task", "markt/kelly", r"did you mean market/kelly\?"),
+        ("task", "market/foo", "choose from market/kelly, .*, market/leverage, market/liquidation"),
+        ("task", "finite/foo", "choose from finite/cliff, finite/frozen-lake, finite/random"),
+        ("agent", "market/foo", "choose from dqn"),
         ("agent", "dqm", "did you mean dqn"),
         ("agent", "dqm:fast", "did you mean dqn"),
         ("agent", "nothing like it", "your own as module:Name"),

@@ -23,6 +23,7 @@ from qfolio.commands.arguments import (
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import listed
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -58,8 +59,7 @@ def train(
     Args:
         task: Task to learn (default: pendulum): pendulum, pendulum/grid, pendulum/hidden or catch;
             a finite process, finite/cliff, finite/frozen-lake or finite/random; a market with a
-            known optimum, market/kelly, market/merton, market/regime, market/ar1, market/no-trade
-            or market/garleanu-pedersen; an environment of Gymnasium by its ID, such as
+            known optimum, {markets}; an environment of Gymnasium by its ID, such as
             gym:CartPole-v1; or your own as module:Name.
         agent: Algorithm (default: the first that has presets for the task): dqn, reinforce, a2c,
             ppo, ddpg, td3, sac or mbpo; for numbered states q-learning, sarsa, expected-sarsa,
@@ -127,6 +127,9 @@ def train(
     if contrast is not None and contrast.interrupted:
         stop(_resume(run, folder, on))
     return outcome(folder, _finish(run, folder, contrast))
+
+
+train.__doc__ = (train.__doc__ or "").replace("{markets}", listed(registry.of("market"), "or"))
 
 
 def evaluate(

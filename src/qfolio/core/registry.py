@@ -141,6 +141,11 @@ GYM = "gym:"
 _GYMNASIUM = "qfolio.tasks.gymnasium:GymnasiumTask"
 
 
+def of(family: str, names: Iterable[str] = tuple(TASKS)) -> list[str]:
+    """Those names (default: qfolio's tasks) that begin with a family, such as "market"."""
+    return [name for name in names if name.startswith(f"{family}/")]
+
+
 def is_known(kind: Kind, name: str) -> bool:
     """Whether qfolio or an installed package defines this name."""
     return _where(kind, name) is not None
@@ -268,7 +273,12 @@ def _require_imported(kind: Kind, name: str, module: str) -> None:
 def _unknown(kind: Kind, name: str) -> QfolioError:
     table = ENTRIES[kind].where(kind)
     first, colon, _ = name.partition(":")
-    if close := closest(first, table):
+    family, slash, own = first.partition("/")
+    kin = {each.removeprefix(f"{family}/"): each for each in of(family, table)} if slash else {}
+    if kin:  # what follows the slash tells its members apart
+        close = closest(own, kin)
+        hint = f"did you mean {kin[close]}?" if close else f"choose from {', '.join(kin.values())}."
+    elif close := closest(first, table):
         hint = f"did you mean {close}?"
     elif colon:
         hint = f"a module {first} is neither installed nor in this folder."
