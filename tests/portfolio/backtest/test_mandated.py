@@ -183,7 +183,30 @@ def test_a_mandate_that_cannot_be_met_is_refused_before_anything_is_written(tmp_
         create({"assets": {"cap": 0.1}, "cash": {"max": 0.05}}, tmp_path / "run")
     with pytest.raises(QfolioError, match="names 'Z'"):
         create({"assets": {"forbidden": ["Z"]}}, tmp_path / "run")
+    with pytest.raises(
+        QfolioError, match=r"volatility is at least .* with cash of at most 5%, and"
+    ):
+        create({"risk": {"volatility": 0.02}, "cash": {"max": 0.05}}, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_tracking_error_is_against_the_benchmark_of_the_backtest():
+    def against(limits, **given):
+        backtest = create(limits, agents={"pathwise": AGENTS["pathwise"]}, **given)
+        return backtest.tasks["pathwise"].written.risk.benchmark
+
+    risk = {"tracking_error": 0.03}
+    assert against({"risk": risk}) == "equal-weight"
+    assert against({"risk": risk}, benchmark="B") == "B"
+    assert against({"risk": risk}, benchmark="minimum-variance") == "minimum-variance"
+    assert against({"risk": risk, "benchmark": "A"}, benchmark="B") == "A"
+    assert against({"risk": {**risk, "benchmark": "A"}}, benchmark="B") == "A"
+    assert against({"risk": {"volatility": 9}}, benchmark="B") is None
+    own, message = np.zeros(200), "tracking error cannot be measured against the benchmark '"
+    with pytest.raises(QfolioError, match=message + "benchmark', which is no asset"):
+        against({"risk": risk}, benchmark=own)
+    with pytest.raises(QfolioError, match=message + "B'"):
+        against({"risk": risk}, strategies={"B": own}, benchmark="B")
 
 
 def test_without_a_mandate_the_program_is_as_before():

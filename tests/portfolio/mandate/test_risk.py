@@ -12,8 +12,9 @@ import pytest
 from jaxtyping import Array
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated, exactly
-from qfolio.portfolio.mandate.mandate import Mandate
+from qfolio.portfolio.mandate.mandate import Mandate, feasible, settled
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
@@ -214,3 +215,55 @@ def test_what_it_is_measured_against_must_be_known():
     assert "benchmark" not in Mandate.of({"benchmark": "A", "risk": {"volatility": 0.1}}).text(
         ASSETS
     )
+
+
+def calmer(made: Mandated, share: float) -> Mandated:
+    """The set at a row where all volatility is a share of what it is."""
+    assert made.risk is not None
+    return made.knowing(made.risk._replace(covariance=share**2 * made.risk.covariance))
+
+
+SHORTS = {"assets": {"cap": 0.5, "floor": -0.1}, "cash": {"min": -0.2, "max": 0.0}}
+
+
+@pytest.mark.parametrize(
+    ("kind", "limits"),
+    [
+        ("volatility", {"cash": {"max": 0.05}}),
+        ("volatility", {"assets": {"cap": 0.25}, "cash": {"max": 0.1}}),
+        ("volatility", SHORTS | {"exposure": {"gross": 1.5}}),
+        ("tracking error", {"cash": {"min": 0.2}}),
+        ("tracking error", {"assets": {"forbidden": ["A", "B"]}}),
+    ],
+)  # fmt: skip
+def test_the_least_risk_is_what_a_conic_solver_finds(kind, limits):
+    prices = table()
+    task = portfolio(prices, {kind.replace(" ", "_"): 0.001}, **limits)
+    made = feasible(task.mandate, np.ones(5, bool)).knowing(task.risk_at(jnp.array(300)))
+    weights, center = cvxpy.Variable(5), np.full(5, 0.2 if kind == "tracking error" else 0.0)
+    low, high, rows, most, gross, _ = made.limits[:6]
+    conditions = [weights >= low, weights <= high, rows @ weights <= most]
+    conditions += [cvxpy.norm1(weights) <= gross] if np.isfinite(gross) else []
+    risk = cvxpy.norm(annual_returns(prices, 300) @ (weights - center))
+    least = cvxpy.Problem(cvxpy.Minimize(risk), conditions).solve(cvxpy.CLARABEL)
+    found = checks._least_risk(made, kind, 0.0)
+    assert least * (1 - checks.GAP) - 1e-6 <= found <= least * (1 + 1e-4)
+    checks.require_safe(task.mandate, [calmer(made, 1e-9)])
+    with pytest.raises(
+        QfolioError, match=rf"cannot be met: {kind} is at least {100 * found:.3g}% at"
+    ):
+        checks.require_safe(task.mandate, [made])
+
+
+def test_what_forces_risk_is_named_if_no_row_allows_as_little():
+    prices = table()
+    task = portfolio(prices, {"volatility": 0.02}, assets={"cap": 0.6}, cash={"max": 0.05})
+    risky = feasible(task.mandate, np.ones(5, bool)).knowing(task.risk_at(jnp.array(300)))
+    said = (
+        r"least \d+\.?\d*% at the start of every fold, with cash of at most 5%, and "
+        r"risk\.volatility is 2%; change"
+    )
+    with pytest.raises(QfolioError, match=said):
+        checks.require_safe(task.mandate, [risky, risky])
+    checks.require_safe(task.mandate, [risky, calmer(risky, 0.1)])
+    checks.require_safe(settled({"cash": {"max": 0.05}}, ASSETS), iter([]))

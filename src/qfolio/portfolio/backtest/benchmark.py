@@ -5,12 +5,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
+
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES, short
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
 from qfolio.portfolio.backtest.own import Own, buy_and_hold
 from qfolio.portfolio.backtest.own_tables import read_own
+from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.prices.table import Prices
 
 BENCHMARK = "benchmark"
@@ -96,3 +99,32 @@ def field_of(
         )
     add(Path(name).stem, Path(name))
     return Field(Path(name).stem, rules, own)
+
+
+def tracked(
+    mandate: Mandate, benchmark: Any, field: Field, prices: Prices, strategies: Mapping[str, Any]
+) -> Mandate:
+    """The mandate, whose tracking error is against the backtest's benchmark if it names none.
+
+    Args:
+        mandate: The mandate.
+        benchmark: As ``field_of`` takes it.
+        field: What ``field_of`` makes of it.
+        prices: The table of the backtest.
+        strategies: The user's own strategies by name.
+
+    Raises:
+        QfolioError: The benchmark is neither an asset nor a baseline.
+    """
+    risk = mandate.risk
+    named = risk.benchmark or mandate.benchmark
+    if benchmark is None or risk.tracking_error is None or named is not None:
+        return mandate
+    name = str(benchmark) if isinstance(benchmark, str | Path) else field.benchmark
+    if name in strategies or name not in {*prices.assets, *BASELINES, *field.baselines}:
+        raise QfolioError(
+            f"The mandate's tracking error cannot be measured against the benchmark {quote(name)}, "
+            "which is no asset of the table and no baseline; set risk.benchmark to one, or to "
+            "column:NAME with its weights."
+        )
+    return msgspec.structs.replace(mandate, risk=msgspec.structs.replace(risk, benchmark=name))

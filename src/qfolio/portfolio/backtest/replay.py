@@ -1,6 +1,6 @@
 """Replays agents and baselines over the folds of a backtest."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -188,6 +188,10 @@ class Replay:
         return (
             Patterns.of(mandate, tradable, self.cap) if mandate and tradable is not None else None
         )
+
+    def starts(self) -> Iterator[Mandated]:
+        """What the mandate allows at the first decision of each fold."""
+        return (self._feasible(i, fold.decisions.start) for i, fold in enumerate(self.folds))
 
     def _feasible(self, fold: int, row: int) -> Mandated:
         """What the mandate allows at a row of a fold."""

@@ -30,7 +30,7 @@ from qfolio.experiments.log import Log
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest import assessment, memory
 from qfolio.portfolio.backtest.baselines import baseline
-from qfolio.portfolio.backtest.benchmark import field_of
+from qfolio.portfolio.backtest.benchmark import field_of, tracked
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
 from qfolio.portfolio.backtest.folds import Fold, latest, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
@@ -190,6 +190,8 @@ class Backtest:
             cost = float(terms.costs.get("cost", cost))
             cost_model = (cost_model == PROPORTIONAL and terms.cost_model) or cost_model
         field = field_of(prices, agents, baselines, strategies or {}, benchmark)
+        if terms is not None:
+            terms = tracked(terms, benchmark, field, prices, strategies or {})
         config = BacktestConfig(
             prices=describe(prices),
             assets=list(prices.assets),
@@ -223,6 +225,8 @@ class Backtest:
             checks.require(settled(config.mandate, prices.assets), every, config.cap)
         given = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
         backtest = cls(prices, config, None, given, field.own)
+        if config.mandate is not None:
+            checks.require_safe(backtest.replay.task.mandate, backtest.replay.starts(), config.cap)
         if out is not None:
             with new_folder(Path(out)) as folder:
                 BacktestFolder(folder).write(config, prices, field.own)

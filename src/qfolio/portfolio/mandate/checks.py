@@ -1,19 +1,25 @@
 """Whether a mandate can be met: which limits clash, and what is unusual about the others."""
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import near, quote
+from qfolio.core.text import listed, near, quote
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.mandate import feasible, parse
 from qfolio.portfolio.mandate.projection import Limits
 
 TINY = 1e-7
+
+CLEARLY = 1.05
+"""Least risk up to this multiple of a limit counts as met."""
+
+GAP, VERTICES = 0.01, 200
+"""The least risk is known to within this share, unless that takes more vertices."""
 
 
 def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> list[str]:
@@ -83,6 +89,78 @@ def unusual(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
                     "also the most that the other limits allow."
                 )
     return notes
+
+
+def require_safe(text: str, starts: Iterable[Mandated], most: float = 1.0) -> None:
+    """Raises QfolioError if a limit on risk can be met at none of some rows.
+
+    text, most: as for ``mandate.feasible``. starts: the sets at these rows, which know their risk.
+    Turnover and the number of holdings do not count, and each limit on risk counts by itself: with
+    them there may be even more risk.
+    """
+    risk = parse(text)[1].risk
+    given = {"volatility": risk.volatility, "tracking error": risk.tracking_error}
+    limits = {name: limit for name, limit in given.items() if limit is not None}
+    never: dict[str, tuple[float, Mandated | None]] = dict.fromkeys(limits, (np.inf, None))
+    for made in starts if limits else ():
+        for name, (lowest, _) in list(never.items()):
+            least = _least_risk(made, name, CLEARLY * limits[name])
+            if least <= CLEARLY * limits[name]:
+                del never[name]
+            elif least < lowest:
+                never[name] = least, made
+        if not never:
+            return
+    for name, (least, safest) in never.items():
+        assert safest is not None  # there is a first row
+        allowed, said = CLEARLY * limits[name], _said(text, safest, most)
+        clash = list(range(len(said)))
+        for i in range(len(said)):
+            rest = [other for other in clash if other != i]
+            if _least_risk(safest, name, allowed, rest) > allowed:
+                clash = rest
+        forced = f", with {listed([said[i] for i in clash])}" if clash else ""
+        raise QfolioError(
+            f"The mandate cannot be met: {name} is at least {100 * least:.3g}% at the start of "
+            f"every fold{forced}, and risk.{name.replace(' ', '_')} is {_percent(limits[name])}; "
+            "change one of them."
+        )
+
+
+def _least_risk(
+    made: Mandated, kind: str, enough: float, kept: Collection[int] | None = None
+) -> float:
+    """A lower bound of volatility or tracking error within the limits, to within ``GAP``.
+
+    enough: a risk up to which it is not lowered further. kept: as for ``_found``. The least risk of
+    a mix of vertices is found exactly, and the vertex that lowers it most joins them (simplicial
+    decomposition, von Hohenbalken 1977).
+    """
+    from scipy.optimize import nnls
+
+    assert made.risk is not None
+    covariance = np.asarray(made.risk.covariance, float)
+    center = np.asarray(made.risk.benchmark, float) if kind == "tracking error" else 0.0
+    values, vectors = np.linalg.eigh(covariance)
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    count, slope = len(covariance), np.zeros(len(covariance))
+    vertices: list[np.ndarray] = []
+    risk = least = 0.0
+    for _ in range(VERTICES):
+        found = _found(made.limits, kept, value=-slope)
+        assert found is not None  # the set is not empty
+        vertex = found[:count] - found[count : 2 * count] - center
+        if vertices and (least := float(slope @ vertex) / risk) >= (1 - GAP) * risk:
+            break
+        vertices.append(vertex)
+        mixed = np.array(vertices).T
+        table = np.vstack([root @ mixed, np.ones(len(vertices))])
+        shares = nnls(table, np.append(np.zeros(count), 1.0), maxiter=10_000)[0]
+        weights = mixed @ (shares / shares.sum())
+        risk, slope = float(np.linalg.norm(root @ weights)), covariance @ weights
+        if risk <= enough:
+            return risk
+    return least
 
 
 def relaxed(made: Mandated) -> tuple[Mandated, list[str]]:

@@ -124,7 +124,7 @@ class Limited(Section, frozen=True):
     """Limits on the risk of an order, a year, as the last ``rows`` returns show it.
 
     benchmark: what tracking error is measured against: an asset, a baseline, or column:NAME with
-    its weights (default: the mandate's benchmark, or else equal weights).
+    its weights (default: the mandate's benchmark, or that of the backtest, or equal weights).
     """
 
     volatility: Annotated[float, msgspec.Meta(gt=0, le=10)] | None = None
