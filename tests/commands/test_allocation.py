@@ -242,6 +242,8 @@ def test_a_baseline_is_followed(folder, monkeypatch, capsys):
     assert "A baseline, which learned nothing: it grew by" in plan["verdict"]
     assert records(folder)[-1]["policy"] is None
     capsys.readouterr()
+    assert qfolio(monkeypatch, "allocate", folder, "--reproduce", "2020-09-16") == 0
+    assert "is reproduced: prices, settings and holdings have" in capsys.readouterr().out
     momentum = ["--agent", "momentum", "--capital", 3000]
     assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *momentum) == 0
     assert "Baseline: momentum.\nIn its backtest: A baseline" in capsys.readouterr().out

@@ -268,6 +268,7 @@ def _reproduce(
 ) -> Document:
     """Recomputes an allocation of the ledger and prints the largest difference in weight."""
     from qfolio.commands import console
+    from qfolio.core.text import listed
     from qfolio.portfolio.desk.holdings import read_holdings
 
     held = None
@@ -275,10 +276,10 @@ def _reproduce(
         held = read_holdings(holdings, desk.run.prices.assets, capital, debts=desk.debts)
     record, again = desk.reproduce(date, prices, held)
     off = max(abs(x - y) for x, y in zip(again.weights.tolist(), record.target, strict=True))
+    same = listed(["prices", "settings", "holdings", *(["policy"] if record.policy else [])])
     console.say(
         f"Record {record.number} of {record.date} ({record.agent}, made {record.made} by qfolio "
-        f"{record.version}) is reproduced: prices, settings, holdings"
-        f"{' and policy' if record.policy else ''} have the digests of the ledger, and no target "
+        f"{record.version}) is reproduced: {same} have the digests of the ledger, and no target "
         f"weight is off by more than {off:.1g}."
     )
     return {"record": record.number, **again.to_json()}
