@@ -20,6 +20,13 @@ VISIBLE = """
 """
 
 
+@pytest.fixture(scope="module")
+def page_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("usual") / "report.html"
+    path.write_text(render_backtest(usual(60)), encoding="utf-8")
+    return path
+
+
 def test_legend_click_hides_the_lines(browser: Browser, folder: Path) -> None:
     browser.complaints.clear()
     browser.show((folder / "report.html").as_uri(), 1280, DRAWN)
@@ -104,6 +111,20 @@ def test_names_stand_where_lines_end(browser: Browser, folder: Path) -> None:
     browser.wait(f"{names}.length === 4")
     assert f"DQN {ATTACK}" not in browser.evaluate(names)
     assert browser.complaints == []
+
+
+def test_names_are_whole_on_a_phone(browser: Browser, page_path: Path) -> None:
+    browser.show(page_path.as_uri(), 390, DRAWN, phone=True)
+    spans = "[...document.querySelectorAll('#wealth-labels span')]"
+    browser.wait(f"{spans}.length === 5")
+    cut = f"{spans}.filter(s => s.scrollWidth > s.clientWidth).map(s => s.textContent)"
+    assert browser.evaluate(cut) == []
+    lows, highs = browser.evaluate(
+        f"(() => {{ const boxes = {spans}.map(s => s.getBoundingClientRect())"
+        ".sort((a, b) => a.top - b.top);"
+        "return [boxes.slice(1).map(b => b.top), boxes.slice(0, -1).map(b => b.bottom)]; })()"
+    )
+    assert np.all(np.array(lows) - highs > -0.5)  # none covers another
 
 
 def test_tear_sheet_opens_and_draws(browser: Browser, tmp_path: Path) -> None:

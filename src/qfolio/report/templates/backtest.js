@@ -56,7 +56,7 @@
     return Plotly.react(chart,
       [...lines("wealth", data.dates, "y", true), ...lines("drawdown", data.dates, "y2", false)],
       layout(narrow.matches ? 480 : 590, {
-        margin: { r: room() },
+        margin: { r: room(names.filter((_, index) => !hidden.has(index))) },
         titles: [["Wealth, starting at 1 (log scale)", 1], ["Drawdown", 0.26]],
         xaxis: { anchor: "y2" },
         yaxis: { type: "log", domain: [0.36, 1], tickvals: ticks, ticktext: ticks.map(tidy),
@@ -87,7 +87,7 @@
     return Plotly.react(chart,
       [...lines("sharpe", data.dates, "y", false), ...lines("beta", data.dates, "y2", false)],
       layout(state.printing ? 290 : narrow.matches ? 440 : 470, {
-        margin: { r: room() },
+        margin: { r: room(names.filter((_, index) => !hidden.has(index))) },
         titles: [["Sharpe ratio of the last year", 1], ["Beta of the last year", 0.36]],
         xaxis: { anchor: "y2" },
         yaxis: { domain: [0.46, 1], range: [low - edge, high + edge], nticks: 6 },

@@ -111,15 +111,21 @@ const tools = (() => {
     return low <= high ? [low, high] : null;
   }
 
-  /** Room for names at the right of a chart. */
-  const room = () => (narrow.matches ? 66 : 118);
+  /** Room for names at the right of a chart: what the longest needs, up to a limit. */
+  const pen = document.createElement("canvas").getContext("2d");
+  function room(names) {
+    const [size, most] = narrow.matches ? [0.68, 96] : [0.76, 150]; // in rem, as of .labels
+    pen.font = `600 ${size * parseFloat(getComputedStyle(document.documentElement).fontSize)}px ${SANS}`;
+    const widest = Math.max(...names.map((name) => pen.measureText(name).width), 30);
+    return Math.min(Math.ceil(widest) + 12, most);
+  }
 
   /** Puts names where lines end, moved apart where they would overlap. */
   function label(id, chart, axis, entries) {
     const place = byId(id);
     place.replaceChildren();
     const { _offset: top, _length: height } = chart._fullLayout[axis];
-    const gap = narrow.matches ? 11 : 14;
+    const gap = narrow.matches ? 13 : 14;
     const marks = entries.map((entry) => ({ ...entry, at: top + entry.at * height }))
       .sort((a, b) => a.at - b.at);
     for (let i = 1; i < marks.length; i += 1) marks[i].at = Math.max(marks[i].at, marks[i - 1].at + gap);
@@ -132,7 +138,7 @@ const tools = (() => {
       const span = document.createElement("span");
       span.textContent = mark.name;
       span.style.top = `${mark.at}px`;
-      span.style.width = `${room() - 8}px`;
+      span.style.width = `${chart.layout.margin.r - 8}px`;
       span.style.color = color(mark.color);
       place.append(span);
     }
