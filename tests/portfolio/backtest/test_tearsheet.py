@@ -78,6 +78,8 @@ def test_alpha_is_what_a_reference_leaves() -> None:
     # Both are one point above or below their means, .01 and .02, so the slope is 1.
     assert alpha([0.0, 0.02], [0.01, 0.03], 100) == pytest.approx(-1.0)
     assert math.isnan(alpha(market, np.full(4, 0.001), 250))
+    assert math.isnan(alpha(market, market[::-1] / 100, 250))  # as interest on cash moves
+    assert alpha(5 * market, market, 250) == pytest.approx(0)
 
 
 def test_stability_of_a_straight_line() -> None:

@@ -16,6 +16,11 @@ MEASURES = (
 )
 
 
+STEADY = 10.0
+"""A strategy this many times as volatile as another is not compared with it: as with cash, whose
+interest alone fluctuates, a ratio to it would say nothing."""
+
+
 # Measures ------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qfolio.portfolio.backtest.measures import (
+    STEADY,
     Floats,
     checked_dates,
     deviations,
@@ -125,7 +126,7 @@ def leverage(weights: ArrayLike) -> tuple[float, float]:
 def alpha(returns: ArrayLike, reference: ArrayLike, periods_per_year: float) -> float:
     """Return the annual mean return that the regression on a reference leaves.
 
-    NaN if the reference did not move.
+    NaN if the returns fluctuate ``STEADY`` times as much as the reference.
 
     Args:
         returns: Simple returns of shape (periods,).
@@ -133,10 +134,10 @@ def alpha(returns: ArrayLike, reference: ArrayLike, periods_per_year: float) -> 
         periods_per_year: For example 252 for trading days.
     """
     ours, theirs = np.asarray(returns, dtype=float), np.asarray(reference, dtype=float)
-    moved = deviations(theirs)
-    if not moved.any():
+    own, other = deviations(ours), deviations(theirs)
+    if own @ own >= STEADY**2 * (other @ other):
         return math.nan
-    beta = float(moved @ deviations(ours) / (moved @ moved))
+    beta = float(other @ own / (other @ other))
     return periods_per_year * float(ours.mean() - beta * theirs.mean())
 
 

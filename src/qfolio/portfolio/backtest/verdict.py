@@ -8,6 +8,7 @@ from qfolio.portfolio.backtest.assessment import JUDGED, Assessment, StrategyAss
 from qfolio.portfolio.backtest.bootstrap import LEVEL
 from qfolio.portfolio.backtest.differences import Contrast, Difference, Finding
 from qfolio.portfolio.backtest.estimates import Measured
+from qfolio.portfolio.backtest.measures import STEADY
 
 _MEASURES: dict[Measured, str] = {
     "growth": "growth",
@@ -17,10 +18,6 @@ _MEASURES: dict[Measured, str] = {
 
 _MOVES = {"better": "less", "worse": "more"}
 """Volatility in words, by finding."""
-
-STEADY = 10.0
-"""A strategy this many times as volatile as another is not compared with it: as with cash, whose
-interest alone fluctuates, the ratio would say nothing."""
 
 
 def verdicts(assessment: Assessment) -> dict[str, list[str]]:
