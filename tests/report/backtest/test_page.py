@@ -78,6 +78,17 @@ def test_says_how_assets_enter_and_leave_the_table(data: BacktestData, page: Pag
     assert "A table of assets that still trade" not in text
 
 
+def test_short_sales_are_not_called_impossible(data: BacktestData) -> None:
+    def said(mandate: Any) -> bool:
+        page = render_backtest(replace(data, config={**data.config, "mandate": mandate}))
+        return "Short sales and borrowing: weights are never negative" in page
+
+    assert said(None)
+    assert said({"assets": {"floor": {"A": 0.1}}, "cash": {"min": 0.0}})
+    assert not said({"assets": {"floor": -0.1}})
+    assert not said({"cash": {"min": -1.0}})
+
+
 def test_the_haircut_is_found_from_the_payout() -> None:
     frame = pd.DataFrame(
         {"date": ["2020-01-01", "2020-01-02", "2020-01-03", "2020-01-06"], "A": [1, 2, 3, 4.0],

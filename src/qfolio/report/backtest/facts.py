@@ -113,10 +113,21 @@ def account(data: BacktestData) -> dict[str, Any]:
         "mandate": "; ".join(_limits(settings.get("mandate") or {})),
         "model": None if settings.get("cost_model") in PLAIN else settings["cost_model"],
         "calendar": settings.get("calendar") or None,
+        "long_only": _long_only(data),
         "universe": " ".join(universe(data.prices)),
         "trials": _counts(test),
         "earlier": test.earlier_trials,
     }
+
+
+def _long_only(data: BacktestData) -> bool:
+    """Whether nobody may, and nobody does, sell short or borrow."""
+    mandate = data.config.get("mandate") or {}
+    floor = mandate.get("assets", {}).get("floor")
+    floors = list(floor.values()) if isinstance(floor, dict) else [floor]
+    least = [*floors, mandate.get("cash", {}).get("min")]
+    held = [series.weights for series in data.strategies.values() if series.weighted]
+    return all((each or 0) >= 0 for each in least) and all(w.min() > -1e-6 for w in held)
 
 
 def _limits(mandate: dict[str, Any], place: str = "") -> list[str]:
