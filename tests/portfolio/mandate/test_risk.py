@@ -267,3 +267,15 @@ def test_what_forces_risk_is_named_if_no_row_allows_as_little():
         checks.require_safe(task.mandate, [risky, risky])
     checks.require_safe(task.mandate, [risky, calmer(risky, 0.1)])
     checks.require_safe(settled({"cash": {"max": 0.05}}, ASSETS), iter([]))
+
+
+@pytest.mark.parametrize(
+    ("forbidden", "said"),
+    [(["A"], "with assets.forbidden, and .* change one of them"), ([], "fold, and .* raise it")],
+)
+def test_assets_that_cannot_be_held_may_force_tracking_error(forbidden, said):
+    task = portfolio(table(), {"tracking_error": 0.001}, assets={"forbidden": forbidden})
+    there = np.array([False, True, True, True, True])
+    made = feasible(task.mandate, there).knowing(task.risk_at(jnp.array(300)))
+    with pytest.raises(QfolioError, match=said):
+        checks.require_safe(task.mandate, [made])

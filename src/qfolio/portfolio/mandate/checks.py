@@ -98,7 +98,8 @@ def require_safe(text: str, starts: Iterable[Mandated], most: float = 1.0) -> No
     Turnover and the number of holdings do not count, and each limit on risk counts by itself: with
     them there may be even more risk.
     """
-    risk = parse(text)[1].risk
+    _, mandate = parse(text)
+    risk, forbidden = mandate.risk, mandate.assets.forbidden
     given = {"volatility": risk.volatility, "tracking error": risk.tracking_error}
     limits = {name: limit for name, limit in given.items() if limit is not None}
     never: dict[str, tuple[float, Mandated | None]] = dict.fromkeys(limits, (np.inf, None))
@@ -119,11 +120,12 @@ def require_safe(text: str, starts: Iterable[Mandated], most: float = 1.0) -> No
             rest = [other for other in clash if other != i]
             if _least_risk(safest, name, allowed, rest) > allowed:
                 clash = rest
-        forced = f", with {listed([said[i] for i in clash])}" if clash else ""
+        forced = [said[i] for i in clash] or ["assets.forbidden"][: len(forbidden)]
+        force = f", with {listed(forced)}" if forced else ""
         raise QfolioError(
             f"The mandate cannot be met: {name} is at least {100 * least:.3g}% at the start of "
-            f"every fold{forced}, and risk.{name.replace(' ', '_')} is {_percent(limits[name])}; "
-            "change one of them."
+            f"every fold{force}, and risk.{name.replace(' ', '_')} is {_percent(limits[name])}; "
+            f"{'change one of them' if forced else 'raise it'}."
         )
 
 
