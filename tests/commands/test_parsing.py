@@ -68,7 +68,9 @@ def test_options_are_in_groups(monkeypatch, capsys):
     places = [page.index(f"{title} options") for title in titles]
     assert places == sorted(places)
     assert places[2] < page.index("--cap FLOAT") < places[3]
-    assert "Largest weight of one asset, from 0 to 1 (default: 1)." in page
+    said = " ".join(page.replace("│", " ").split())
+    assert "Largest weight of one asset, from 0 to 1; a mandate" in said
+    assert "may set a cap above 1 instead (default: 1)." in said
 
 
 @pytest.mark.parametrize("name", EVERY)
