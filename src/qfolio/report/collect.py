@@ -139,6 +139,7 @@ def backtest_data(
         why=why,
         moves=_moves(backtest),
         capacity=capacity(backtest.replay, entries, assessment.reference),
+        risk_free=backtest.replay.growth[:, 0] - 1,
     )
 
 

@@ -147,4 +147,9 @@ def test_rolling_figures_begin_after_a_year() -> None:
     ratio = np.mean(np.sqrt(252) * last.mean(axis=1) / last.std(axis=1, ddof=1))
     assert dqn["sharpe"][-1] == pytest.approx(ratio, rel=1e-2)
     assert equal["beta"][-1] == 1
+    free = np.full(400, 0.0002)
+    over = Page(render_backtest(replace(data, risk_free=free))).data["strategies"][0]
+    ratio = np.mean(np.sqrt(252) * (last.mean(axis=1) - 0.0002) / last.std(axis=1, ddof=1))
+    assert over["sharpe"][-1] == pytest.approx(ratio, rel=1e-2)
+    assert over["beta"] == dqn["beta"]
     assert "sharpe" not in Page(render_backtest(usual(300))).data["strategies"][0]

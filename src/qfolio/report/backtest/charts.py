@@ -67,7 +67,8 @@ def _rolling(
     """Rolling Sharpe ratio and beta to the reference, averaged over the seeds."""
     returns, year = data.strategies[name].returns, data.assessment.periods_per_year
     reference = data.strategies[data.assessment.reference].returns[0]
-    both = rolling_sharpe(returns, window, year), rolling_beta(returns, reference, window)
+    excess = returns if data.risk_free is None else returns - data.risk_free
+    both = rolling_sharpe(excess, window, year), rolling_beta(returns, reference, window)
     sharpe, beta = (np.append(np.nan, values.mean(axis=0)[ends]) for values in both)
     return {"sharpe": compact(sharpe, 3), "beta": compact(beta, 3)}
 

@@ -70,6 +70,7 @@ class BacktestData:
         moves: Simple returns of the assets on these days, shape (D, N), 0 before an asset's start;
             without them, the page does not say what each asset contributed.
         capacity: Growth by capital, if costs depend on it.
+        risk_free: Simple returns of cash on these days, shape (D,) (default: 0).
     """
 
     title: str
@@ -86,6 +87,7 @@ class BacktestData:
     why: Why | None = None
     moves: Floats | None = None
     capacity: Capacity | None = None
+    risk_free: Floats | None = None
 
 
 def require_fit(data: BacktestData) -> None:
