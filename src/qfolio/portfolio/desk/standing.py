@@ -17,7 +17,8 @@ class Standing:
     agent: its name, or that of a baseline or a strategy of the user's own.
     verdict: the sentence of the report, or the measures of what is no agent; empty if the backtest
     is not finished.
-    worse: whether an agent grows more slowly than the benchmark, or than its best rebalancing.
+    worse: whether an agent grows more slowly than the benchmark, or than its best rebalancing, or
+    loses everything.
     """
 
     agent: str
@@ -42,12 +43,13 @@ class Standing:
                 measured = _measured(kind, strategies[agent]["measures"])
                 return Standing(agent, measured, False, kind)
             name = followed(agent, strategies)
+            lost = -1 in strategies[name]["measures"]["growth"]["per_seed"]
             worse = any(
                 strategies[name][key] is not None
                 and strategies[name][key]["growth"]["finding"] == "worse"
                 for key in ("to_rebalanced", "to_reference")
             )
-            return Standing(agent, str(summary["verdicts"][name][0]), worse)
+            return Standing(agent, str(summary["verdicts"][name][0]), lost or worse)
         except (AttributeError, IndexError, KeyError, TypeError, ValueError):
             raise QfolioError(
                 f"{path} is damaged; write it again with qfolio backtest --resume {folder}."

@@ -1,0 +1,39 @@
+import json
+
+import pytest
+
+from qfolio.core.errors import QfolioError
+from qfolio.portfolio.desk.standing import Standing
+
+
+def summary(folder, growth, finding):
+    difference = {"growth": {"finding": finding}}
+    strategy = {
+        "measures": {"growth": {"per_seed": growth}},
+        "to_reference": difference,
+        "to_rebalanced": None,
+    }
+    found = {"strategies": {"tilts": strategy}, "verdicts": {"tilts": ["tilts did something."]}}
+    (folder / "summary.json").write_text(json.dumps(found))
+
+
+@pytest.mark.parametrize(
+    ("growth", "finding", "worse"),
+    [
+        ([0.05, 0.06], "none", False),
+        ([0.05, 0.06], "worse", True),
+        ([0.05, -1.0], "none", True),  # no statistics are left of an account that is lost
+    ],
+)
+def test_a_policy_that_is_worse_or_loses_everything_is_not_followed_unasked(
+    tmp_path, growth, finding, worse
+):
+    summary(tmp_path, growth, finding)
+    standing = Standing.of(tmp_path, "tilts")
+    assert standing.worse is worse
+    standing.require_sound(tmp_path, named=True)
+    if worse:
+        with pytest.raises(QfolioError, match="tilts did something; to trade it nevertheless"):
+            standing.require_sound(tmp_path, named=False)
+    else:
+        standing.require_sound(tmp_path, named=False)
