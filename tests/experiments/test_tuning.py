@@ -540,7 +540,7 @@ def test_the_page(optimum, tmp_path):
     assert "://" not in text.replace("http://www.w3.org", "")
     assert text.count("<svg") == 6
     assert "color-mix(in srgb, var(--accent)" in text
-    assert ("regret (higher is better)" in text) == (optimum is not None)
+    assert ("regret (smallest at the top)" in text) == (optimum is not None)
     assert "1 diverged" in text
     assert "better (+8.3" in text
 
