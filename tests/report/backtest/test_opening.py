@@ -67,7 +67,8 @@ def test_the_conclusion_says_who_beats_the_reference(plain: BacktestData) -> Non
     assert lead_name(data) == "pathwise"
     assert conclusion(data) == (
         "pathwise beats equal weight, however it is rebalanced, in growth and Sharpe ratio: it "
-        f"grew {growth(data, 'pathwise')} a year after costs, never {growth(data, 'never')}."
+        f"grew {growth(data, 'pathwise')} a year after costs, against {growth(data, 'never')} of "
+        "never."
     )
     both = found(plain, pathwise=("better", "none"), DQN=("better", "none"))
     assert conclusion(both).startswith(
@@ -142,7 +143,7 @@ def test_all_stand_beside_the_reference_of_the_verdict(plain: BacktestData) -> N
             data, strategies={n: s for n, s in data.strategies.items() if "DQN" not in n}
         )
         assert rival_name(alone_tested) == other
-        assert conclusion(alone_tested).endswith(f", {other} {growth(plain, other)}.")
+        assert conclusion(alone_tested).endswith(f", against {growth(plain, other)} of {other}.")
         assert all(tile["other"].startswith(other) for tile in tiles(alone_tested))
     # Where the others are not the same, each line names its own.
     assert verdict_lines(data)["against"] == ""
@@ -177,7 +178,7 @@ def test_tiles_stand_beside_the_reference(plain: BacktestData) -> None:
     shown = {tile["name"]: tile for tile in tiles(data)}
     own, other = (data.assessment.strategies[n].measures for n in ("pathwise", "never"))
     assert shown["Sharpe ratio"]["value"] == number(own["sharpe"].mean, 2)
-    assert shown["Sharpe ratio"]["other"] == f"never {number(other['sharpe'].mean, 2)}"
+    assert shown["Sharpe ratio"]["other"] == f"never: {number(other['sharpe'].mean, 2)}"
     assert shown["Deepest drawdown"]["value"] == percent(own["drawdown"].mean)
     assert shown["Turnover a year"]["value"] == f"{number(own['turnover'].mean)} ×"
     assert [tile["side"] for tile in shown.values()] == ["better", "none", "", "", ""]

@@ -88,7 +88,7 @@ def conclusion(data: BacktestData) -> str:
     def told(subject: str) -> str:
         who, other = "it" if subject == lead else lead, difference.reference
         own, theirs = (test.strategies[name].measures["growth"].mean for name in (lead, other))
-        return f"{who} grew {percent(own)} a year after costs, {other} {percent(theirs)}"
+        return f"{who} grew {percent(own)} a year after costs, against {percent(theirs)} of {other}"
 
     if winners := which("growth", "better"):
         verb = "beats" if len(winners) == 1 else "beat"
@@ -158,7 +158,7 @@ def tiles(data: BacktestData) -> list[dict[str, str]]:
         {
             "name": name,
             "value": written(key, own[key].mean),
-            "other": "" if lead is None else f"{rival} {written(key, other[key].mean)}",
+            "other": "" if lead is None else f"{rival}: {written(key, other[key].mean)}",
             "side": side.get(key, ""),
         }
         for key, name in TILES.items()
