@@ -1,5 +1,7 @@
 """What a signal is worth, where it is known what the policy follows."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -115,3 +117,19 @@ def test_a_menu_tilts_by_the_shuffled_signals(prices):
     changed = [each.high - each.low > 1e-4 for each in worth.signals]  # from shuffle to shuffle
     assert changed == [False, True, False]
     assert not worth.ignored
+
+
+def test_a_policy_that_is_wiped_out_is_explained():
+    """With twice its wealth in assets, it loses everything on the day they all halve."""
+    calm = planted()
+    values = calm.values * np.where(np.arange(len(calm)) < 500, 1, 0.45)[:, None]
+    prices = dataclasses.replace(calm, values=values)
+    mandate = {
+        "assets": {"cap": 1.0, "floor": 1 / 3},
+        "cash": {"min": -1.0},
+        "exposure": {"gross": 2.0},
+    }
+    stretches = four_folds(prices, mandate=mandate)
+    worth, _ = found("constant", stretches, prices)
+    assert worth.ignored
+    assert worth.everything.lost == 0

@@ -22,6 +22,7 @@ from qfolio.portfolio.backtest.attribution.replays import (
 )
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.market import RUIN
 
 DRAWS = 3
 """Number of shuffles of each signal."""
@@ -110,7 +111,8 @@ def importance(
                 conditions=task.conditions,
                 long_only=task.feasible.long_only,
             )
-            logs.append(replayed.growth)
+            # Ruin, which has no finite growth, is as bad as while agents learn.
+            logs.append(np.maximum(replayed.growth, np.log(RUIN)))
     lost = (logs[0] - np.array(logs[1:])).reshape(count + 1, draws, -1)
     each = periods_per_year * lost.mean(2)
     worth = [
