@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from qfolio.portfolio.backtest.baselines import Baseline
+from qfolio.portfolio.backtest.baselines.equal_weight import BuyAndHold
 from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import AT_EVERY_ROW, orders
+from qfolio.portfolio.backtest.replay import Replay
 from qfolio.portfolio.calendars import decision_rows, elapsed
 from qfolio.portfolio.following import begin
 from qfolio.portfolio.market import Holding
@@ -188,6 +190,35 @@ def test_a_margin_call_is_a_decision_whatever_the_calendar_says():
     assert (ordered & ~decides).sum() > 2  # calls
     before = np.flatnonzero(ordered & ~decides)[0]
     np.testing.assert_array_equal(called[:before], free[:before])
+
+
+def leveraged(calendar: str) -> tuple[Prices, Portfolio]:
+    """Assets of 1.65 times the wealth, which a fall of prices brings beyond a margin."""
+    prices = table(7, sigma=0.03)
+    debts = {"assets": {"cap": 2.0, "floor": 0.55}, "cash": {"min": -1.0}}
+    return prices, made(prices, calendar, exposure={"gross": 1.7, "margin": 0.58}, **debts)
+
+
+def test_a_margin_call_does_not_wait_for_a_band():
+    _, task = leveraged("drift:0.9")
+    held = by_task(task, np.tile([-0.65, 0.55, 0.55, 0.55], (800, 1)))
+    assert abs(held[:, 1:]).sum(1).max() <= 1 / 0.58
+
+
+def test_a_margin_call_does_not_wait_for_a_baseline():
+    fold = Fold("only", slice(0, FIRST), slice(FIRST, LAST), slice(0, FIRST))
+    for calendar in ("yearly", "drift:0.9"):
+        prices, task = leveraged(calendar)
+        replay = Replay(prices, [fold], task.deciding_at(FIRST), 1.0)
+        entry, _ = replay.baseline("baseline", "hold", BuyAndHold())
+        ordered = entry.decisions[0][~np.isnan(entry.decisions[0, :, 0])]
+        calls = len(ordered) - 1  # it buys once, and never trades of its own accord
+        assert calls > 2
+        assert abs(ordered[:, 1:]).sum(1).max() <= 1.7 + 1e-6
+        said = [f"Trades that margin calls forced: hold ({calls})."]
+        # With a band, every row decides.
+        assert replay.called({"hold": entry}, ()) == (said if calendar == "yearly" else [])
+        assert replay.called({"hold": entry}, ("hold",)) == []
 
 
 def test_terms_do_nothing_where_there_are_none():

@@ -40,13 +40,16 @@ class Terms(NamedTuple):
     def due(self, row: Any, held: Any) -> Any:
         """Whether a decision is due at a row with some weights held; a bool, or an array ()."""
         decides = self.decides[row] if len(self.decides) else True
-        if self.called < float("inf"):
-            decides |= abs(held[1:]).sum() > self.called
-        return decides
+        return decides | self.calls(held)
+
+    def calls(self, held: Any) -> Any:
+        """Whether some weights held are a margin call."""
+        return abs(held[1:]).sum() > self.called if self.called < float("inf") else False
 
     def beyond(self, held: Any, wanted: Any) -> Any:
-        """Whether the holding is far enough from the target for an order."""
-        return abs(wanted - held).max() > self.band if self.band else True
+        """Whether the holding is far enough from the target for an order, or a margin call."""
+        far = abs(wanted - held).max() > self.band if self.band else True
+        return far | self.calls(held)
 
     def begin(self, held: Any, spent: Any = 0.0) -> Plan | None:
         """The plan of an account without earlier orders; None if it needs none."""

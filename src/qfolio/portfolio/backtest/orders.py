@@ -113,7 +113,7 @@ def orders(
             for row in rows if again or watched else sorted(asked):
                 held = drifted(last, prices[row_last], prices[row])
                 held = held if listed is None else cashed(held, listed[row])
-                called = terms.called < np.inf and abs(held[1:]).sum() > terms.called
+                called = terms.calls(held)
                 if row in asked or (called and not stands):
                     known = slice(0, row + 1)
                     open_to = allowed if universe is None else allowed[row]
@@ -123,12 +123,15 @@ def orders(
                     wanted = None
                 due = trading[row - rows[0]] or called or not (again or watched)
                 order, given = held, False
-                if wanted is not None and due:
+                if called or (wanted is not None and due):
                     mandated = None if feasible is None else feasible(number, row)
                     left = terms.unspent(plan)
                     if left is not None and isinstance(mandated, Mandated):
                         mandated = mandated.spending(left)
-                    order = obeying(name, wanted, held, history, mandated)
+                    if wanted is not None:
+                        order = obeying(name, wanted, held, history, mandated)
+                    elif mandated is not None:  # a lender does not wait for the baseline
+                        order = exactly(mandated, held, held)
                     given = terms.beyond(held, order)
                 target, plan = terms.trade(held, order, given, plan)
                 if given or (target != held).any():
@@ -170,11 +173,12 @@ def _tradable(fold: Fold, prices: Floats, chosen: Bools | None) -> Bools:
 
 
 def drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
-    """Weights ordered at one row's prices, drifted to another's."""
+    """Weights ordered at one row's prices, drifted to another's; cash once all is lost."""
     worth = weights.copy()
     bought = weights[1:] != 0  # others may have no price yet
     worth[1:][bought] *= now[bought] / then[bought]
-    return np.asarray(worth / worth.sum())
+    total = worth.sum()
+    return np.asarray(worth / total if total > 0 else np.eye(len(worth))[0])
 
 
 def obeying(

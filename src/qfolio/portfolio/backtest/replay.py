@@ -1,6 +1,6 @@
 """Replays agents and baselines over the folds of a backtest."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -227,6 +227,23 @@ class Replay:
             for said, names in over.items()
             if names
         ]
+
+    def called(self, entries: Mapping[str, Entry], own: Container[str]) -> list[str]:
+        """A note on margin calls: who traded at rows where the calendar had no decision.
+
+        own: names of strategies of the user's own, which have no margin calls.
+        """
+        terms, first = self._terms, self.folds[0].decisions.start
+        if terms.called == np.inf or not len(terms.decides):
+            return []
+        planned = np.convolve(terms.decides, np.ones(terms.fill))[first:] > 0
+        said = []
+        for name, entry in entries.items():
+            traded = ~np.isnan(entry.decisions[..., 0]) & (entry.simulation.wealth[:, :-1] > 0)
+            count = int((traded & ~planned[: traded.shape[1]]).sum())
+            if count and name not in own:
+                said.append(f"{name} ({count:,})")
+        return [f"Trades that margin calls forced: {first_of(said)}."] if said else []
 
     def wiped_out(self, entries: Mapping[str, Entry]) -> list[str]:
         """A note on each strategy that lost everything."""

@@ -425,6 +425,7 @@ class Backtest:
             *replay.mandated(),
             *notes,
             *replay.too_risky(entries),
+            *replay.called(entries, self._own),
             *replay.wiped_out(entries),
         ]
 
