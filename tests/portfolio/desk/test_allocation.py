@@ -53,6 +53,25 @@ def test_from_one_asset_to_the_other_by_hand():
     np.testing.assert_allclose(allocation.held, [0, 1, 0])
 
 
+class Keeping(Fixed):
+    """Wants what it holds."""
+
+    def weights(self, prices, holdings=None, **options):
+        assert min(holdings.values()) >= 0
+        return holdings
+
+
+def test_an_overdraft_is_repaid():
+    """Prices rose before trades were filled: 100 in A and 100 in B, and 4 of them borrowed."""
+    shares = np.array([5, 2.5])
+    allocation = Allocation.of(Keeping([1, 0, 0], 0.01), PRICES, shares, -4.0, debts=False)
+    assert allocation.cash_after == pytest.approx(0, abs=1e-9)
+    np.testing.assert_allclose(allocation.trades * [20, 40], [-2 / 0.99] * 2)
+    with pytest.raises(QfolioError, match="an overdraft of 11"):
+        Allocation.of(Keeping([1, 0, 0], 0.01), PRICES, shares, -20.0, debts=False)
+    assert Allocation.of(Fixed([-0.1, 0.5, 0.6], 0), PRICES, shares, -20.0).wealth == 180
+
+
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("whole", [False, True])
 def test_money_is_neither_made_nor_lost(seed, whole):

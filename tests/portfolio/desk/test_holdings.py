@@ -48,6 +48,11 @@ def test_shorts_and_loans_where_they_are_allowed(tmp_path: Path):
         read_holdings(write(tmp_path, "asset,shares\nAAA,-inf\n"), ASSETS, None, debts=True)
 
 
+def test_an_overdraft_is_read_although_shorts_are_not_allowed(tmp_path: Path):
+    _, cash = read_holdings(write(tmp_path, "asset,shares\nAAA,1\ncash,-7\n"), ASSETS, None)
+    assert cash == -7
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

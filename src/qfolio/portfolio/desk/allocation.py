@@ -24,6 +24,9 @@ MAX_AGE = datetime.timedelta(days=7)
 NOISE = 1e-6
 """Smaller changes of a weight are not ordered, since policies decide in float32."""
 
+OVERDRAFT = 0.05
+"""Largest negative cash of a long-only account, as a share of wealth; an order repays it."""
+
 
 @runtime_checkable
 class Followed(Protocol):
@@ -61,6 +64,7 @@ class Allocation:
         *,
         whole_shares: bool = False,
         spent: float = 0.0,
+        debts: bool = True,
     ) -> "Allocation":
         """The policy's target after the table's last row, and the trades from the current holding.
 
@@ -75,9 +79,11 @@ class Allocation:
             whole_shares: Whether to trade whole shares only, as near to the target as possible.
                 Where the mandate has lots, whole lots are traded in any case.
             spent: Turnover since the calendar year began, for a mandate that limits it.
+            debts: Whether the policy may be in debt. If not, it decides as if an overdraft, which
+                is left where prices rise before trades are filled, were repaid.
 
         Raises:
-            QfolioError: There is nothing to allocate.
+            QfolioError: There is nothing to allocate, or the overdraft is large.
         """
         last = prices.values[-1]
         known = np.where(np.isnan(last), 0.0, last)  # without a price there are no shares
@@ -87,9 +93,17 @@ class Allocation:
                 "There is nothing to allocate: give --capital, or --holdings with shares or cash."
             )
         held = np.append(cash, shares * known) / wealth
+        seen = held
+        if not debts and cash < 0:
+            if held[0] < -OVERDRAFT:
+                raise QfolioError(
+                    f"Cash is {cash:,.2f}, an overdraft of {-held[0]:.1%} of the wealth, and the "
+                    f"backtest is long-only; bring it below {OVERDRAFT:.0%}."
+                )
+            seen = np.append(0.0, held[1:] / held[1:].sum())
         names = ("cash", *prices.assets)
         before: dict[str, Any] = {"spent": spent} if spent else {}  # not every policy takes it
-        targets = policy.weights(prices, dict(zip(names, held.tolist(), strict=True)), **before)
+        targets = policy.weights(prices, dict(zip(names, seen.tolist(), strict=True)), **before)
         weights = _ordered(np.array([targets[name] for name in names]), held)
         trades = np.zeros(len(shares))
         context = context_of(policy.costs, prices, wealth)

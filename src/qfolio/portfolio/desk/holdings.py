@@ -29,7 +29,8 @@ def read_holdings(
             Without it, all is cash.
         assets: The assets that may be held.
         capital: Cash, if the table does not give it.
-        debts: Whether shares may be negative (sold short), and cash too (a loan).
+        debts: Whether shares may be negative (sold short). Cash always may: it is a loan, or an
+            overdraft.
 
     Raises:
         QfolioError: The file is not such a table, names an unknown asset or one asset twice, a
@@ -65,8 +66,8 @@ def read_holdings(
             raise QfolioError(f"{where}: there is no number of shares of {quote(name)}.")
         if wrong[i] or (name != CASH and CURRENCIES & set(str(cells[i]))):
             raise QfolioError(f"{where}: {not_a_number(cells[i], table.decimal)}.")
-        if not math.isfinite(amount) or (amount < 0 and not debts):
-            wanted = "a number" if debts else "0 or more: the backtest is long-only"
+        if not math.isfinite(amount) or (amount < 0 and name != CASH and not debts):
+            wanted = "a number" if debts or name == CASH else "0 or more: the backtest is long-only"
             raise QfolioError(f"{where}: {quote(name)} has {amount:g} shares; give {wanted}.")
         held[name] = amount
     cash = held.pop(CASH, capital or 0.0)
