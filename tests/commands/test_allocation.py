@@ -317,6 +317,23 @@ def test_nothing_to_trade_is_an_empty_file_of_orders(folder, monkeypatch, capsys
     assert not path.exists()  # a dry run writes nothing
 
 
+def test_a_day_without_a_decision_is_named(copy, monkeypatch, capsys, tmp_path):
+    """The first allocation is due at once; the second one comes before the first of October."""
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    path = copy / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"calendar": "monthly"}))
+    said = "The backtest decides monthly, and would not on 2020-09-26; its latest decision was due"
+    of = ["--agent", "equal-weight", "--capital", 1000]
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, *of) == 0
+    assert "decides monthly" not in capsys.readouterr().out
+    for rows, last in ((270, "2020-09-26"), (275, "2020-10-01")):
+        newer = write_table(tmp_path / f"{rows}.csv", rows=rows)
+        options = ["--prices", newer, "--as-of", last, *of]
+        assert qfolio(monkeypatch, "allocate", copy, *options) == 0
+        printed = " ".join(capsys.readouterr().out.split())
+        assert (f"{said} on 2020-09-01." in printed) == (rows == 270)
+
+
 @pytest.mark.slow
 def test_a_budget_of_the_year_is_that_of_the_ledger(tmp_path, monkeypatch, capsys):
     prices, mandate = write_table(tmp_path / "prices.csv"), tmp_path / "mandate.toml"

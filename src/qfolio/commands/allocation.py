@@ -146,7 +146,13 @@ def allocate(
         )
     spent = desk.spent(followed, table)
     allocation = Allocation.of(
-        followed, table, shares, cash, whole_shares=whole_shares, spent=spent
+        followed,
+        table,
+        shares,
+        cash,
+        whole_shares=whole_shares,
+        spent=spent,
+        debts=desk.debts,
     )
     rows = None if orders is None else order_rows(allocation, layout, currency)
     said, number = "A dry run: nothing is written.", None
@@ -169,7 +175,7 @@ def allocate(
     console.print_allocation(allocation, standing, trained)
     for reason in why:
         console.tell(f"Why {sentence(reason)}")
-    for line in (*gone, *notes, *desk.terms(followed, allocation, spent), said):
+    for line in (*gone, *notes, *desk.terms(followed, table, allocation, spent), said):
         console.tell(line)
     return {
         "agent": name,

@@ -38,7 +38,8 @@ def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bo
         return rows % int(calendar) == 0
     raise QfolioError(
         f"calendar is {calendar!r}; it must be {', '.join(PERIODS)}, a number of rows, or "
-        f"{DRIFT} and a band between 0 and 1, such as {DRIFT}0.05."
+        f"{DRIFT} and a band between 0 and 1, such as {DRIFT}0.05; leave it out to trade at every "
+        "row."
     )
 
 

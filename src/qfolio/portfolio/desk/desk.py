@@ -15,6 +15,7 @@ from qfolio.core.version import __version__
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.own import Own
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
@@ -131,10 +132,11 @@ class Desk:
         return self.ledger.spent(table.dates[-1], before) if limited else 0.0
 
     def terms(
-        self, followed: Policy | Untrained, allocation: Allocation, spent: float
+        self, followed: Policy | Untrained, table: Prices, allocation: Allocation, spent: float
     ) -> list[str]:
-        """Sentences on how the mandate requires an allocation to be traded."""
-        trading, said = followed.task.written.trading, []
+        """Sentences on when and how the backtest and its mandate would trade an allocation."""
+        trading = followed.task.written.trading
+        said = self._early(followed, table, allocation)
         if trading.fill > 1:
             said.append(
                 f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
@@ -146,6 +148,30 @@ class Desk:
                 f"used {spent:.1%} this year, and this one uses {allocation.turnover:.1%}."
             )
         return said
+
+    def _early(
+        self, followed: Policy | Untrained, table: Prices, allocation: Allocation
+    ) -> list[str]:
+        """Says so if the backtest's calendar has no decision at a table's last row.
+
+        The first allocation is due at any row, as in the backtest, and strategies of the user's own
+        have their own dates.
+        """
+        terms, calendar = followed.task.terms, self.run.config.calendar
+        days = table.dates
+        started = any(record.moment < days[-1] for record in self.ledger.current())
+        if not started or isinstance(followed, Ordered) or terms.calls(allocation.held):
+            return []
+        if calendar.isdecimal() and days[0] != self.run.prices.dates[0]:
+            return []  # rows are counted from the first one of the backtest
+        due = decision_rows(calendar, days)
+        if due[-1]:
+            return []
+        often = f"every {calendar} rows" if calendar.isdecimal() else calendar
+        return [
+            f"The backtest decides {often}, and would not on {day(days[-1])}; its latest decision "
+            f"was due on {day(days[due][-1])}."
+        ]
 
     def record(
         self, name: str, allocation: Allocation, prices: Prices, whole_shares: bool
@@ -216,7 +242,9 @@ class Desk:
             )
         spent = self.spent(followed, table, record.number)
         whole = record.whole_shares
-        again = Allocation.of(followed, table, shares, cash, whole_shares=whole, spent=spent)
+        again = Allocation.of(
+            followed, table, shares, cash, whole_shares=whole, spent=spent, debts=self.debts
+        )
         off = float(abs(again.weights - np.array(record.target)).max())
         if off > SAME:
             raise QfolioError(
