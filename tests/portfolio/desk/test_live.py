@@ -8,6 +8,7 @@ from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import Proportional
 from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.follow import Following
 from qfolio.portfolio.desk.ledger import Record
 from qfolio.portfolio.desk.live import mark
 from qfolio.portfolio.itemized import Itemized
@@ -133,6 +134,41 @@ def test_a_trade_that_waits_a_row_by_hand():
         [by_hand([[10.0], [20.0], [30.0]], 0.0, 100.0, 10.0)[1]], prices, Proportional(0.0), 1
     )
     assert poor.short == 1
+
+
+def test_an_account_is_wiped_out_once():
+    """10 shares bought for 100 with a loan of 50 fall to 4 each, and then rise again."""
+    prices, one = by_hand([[10.0], [10.0], [4.0], [8.0]], 10.0, -50.0, 0.0)
+    found = mark([one], prices, Proportional(0.0), lag=0)
+    np.testing.assert_allclose(found.returns, [0, -1, 0])
+    np.testing.assert_allclose(found.wealth, [50, -10, 30])
+    assert found.ruin == prices.dates[2]
+    flat = np.ones(3)
+    said = Following(
+        "x",
+        [one],
+        found,
+        0 * flat,
+        "y",
+        0 * flat,
+        "",
+        np.ones((3, 3)),
+        flat,
+        252,
+        None,
+        False,
+        "1y",
+    ).sentences()
+    assert "The account was wiped out on 2024-01-03: its debts exceeded what it owned." in said
+    assert not any("consistent" in each or "differed" in each for each in said)
+    assert mark([one], prices.between(None, 2), Proportional(0.0), lag=0).ruin is None
+
+
+def test_a_loan_that_is_wanted_is_no_overdraft():
+    prices, one = by_hand([[10.0], [20.0], [20.0]], 0.0, 100.0, 15.0)
+    owed = Record(**{f: getattr(one, f) for f in one.__struct_fields__} | {"target": [-0.5, 1.5]})
+    assert mark([one], prices, Proportional(0.0), 1).short == 1
+    assert mark([owed], prices, Proportional(0.0), 1).short == 0
 
 
 def test_orders_filled_over_several_rows_equal_the_replay_of_their_parts():

@@ -80,15 +80,19 @@ class Following:
             f"above {middle}.{place}",
         ]
         level = f"evidence against it {self.evidence[-1]:.2g}, alarm at {consistency.ALARM:.0f}"
-        if self.alarm is None:
+        if live.ruin is not None:
+            said.append(
+                f"The account was wiped out on {day(live.ruin)}: its debts exceeded what it owned."
+            )
+        elif self.alarm is None:
             said.append(f"Live returns are consistent with the backtest ({level}).")
-        else:
+        if self.alarm is not None:
             said.append(
                 f"ALARM since {day(self.alarm)}: live returns are worse than the backtest's "
                 f"({level})."
             )
         said += [self._retrain(), *([self.note] if self.note else [])]
-        flows = live.flows[abs(live.flows) > 1e-6 * live.wealth]
+        flows = live.flows[abs(live.flows) > 1e-6 * abs(live.wealth)]
         if flows.size:
             said.append(
                 f"Holdings differed from those expected {amount(flows.size, 'time')}, by "
@@ -234,7 +238,8 @@ def _tested(desk: Desk, name: str, first: Record) -> np.ndarray:
 def _measures(returns: np.ndarray, year: float) -> dict[str, float]:
     if len(returns) < 2:
         return {}
-    growth = float(np.log1p(returns).sum())
+    with np.errstate(divide="ignore"):  # all may be lost
+        growth = float(np.log1p(returns).sum())
     deviation = float(returns.std(ddof=1))
     return {
         "growth": float(np.expm1(growth)),

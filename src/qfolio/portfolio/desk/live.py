@@ -25,7 +25,13 @@ class Live:
     costs: np.ndarray  # money paid for the trades of the row before
     flows: np.ndarray  # holdings given to an allocation at the row before, less those expected
     first: int  # row of the table before the first return
-    short: int  # number of trades that left negative cash: prices rose before they were filled
+    short: int  # number of trades that left an overdraft: prices rose before they were filled
+
+    @property
+    def ruin(self) -> np.datetime64 | None:
+        """The date at which debts exceeded what was owned; None if they never did."""
+        lost = np.flatnonzero(self.returns <= -1)
+        return self.dates[lost[0]] if lost.size else None
 
 
 def mark(
@@ -69,7 +75,7 @@ def mark(
     base = total = paid = flow = 0.0
     due: dict[int, np.ndarray] = {}
     table: list[tuple[float, ...]] = []
-    short = 0
+    short, loan = 0, False
     for row in range(first, len(prices)):
         if row > first:
             before = np.append(cash, units * values[row - 1])
@@ -86,13 +92,16 @@ def mark(
                 due = {then: np.where(gone, 0.0, part) for then, part in due.items()}
             total = cash + float(units @ values[row])
             if row > first + lag:
-                table.append((total / base - 1, total, cash, paid, flow))
+                # As in the backtest, no more than all can be lost, and nothing is earned then.
+                earned = max(total / base - 1, -1.0) if base > 0 else 0.0
+                table.append((earned, total, cash, paid, flow))
         paid, flow, after = 0.0, 0.0, total
         if row in due:
             units, cash, paid = _filled(due.pop(row), units, cash, prices, row, model)
-            after, short = total - paid, short + (cash < -1e-9 * total)
+            after, short = total - paid, short + (not loan and cash < -1e-9 * total)
         if row in at:
             record = at[row]
+            loan = record.target[0] < -1e-6  # negative cash was wanted
             scale = np.divide(
                 np.array([price or 0.0 for price in record.prices]), values[row],
                 out=np.ones(len(units)), where=values[row] > 0,
@@ -105,7 +114,7 @@ def mark(
             due = {row + lag + later: part for later in range(fill)}
             if lag == 0:
                 units, cash, more = _filled(due.pop(row), units, cash, prices, row, model)
-                paid, short = paid + more, short + (cash < -1e-9 * total)
+                paid, short = paid + more, short + (not loan and cash < -1e-9 * total)
         base = total + flow
     returns, wealth, money, costs, flows = np.array(table).reshape(-1, 5).T
     dates = prices.dates[first + lag + 1 :]
