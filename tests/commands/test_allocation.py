@@ -334,6 +334,16 @@ def test_a_day_without_a_decision_is_named(copy, monkeypatch, capsys, tmp_path):
         assert (f"{said} on 2020-09-01." in printed) == (rows == 270)
 
 
+def test_a_holding_within_the_band_is_said_to_stay(copy, monkeypatch, capsys, tmp_path):
+    path, holdings = copy / "config.json", tmp_path / "holdings.csv"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"calendar": "drift:0.6"}))
+    holdings.write_text("asset,shares\nA,1\nB,1\nC,1\n")
+    options = [*AS_OF, "--agent", "equal-weight", "--holdings", holdings]
+    assert qfolio(monkeypatch, "allocate", copy, *options) == 0
+    said = "Nothing is ordered: no weight is more than 0.6 from what is wanted."
+    assert said in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.slow
 def test_a_budget_of_the_year_is_that_of_the_ledger(tmp_path, monkeypatch, capsys):
     prices, mandate = write_table(tmp_path / "prices.csv"), tmp_path / "mandate.toml"

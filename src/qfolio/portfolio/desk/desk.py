@@ -15,7 +15,7 @@ from qfolio.core.version import __version__
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.own import Own
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.calendars import decision_rows
+from qfolio.portfolio.calendars import band, decision_rows
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
@@ -136,7 +136,7 @@ class Desk:
     ) -> list[str]:
         """Sentences on when and how the backtest and its mandate would trade an allocation."""
         trading = followed.task.written.trading
-        said = self._early(followed, table, allocation)
+        said = self._timing(followed, table, allocation)
         if trading.fill > 1:
             said.append(
                 f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
@@ -149,16 +149,18 @@ class Desk:
             )
         return said
 
-    def _early(
+    def _timing(
         self, followed: Policy | Untrained, table: Prices, allocation: Allocation
     ) -> list[str]:
-        """Says so if the backtest's calendar has no decision at a table's last row.
+        """Says so if the backtest's calendar has no order at a table's last row.
 
         The first allocation is due at any row, as in the backtest, and strategies of the user's own
         have their own dates.
         """
         terms, calendar = followed.task.terms, self.run.config.calendar
-        days = table.dates
+        days, within = table.dates, band(calendar)
+        if within and not allocation.trades.any():
+            return [f"Nothing is ordered: no weight is more than {within:g} from what is wanted."]
         started = any(record.moment < days[-1] for record in self.ledger.current())
         if not started or isinstance(followed, Ordered) or terms.calls(allocation.held):
             return []
