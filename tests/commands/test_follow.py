@@ -118,3 +118,15 @@ def test_a_baseline_is_followed_without_training(folder, monkeypatch, capsys, tm
     assert qfolio(monkeypatch, "allocate", copy, *of) == 0
     assert qfolio(monkeypatch, "follow", copy, "--prices", prices) == 0
     assert "equal-weight learns nothing, so there is nothing to train." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["follow", "allocate"])
+def test_columns_come_from_files_of_their_own(folder, monkeypatch, capsys, tmp_path, command):
+    prices, rates = table(tmp_path / "later.csv", 335), tmp_path / "rates.csv"
+    rates.write_text("date,rate\n2019-12-01,0.02\n")
+    more = ["--as-of", "2020-11-30", "--capital", 1, "--dry-run"] if command == "allocate" else []
+    given = [command, folder, "--prices", prices, *more, "--columns"]
+    assert qfolio(monkeypatch, *given, f"rate={rates}") == 0
+    capsys.readouterr()
+    assert qfolio(monkeypatch, *given, "rate=none.csv") == 2
+    assert "'none.csv' cannot be read" in capsys.readouterr().err

@@ -39,6 +39,7 @@ def allocate(
     delisting_haircut: float = 0.0,
     members: File = None,
     features: Names = (),
+    columns: Names = (),
     returns: Returns = None,
     date: Name = None,
 ) -> Document:
@@ -82,6 +83,8 @@ def allocate(
         delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
         members: Table of the assets that may be bought at each date (default: all).
         features: Columns that hold features (default: those of the backtest).
+        columns: Columns of the whole market; NAME=FILE reads one from a file (default: those of
+            the backtest, in --prices).
         returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
             shares and orders need prices (default: they are prices).
         date: Column of dates (default: found by its name).
@@ -113,7 +116,13 @@ def allocate(
         )
     universe = {"ended": ended, "delisting_haircut": delisting_haircut, "members": members}
     desk = Desk.open(
-        folder, missing=missing, features=features, returns=returns, date=date, **universe
+        folder,
+        missing=missing,
+        features=features,
+        columns=columns,
+        returns=returns,
+        date=date,
+        **universe,
     )
     if reproduce is not None:
         if agent is not None or update or orders is not None:
@@ -201,6 +210,7 @@ def follow(
     delisting_haircut: float = 0.0,
     members: File = None,
     features: Names = (),
+    columns: Names = (),
     date: Name = None,
 ) -> Document:
     """Show what the allocations of a ledger have earned, compared with the backtest.
@@ -226,6 +236,8 @@ def follow(
         delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
         members: Table of the assets that may be bought at each date (default: all).
         features: Columns that hold features (default: those of the backtest).
+        columns: Columns of the whole market; NAME=FILE reads one from a file (default: those of
+            the backtest, in --prices).
         date: Column of dates (default: found by its name).
     """
     import numpy as np
@@ -242,7 +254,9 @@ def follow(
     from qfolio.report.follow import LiveRows, render_following
 
     universe = {"ended": ended, "delisting_haircut": delisting_haircut, "members": members}
-    desk = Desk.open(folder, missing=missing, features=features, date=date, **universe)
+    desk = Desk.open(
+        folder, missing=missing, features=features, columns=columns, date=date, **universe
+    )
     following = marked(desk, prices, benchmark)
     path = folder / "follow.csv" if out is None else out
     following.write(path)

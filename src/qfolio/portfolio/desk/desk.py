@@ -44,7 +44,7 @@ class Desk:
         """The desk of a finished backtest; options are those of ``prices.load``."""
         run = Backtest.open(folder)
         known = {**options, "features": options.get("features") or tuple(run.config.feature_names)}
-        known.setdefault("columns", tuple(run.config.prices.get("columns", ())))
+        known["columns"] = options.get("columns") or tuple(run.config.prices.get("columns", ()))
         ends = "gap" if run.prices.tradable is None else "cash-out"
         known["ended"] = options.get("ended") or ends
         # Policies and baselines look at the last rows only; assets may start at any row before.
