@@ -143,25 +143,28 @@ def test_an_account_is_wiped_out_once():
     np.testing.assert_allclose(found.returns, [0, -1, 0])
     np.testing.assert_allclose(found.wealth, [50, -10, 30])
     assert found.ruin == prices.dates[2]
-    flat = np.ones(3)
-    said = Following(
-        "x",
-        [one],
-        found,
-        0 * flat,
-        "y",
-        0 * flat,
-        "",
-        np.ones((3, 3)),
-        flat,
-        252,
-        None,
-        False,
-        "1y",
-    ).sentences()
+    none = np.zeros(3)
+    followed = Following(
+        "x", [one], found, none, none, none, "y", none, "", np.ones((3, 3)), none + 1, 252, None,
+        False, "1y",
+    )  # fmt: skip
+    said = followed.sentences()
     assert "The account was wiped out on 2024-01-03: its debts exceeded what it owned." in said
     assert not any("consistent" in each or "differed" in each for each in said)
     assert mark([one], prices.between(None, 2), Proportional(0.0), lag=0).ruin is None
+
+
+def test_sharpe_ratios_are_of_returns_over_cash():
+    prices, one = by_hand([[10.0], [10.0], [12.0], [11.0], [13.0]], 10.0, 0.0, 0.0)
+    found, cash = mark([one], prices, Proportional(0.0), lag=0), np.array([0.01, 0, 0.02, 0.01])
+    none = np.zeros(4)
+    followed = Following(
+        "x", [one], found, none, cash, none, "y", none, "", np.ones((3, 4)), none + 1, 252, None,
+        False, "1y",
+    )  # fmt: skip
+    excess = found.returns - cash
+    sharpe = excess.mean() / excess.std(ddof=1) * 252**0.5
+    assert followed.rows()["live"]["sharpe"] == pytest.approx(sharpe)
 
 
 def test_a_loan_that_is_wanted_is_no_overdraft():

@@ -13,12 +13,15 @@ from qfolio.core.text import amount, figure
 from qfolio.portfolio.backtest.folder import BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
 from qfolio.portfolio.backtest.measures import drawdown
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.desk import consistency
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.ledger import Record
 from qfolio.portfolio.desk.live import Live, mark
 from qfolio.portfolio.desk.reference import reference
 from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.table import Prices
 
 SEED = 0
 """Seed of the bootstrap: the same ledger gives the same evidence whenever one looks."""
@@ -29,6 +32,7 @@ class Following:
     """A ledger marked to market; arrays have an entry for each live row.
 
     agent: that of the last allocation. tested: its net returns in the backtest, shape (T,).
+    cash, tested_cash: what cash earned, live and in the backtest, of the same shapes.
     benchmark: name of the backtest's benchmark. reference: its live net returns. note: a remark on
     these, or "". band: growth of wealth that the backtest leads one to expect, shape (3, rows).
     evidence: evidence against the backtest. learned: date of the last row that the policy learned
@@ -40,6 +44,8 @@ class Following:
     records: list[Record]
     live: Live
     tested: np.ndarray
+    cash: np.ndarray
+    tested_cash: np.ndarray
     benchmark: str
     reference: np.ndarray
     note: str
@@ -120,10 +126,11 @@ class Following:
 
     def rows(self) -> dict[str, dict[str, float]]:
         """Growth in all and per year, volatility, Sharpe ratio and maximum drawdown, by name."""
+        year = self.periods_per_year
         return {
-            "live": _measures(self.live.returns, self.periods_per_year),
-            f"{self.benchmark}, live": _measures(self.reference, self.periods_per_year),
-            f"{self.agent}, backtest": _measures(self.tested, self.periods_per_year),
+            "live": _measures(self.live.returns, self.cash, year),
+            f"{self.benchmark}, live": _measures(self.reference, self.cash, year),
+            f"{self.agent}, backtest": _measures(self.tested, self.tested_cash, year),
         }
 
     def write(self, path: Path) -> None:
@@ -203,6 +210,8 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
         records,
         live,
         tested,
+        _earned_by_cash(table, known.costs, live.first, count),
+        run.replay.growth[: len(tested), 0] - 1,
         other,
         theirs,
         note,
@@ -235,16 +244,24 @@ def _tested(desk: Desk, name: str, first: Record) -> np.ndarray:
     return columns[column][:count]
 
 
-def _measures(returns: np.ndarray, year: float) -> dict[str, float]:
+def _earned_by_cash(table: Prices, costs: CostModel, first: int, count: int) -> np.ndarray:
+    """What cash earned over some rows of a table; the first return begins at row ``first``."""
+    rows, known = np.arange(first, first + count), Conditions.of(table, costs.columns)
+    still = np.ones((count, len(table.assets)))
+    return np.asarray(costs.carry(still, known.holding(rows, rows + 1))[:, 0] - 1)
+
+
+def _measures(returns: np.ndarray, cash: np.ndarray, year: float) -> dict[str, float]:
     if len(returns) < 2:
         return {}
+    excess = returns - cash
+    spread = float(excess.std(ddof=1))
     with np.errstate(divide="ignore"):  # all may be lost
         growth = float(np.log1p(returns).sum())
-    deviation = float(returns.std(ddof=1))
     return {
         "growth": float(np.expm1(growth)),
         "a year": float(np.expm1(growth * year / len(returns))),
-        "volatility": deviation * year**0.5,
-        "sharpe": float(returns.mean()) / deviation * year**0.5 if deviation else 0.0,
+        "volatility": float(returns.std(ddof=1)) * year**0.5,
+        "sharpe": float(excess.mean()) / spread * year**0.5 if spread else 0.0,
         "drawdown": float(drawdown(returns).max()),
     }
