@@ -445,6 +445,35 @@ def test_an_order_over_several_rows_buys_nothing_that_has_left(seed: int) -> Non
         holding /= holding.sum()
 
 
+def test_baselines_keep_to_the_calendar_in_every_fold() -> None:
+    """Also those that decide once a fold, whose second one begins between two decisions."""
+    prices, _ = moving(0, 60, 5)
+    folds = [Fold("one", slice(0, 20), slice(20, 37), slice(0, 20)),
+             Fold("two", slice(0, 37), slice(37, 58), slice(0, 37))]  # fmt: skip
+    task = Portfolio.of(prices, window=5, horizon=5, calendar="10").deciding_at(20)
+    entry, _ = Replay(prices, folds, task, 1.0).baseline(
+        "baseline", "equal-weight", baseline("equal-weight")
+    )
+    assert np.flatnonzero(~np.isnan(entry.decisions[0, :, 0])).tolist() == [0, 10, 20, 30]
+
+
+def test_what_a_delisting_paid_counts_as_cash_for_baselines() -> None:
+    """Its sale takes nothing of the turnover that a mandate allows."""
+    frame = frame_of(40, 3)
+    frame.iloc[25:, 0] = np.nan
+    prices = load(frame, ended="cash-out")
+    mandate = {"trading": {"turnover": 0.1}}
+    task = Portfolio.of(prices, window=5, horizon=5, mandate=mandate)
+    folds = [Fold("one", slice(0, 10), slice(10, 38), slice(0, 10))]
+    entry, _ = Replay(prices, folds, task, 1.0).baseline(
+        "baseline", "equal-weight", baseline("equal-weight")
+    )
+    decisions = entry.decisions[0]
+    assert decisions[14, 1] > 0.3  # the last row with a price of A
+    assert decisions[15, 0] == pytest.approx(decisions[14, 1] - 0.1, abs=0.02)
+    assert decisions[16, 0] == pytest.approx(decisions[15, 0] - 0.1, abs=0.02)
+
+
 @pytest.mark.parametrize("menu", ["grid:4", "tilts:0.2", "overweight:0.2"])
 def test_menus_order_what_is_there(menu: str) -> None:
     prices, _ = moving(2, 60, 5)

@@ -121,7 +121,7 @@ def orders(
                     wanted = baseline.decide(history, held) if open_to.any() else nothing
                 elif not stands:
                     wanted = None
-                due = trading[row - rows[0]] or called or not (again or watched)
+                due = trading[row - rows[0]] or called or not (again or watched or each)
                 order, given = held, False
                 if called or (wanted is not None and due):
                     mandated = None if feasible is None else feasible(number, row)

@@ -276,6 +276,7 @@ class Replay:
             table.dates,
             table.values,
             universe=table.tradable,
+            listed=table.listed,
             cap=min(self.cap, largest_weight(text)) if text else self.cap,
             feasible=self._feasible if text else None,
             month=table.month,
