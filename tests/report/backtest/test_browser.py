@@ -97,6 +97,48 @@ def test_choosing_a_strategy(browser: Browser, folder: Path) -> None:
     assert browser.complaints == []
 
 
+OVERLAPS = """
+(() => {
+  const meet = (a, b) => a.left < b.right && b.left < a.right
+    && a.top < b.bottom && b.top < a.bottom;
+  const box = (text) => text.getBoundingClientRect();
+  return [...document.querySelectorAll('.chart')].flatMap((chart) => {
+    const titles = [...chart.querySelectorAll('.annotation-text')];
+    const numbers = [...chart.querySelectorAll('.ytick text, .y2tick text')];
+    return titles.flatMap((title) => numbers.filter((each) => meet(box(title), box(each)))
+      .map((each) => [title.textContent, each.textContent]));
+  });
+})()
+"""
+
+
+@pytest.mark.parametrize("paper", [False, True])
+def test_titles_and_numbers_of_charts_keep_apart(
+    browser: Browser, tmp_path: Path, paper: bool
+) -> None:
+    (tmp_path / "report.html").write_text(render_backtest(usual(400)), encoding="utf-8")
+    browser.show((tmp_path / "report.html").as_uri(), 1280, DRAWN)
+    browser.evaluate("document.getElementById('sheet').open = true")
+    browser.wait("document.querySelectorAll('#rolling .main-svg').length > 0")
+    if paper:
+        browser.evaluate("dispatchEvent(new Event('beforeprint'))")
+        browser.wait("document.getElementById('costs').layout.width === 660")
+    assert browser.evaluate("document.querySelectorAll('.chart .annotation-text').length") == 8
+    assert browser.evaluate(OVERLAPS) == []
+    turned = "[...document.querySelectorAll('.xtick text')].map(t => t.getAttribute('transform'))"
+    assert not any("rotate" in (each or "") for each in browser.evaluate(turned))
+
+
+def test_tables_stay_whole_on_paper(browser: Browser, folder: Path) -> None:
+    browser.show((folder / "report.html").as_uri(), 1280, DRAWN)
+    browser.call("Emulation.setEmulatedMedia", media="print")
+    style = "getComputedStyle(document.querySelector('%s')).%s"
+    parts = (".wide-table", "breakInside"), (".wide-table ~ .printed", "breakBefore")
+    found = [browser.evaluate(style % part) for part in parts]
+    browser.call("Emulation.setEmulatedMedia", media="")
+    assert found == ["avoid", "avoid"]
+
+
 def test_names_stand_where_lines_end(browser: Browser, folder: Path) -> None:
     browser.complaints.clear()
     browser.show((folder / "report.html").as_uri(), 1280, DRAWN)

@@ -180,7 +180,7 @@ def test_tiles_stand_beside_the_reference(plain: BacktestData) -> None:
     assert shown["Sharpe ratio"]["value"] == number(own["sharpe"].mean, 2)
     assert shown["Sharpe ratio"]["other"] == f"never: {number(other['sharpe'].mean, 2)}"
     assert shown["Deepest drawdown"]["value"] == percent(own["drawdown"].mean)
-    assert shown["Turnover a year"]["value"] == f"{number(own['turnover'].mean)} ×"
+    assert shown["Turnover a year"]["value"] == f"{number(own['turnover'].mean)}\N{NO-BREAK SPACE}×"
     assert [tile["side"] for tile in shown.values()] == ["better", "none", "", "", ""]
 
 

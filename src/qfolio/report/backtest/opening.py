@@ -148,7 +148,7 @@ def tiles(data: BacktestData) -> list[dict[str, str]]:
 
     def written(key: str, value: float) -> str:
         if key == "turnover" and not math.isnan(value):
-            return f"{number(value)} ×"
+            return f"{number(value)}\N{NO-BREAK SPACE}×"
         if key == "cost_drag":
             return percent(value, 2)
         return number(value, 2) if key == "sharpe" else percent(value)

@@ -42,7 +42,8 @@
     return Plotly.react(byId("weights"), traces, layout(inner + TOP + BOTTOM, {
       margin: margin(),
       titles: [[alone ? "Weight" : "Active weight", 1], ["Effective number of assets", below]],
-      xaxis: { anchor: "y2" },
+      // On paper, more dates would be turned to fit, and cut off.
+      xaxis: { anchor: "y2", ...(state.printing && { nticks: 5 }) },
       yaxis: { domain: [1 - share, 1], range: [order.length - 0.5, -0.5], visible: false,
         showgrid: false },
       yaxis2: { domain: [0, below], rangemode: "tozero", nticks: 4 },

@@ -11,6 +11,8 @@ const tools = (() => {
 
   const MARGIN = 44; // left of an axis, for its numbers
   const PRINTED = 380; // the most height of a chart on paper
+  const TOP = 26, BOTTOM = 40; // above and below the plots of a chart
+  const GAP = 36; // between two plots: half a number, a title, and half a number
   const MINUS = "\u2212";
   const SANS = getComputedStyle(document.documentElement).getPropertyValue("--sans").trim();
   const byId = (id) => document.getElementById(id);
@@ -31,13 +33,16 @@ const tools = (() => {
 
   // Axes ------------------------------------------------------------------------------------
 
-  function layout(height, more) {
+  function layout(wanted, more) {
     const text = color("muted");
+    const height = state.printing ? Math.min(wanted, PRINTED) : wanted;
+    const upper = more.yaxis2 && [Math.max(more.yaxis.domain[0],
+      more.yaxis2.domain[1] + GAP / (height - TOP - BOTTOM)), 1];
     return {
-      height: state.printing ? Math.min(height, PRINTED) : height, width: state.printing ? 660 : undefined,
+      height, width: state.printing ? 660 : undefined,
       paper_bgcolor: color("paper"), plot_bgcolor: color("paper"),
       font: { family: SANS, size: 12, color: text },
-      margin: { l: MARGIN, r: 10, t: 26, b: 40, ...more.margin },
+      margin: { l: MARGIN, r: 10, t: TOP, b: BOTTOM, ...more.margin },
       showlegend: false, hovermode: "x", hoverdistance: -1, spikedistance: -1,
       dragmode: coarse.matches ? false : "zoom", uirevision: "kept",
       xaxis: {
@@ -48,6 +53,7 @@ const tools = (() => {
       },
       ...Object.fromEntries(["yaxis", "yaxis2"].filter((name) => more[name]).map((name) => [name, {
         gridcolor: color("hairline"), zeroline: false, fixedrange: true, ...more[name],
+        ...(upper && name === "yaxis" ? { domain: upper } : {}),
       }])),
       shapes: (more.shapes || []).map((shape) => ({
         type: "line", xref: "paper", x0: 0, x1: 1, layer: "below",
@@ -55,7 +61,7 @@ const tools = (() => {
       })),
       annotations: (more.titles || []).map(([title, y]) => ({
         text: title, x: 0, y, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom",
-        yshift: 5, xshift: -(more.margin?.l ?? MARGIN), showarrow: false, font: { size: 12.5, color: color("ink") },
+        yshift: 9, xshift: -(more.margin?.l ?? MARGIN), showarrow: false, font: { size: 12.5, color: color("ink") },
       })),
     };
   }
