@@ -224,6 +224,15 @@ def test_a_damaged_ledger_is_refused(copy, monkeypatch, capsys, content, message
     assert message in capsys.readouterr().err
 
 
+def test_holdings_that_were_changed_in_the_ledger_are_noticed(copy, monkeypatch, capsys):
+    """By all commands that read it, not by --reproduce alone."""
+    allocation(copy, monkeypatch, capsys, "--capital", 1000)
+    path = max((copy / "ledger").glob("*.json"))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"cash": 2000.0}))
+    assert qfolio(monkeypatch, "follow", copy) == 2
+    assert "is damaged (its holdings do not have their digest)" in capsys.readouterr().err
+
+
 def test_what_the_ledger_does_not_know_is_refused(copy, monkeypatch, capsys):
     shutil.rmtree(copy / "ledger", ignore_errors=True)
     assert qfolio(monkeypatch, "allocate", copy, "--reproduce", "2020-09-16") == 2

@@ -203,6 +203,10 @@ class Ledger:
                 record.digests
             ):
                 raise ValueError("its number or digests are wrong")
+            if record.digests["holdings"] != holdings_digest(
+                record.assets, np.array(record.shares), record.cash
+            ):
+                raise ValueError("its holdings do not have their digest")
         except (msgspec.ValidationError, ValueError) as error:
             raise QfolioError(f"{path} is damaged ({error}); restore it.") from None
         return record
