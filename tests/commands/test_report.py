@@ -49,7 +49,7 @@ def test_without_a_browser_nothing_is_written(backtest, monkeypatch, capsys):
     monkeypatch.setenv("QFOLIO_CHROMIUM", "no-such-program")
     (backtest / "report.html").unlink(missing_ok=True)
     assert qfolio(monkeypatch, "report", backtest, "--pdf") == 2
-    assert "needs Chromium or Chrome" in capsys.readouterr().err
+    assert "QFOLIO_CHROMIUM is 'no-such-program', which is not a program" in capsys.readouterr().err
     assert not (backtest / "report.html").exists()
 
 

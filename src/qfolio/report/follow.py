@@ -85,7 +85,8 @@ def draw_following(rows: LiveRows, width: float) -> Figure:
     below.set_yticks([1, rows.alarm], ["1", f"{rows.alarm:g}"])
     below.minorticks_off()
     below.set_title(f"Evidence against the backtest; alarm at {rows.alarm:g}")
-    ticks = AutoDateLocator(minticks=2, maxticks=4 if few else 8)
+    # With fewer, no step fits between 18 and 24 months, and matplotlib warns.
+    ticks = AutoDateLocator(minticks=2, maxticks=5 if few else 8)
     below.xaxis.set_major_locator(ticks)
     below.xaxis.set_major_formatter(ConciseDateFormatter(ticks, show_offset=False))
     marks = {"live": live, rows.benchmark_name: other, "backtest, median": median, "95%": shade}

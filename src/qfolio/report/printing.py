@@ -8,6 +8,7 @@ from pathlib import Path
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import write_bytes
+from qfolio.core.text import quote
 
 PROGRAMS = (
     *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),
@@ -36,6 +37,8 @@ def print_pdf(page: Path, target: Path) -> None:
     """
     browser = find_browser()
     if browser is None:
+        if chosen := os.environ.get("QFOLIO_CHROMIUM"):
+            raise QfolioError(f"QFOLIO_CHROMIUM is {quote(chosen)}, which is not a program.")
         raise QfolioError(
             "Printing a PDF needs Chromium or Chrome, and neither was found; install one, or set "
             "QFOLIO_CHROMIUM to its program."
