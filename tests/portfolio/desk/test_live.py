@@ -167,6 +167,24 @@ def test_sharpe_ratios_are_of_returns_over_cash():
     assert followed.rows()["live"]["sharpe"] == pytest.approx(sharpe)
 
 
+def test_a_margin_call_is_said_while_it_lasts():
+    """10 shares bought for 100 with a loan of 50: at 8 each, 80 are held with a wealth of 30."""
+    prices, one = by_hand([[10.0], [10.0], [8.0], [12.0]], 10.0, -50.0, 0.0)
+    for rows, called in ((3, True), (4, False)):
+        found = mark([one], prices.between(None, rows), Proportional(0.0), lag=0)
+        none = np.zeros(rows - 1)
+        followed = Following(
+            "x", [one], found, none, none, none, "y", none, "", np.ones((3, rows - 1)), none + 1,
+            252, None, False, "1y", 2.5,
+        )  # fmt: skip
+        said = [each for each in followed.sentences() if each.startswith("MARGIN CALL")]
+        assert bool(said) == called
+        if said:
+            assert (
+                "2024-01-03: gross exposure is 2.67 times the wealth, and the mandate's" in said[0]
+            )
+
+
 def test_a_loan_that_is_wanted_is_no_overdraft():
     prices, one = by_hand([[10.0], [20.0], [20.0]], 0.0, 100.0, 15.0)
     owed = Record(**{f: getattr(one, f) for f in one.__struct_fields__} | {"target": [-0.5, 1.5]})

@@ -55,6 +55,7 @@ class Following:
     learned: np.datetime64 | None
     overdue: bool
     test: str
+    called: float = np.inf
 
     @cached_property
     def growth(self) -> np.ndarray:
@@ -96,6 +97,12 @@ class Following:
             said.append(
                 f"ALARM since {day(self.alarm)}: live returns are worse than the backtest's "
                 f"({level})."
+            )
+        gross = live.gross[-1]
+        if gross > self.called and live.ruin is None:
+            said.append(
+                f"MARGIN CALL on {day(live.dates[-1])}: gross exposure is {gross:.3g} times the "
+                f"wealth, and the mandate's margin allows {self.called:.3g}; allocate again."
             )
         said += [self._retrain(), *([self.note] if self.note else [])]
         flows = live.flows[abs(live.flows) > 1e-6 * abs(live.wealth)]
@@ -221,6 +228,7 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
         learned,
         learned is not None and overdue(learned, run.config.test, table.dates),
         run.config.test,
+        known.task.terms.called,
     )
 
 

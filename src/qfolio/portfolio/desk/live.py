@@ -24,6 +24,7 @@ class Live:
     cash: np.ndarray  # part of wealth
     costs: np.ndarray  # money paid for the trades of the row before
     flows: np.ndarray  # holdings given to an allocation at the row before, less those expected
+    gross: np.ndarray  # absolute values of assets, as a multiple of wealth; infinite without any
     first: int  # row of the table before the first return
     short: int  # number of trades that left an overdraft: prices rose before they were filled
 
@@ -94,7 +95,9 @@ def mark(
             if row > first + lag:
                 # As in the backtest, no more than all can be lost, and nothing is earned then.
                 earned = max(total / base - 1, -1.0) if base > 0 else 0.0
-                table.append((earned, total, cash, paid, flow))
+                held = float(abs(units * values[row]).sum())
+                gross = held / total if total > 0 else np.inf
+                table.append((earned, total, cash, paid, flow, gross))
         paid, flow, after = 0.0, 0.0, total
         if row in due:
             units, cash, paid = _filled(due.pop(row), units, cash, prices, row, model)
@@ -116,9 +119,9 @@ def mark(
                 units, cash, more = _filled(due.pop(row), units, cash, prices, row, model)
                 paid, short = paid + more, short + (not loan and cash < -1e-9 * total)
         base = total + flow
-    returns, wealth, money, costs, flows = np.array(table).reshape(-1, 5).T
+    returns, wealth, money, costs, flows, gross = np.array(table).reshape(-1, 6).T
     dates = prices.dates[first + lag + 1 :]
-    return Live(dates, returns, wealth, money, costs, flows, first + lag, int(short))
+    return Live(dates, returns, wealth, money, costs, flows, gross, first + lag, int(short))
 
 
 def _filled(
