@@ -38,6 +38,18 @@ def test_a_seed_alone_equals_the_seed_among_others(task, agent):
         same(alone.fetch(), jax.tree.map(lambda x, s=seed: x[s : s + 1], together.fetch()))
 
 
+def test_members_of_another_number_share_programs(task, agent):
+    """A smaller population that comes first leaves no member of a larger one out."""
+    small, large = (Population(task, agent, range(count), room=5) for count in (1, 5))
+    for population in (small, large):
+        while population.steps < 120:
+            population.advance(120 - population.steps)
+    assert small._programs is large._programs
+    same(large.fetch(), trained(task, agent, range(5), [120])[0].fetch())
+    first = jax.tree.map(lambda leaf: leaf[:1], large.fetch())
+    same(small.fetch(), first)
+
+
 def test_different_seeds_differ(task, agent):
     population, _ = trained(task, agent, range(3), [60])
     weights = agent.weights(population.fetch().agent).mlp.weights[0]

@@ -10,7 +10,6 @@ to the last bit.
 import datetime
 import os
 from collections.abc import Callable
-from functools import partial
 from importlib.metadata import version
 from platform import python_version
 from typing import Any
@@ -99,6 +98,7 @@ class Members:
     room: number of members to provide slots for, if more than ``count``.
     one_by_one: whether a device runs its members in turn instead of in lockstep.
     form: everything that compiled programs depend on.
+    taken: number of taken slots of each device, the first argument of compiled programs.
 
     Outside, leaves have a leading axis of length ``count``; on the devices, an axis of slots.
     ``place`` and ``fetch`` convert between the two.
@@ -119,7 +119,7 @@ class Members:
             jax.sharding.Mesh(np.array(devices), ("member",)), PartitionSpec("member")
         )
         taken = np.array([len(share) for share in shares], np.int32)
-        self._taken = jax.device_put(taken, self._sharding)
+        self.taken = jax.device_put(taken, self._sharding)
 
     def place(self, tree: Any) -> Any:
         """Moves leaves with a leading member axis to the devices."""
@@ -133,7 +133,9 @@ class Members:
     def compile(
         self, function: Callable[..., Any], *example: Any, split: int = 1, donate: bool = False
     ) -> Any:
-        """Compiles ``function(*members, *shared)`` for all members.
+        """Compiles ``function(*members, *shared)`` into a program of ``taken`` and these arguments.
+
+        It serves all populations of the same form, whatever their number of members.
 
         example: arguments of the shapes to compile for; the first ``split`` of them have an axis of
         slots, the others are the same for all members. donate: reuses the first one's memory.
@@ -155,7 +157,7 @@ class Members:
             )(taken, *args)
 
         program = jax.jit(on_all, donate_argnums=1 if donate else ())
-        return partial(program.lower(self._taken, *example).compile(), self._taken)
+        return program.lower(self.taken, *example).compile()
 
 
 def _map(function: Callable[[Any], Any], members: Any, count: Array) -> Any:

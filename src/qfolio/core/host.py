@@ -312,6 +312,9 @@ class HostPopulation(Population):
     def _compile(self, one: Callable[..., Any], *args: Any, donate: bool) -> Any:
         return jax.jit(one, donate_argnums=0 if donate else ()).lower(*args).compile()
 
+    def _call(self, program: Any, *args: Any) -> Any:
+        return program(*args)
+
 
 def population_of(
     task: Task, agents: Agent | Sequence[Agent], seeds: Sequence[int], room: int = 0

@@ -226,11 +226,15 @@ class Population:
             start = perf_counter()
             self._programs[name] = self._compile(one, *args, donate=donate)
             self.seconds_compile += perf_counter() - start
-        return self._programs[name](*args)
+        return self._call(self._programs[name], *args)
 
     def _compile(self, one: Callable[..., Any], *args: Any, donate: bool) -> Any:
         """Compiles for arguments shaped like these; ``donate`` reuses the first one's memory."""
         return self._members.compile(one, *args, split=2, donate=donate)
+
+    def _call(self, program: Any, *args: Any) -> Any:
+        """Calls what ``_compile`` returned, maybe for a population with another number of members."""
+        return program(self._members.taken, *args)
 
 
 @lru_cache(maxsize=8)
