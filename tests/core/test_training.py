@@ -6,7 +6,7 @@ import pytest
 
 from qfolio.agents.dqn import DQN
 from qfolio.core.errors import QfolioError
-from qfolio.core.population import Population
+from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin
 
 from probes import Endless, Explosive, RewardDelay
@@ -48,6 +48,19 @@ def test_members_of_another_number_share_programs(task, agent):
     same(large.fetch(), trained(task, agent, range(5), [120])[0].fetch())
     first = jax.tree.map(lambda leaf: leaf[:1], large.fetch())
     same(small.fetch(), first)
+
+
+def test_a_rehearsal_compiles_what_a_population_runs(task, agent):
+    """And nothing else: no state is made, and training is the same to the bit."""
+    expected, _ = trained(task, agent, range(3), [120])
+    programs_of.cache_clear()
+    rehearsal = Rehearsal(task, agent, range(3))
+    assert rehearsal._programs.keys() == {"begin", "collect", "learn"}
+    assert not any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(rehearsal.state))
+    population, _ = trained(task, agent, range(3), [120])
+    assert population._programs is rehearsal._programs
+    assert population.seconds_compile == 0
+    same(population.fetch(), expected.fetch())
 
 
 def test_different_seeds_differ(task, agent):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache, partial
+from threading import Lock
 from time import perf_counter
 from typing import Any
 
@@ -120,7 +121,13 @@ class Population:
         loss is not finite; ``state`` is of no use then. Without it, the other members continue, and
         ``healthy`` shows which failed.
         """
-        steps, learning = self._plan(steps, chunk_steps(self.task, self.agent))
+        self.state, episodes = self._advance(*self._plan(steps, chunk_steps(self.task, self.agent)))
+        if strict:
+            self._require_healthy()
+        return self._members.fetch(episodes)
+
+    def _advance(self, steps: int, learning: bool) -> tuple[TrainingState, Episodes]:
+        """The state after some steps and their records, both on the devices."""
 
         def program(
             task: Task, agent: Agent, state: TrainingState, steps: Array
@@ -128,10 +135,7 @@ class Population:
             return advance(task, agent, state, steps, learning=learning)
 
         name = "learn" if learning else "collect"
-        self.state, episodes = self._run(name, program, self.state, np.int32(steps), donate=True)
-        if strict:
-            self._require_healthy()
-        return self._members.fetch(episodes)
+        return self._run(name, program, self.state, np.int32(steps), donate=True)
 
     @property
     def learning(self) -> bool:
@@ -224,7 +228,9 @@ class Population:
         args = (member, own, self._shared, *args)
         if name not in self._programs:
             start = perf_counter()
-            self._programs[name] = self._compile(one, *args, donate=donate)
+            with self._programs.compiling:
+                if name not in self._programs:
+                    self._programs[name] = self._compile(one, *args, donate=donate)
             self.seconds_compile += perf_counter() - start
         return self._call(self._programs[name], *args)
 
@@ -233,14 +239,35 @@ class Population:
         return self._members.compile(one, *args, split=2, donate=donate)
 
     def _call(self, program: Any, *args: Any) -> Any:
-        """Calls what ``_compile`` returned, maybe for a population with another number of members."""
+        """Calls what ``_compile`` returned, for this or another population of the same form."""
         return program(self._members.taken, *args)
 
 
-@lru_cache(maxsize=8)
-def programs_of(form: Hashable) -> dict[str, Any]:
-    """Compiled programs by name, shared by all populations of one form."""
-    return {}
+class Rehearsal(Population):
+    """Compiles the programs of such a population; its states are only shapes, without memory."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        for learning in (False, True) if self.agent.warm_up() else (True,):
+            self._advance(0, learning)
+
+    def _call(self, program: Any, *args: Any) -> Any:
+        shape = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding)  # noqa: E731
+        return jax.tree.map(shape, program.out_info)
+
+
+class Programs(dict[str, Any]):
+    """Compiled programs by name; the thread that compiles one holds ``compiling``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.compiling = Lock()
+
+
+@lru_cache(maxsize=32)
+def programs_of(form: Hashable) -> Programs:
+    """The programs that all populations of one form share."""
+    return Programs()
 
 
 def _split(

@@ -19,6 +19,7 @@ from qfolio.portfolio.backtest.replay import Stretch, decide
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.backtest.training import FoldsJob
 from qfolio.portfolio.following import begin, follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices
 
@@ -211,6 +212,21 @@ def test_what_was_trained_stays(finished, tmp_path):
     one, other = ((members(b), b.policy("pathwise").learner) for b in (resumed, finished))
     for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
         np.testing.assert_array_equal(x, y)
+
+
+def test_further_agents_are_prepared_while_the_first_trains(monkeypatch):
+    """One that fails then says so when its turn comes, as the first one does."""
+    prepared = []
+
+    def prepare(job):
+        prepared.append(job.name)
+        raise MemoryError
+
+    monkeypatch.setattr(FoldsJob, "prepare", prepare)
+    backtest = create(prices=table(rows=160))
+    backtest.run(lambda job, done, share: [Interrupt()] if done else [])
+    assert prepared == [f"pathwise/{backtest.folds[0].name}"]
+    assert backtest.interrupted
 
 
 def test_no_strategy_looks_ahead():

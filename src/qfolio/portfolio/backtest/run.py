@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow, updates_of
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
-from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
+from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold, preparing
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.mandate import Mandate, reach, settled
 from qfolio.portfolio.policy import Policy
@@ -326,7 +327,9 @@ class Backtest:
         if not jobs:
             return
         lock = contextlib.nullcontext() if self.folder is None else locked(self.folder)
-        with lock, Log(self.folder).opened(**self._about) as log:
+        first = [next(group) for _, group in groupby(jobs, lambda job: job.agent_name)]
+        ahead = preparing(first[1:] if isinstance(executor, Here) else [])
+        with lock, ahead, Log(self.folder).opened(**self._about) as log:
             self.interrupted = carry_out(executor, jobs, listen, self.store, log)
 
     @property

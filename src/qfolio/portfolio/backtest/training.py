@@ -1,6 +1,8 @@
 """Training the folds of a backtest: all seeds of some folds are one job."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -8,7 +10,7 @@ import jax
 from jaxtyping import PyTree
 
 from qfolio.core.mdp import Agent
-from qfolio.core.population import Population
+from qfolio.core.population import Population, Rehearsal
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.portfolio.task import Portfolio
@@ -55,9 +57,7 @@ class FoldsJob:
 
     def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:
         """The trained folds by name; None if Ctrl-C stopped it."""
-        tasks = [task for task in self.tasks for _ in self.seeds]
-        seeds, room = self.seeds * len(self.folds), self.most * len(self.seeds)
-        population = Population(tasks, self.agent, seeds, room)
+        population = Population(*self._population)
         kept = _RowsByFold(self)
         training = fit(population, self.budget, [kept, *listeners], config={"job": self.name})
         if training.interrupted and not training.finished:
@@ -67,11 +67,34 @@ class FoldsJob:
             for i, fold in enumerate(self.folds)
         }
 
+    def prepare(self) -> None:
+        """Compiles the programs of ``run``."""
+        Rehearsal(*self._population)
+
+    @property
+    def _population(self) -> tuple[list[Portfolio], Agent, tuple[int, ...], int]:
+        """The arguments of its population."""
+        tasks = [task for task in self.tasks for _ in self.seeds]
+        seeds, room = self.seeds * len(self.folds), self.most * len(self.seeds)
+        return tasks, self.agent, seeds, room
+
     def _kept(self, population: Population, fold: int) -> PyTree:
         whole = self.folds[fold] == self.whole
         members = population.fetch().agent if whole else population.weights()
         first, count = fold * len(self.seeds), len(self.seeds)
         return jax.tree.map(lambda x: x[first : first + count], members)
+
+
+@contextlib.contextmanager
+def preparing(jobs: Iterable[FoldsJob]) -> Iterator[None]:
+    """Prepares jobs in a thread beside the block, which may run them at any time."""
+    with ThreadPoolExecutor(1) as thread:
+        for job in jobs:
+            thread.submit(job.prepare)  # what it raises, the job raises again when it runs
+        try:
+            yield
+        finally:
+            thread.shutdown(wait=False, cancel_futures=True)  # at the end, waits for the one begun
 
 
 class _RowsByFold(Listener):
