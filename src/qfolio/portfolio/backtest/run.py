@@ -8,6 +8,7 @@ float64, beside classical allocators under the same rules.
 import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
@@ -50,6 +51,10 @@ from qfolio.portfolio.task import Portfolio
 
 PROPORTIONAL = "proportional"
 """The default cost model."""
+
+SMALL = 10**6
+"""Number of prices below which two agents are replayed or explained side by side. Compiling their
+programs takes one core each, so this saves time; but the arrays of both are in memory."""
 
 FOLDS_AT_ONCE = 8
 """Folds that train at once if members advance in lockstep; results are kept after each group."""
@@ -417,12 +422,15 @@ class Backtest:
 
     def entries(self) -> tuple[dict[str, Entry], list[str]]:
         """Every strategy replayed over all folds, and notes on problems."""
-        replay = self.replay
-        entries: dict[str, Entry] = {}
-        for name, agent in self.agents.items():
-            entries |= replay.agent(name, agent, self.stretches(name), self.config.seeds)
+        replay, seeds = self.replay, self.config.seeds
+
+        def follow(name: str) -> dict[str, Entry]:
+            return replay.agent(name, self.agents[name], self.stretches(name), seeds)
+
+        with ThreadPoolExecutor(self.side_by_side) as threads:
+            found = list(threads.map(follow, self.agents))
         others, notes = replay.others(self.baselines, self._own, self.config.benchmark)
-        entries |= others
+        entries = {name: entry for each in (*found, others) for name, entry in each.items()}
         return entries, [
             *replay.left_out(),
             *replay.mandated(),
@@ -431,6 +439,11 @@ class Backtest:
             *replay.called(entries, self._own),
             *replay.wiped_out(entries),
         ]
+
+    @property
+    def side_by_side(self) -> int:
+        """Number of agents that are replayed or explained at once."""
+        return 2 if self.prices.values.size < SMALL else 1
 
     @cached_property
     def replay(self) -> Replay:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 from qfolio.core.errors import QfolioError
@@ -35,8 +36,10 @@ def finish(backtest: Backtest) -> Finished:
     if backtest.folder is None:
         raise QfolioError("The backtest has no folder to write to; create it with out=FOLDER.")
     entries, notes = backtest.entries()
-    assessment = backtest.assess(entries)
-    why = explain(backtest, entries)
+    with ThreadPoolExecutor(1) as thread:
+        explained = thread.submit(explain, backtest, entries)
+        assessment = backtest.assess(entries)
+        why = explained.result()
     write_tables(backtest, entries, assessment, why)
     write_page(backtest, entries, assessment, notes, why)
     return Finished(entries, assessment, why)

@@ -5,15 +5,16 @@ docs/guides/why.md lists formulas and sources.
 """
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from qfolio.core.mdp import Discrete
 from qfolio.portfolio.backtest.attribution.decomposition import decompose
 from qfolio.portfolio.backtest.attribution.diagnosis import diagnose
 from qfolio.portfolio.backtest.attribution.distillation import Rule, distil
 from qfolio.portfolio.backtest.attribution.factors import exposures, factor_returns
 from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
+from qfolio.portfolio.backtest.attribution.hac import Floats
 from qfolio.portfolio.backtest.attribution.importance import importance, of_seeds
 from qfolio.portfolio.backtest.attribution.replays import channel_names, channels
 from qfolio.portfolio.backtest.attribution.slices import slices
@@ -26,46 +27,63 @@ from qfolio.portfolio.backtest.run import Backtest
 def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
     """Explain every agent of a finished backtest, from the replays of ``Backtest.entries``."""
     prices, config = backtest.prices, backtest.config
+    year = prices.periods_per_year
+    factors = factor_returns(prices.values, backtest.folds, config.lag, year)
+    one = lambda name: _explained(name, backtest, entries, factors)  # noqa: E731
+    with ThreadPoolExecutor(backtest.side_by_side) as threads:
+        found = list(threads.map(one, backtest.agents))
+    traded = (followed(name, entries) for name in backtest.agents)
+    agents = {name: why for name, (why, _) in zip(traded, found, strict=True)}
+    diagnosis = {name: said for _, of in found for name, said in of.items() if said}
+    return Why(config.benchmark, agents, diagnosis)
+
+
+def _explained(
+    name: str, backtest: Backtest, entries: Mapping[str, Entry], factors: dict[str, Floats]
+) -> tuple[AgentWhy, dict[str, list[str]]]:
+    """An agent's attributions, and the diagnosis of each of its entries."""
+    prices, config, agent = backtest.prices, backtest.config, backtest.agents[name]
     begin = backtest.folds[0].decisions.start
     folds = {
         fold.name: slice(fold.decisions.start - begin, fold.decisions.stop - begin)
         for fold in backtest.folds
     }
     year = prices.periods_per_year
-    factors = factor_returns(prices.values, backtest.folds, config.lag, year)
     reference = entries[config.benchmark].simulation.returns[0]
-    agents, diagnosis = {}, {}
-    for name, agent in backtest.agents.items():
-        traded = followed(name, entries)
-        entry, stretches = entries[traded], backtest.stretches(name)
-        net = entry.simulation.returns[0]
-        names = channel_names(backtest.tasks[name], prices.feature_names)
-        worth, held = importance(agent, stretches, names, prices.values, year)
-        few = of_seeds(stretches, worth.seeds)
-        shared = [each.shared for each in worth.signals] or [False] * len(names)
-        agents[traded] = AgentWhy(
-            decomposition=decompose(
-                net,
-                entry.simulation.weights[0],
-                backtest.replay.growth - 1,
-                folds,
-                prices.assets,
-                year,
-                ~np.isnan(prices.values[begin + config.lag :][: len(net)]),
-            ),
-            exposures=exposures(net - reference, factors, year),
-            importance=worth,
-            slices=slices(agent, few, names, prices.assets, held, shared),
-            gradients=integrated_gradients(agent, few, names, held),
-            rule=_rule(entry.decisions[0], stretches, names),
-            menu=isinstance(stretches[0].task.actions, Discrete),
+    traded = followed(name, entries)
+    entry, stretches = entries[traded], backtest.stretches(name)
+    net = entry.simulation.returns[0]
+    names = channel_names(backtest.tasks[name], prices.feature_names)
+    worth, held = importance(agent, stretches, names, prices.values, year)
+    few = of_seeds(stretches, worth.seeds)
+    shared = [each.shared for each in worth.signals] or [False] * len(names)
+    why = AgentWhy(
+        decomposition=decompose(
+            net,
+            entry.simulation.weights[0],
+            backtest.replay.growth - 1,
+            folds,
+            prices.assets,
+            year,
+            ~np.isnan(prices.values[begin + config.lag :][: len(net)]),
+        ),
+        exposures=exposures(net - reference, factors, year),
+        importance=worth,
+        slices=slices(agent, few, names, prices.assets, held, shared),
+        gradients=integrated_gradients(agent, few, names, held),
+        rule=_rule(entry.decisions[0], stretches, names),
+        menu=bool(stretches[0].task.menu),
+    )
+    return why, {
+        each: diagnose(
+            each,
+            entries[each],
+            list(folds.values()),
+            prices.assets,
+            worth.ignored and each == traded,
         )
-        for each in dict.fromkeys((name, traded)):
-            ignored = worth.ignored and each == traded
-            said = diagnose(each, entries[each], list(folds.values()), prices.assets, ignored)
-            if said:
-                diagnosis[each] = said
-    return Why(config.benchmark, agents, diagnosis)
+        for each in dict.fromkeys((name, traded))
+    }
 
 
 def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> Rule:
