@@ -7,7 +7,6 @@ from time import perf_counter
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
@@ -62,8 +61,7 @@ class Population:
     def _require_memory(self) -> None:
         """Raises QfolioError if memory is too small for a form that has not been run before."""
         if not self._programs:
-            seed = jnp.array(0, jnp.uint32)
-            first = jax.eval_shape(lambda: begin(self.task, self.agent, seed))
+            first = jax.eval_shape(lambda: self.agent.init(self.task, jax.random.key(0)))
             require_memory(first, max(len(self.seeds), self._room))
 
     def _begin(self, own: list[np.ndarray], form: Hashable) -> None:

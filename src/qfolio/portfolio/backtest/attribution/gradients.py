@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from qfolio.core.mdp import Agent, Discrete
+from qfolio.core.mdp import Agent
 from qfolio.portfolio.backtest.attribution.slices import answer
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.task import Portfolio
@@ -55,7 +55,7 @@ def integrated_gradients(
         names: Names of the channels that the agent observes.
         held: Weights held when deciding, shape (D, entry).
     """
-    if isinstance(stretches[0].task.actions, Discrete):
+    if stretches[0].task.menu:
         return None
     each = -(-DAYS // len(stretches))
     begin = stretches[0].fold.decisions.start
