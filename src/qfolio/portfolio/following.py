@@ -56,9 +56,10 @@ def follow(
         QfolioError: Targets are not numbers, or not feasible.
     """
     portfolios = jax.tree.map(lambda x: x[None] if together else x[:, None], members)
-    found = paths(task.exact, agent, portfolios, jnp.array(first, jnp.int32), held, count)
+    found = paths(task, agent, portfolios, jnp.array(first, jnp.int32), held, count)
     wanted, targets, after = jax.tree.map(np.asarray, found)
-    _require_feasible(task, agent, wanted, first)
+    changed = wanted != _before(held.weights, after.weights)
+    _require_feasible(task, agent, wanted, changed.any(-1), first)
     return targets, after
 
 
@@ -79,8 +80,12 @@ def ordered(task: Portfolio, targets: np.ndarray, held: ArrayLike, after: np.nda
     """
     if not task.calendar:
         return np.ones(targets.shape[:2], bool)
-    before = np.concatenate([np.asarray(held, after.dtype)[:, None], after[:, :-1]], axis=1)
-    return np.asarray((targets != before).any(-1))
+    return np.asarray((targets != _before(held, after)).any(-1))
+
+
+def _before(held: ArrayLike, after: np.ndarray) -> np.ndarray:
+    """Weights before each decision; ``after`` are those one row after each."""
+    return np.concatenate([np.asarray(held, after.dtype)[:, None], after[:, :-1]], axis=1)
 
 
 @eqx.filter_jit(donate="none")
@@ -118,13 +123,18 @@ def paths(
     return jax.vmap(path)(members, held)
 
 
-def _require_feasible(task: Portfolio, agent: Agent, wanted: np.ndarray, first: int) -> None:
-    """Raises QfolioError for infeasible weights; a replay would read NaN as no order."""
+def _require_feasible(
+    task: Portfolio, agent: Agent, wanted: np.ndarray, changed: np.ndarray, first: int
+) -> None:
+    """Raises QfolioError for infeasible weights; a replay would read NaN as no order.
+
+    changed: which of the weights wanted are not those held; these may have drifted out of the set.
+    """
     allowed = task.feasible
     if isinstance(allowed, Mandated) and task.patterns is not None:
         allowed = task.patterns.at(first + np.arange(wanted.shape[1]), allowed)
     for said, amount in allowed.violations(wanted).items():
-        wrong = ~(amount <= TOLERANCE)
+        wrong = changed & ~(amount <= TOLERANCE)
         if wrong.any():
             seed, day = np.argwhere(wrong)[0]
             raise QfolioError(

@@ -36,7 +36,7 @@ from qfolio.portfolio.mandate.mandate import (
     reach,
     settled,
 )
-from qfolio.portfolio.mandate.risk import Risk
+from qfolio.portfolio.mandate.risk import Past, Risk, covariances
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.universe import Patterns
@@ -63,6 +63,7 @@ class Portfolio(Market):
     decides: Bool[Array, " decision"]  # whether a decision is due at each row; no rows if always
     elapsed: Float[Array, " dated"]  # share of the year at each row, see Terms; no rows if unused
     benchmarks: Float[Array, "benchmarked asset"]  # a benchmark's weights; no rows without one
+    covariances: Float[Array, "estimated asset asset"]  # of returns; no rows without limits on risk
     year: Float[Array, ""]  # rows in a year
     tradable: Bool[Array, "row asset"] | None  # at each row; None if all assets always are
     first_decision: Row
@@ -111,6 +112,7 @@ class Portfolio(Market):
             decides=jnp.zeros(0, bool),
             elapsed=jnp.zeros(0),
             benchmarks=jnp.zeros((0, assets)),
+            covariances=jnp.zeros((0, assets, assets)),
             year=jnp.ones(()),
             tradable=None,
             first_decision=jnp.array(0, jnp.int32),
@@ -136,8 +138,10 @@ class Portfolio(Market):
         terms, risk = self.written.trading, self.written.risk
         passed = elapsed(prices.dates) if terms.turnover_a_year else np.zeros(0)
         compared = anchors.path(risk.benchmark, prices) if risk.benchmark else logs[:0]
-        year = np.array(prices.periods_per_year)
-        given = (logs, extra, followed, then, passed, compared, year)
+        year, known = np.array(prices.periods_per_year), np.zeros((0, *self.covariances.shape[1:]))
+        if self.allowed is not None and self.allowed.limits_risk:
+            known = covariances(logs, risk.rows, prices.periods_per_year)
+        given = (logs, extra, followed, then, passed, compared, known, year)
         arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), given)
         decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)
         decides[-1:] = True  # tomorrow's weights may be asked for on any day
@@ -146,8 +150,8 @@ class Portfolio(Market):
             patterns = Patterns.of(self.mandate, tradable, self.max_weight)[0].in_float32()
         return eqx.tree_at(
             lambda t: (
-                t.log_relatives, t.extra, t.anchors, t.conditions, t.elapsed, t.benchmarks, t.year,
-                t.decides, t.tradable, t.patterns,
+                t.log_relatives, t.extra, t.anchors, t.conditions, t.elapsed, t.benchmarks,
+                t.covariances, t.year, t.decides, t.tradable, t.patterns,
             ),
             self,
             (*arrays, *jax.tree.map(jnp.asarray, (decides, tradable, patterns))),
@@ -247,12 +251,6 @@ class Portfolio(Market):
             1 / margin if margin else np.inf,
         )
 
-    @property
-    def exact(self) -> "Portfolio":
-        """The same task, whose orders are nearest also with limits on risk; no derivatives."""
-        allowed = self.allowed
-        return self if allowed is None else eqx.tree_at(lambda t: t.allowed, self, allowed.exact)
-
     def filling(self, rows: int) -> "Portfolio":
         """The same task with orders filled over a given number of rows."""
         if self.terms.fill == rows:
@@ -278,13 +276,17 @@ class Portfolio(Market):
     def allow(
         self, market: Row, holding: Holding, weights: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
-        feasible = self.feasible_at(market)
+        """As in any market; what is held where no decision is due."""
+        feasible, held = self.feasible_at(market), holding.weights
         if self.tradable is not None:
             weights = universe.spread(weights, self.tradable[market], self.feasible.long_only)
+        due = jnp.asarray(self.terms.due(market, held))
+        if not isinstance(feasible, Mandated):
+            return jnp.where(due, feasible.project(weights, held), held)
         left = self.terms.unspent(holding.plan)
-        if left is not None and isinstance(feasible, Mandated):
+        if left is not None:
             feasible = feasible.spending(left)
-        return feasible.project(weights, holding.weights)
+        return feasible.project(weights, held, due)
 
     def trade(
         self, market: Row, holding: Holding, wanted: Float[Array, " entry"]
@@ -333,12 +335,15 @@ class Portfolio(Market):
             return CappedSimplex(self._limits(market))
         if self.patterns is not None:
             allowed = self.patterns.at(market, allowed)
-        return allowed.knowing(self.risk_at(market)) if allowed.limits_risk else allowed
+        return allowed.knowing(self._past(market)) if allowed.limits_risk else allowed
 
     def risk_at(self, market: Row) -> Risk:
         """The risk estimated at a row from the returns up to it."""
-        past = self.written.risk.rows
-        return Risk.at(self.log_relatives, self.benchmarks, market, past, self.year)
+        return self._past(market).risk
+
+    def _past(self, market: Row) -> Past:
+        rows = self.written.risk.rows
+        return Past(self.log_relatives, self.covariances, self.benchmarks, market, self.year, rows)
 
     def _limits(self, market: Row) -> Float[Array, " asset"]:
         """The largest weights at a row."""

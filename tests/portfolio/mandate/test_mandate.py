@@ -132,6 +132,16 @@ def test_what_is_wrong_in_a_file_is_said(tmp_path, text, message):
         settled(written(tmp_path, text), ASSETS)
 
 
+def test_the_example_of_the_guide_is_a_mandate(tmp_path):
+    guide = (Path(__file__).parents[3] / "docs/guides/mandate.md").read_text(encoding="utf-8")
+    toml, groups = (guide.split(fence)[1].split("\n```")[0] for fence in ("```toml", "```\nasset"))
+    assets = ["SPY", "TLT", "USO", "GLD", "XLE", "XOM", "EWG"]
+    path = written(tmp_path, toml, "asset" + groups)
+    _, mandate = parse(settled(path, assets))
+    members = {name: group.assets for _, name, group in mandate.every_group}
+    assert members == {"Energy": ("XLE", "XOM"), "US": ("XLE", "XOM"), "metals": ("GLD", "SLV")}
+
+
 GROUP = {"assets": ["XLE", "XOM"]}
 
 

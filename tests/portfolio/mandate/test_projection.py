@@ -1,4 +1,4 @@
-"""Projections against a convex solver, and their derivatives against finite differences."""
+"""Projections against a convex solver."""
 
 import warnings
 
@@ -8,35 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from projections import ASSETS, CASES, KINDS, cases
 from qfolio.portfolio.mandate.projection import Limits, excess, nearest
-
-ASSETS, CASES = 10, 60
-
-KINDS = [(False, False), (False, True), (True, False), (True, True)]
-
-
-def case(rng: np.random.Generator, short: bool, turnover: bool):
-    """Wanted and held weights, and limits that some weights meet, most of them barely."""
-    low = np.where(rng.random(ASSETS) < 0.3, rng.random(ASSETS) / 20, 0.0) - 0.3 * short
-    high = np.maximum(low, 0.05 + 0.4 * rng.random(ASSETS))
-    inside = rng.uniform(low, high)
-    if not short:
-        inside = low + (inside - low) * min(1, (0.99 - low.sum()) / (inside - low).sum())
-    groups = 1.0 * (rng.random((4, ASSETS)) < 0.4)  # they overlap
-    rows = np.concatenate([np.ones((1, ASSETS)), -np.ones((1, ASSETS)), groups, -groups])
-    most = rows @ inside + 0.1 * rng.random(10) * (rng.random(10) < 0.7)
-    most[rng.random(10) < 0.3] = np.inf
-    held = 0.9 * rng.dirichlet(np.ones(ASSETS))
-    gross = abs(inside).sum() * (1 + 0.1 * rng.random()) if short else np.inf
-    limit = abs(inside - held).sum() * (1 + 0.2 * rng.random()) if turnover else np.inf
-    wanted = rng.normal(size=ASSETS) / 2 if short else rng.dirichlet(np.full(ASSETS, 0.5))
-    return wanted, held, Limits(low, high, rows, most, np.array(gross), np.array(limit))
-
-
-def cases(seed: int, short: bool, turnover: bool):
-    rng = np.random.default_rng(seed)
-    made = [case(rng, short, turnover) for _ in range(CASES)]
-    return made, jax.tree.map(lambda *x: np.stack(x), *made)
 
 
 def solved(wanted, held, limits):
@@ -66,33 +39,6 @@ def test_it_is_the_point_that_a_convex_solver_finds(short, turnover):
     np.testing.assert_allclose(exact, expected, atol=1e-6)
     single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), stacked)
     np.testing.assert_allclose(jax.jit(jax.vmap(nearest))(*single), exact, atol=2e-6)
-
-
-@pytest.mark.parametrize(("short", "turnover"), KINDS)
-@pytest.mark.slow
-def test_derivatives_are_those_of_finite_differences(short, turnover):
-    _, (wanted, held, limits) = cases(1, short, turnover)
-    rng = np.random.default_rng(2)
-    along = 1e-6 * rng.normal(size=(2, *wanted.shape))
-
-    with jax.enable_x64(True):
-        one = lambda wanted, held, limits, by, by_held: jax.jvp(  # noqa: E731
-            lambda x, h: nearest(x, h, limits), (wanted, held), (by, by_held)
-        )[1]
-        found = jax.jit(jax.vmap(one))(wanted, held, limits, *along)
-        moved = jax.jit(jax.vmap(nearest))
-        ahead = moved(wanted + along[0], held + along[1], limits)
-        behind = moved(wanted - along[0], held - along[1], limits)
-        weight = rng.normal(size=wanted.shape)
-        pulled = jax.jit(jax.vmap(jax.grad(lambda x, h, of, v: nearest(x, h, of) @ v)))(
-            wanted, held, limits, weight
-        )
-        alone = jax.jit(jax.vmap(one))(wanted, held, limits, along[0], 0 * along[1])
-        np.testing.assert_allclose(
-            (pulled * along[0]).sum(1), (alone * weight).sum(1), atol=1e-9 * abs(weight).max()
-        )
-        off = abs(np.asarray(found - (ahead - behind) / 2)).max(1) / 1e-6
-    assert (off < 1e-3).mean() > 0.95  # the others have a kink within 1e-6
 
 
 def test_weights_within_the_limits_stay_to_the_bit():

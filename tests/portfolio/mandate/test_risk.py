@@ -15,6 +15,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated, exactly
 from qfolio.portfolio.mandate.mandate import Mandate, feasible, settled
+from qfolio.portfolio.mandate.risk import Risk
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
@@ -111,25 +112,12 @@ def test_no_order_is_nearer(risk):
         return exactly(task.feasible_at(row), wanted, held)
 
     def of_agent(task, row, wanted, held):
-        return traded(task.exact, row, *jnp.asarray([wanted, held], jnp.float32))
+        return traded(task, row, *jnp.asarray([wanted, held], jnp.float32))
 
     for order in (of_baseline, of_agent):
         ratios = distances(risk, order)
         assert np.mean(ratios) < 1.0001
         assert max(ratios) < 1.005
-
-
-@pytest.mark.parametrize(
-    ("risk", "mean", "worst"),
-    [(RISKS[0], 1.01, 1.06), (RISKS[1], 1.06, 1.3), (RISKS[2], 1.08, 1.45)],
-)
-def test_no_order_in_training_is_much_nearer(risk, mean, worst):
-    ratios = distances(
-        risk,
-        lambda task, row, *both: traded(task, row, *jnp.asarray(both, jnp.float32)),
-    )
-    assert 1.001 < np.mean(ratios) < mean
-    assert max(ratios) < worst
 
 
 def test_other_limits_hold_and_both_risks_are_met_where_they_can_be():
@@ -178,9 +166,10 @@ def test_risk_is_known_without_later_prices():
         np.testing.assert_allclose(risk, volatility(prices, early, wanted[1:]), rtol=1e-4)
 
 
-def test_its_derivative_is_that_of_finite_differences():
+@pytest.mark.parametrize("risk", RISKS)
+def test_its_derivative_is_that_of_finite_differences(risk):
     with jax.enable_x64(True):
-        task = portfolio(table(), {"volatility": 0.1, "tracking_error": 0.05})
+        task = portfolio(table(), risk)
         allowed, rng = task.feasible_at(jnp.array(300)), np.random.default_rng(4)
         wanted, held, by = jnp.asarray(rng.dirichlet(np.ones(6), (3, 40)))
         score = jnp.asarray(rng.normal(size=(40, 6)))
@@ -189,11 +178,20 @@ def test_its_derivative_is_that_of_finite_differences():
             return (allowed.project(wanted, held) * score).sum()
 
         slope = (jax.jit(jax.vmap(jax.grad(worth)))(wanted, held, score) * (by - wanted)).sum(1)
-        step, each = 1e-6, jax.jit(jax.vmap(worth))
+        step, each = 1e-3, jax.jit(jax.vmap(worth))
         ahead, back = (each(wanted + s * (by - wanted), held, score) for s in (step, -step))
+        # The search ends where risk is met; along the limit, the order is less exact.
         off = np.asarray(abs(slope - (ahead - back) / (2 * step)))
-        assert np.median(off) < 1e-6
-        assert np.mean(off < 1e-4) >= 0.9  # but at kinks
+        assert np.median(off) < 1e-4
+        assert np.mean(off < 3e-3) >= 0.85  # but at kinks
+        assert np.median(abs(slope)) > 0.05
+
+
+def test_no_wish_moves_an_order_whose_risk_cannot_be_met():
+    task = portfolio(table(), {"volatility": 0.1, "tracking_error": 0.001})
+    allowed, equal = task.feasible_at(jnp.array(300)), jnp.array([0.0, *[0.2] * 5])
+    slope = jax.grad(lambda wanted: (allowed.project(wanted, equal) * jnp.arange(6.0)).sum())(equal)
+    np.testing.assert_array_equal(slope, 0.0)
 
 
 def test_its_derivative_is_finite_at_the_benchmark():
@@ -219,7 +217,7 @@ def test_what_it_is_measured_against_must_be_known():
 
 def calmer(made: Mandated, share: float) -> Mandated:
     """The set at a row where all volatility is a share of what it is."""
-    assert made.risk is not None
+    assert isinstance(made.risk, Risk)
     return made.knowing(made.risk._replace(covariance=share**2 * made.risk.covariance))
 
 

@@ -12,6 +12,7 @@ from qfolio.core.text import listed, near, quote
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.mandate import feasible, parse
 from qfolio.portfolio.mandate.projection import Limits
+from qfolio.portfolio.mandate.risk import Risk
 
 TINY = 1e-7
 
@@ -140,7 +141,7 @@ def _least_risk(
     """
     from scipy.optimize import nnls
 
-    assert made.risk is not None
+    assert isinstance(made.risk, Risk)
     covariance = np.asarray(made.risk.covariance, float)
     center = np.asarray(made.risk.benchmark, float) if kind == "tracking error" else 0.0
     values, vectors = np.linalg.eigh(covariance)

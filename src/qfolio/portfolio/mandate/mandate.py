@@ -394,7 +394,7 @@ def _fields(place: str) -> list[str]:
 
 
 def _with_members(mandate: Mandate, file: Path, source: str) -> Mandate:
-    """The mandate, with the assets of each group as a CSV says."""
+    """The mandate, with the assets of each group that names none as a CSV says."""
     try:
         with file.open(encoding="utf-8-sig", newline="") as lines:
             table = list(csv.DictReader(lines))
@@ -408,9 +408,13 @@ def _with_members(mandate: Mandate, file: Path, source: str) -> Mandate:
         )
     groups: dict[str, dict[str, Group]] = {}
     for column, value, group in mandate.every_group:
+        if group.assets:
+            groups.setdefault(column, {})[value] = group
+            continue
         if column not in columns:
             raise QfolioError(
-                f"{source}: [groups.{column}] is no column of {file}; {near(column, columns[1:])}"
+                f"{source}: [groups.{column}] is no column of {file}, and [groups.{column}."
+                f"{value}] lists no assets; {near(column, columns[1:])}"
             )
         members = tuple(row["asset"].strip() for row in table if _cell(row, column) == value)
         if not members:

@@ -4,7 +4,7 @@ The set is low ≤ w ≤ high, rows·w ≤ most, Σ|w| ≤ gross and Σ|w − he
 multiplier for each condition but the first, the problem falls apart into one for each asset, which
 has a closed form. The multipliers maximize a concave, piecewise quadratic function: a semismooth
 Newton method (Qi & Sun 1993), projected onto their bounds (Bertsekas 1982), finds the piece of the
-maximum, and then its last step is exact. That step is also what is differentiated.
+maximum, and then its last step is exact. The piece, a face of the set, also gives the derivative.
 """
 
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from qfolio.core import symmetric
 
@@ -22,11 +22,13 @@ LARGEST, OF_TURNOVER, OF_PLANES = 100.0, 10.0, 1.0
 contradict it, turnover is exceeded by as little as they require (an exact penalty). Planes (see
 ``below``) yield to all limits."""
 
-ITERATIONS = 60
+ITERATIONS, FEW = 60, 12
+"""Most steps of a search. A few are enough unless limits contradict each other."""
+
 LENGTHS, SHORTENING = 8, 4.0
 """Steps are tried at so many lengths, each a quarter of the one before."""
 
-LONGEST = 4.0
+LONGEST = 16.0
 ROUNDING = 16
 """Excesses up to this many times the precision of a number count as none."""
 
@@ -43,6 +45,14 @@ class Limits(NamedTuple):
     penalty: Any = None  # (row,), bounds of the multipliers (default: LARGEST)
 
 
+class Face(NamedTuple):
+    """The face of the set on which the nearest weights lie."""
+
+    free: Bool[Array, "asset *path"]  # neither at a bound nor at a kink
+    stays: Bool[Array, "asset *path"]  # as held
+    binding: Bool[Array, "condition *path"]
+
+
 class _Found(NamedTuple):
     """Where a search is."""
 
@@ -56,10 +66,9 @@ def nearest(
 ) -> Float[Array, " asset"]:
     """The weights within the limits that are nearest to those wanted, which may be anywhere.
 
-    Weights within the limits are returned unchanged. Differentiable almost everywhere in ``wanted``
-    and ``held``.
+    Weights within the limits are returned unchanged. It has no derivative; see ``pulled_back``.
     """
-    return solution(search(wanted, held, limits), wanted, held, limits)
+    return approximate(search(wanted, held, limits), wanted, held, _arrays(limits, wanted))
 
 
 def search(
@@ -67,15 +76,19 @@ def search(
     held: Float[Array, " asset"],
     limits: Limits,
     start: Float[Array, " condition"] | None = None,
+    iterations: int = ITERATIONS,
 ) -> Float[Array, " condition"]:
-    """The multipliers of ``nearest``, without derivatives.
+    """The multipliers of ``nearest``.
 
     start: multipliers to search from, such as those of limits that differ little (default: 0).
+    iterations: at most so many steps; contradictory limits need most.
     """
     limits = _arrays(limits, wanted)
     start = none_binds(limits) if start is None else start
-    given = lax.stop_gradient((wanted, held, limits, start))
-    return lax.stop_gradient(_search(*(jax.tree.map(lambda x: x[..., None], given)))[..., 0])
+    most = jnp.array(iterations, jnp.int32)
+    given = jax.tree.map(lambda x: x[..., None], (wanted, held, limits, start, most))
+    found: Array = _search(*given)[..., 0]
+    return found
 
 
 @custom_vmap
@@ -84,6 +97,7 @@ def _search(
     held: Float[Array, "asset path"],
     limits: Limits,
     start: Float[Array, "condition path"],
+    iterations: Int[Array, " path"],
 ) -> Float[Array, "condition path"]:
     """As ``search``, with a last axis of paths, which the processor takes side by side."""
     largest = _largest(limits)
@@ -108,21 +122,25 @@ def _search(
             tried = at(SHORTENING ** -i.astype(wanted.dtype))
             return _choose(tried.value > best.value, tried, best)
 
-        whole = at(jnp.ones((), wanted.dtype))
+        whole, done = at(jnp.ones((), wanted.dtype)), found.error <= accuracy
         # Near the maximum the differences of values are rounding errors, and errors tell more.
-        well = (whole.value >= found.value - accuracy) & (whole.error <= found.error / 2)
-        kept = well | (found.error <= accuracy)
-        others = jnp.where(kept.all(), 1, LENGTHS)
+        nearer = (whole.value >= found.value - accuracy) & (whole.error <= found.error / 2)
+        well = jnp.where(done, whole.error < found.error, nearer)
+        others = jnp.where((well | done).all(), 1, LENGTHS)
         best = _choose(well, whole, lax.fori_loop(1, others, better, whole))
-        return _choose(found.error <= accuracy, found, best)
+        return _choose(done & ~well, found, best)
 
-    def going(search: tuple[Array, _Found]) -> Array:
-        step, found = search
-        return (step < ITERATIONS) & (found.error > accuracy).any()
+    def going(search: tuple[Array, Array, _Found]) -> Array:
+        step, last, _ = search
+        return (step < iterations.max()) & ~last
 
-    begin = jnp.array(0, jnp.int32), _Found(start, *value(start))
-    step = lambda search: (search[0] + 1, improve(search[1]))  # noqa: E731
-    return lax.while_loop(going, step, begin)[1].multipliers
+    def advance(search: tuple[Array, Array, _Found]) -> tuple[Array, Array, _Found]:
+        step, _, found = search
+        # One more step than are needed rounds better.
+        return step + 1, (found.error <= accuracy).all(), improve(found)
+
+    begin = jnp.array(0, jnp.int32), jnp.array(False), _Found(start, *value(start))
+    return lax.while_loop(going, advance, begin)[2].multipliers
 
 
 @_search.def_vmap
@@ -154,27 +172,6 @@ def below(
 def none_binds(limits: Limits) -> Float[Array, " condition"]:
     """The multipliers of weights that no condition moves."""
     return jnp.zeros_like(_largest(limits))
-
-
-def solution(
-    multipliers: Float[Array, " condition"],
-    wanted: Float[Array, " asset"],
-    held: Float[Array, " asset"],
-    limits: Limits,
-) -> Float[Array, " asset"]:
-    """The weights that belong to the multipliers found, with derivatives."""
-    limits = _arrays(limits, wanted)
-    system, over = _newton(multipliers, wanted, held, limits)
-    step = _bounded(symmetric.solve(system, over[:, None])[:, 0])
-    last = lax.stop_gradient(step)
-
-    def error_of(multipliers: Array) -> Array:
-        over = excess(approximate(multipliers, wanted, held, limits), held, limits)
-        return _error(multipliers, over, _largest(limits))
-
-    # One more step rounds better, unless it has no length; its derivative counts in any case.
-    better = lax.stop_gradient(error_of(multipliers + last) < error_of(multipliers))
-    return approximate(multipliers + jnp.where(better, 0.0, -last) + step, wanted, held, limits)
 
 
 # Arrays of the functions below may have further axes behind those named.
@@ -214,33 +211,58 @@ def excess(
     return jnp.where(applies, over - jnp.where(applies, most, 0.0), -1.0)
 
 
+def face(
+    multipliers: Float[Array, "condition *path"],
+    weights: Float[Array, "asset *path"],
+    held: Float[Array, "asset *path"],
+    limits: Limits,
+) -> Face:
+    """The face on which weights lie, given their multipliers."""
+    over = excess(weights, held, limits) > ROUNDING * jnp.finfo(weights.dtype).eps
+    inside = (weights > limits.low) & (weights < limits.high)
+    stays = inside & (multipliers[-1] > 0) & (weights == held)
+    free = inside & ~stays & ~((multipliers[-2] > 0) & (weights == 0))
+    # A limit that yields is exceeded although its multiplier is as large as it may be.
+    binding = jnp.where(multipliers > 0, (multipliers < _largest(limits)) | ~over, over)
+    return Face(free, stays, binding)
+
+
+def slopes(
+    weights: Float[Array, "asset *path"],
+    held: Float[Array, "asset *path"],
+    rows: Float[Array, "row asset *path"],
+    binding: Bool[Array, "condition *path"],
+) -> Float[Array, "condition asset *path"]:
+    """The slopes of the conditions that bind; 0 for the others."""
+    signs = jnp.stack([jnp.sign(weights), jnp.sign(weights - held)])
+    return jnp.where(binding[:, None], jnp.concatenate([rows, signs]), 0.0)
+
+
+def ridge(
+    squares: Float[Array, "condition *path"], binding: Bool[Array, "condition *path"]
+) -> Float[Array, "condition *path"]:
+    """What the diagonal of a system of conditions gets so that it can be solved."""
+    least = 100 * jnp.finfo(squares.dtype).eps * jnp.maximum(squares.max(0), 1.0)
+    return jnp.where(binding, least, 1.0)
+
+
 def _newton(
     multipliers: Array, wanted: Array, held: Array, limits: Limits
 ) -> tuple[Float[Array, "condition condition *path"], Float[Array, "condition *path"]]:
     """The equations of the step to the maximum, if no asset and no multiplier left its piece on
     the way."""
     weights = approximate(multipliers, wanted, held, limits)
-    over = excess(weights, held, limits)
-    fixed, at, bounds = lax.stop_gradient((weights, over, limits))
-    kinked = jnp.where(multipliers[-2] > 0, fixed == 0, False)
-    kinked |= jnp.where(multipliers[-1] > 0, fixed == lax.stop_gradient(held), False)
-    free = (fixed > bounds.low) & (fixed < bounds.high) & ~kinked
-    signs = jnp.stack([jnp.sign(fixed), jnp.sign(fixed - lax.stop_gradient(held))])
-    slopes = jnp.where(free, jnp.concatenate([bounds.rows, signs]), 0.0)
-    precision = jnp.finfo(fixed.dtype).eps
-    over_all = at > ROUNDING * precision
-    moving = jnp.where(multipliers > 0, (multipliers < _largest(limits)) | ~over_all, over_all)
-    slopes = jnp.where(moving[:, None], slopes, 0.0)
-    squares = (slopes**2).sum(1)
-    ridge = jnp.where(moving, 100 * precision * jnp.maximum(squares.max(0), 1.0), 1.0)
-    one = jnp.expand_dims(jnp.eye(len(ridge), dtype=fixed.dtype), range(2, 1 + ridge.ndim))
-    system = (slopes[:, None] * slopes).sum(2) + one * ridge
-    return system, jnp.where(moving, over, 0.0)
+    free, _, binding = face(multipliers, weights, held, limits)
+    sloped = jnp.where(free, slopes(weights, held, limits.rows, binding), 0.0)
+    over = jnp.where(binding, excess(weights, held, limits), 0.0)
+    more = ridge((sloped**2).sum(1), binding)
+    one = jnp.expand_dims(jnp.eye(len(more), dtype=weights.dtype), range(2, 1 + more.ndim))
+    return (sloped[:, None] * sloped).sum(2) + one * more, over
 
 
 def _bounded(step: Array) -> Array:
     """If no asset is free, the step has no length; weights differ by 1."""
-    return step / jnp.maximum(lax.stop_gradient(abs(step).max(0)) / LONGEST, 1.0)
+    return step / jnp.maximum(abs(step).max(0) / LONGEST, 1.0)
 
 
 def _error(multipliers: Array, over: Array, largest: Array) -> Array:

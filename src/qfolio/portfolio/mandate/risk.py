@@ -6,16 +6,21 @@ in the noise of so few.
 Weights with so little risk form an ellipsoid. A tangent plane of it is one more row of linear
 limits, and a line to a safe portfolio stays within all convex limits and meets the ellipsoid at the
 root of a quadratic equation. Repeated, the two lead to the nearest point of the ellipsoid within
-all other limits (cutting planes, Veinott 1967); once is enough for training.
+all other limits (cutting planes, Veinott 1967).
 """
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 TINY = 1e-12
+
+ROOM = 2**24
+"""Most numbers in the covariances of all rows; with more, each is computed where it is needed."""
 
 
 class Risk(NamedTuple):
@@ -23,31 +28,6 @@ class Risk(NamedTuple):
 
     covariance: Float[Array, "asset asset"]  # of returns, a year
     benchmark: Float[Array, " asset"]  # weights held by the benchmark
-
-    @staticmethod
-    def at(
-        log_relatives: Float[Array, "row asset"],
-        benchmarks: Float[Array, "benchmarked asset"],
-        row: Int[Array, ""],
-        past: int,
-        year: Float[Array, ""],
-    ) -> "Risk":
-        """The risk as a row knows it, from ``past`` returns up to it, or as many as there are.
-
-        log_relatives: those of the first row are not known. benchmarks: weights at each row; no
-        rows without a benchmark. year: rows in a year.
-        """
-        count, assets = log_relatives.shape
-        size = min(past, count)
-        start = jnp.maximum(row + 1 - size, 0)
-        rows = start + jnp.arange(size)
-        known = (rows > 0) & (rows <= row)
-        logs = lax.dynamic_slice_in_dim(log_relatives, start, size)
-        returns = jnp.where(known[:, None], jnp.expm1(logs), 0.0)
-        weights = jnp.zeros(assets)
-        if benchmarks.shape[0]:
-            weights = lax.dynamic_index_in_dim(benchmarks, row, keepdims=False)
-        return Risk(year / jnp.maximum(known.sum(), 1) * (returns.T @ returns), weights)
 
     def of(self, weights: Float[Array, " asset"]) -> Float[Array, ""]:
         """The annual volatility of weights; at least 1e-6, so that its derivative is finite."""
@@ -89,3 +69,45 @@ class Risk(NamedTuple):
         size = jnp.maximum(lax.stop_gradient(abs(slope).max()), TINY)
         row = slope / size
         return row, most * self.of(active) / size + row @ center
+
+
+class Past(eqx.Module):
+    """What is known of returns at a row; risk is estimated from it where it is needed."""
+
+    log_relatives: Float[Array, "row asset"]  # those of the first row are not known
+    covariances: Float[Array, "estimated asset asset"]  # of each row, if there is room for them
+    benchmarks: Float[Array, "benchmarked asset"]  # weights; no rows without a benchmark
+    row: Int[Array, ""]
+    year: Float[Array, ""]  # rows in a year
+    rows: int = eqx.field(static=True)  # returns that risk is estimated from, if there are as many
+
+    @property
+    def risk(self) -> Risk:
+        weights = jnp.zeros(self.log_relatives.shape[1])
+        if self.benchmarks.shape[0]:
+            weights = lax.dynamic_index_in_dim(self.benchmarks, self.row, keepdims=False)
+        if self.covariances.shape[0]:
+            known = lax.dynamic_index_in_dim(self.covariances, self.row, keepdims=False)
+            return Risk(known, weights)
+        size = min(self.rows, len(self.log_relatives))
+        start = jnp.maximum(self.row + 1 - size, 0)
+        rows = start + jnp.arange(size)
+        known = (rows > 0) & (rows <= self.row)
+        logs = lax.dynamic_slice_in_dim(self.log_relatives, start, size)
+        returns = jnp.where(known[:, None], jnp.expm1(logs), 0.0)
+        return Risk(self.year / jnp.maximum(known.sum(), 1) * (returns.T @ returns), weights)
+
+
+def covariances(
+    log_relatives: Float[np.ndarray, "row asset"], past: int, year: float
+) -> Float[np.ndarray, "estimated asset asset"]:
+    """What ``Past`` estimates at each row; no rows if they need more numbers than ``ROOM``."""
+    rows, assets = log_relatives.shape
+    if rows * assets**2 > ROOM:
+        return np.zeros((0, assets, assets))
+    returns = np.expm1(log_relatives)
+    returns[:1] = 0.0
+    products = returns[:, :, None] * returns[:, None]
+    sums = np.cumsum(products, axis=0, out=products)
+    sums[past:] -= sums[:-past].copy()
+    return np.asarray(sums * (year / np.clip(np.arange(rows), 1, past))[:, None, None])

@@ -67,7 +67,7 @@ def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reas
     held = jnp.asarray(allocation.held[None], jnp.float32)
     row = jnp.array([len(prices) - 1], jnp.int32)
     task = on_table(policy.task, prices)
-    allowed, nearest = _allowed(task.exact, row[0], held[0])
+    allowed, nearest = _allowed(task, row[0], held[0])
     required = (np.asarray(nearest, float) - allocation.held)[1:]
     bounds = _bounds(allowed, allocation.weights, allocation.held)
     moved = np.asarray(integrated(task, policy.agent, policy.members, row, held)[0])[0]
