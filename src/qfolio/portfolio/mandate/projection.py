@@ -118,17 +118,22 @@ def _search(
             tried = jnp.clip(found.multipliers + length * direction, 0.0, largest)
             return _Found(tried, *value(tried))
 
-        def better(i: Array, best: _Found) -> _Found:
+        def shorter(tries: tuple[Array, _Found]) -> tuple[Array, _Found]:
+            i, best = tries
             tried = at(SHORTENING ** -i.astype(wanted.dtype))
-            return _choose(tried.value > best.value, tried, best)
+            return i + 1, _choose(tried.value > best.value, tried, best)
 
         whole, done = at(jnp.ones((), wanted.dtype)), found.error <= accuracy
         # Near the maximum the differences of values are rounding errors, and errors tell more.
         nearer = (whole.value >= found.value - accuracy) & (whole.error <= found.error / 2)
         well = jnp.where(done, whole.error < found.error, nearer)
-        others = jnp.where((well | done).all(), 1, LENGTHS)
-        best = _choose(well, whole, lax.fori_loop(1, others, better, whole))
-        return _choose(done & ~well, found, best)
+
+        def falling(tries: tuple[Array, _Found]) -> Array:
+            i, best = tries
+            return (i < LENGTHS) & ~(well | done | (best.value > found.value)).all()
+
+        best = lax.while_loop(falling, shorter, (jnp.array(1, jnp.int32), whole))[1]
+        return _choose(done & ~well, found, _choose(well, whole, best))
 
     def going(search: tuple[Array, Array, _Found]) -> Array:
         step, last, _ = search
