@@ -231,3 +231,32 @@ def test_terms_do_nothing_where_there_are_none():
 
 def _relatives(prices: Prices) -> np.ndarray:
     return prices.values[FIRST + 1 : LAST + 1] / prices.values[FIRST:LAST]
+
+
+@pytest.mark.parametrize("calendar", ["yearly", "drift:0.05"])
+def test_interest_brings_a_baseline_to_its_orders_at_the_rows_of_an_agent(calendar):
+    """A loan at 15% a year, and assets whose fees of 5% do more than their prices."""
+    prices = table(6, sigma=0.0005)
+    task = Portfolio.of(
+        prices,
+        window=10,
+        horizon=20,
+        calendar=calendar,
+        cost_model="itemized(cash_rate=0.1, borrow_spread=0.05, carry_rate=-0.05)",
+        mandate={
+            "assets": {"cap": 2.0, "floor": 0.55},
+            "cash": {"min": -1.0},
+            "exposure": {"gross": 1.7, "margin": 0.58},
+        },
+    ).deciding_at(FIRST)
+    wanted = np.tile([0.1, 0.3, 0.3, 0.3], (800, 1))  # the mandate makes it 0.55 of each
+    rule = type("Rule", (Given,), {"wanted": wanted})()
+    fold = Fold("only", slice(0, FIRST), slice(FIRST, LAST), slice(0, FIRST))
+    entry, _ = Replay(prices, [fold], task, 2.0).baseline("baseline", "rule", rule)
+    ordered = ~np.isnan(entry.decisions[0, :, 0])
+    levered = np.array([-0.65, 0.55, 0.55, 0.55])
+    agent = abs(by_task(task, np.tile(levered, (800, 1))) - levered).max(1) < 1e-5
+    np.testing.assert_array_equal(ordered, agent)
+    np.testing.assert_allclose(entry.decisions[0, ordered] - levered, 0, atol=1e-5)
+    forced = ordered & ~decision_rows("yearly", prices.dates)[FIRST:LAST]
+    assert 3 < forced.sum() < 40

@@ -433,7 +433,7 @@ def test_an_order_over_several_rows_buys_nothing_that_has_left(seed: int) -> Non
     terms = AT_EVERY_ROW._replace(decides=np.arange(60) % 8 == 0, fill=6)
     found = orders(
         "equal-weight", baseline("equal-weight"), folds, prices.dates, prices.values,
-        universe=prices.tradable, listed=prices.listed, terms=terms,
+        universe=prices.tradable, conditions=Conditions.of(prices, ()), terms=terms,
     )  # fmt: skip
     relatives = np.nan_to_num(prices.values[1:] / prices.values[:-1], nan=1.0)
     holding = np.eye(6)[0]

@@ -4,11 +4,12 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio.backtest.own import Own
+from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.own_tables import read_own
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.task import Portfolio
 
 AGENTS = {
     "pathwise": Preset(
@@ -159,6 +160,17 @@ def test_later_rows_change_nothing_earlier():
     assert not np.array_equal(before, after, equal_nan=True)
     np.testing.assert_array_equal(after[known], before[known])
     np.testing.assert_array_equal(elsewhere, before)
+
+
+def test_a_holding_from_before_the_test_has_earned_interest():
+    prices, cost = table(), "itemized(cash_rate=0.2)"
+    task = Portfolio.of(prices, window=5, horizon=20, cost_model=cost)
+    own = Own("weights", prices.dates[[10]], np.array([[0.5, 0.5, 0.0, 0.0]]))
+    found = place("mine", own, prices, slice(100, 150), task, 1.0).decisions
+    moved = prices.values[100, 0] / prices.values[10, 0]
+    worth = np.array([np.exp(0.2 * 90 / 365), moved, 0, 0])
+    np.testing.assert_allclose(found[0], worth / worth.sum(), rtol=1e-12)
+    assert np.isnan(found[1:]).all()
 
 
 def test_cash_until_the_first_order_and_dates_between_rows():

@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, Bools, Floats, History
-from qfolio.portfolio.costs import cashed
+from qfolio.portfolio.backtest.growth import Growth, filled_in
+from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.costs import CostModel, Proportional, cashed
 from qfolio.portfolio.execution import Terms
 from qfolio.portfolio.mandate.feasible import Feasible, Mandated, exactly
 
@@ -55,7 +57,8 @@ def orders(
     month: int = 21,
     terms: Terms = AT_EVERY_ROW,
     universe: Bools | None = None,
-    listed: Bools | None = None,
+    costs: CostModel | None = None,
+    conditions: Conditions | None = None,
 ) -> Orders:
     """Ask a baseline for its decisions on every row of the folds.
 
@@ -77,8 +80,10 @@ def orders(
         universe: Which assets may be bought at each row, of shape (rows, N), if they come and go.
             A baseline that estimates may hold only those of them with prices in all of the fold's
             training rows. With the calendar "fold", it then decides at every row.
-        listed: Which assets have a price at each row, of the same shape; holdings of delisted
-            assets become cash.
+        costs: What holding costs and earns (default: nothing), as in the replay, so that a margin
+            call or a band comes at the same row for baselines as for agents.
+        conditions: What the costs read at each row, and which assets are listed; holdings of
+            delisted assets become cash.
 
     Returns:
         Decisions for all rows of the folds, and notes that name the fold.
@@ -91,6 +96,8 @@ def orders(
     prices = np.array(values, dtype=float)
     prices.flags.writeable = False  # shared by all baselines
     _check(folds)
+    conditions = Conditions(np.empty(0), {}, {}) if conditions is None else conditions
+    growth = Growth(filled_in(prices)[0], costs or Proportional(), conditions)
     nothing = np.eye(prices.shape[1] + 1)[0]
     last, row_last, plan = nothing, folds[0].decisions.start, terms.begin(nothing)
     watched = plan is not None or terms.called < np.inf
@@ -111,8 +118,7 @@ def orders(
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             for row in rows if again or watched else sorted(asked):
-                held = drifted(last, prices[row_last], prices[row])
-                held = held if listed is None else cashed(held, listed[row])
+                held = growth.held(last, row_last, row)
                 called = terms.calls(held)
                 if row in asked or (called and not stands):
                     known = slice(0, row + 1)
@@ -138,7 +144,7 @@ def orders(
                     last, row_last = target, row
                     part[row - rows[0]] = target
                 if plan is not None and row + 1 < len(prices):
-                    coming = drifted(plan.order, prices[row], prices[row + 1])
+                    coming = growth.held(plan.order, row, row + 1)
                     coming = coming if universe is None else cashed(coming, universe[row + 1])
                     plan = terms.next_row(row, plan, coming)
         if stands and not (again or watched or each or np.isnan(part[0]).any()):
@@ -170,15 +176,6 @@ def _tradable(fold: Fold, prices: Floats, chosen: Bools | None) -> Bools:
             "rows; begin later or drop the assets that start late."
         )
     return allowed
-
-
-def drifted(weights: Floats, then: Floats, now: Floats) -> Floats:
-    """Weights ordered at one row's prices, drifted to another's; cash once all is lost."""
-    worth = weights.copy()
-    bought = weights[1:] != 0  # others may have no price yet
-    worth[1:][bought] *= now[bought] / then[bought]
-    total = worth.sum()
-    return np.asarray(worth / total if total > 0 else np.eye(len(worth))[0])
 
 
 def obeying(

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.folds import spell
+from qfolio.portfolio.backtest.growth import Growth, filled_in
 from qfolio.portfolio.backtest.measures import Floats
-from qfolio.portfolio.backtest.orders import TOLERANCE, drifted
+from qfolio.portfolio.backtest.orders import TOLERANCE
+from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
@@ -89,7 +91,7 @@ def place(name: str, own: Own, prices: Prices, days: slice, task: Portfolio, cap
     if own.kind == "weights":
         if task.feasible.long_only:
             _require_long_only(name, own)
-        return _placed_weights(name, own, prices, days, cap, none)
+        return _placed_weights(name, own, prices, days, task, cap, none)
     lag = int(task.lag)
     earned = slice(days.start + lag + 1, days.stop + lag + 1)
     returns = (_returns if own.kind == "returns" else _growth)(name, own, prices, earned)
@@ -103,7 +105,13 @@ def place(name: str, own: Own, prices: Prices, days: slice, task: Portfolio, cap
 
 
 def _placed_weights(
-    name: str, own: Own, prices: Prices, days: slice, cap: float, decisions: Floats
+    name: str,
+    own: Own,
+    prices: Prices,
+    days: slice,
+    task: Portfolio,
+    cap: float,
+    decisions: Floats,
 ) -> Placed:
     rows, moved = rows_at(name, own.dates, prices)
     notes = []
@@ -126,8 +134,9 @@ def _placed_weights(
     before = np.flatnonzero(rows < days.start)
     if before.size and np.isnan(decisions[0, 0]):
         last = before[-1]
-        bought = prices.values[rows[last]]
-        decisions[0] = drifted(own.values[last], bought, prices.values[days.start])
+        known = Conditions.of(prices, task.costs.columns)
+        growth = Growth(filled_in(prices.values)[0], task.costs, known)
+        decisions[0] = growth.held(own.values[last], int(rows[last]), days.start)
     ordered = ~np.isnan(decisions[:, 0])
     if not ordered.any():
         raise QfolioError(

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.backtest.growth import Growth, Rows, by_sign, filled_in
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import (
     Context,
     CostModel,
     Proportional,
     cashed,
-    delisted,
     traded,
     with_cash,
 )
@@ -43,7 +43,6 @@ BLOCK = 60_000
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Rows = NDArray[np.intp] | np.intp
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,7 @@ def simulate(
             or missing after an asset's start, or weights do not sum to 1, are negative though
             long-only (both by more than 1e-6), or held before the asset's first price.
     """
-    prices, begun = _prices(values)
+    prices, begun = filled_in(values)
     orders = np.asarray(decisions, dtype=float)
     first, lag = operator.index(first), operator.index(lag)
     rows, assets = prices.shape
@@ -201,37 +200,21 @@ class _Market:
     ) -> None:
         self.prices, self.costs, self.conditions = prices, costs, conditions
         self.listed = conditions.listed  # at all rows of the table
-        self.index = None if self.listed is None else self._index(first)
+        self.growth = Growth(prices, costs, conditions, first)
         self.begun = None if begun.all() else np.insert(begun, 0, True, axis=1)
         self.first, self.lag, self.long_only = first, lag, long_only
         self.days = len(prices) - lag - 1
         day = np.arange(self.days)
         columns = lambda growth: growth.T.copy()[:, None]  # noqa: E731
         self.to_trade = [columns(x) for x in self.moved(day, day)]
-        self.after_trade = [columns(x) for x in self.grown(day + lag, day + lag + 1)]
+        self.after_trade = [columns(x) for x in self.growth.between(day + lag, day + lag + 1)]
         plain = columns(with_cash(prices[day + lag + 1] / prices[day + lag]))
         income = [growth - plain for growth in self.after_trade]
         self.income = income if any(x.any() for x in income) else None
 
     def moved(self, decided: Rows, trade: Rows) -> list[Floats]:
         """Growth from days of decisions to the trades of later days' decisions, cash first."""
-        return self.grown(decided, trade + self.lag)
-
-    def _index(self, first: int) -> list[Floats]:
-        """The product of growth factors from the first row to each.
-
-        An asset that is delisted within a period then earns what cash does for the rest of it.
-        """
-        start = np.arange(len(self.prices) - 1)
-        relatives = self.prices[1:] / self.prices[:-1]
-        context = self.conditions.holding(start + first, start + first + 1)
-        found = self.costs.carry(relatives, context), self.costs.owe(relatives, context)
-        ones = np.ones((1, relatives.shape[1] + 1))
-        return [
-            np.cumprod(np.concatenate([ones, delisted(x, relatives, context.listed)]), axis=0)
-            for x in found
-            if x is not None
-        ]
+        return self.growth.between(decided, trade + self.lag)
 
     def cashed(self, weights: Floats, days: slice) -> Floats:
         """Weights at the trades of some days, of shape (S, days, N + 1), after cash-outs."""
@@ -240,25 +223,11 @@ class _Market:
         begin = self.first + self.lag
         return np.asarray(cashed(weights, self.listed[begin + days.start : begin + days.stop]))
 
-    def grown(self, start: Rows, end: Rows) -> list[Floats]:
-        """Growth factors of each entry from one row to another, owned and owed."""
-        if self.index is not None:
-            return [np.asarray(index[end] / index[start]) for index in self.index]
-        relatives = self.prices[end] / self.prices[start]
-        context = self.conditions.holding(start + self.first, end + self.first)
-        found = self.costs.carry(relatives, context), self.costs.owe(relatives, context)
-        return [np.asarray(growth) for growth in found if growth is not None]
-
     def trades(self, days: slice, wealth: Floats) -> Context:
         """The circumstances of the trades of some days."""
         begin = self.first + self.lag
         rows = slice(begin + days.start, begin + days.stop)
         return self.conditions.trade(rows, self.lag, wealth)
-
-
-def _by_sign(weights: Floats, growth: list[Floats]) -> Floats:
-    """The growth factors of a holding's entries, by the signs of their weights."""
-    return growth[0] if len(growth) == 1 else np.where(weights < 0, growth[1], growth[0])
 
 
 def _replay(
@@ -280,13 +249,13 @@ def _replay(
         raise QfolioError("The start weights are NaN; give weights that sum to 1, or none at all.")
     start = start[..., 0].T
     # The value of the holding's entries at the next trade.
-    worth = start * _by_sign(start, market.moved(np.array(0), np.array(0)))
+    worth = start * by_sign(start, market.moved(np.array(0), np.array(0)))
     latest = np.full((len(orders), 1), -1)  # day of the last order
     wealth, ruined = np.ones((len(orders), 1)), np.zeros((len(orders), 1), bool)
     for low in range(0, market.days, columns):
         now = slice(low, min(low + columns, market.days))
         after, given = _checked(market, orders[:, now], low)
-        after *= _by_sign(after, [growth[..., now] for growth in market.to_trade])
+        after *= by_sign(after, [growth[..., now] for growth in market.to_trade])
         day = np.where(given, np.arange(now.start, now.stop), -1)
         day = np.maximum(np.maximum.accumulate(day, axis=1), latest)
         latest = day[:, -1:]
@@ -298,11 +267,11 @@ def _replay(
                 ordered = np.maximum(ordered, 0)
             wanted = np.where(source[:, None] < 0, start[who], ordered)
             moved = market.moved(np.maximum(source, 0), when + low)
-            after[:, who, when] = (wanted * _by_sign(wanted, moved)).T
+            after[:, who, when] = (wanted * by_sign(wanted, moved)).T
         broke = False if market.long_only else _settled(after)
         after /= after.sum(0)
 
-        growing = _by_sign(after, [growth[..., now] for growth in market.after_trade])
+        growing = by_sign(after, [growth[..., now] for growth in market.after_trade])
         grown = np.concatenate([worth.T[..., None], after * growing], axis=-1)
         worth = grown[..., -1].T
         lost = False if market.long_only else _settled(grown)[:, 1:]
@@ -323,7 +292,7 @@ def _replay(
             of_kind[here] = charged * paid
         if result.financing is not None and market.income is not None:
             entries = np.moveaxis(after, -1, 0)
-            income = _by_sign(entries, [rate[..., now] for rate in market.income])
+            income = by_sign(entries, [rate[..., now] for rate in market.income])
             result.financing[here] = (entries * income).sum(0)
         lost = broke | lost | (remainder <= 0)
         if lost.any() or ruined.any():
@@ -410,23 +379,3 @@ def _checked(market: _Market, weights: Floats, day: int) -> tuple[Floats, Bools]
                 "0) before its first price; give it weight 0 until then."
             )
     return columns, given
-
-
-def _prices(values: ArrayLike) -> tuple[Floats, Bools]:
-    """Checked prices, with each asset's first price filled in before its start, and a mask."""
-    prices = np.asarray(values, dtype=float)
-    if prices.ndim != 2:
-        raise QfolioError(f"Prices have the shape {prices.shape}; it must be (rows, assets).")
-    begun = ~np.isnan(prices)
-    fits = (prices > 0) & (prices < np.inf)
-    if not fits.all():
-        wrong = (begun & ~fits) | (np.maximum.accumulate(begun) & ~begun)
-        if wrong.any():
-            row, asset = np.argwhere(wrong)[0]
-            raise QfolioError(
-                f"The price of asset {asset} (counted from 0) at row {row} is "
-                f"{prices[row, asset]:g}; from its first price on all must be positive and finite."
-            )
-        starts = prices[begun.argmax(0), np.arange(prices.shape[1])]
-        prices = np.where(begun, prices, np.where(begun.any(0), starts, 1))
-    return prices, begun
