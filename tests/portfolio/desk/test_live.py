@@ -112,6 +112,35 @@ def test_shorts_and_loans_equal_the_replay_of_the_same_decisions(seed):
     np.testing.assert_allclose(found.returns[:4], replay.returns[:4], atol=1e-12)
 
 
+@pytest.mark.parametrize("rate", ["0.03", "-0.01"])
+def test_carry_is_paid_in_cash_where_the_replay_reinvests_it(rate):
+    """The first return is the replay's, and later ones differ no more than the docs say."""
+    model, rows = Itemized(0.001, carry_rate=rate), list(range(10, 250, 21))
+    ahead = []
+    for seed in range(10):
+        prices = table(260, seed=seed)
+        targets = np.random.default_rng(seed).dirichlet(np.ones(4), len(rows))
+        records = traded(prices, model, rows, targets)
+        found = mark(records, prices, model, lag=0)
+        decisions = np.full((len(prices) - 1 - 10, 4), np.nan)
+        decisions[np.array(rows) - 10] = targets
+        replay = simulate(
+            prices.values, decisions, first=10, cost=model, lag=0,
+            conditions=Conditions.of(prices, model.columns),
+        )  # fmt: skip
+        assert found.returns[0] == pytest.approx(replay.returns[0], abs=1e-12)
+        off = found.returns - replay.returns
+        assert 1e-6 < abs(off).max() < 6e-5
+        ahead.append(np.prod(1 + found.returns) / np.prod(1 + replay.returns) - 1)
+        # Shares stay as they were traded, and cash takes what they earn.
+        shares = np.array(records[-1].shares) + records[-1].trades
+        held = prices.values[rows[-1] :] @ shares
+        paid = np.cumsum(held[1:] * np.expm1(float(rate) / 365))  # on each new price
+        cash = records[-1].cash_after + paid
+        np.testing.assert_allclose(found.cash[rows[-1] - 10 :], cash, rtol=1e-9, atol=1e-9)
+    assert abs(np.array(ahead)).max() < 4e-4
+
+
 def by_hand(values, shares, cash, trades):
     prices = Prices(np.datetime64("2024-01-01") + np.arange(len(values)), ("A",), np.array(values))
     plan = Allocation(

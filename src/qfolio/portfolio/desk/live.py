@@ -84,7 +84,8 @@ def mark(
                 values[row], values[row - 1], out=np.ones(len(units)), where=values[row - 1] > 0
             )
             growth = model.growth(before, relatives, known.holding(row - 1, row))
-            # What a holding earns besides its price is paid in cash.
+            # What a holding earns besides its price is paid in cash, as brokers do: the shares
+            # of the next record are the account's, so none may be bought with it here.
             cash = cash * growth[0] + float(before[1:] @ (growth[1:] - relatives))
             if known.listed is not None:  # delisted assets become cash, and their orders void
                 gone = known.listed[row] == 0
