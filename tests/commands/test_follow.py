@@ -91,6 +91,24 @@ def test_a_loss_at_every_row_raises_the_alarm(folder, monkeypatch, capsys, tmp_p
     assert "a retrain is due because of the alarm and its age of 80d or more" in printed
 
 
+def test_a_newer_policy_is_named_and_its_age_counts(folder, monkeypatch, capsys, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    follow = ["follow", copy, "--prices", table(tmp_path / "later.csv", 350)]
+    assert qfolio(monkeypatch, *follow) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "up to 2020-09-16; a retrain is due because of its age of 80d or more" in printed
+    longer = table(tmp_path / "longer.csv", 345)
+    assert qfolio(monkeypatch, "backtest", longer, "--resume", copy) == 0
+    capsys.readouterr()
+    assert qfolio(monkeypatch, *follow) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    newer = "up to 2020-09-16, and a newer one, which the next allocation will use, up to"
+    assert f"{newer} 2020-12-10; no retrain is due before it is 80d old." in printed
+    assert qfolio(monkeypatch, *follow, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["retrain_due"], found["newer_policy_learned"]) == (False, "2020-12-10")
+
+
 def test_before_the_first_return(folder, monkeypatch, capsys):
     """The ledger's second allocation is later than the backtest's own prices."""
     assert qfolio(monkeypatch, "follow", folder) == 2

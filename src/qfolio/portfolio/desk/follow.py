@@ -36,8 +36,9 @@ class Following:
     benchmark: name of the backtest's benchmark. reference: its live net returns. note: a remark on
     these, or "". band: growth of wealth that the backtest leads one to expect, shape (3, rows).
     evidence: evidence against the backtest. learned: date of the last row that the policy learned
-    from; None without one. overdue: whether that is a test length ago or more. test: the test
-    length.
+    from; None without one. overdue: whether the newest policy learned a test length ago or more.
+    test: the test length. newer: as ``learned``, of a newer policy that no allocation has used yet;
+    None without one.
     """
 
     agent: str
@@ -56,6 +57,7 @@ class Following:
     overdue: bool
     test: str
     called: float = np.inf
+    newer: np.datetime64 | None = None
 
     @cached_property
     def growth(self) -> np.ndarray:
@@ -122,14 +124,24 @@ class Following:
     def _retrain(self) -> str:
         if self.learned is None:
             return f"{self.agent} learns nothing, so there is nothing to train."
-        why = ["the alarm"] * (self.alarm is not None)
-        why += [f"its age of {self.test} or more, the backtest's test length"] * self.overdue
         until = f"The policy has learned from prices up to {day(self.learned)}"
+        if self.newer is not None:
+            until = (
+                f"{until}, and a newer one, which the next allocation will use, up to "
+                f"{day(self.newer)}"
+            )
+        why = self._reasons()
         return (
             f"{until}; a retrain is due because of {' and '.join(why)}."
             if why
             else (f"{until}; no retrain is due before it is {self.test} old.")
         )
+
+    def _reasons(self) -> list[str]:
+        """Why a retrain is due; an alarm is answered by a policy that has learned from its row."""
+        answered = self.alarm is None or (self.newer is not None and self.newer >= self.alarm)
+        why = [] if answered else ["the alarm"]
+        return why + [f"its age of {self.test} or more, the backtest's test length"] * self.overdue
 
     def rows(self) -> dict[str, dict[str, float]]:
         """Growth in all and per year, volatility, Sharpe ratio and maximum drawdown, by name."""
@@ -166,7 +178,8 @@ class Following:
             "evidence": float(self.evidence[-1]) if len(self.growth) else None,
             "alarm_at": consistency.ALARM,
             "alarm_since": None if self.alarm is None else day(self.alarm),
-            "retrain_due": self.overdue or self.alarm is not None,
+            "retrain_due": bool(self._reasons()),
+            "newer_policy_learned": None if self.newer is None else day(self.newer),
             "flows": float(self.live.flows.sum()),
             "costs": float(self.live.costs.sum()),
             "sentences": self.sentences(),
@@ -211,7 +224,10 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
                 for promised, now in pairs
             ]
         )
-    learned = getattr(known, "learned", None)
+    learned, newer = getattr(known, "learned", None), None
+    if learned is not None and run.newest(agent) != records[-1].policy:
+        newer = run.policy(agent).learned
+    latest = learned if newer is None else newer
     return Following(
         agent,
         records,
@@ -226,9 +242,10 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
         evidence,
         table.periods_per_year,
         learned,
-        learned is not None and overdue(learned, run.config.test, table.dates),
+        latest is not None and overdue(latest, run.config.test, table.dates),
         run.config.test,
         known.task.terms.called,
+        newer,
     )
 
 
