@@ -1,5 +1,7 @@
 """The page of a backtest in a real browser: legends, pointer, choices, phones."""
 
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from qfolio.report.backtest.data import BacktestData, shown_order
 from qfolio.report.backtest.opening import lead_name
 from qfolio.report.backtest.page import render_backtest
+from qfolio.report.printing import find_browser, print_pdf
 
 from backtests import ATTACK, usual
 from browser import Browser
@@ -137,6 +140,20 @@ def test_tables_stay_whole_on_paper(browser: Browser, folder: Path) -> None:
     found = [browser.evaluate(style % part) for part in parts]
     browser.call("Emulation.setEmulatedMedia", media="")
     assert found == ["avoid", "avoid"]
+
+
+def test_the_command_does_not_fill_a_page_alone(tmp_path: Path) -> None:
+    """Where it has no room after the section before, it takes that along."""
+    read = shutil.which("pdftotext")
+    if find_browser() is None or read is None:
+        pytest.skip("no Chromium or no pdftotext found")
+    page, printed = tmp_path / "report.html", tmp_path / "report.pdf"
+    page.write_text(render_backtest(usual()), encoding="utf-8")
+    print_pdf(page, printed)
+    text = subprocess.run([read, printed, "-"], capture_output=True, text=True, check=True).stdout
+    last = text.rstrip("\f").split("\f")[-1]
+    for heading in ("About this test", "Not modeled", "Reproduce"):
+        assert heading in last
 
 
 def test_names_stand_where_lines_end(browser: Browser, folder: Path) -> None:
