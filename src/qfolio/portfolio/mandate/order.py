@@ -116,10 +116,10 @@ def ordered(
     turnover: at most so much, whatever the rules say. Differentiable almost everywhere in it, in
     ``wanted`` and in ``held``.
     """
-    return _ordered(rules, turnover, asked, wanted, held)[0]
+    return _forward(rules, turnover, asked, wanted, held)[0]
 
 
-def _ordered(
+def _forward(
     rules: Rules, turnover: Array, asked: Array, wanted: Weights, held: Weights
 ) -> tuple[Weights, tuple]:
     rules = rules.within(rules.limits._replace(turnover=turnover))
@@ -128,14 +128,14 @@ def _ordered(
     return order.weights, (rules, asked, held, order)
 
 
-def _pulled_back(kept: tuple, gradient: Weights) -> tuple:
+def _backward(kept: tuple, gradient: Weights) -> tuple:
     rules, asked, held, order = kept
-    found = where_needed(_pull_back, asked, (gradient, held, order), rules)
+    found = where_needed(_gradients, asked, (gradient, held, order), rules)
     of_wanted, of_held, of_turnover = found
     return None, of_turnover, None, of_wanted, of_held
 
 
-ordered.defvjp(_ordered, _pulled_back)
+ordered.defvjp(_forward, _backward)
 
 
 @jax.jit  # so that its Python runs once, however often it is mapped
@@ -251,7 +251,7 @@ def _conditions(
 
 
 @jax.jit
-def _pull_back(
+def _gradients(
     given: tuple[Weights, Weights, Order], rules: Rules
 ) -> tuple[Weights, Weights, Float[Array, ""]]:
     """The gradient by what is wanted, what is held and turnover, from that by the order.

@@ -66,7 +66,7 @@ def nearest(
 ) -> Float[Array, " asset"]:
     """The weights within the limits that are nearest to those wanted, which may be anywhere.
 
-    Weights within the limits are returned unchanged. It has no derivative; see ``pulled_back``.
+    Weights within the limits are returned unchanged. It has no derivative; see ``order.py``.
     """
     return approximate(search(wanted, held, limits), wanted, held, _arrays(limits, wanted))
 
