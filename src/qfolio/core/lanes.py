@@ -39,7 +39,10 @@ BLOCK = 32
 
 
 def where_needed(
-    function: Callable[[Own, PyTree], Result], needed: Bool[Array, ""], own: Own, shared: PyTree
+    function: Callable[[Own, PyTree], Result],
+    needed: Bool[Array, ""] | bool,
+    own: Own,
+    shared: PyTree,
 ) -> Result:
     """``function(own, shared)`` if it is needed, and zeros if not. It has no derivative.
 
