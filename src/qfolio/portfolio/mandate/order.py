@@ -44,7 +44,7 @@ ROUNDS = 3
 BARELY = 5e-6
 """Excesses of a limit up to this are rounding errors in float32."""
 
-PLANES, KEPT = 32, 4
+PLANES, KEPT = 32, 6
 """Most projections of an order that is too risky, and the planes of a limit that they keep."""
 
 

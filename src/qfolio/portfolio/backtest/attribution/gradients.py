@@ -108,7 +108,16 @@ def integrated(
             slope = lambda share: jax.jvp(targets, (share * features,), (along,))[1]  # noqa: E731
             return jax.vmap(slope)(places).mean(0)
 
-        pulls = lax.map(pull, jnp.arange(features.shape[-1]))
+        def pulls_back(share: Array) -> Array:
+            _, back = jax.vjp(targets, share * features)
+            each = jnp.eye(features.shape[0])
+            return lax.map(lambda asset: (back(asset)[0] * features).sum((0, 1)), each).T
+
+        # A mandate's orders have derivatives in reverse only; forward, there are fewer to compute.
+        if task.mandate:
+            pulls = lax.map(pulls_back, places).mean(0)
+        else:
+            pulls = lax.map(pull, jnp.arange(features.shape[-1]))
         end, start = jax.vmap(targets)(jnp.stack([features, 0 * features]))
         return pulls, features[:, -1], end - start
 
