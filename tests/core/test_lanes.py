@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from qfolio.core.lanes import anywhere, where_needed
+from qfolio.core.lanes import where_needed
 
 
 def affine(own, shared):
@@ -45,15 +45,3 @@ def test_items_that_need_nothing_are_not_computed():
     xs = jnp.concatenate([jnp.full(100, -1.0), jnp.array([0.1, 0.3])])
     found = jax.vmap(lambda x: where_needed(endless_below, x > 0, x, ()))(xs)
     np.testing.assert_allclose(found, [0.0] * 100 + [1.1, 1.3], rtol=1e-6)
-
-
-def test_a_condition_of_any_item_stays_a_condition():
-    flags = jnp.array([[False, False], [False, True]])
-
-    def one(flag):
-        return lax.cond(anywhere(flag), lambda: 1.0, lambda: 0.0)
-
-    twice = jax.vmap(jax.vmap(one))
-    np.testing.assert_array_equal(twice(flags), np.ones((2, 2)))
-    np.testing.assert_array_equal(twice(jnp.zeros_like(flags)), np.zeros((2, 2)))
-    assert "cond[" in str(jax.make_jaxpr(twice)(flags))

@@ -15,21 +15,6 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Int, PyTree
 
-
-@custom_vmap
-def anywhere(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether the flag is set for any item of a batch.
-
-    A condition of it stays a condition under ``vmap``; one of the flag computes both branches.
-    """
-    return flag
-
-
-@anywhere.def_vmap
-def _anywhere(size: int, batched: Any, flags: Array) -> tuple[Array, bool]:
-    return anywhere(flags.any(0)), False
-
-
 Own = TypeVar("Own")
 
 Result = TypeVar("Result")
@@ -46,8 +31,8 @@ def where_needed(
 ) -> Result:
     """``function(own, shared)`` if it is needed, and zeros if not. It has no derivative.
 
-    own: what differs between the items of a batch. shared: what many of them have in common; it is
-    never copied for each of them.
+    own: what differs between the items of a batch. shared: what many of them have in common; at
+    most a block of its copies is in memory.
     """
     leaves, structure = jax.tree.flatten(shared)
     given = (jnp.asarray(needed), jax.tree.map(jnp.asarray, own), [jnp.asarray(x) for x in leaves])

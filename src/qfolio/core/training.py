@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
-from qfolio.core.lanes import anywhere
 from qfolio.core.mdp import Agent, Metrics, Task, Transition
 
 CHUNK = 400
@@ -158,7 +157,7 @@ def _rollout(
             return jax.tree.map(partial(_select, finished), fresh, states)
 
         # The branch carries the environments only, never the agent with its replay buffer.
-        states = lax.cond(anywhere(finished.any()), reset, lambda states: states, after.state)
+        states = lax.cond(finished.any(), reset, lambda states: states, after.state)
         return (states, jnp.where(finished, 0, length + 1)), transition
 
     times = state.steps + jnp.arange(agent.rollout_steps)

@@ -73,6 +73,16 @@ def traded(prices, model, rows, targets):
     return records
 
 
+def replayed(prices, model, rows, targets, **rules):
+    """The replay of the same decisions, from row 10 on."""
+    decisions = np.full((len(prices) - 1 - 10, 4), np.nan)
+    decisions[np.array(rows) - 10] = targets
+    known = Conditions.of(prices, model.columns)
+    return simulate(
+        prices.values, decisions, first=10, cost=model, lag=0, conditions=known, **rules
+    )
+
+
 @pytest.mark.parametrize("model", [Proportional(0.002), Itemized(0.001, cash_rate="0.05")])
 @pytest.mark.parametrize("seed", range(5))
 def test_returns_equal_the_replay_of_the_same_decisions(model, seed):
@@ -81,12 +91,7 @@ def test_returns_equal_the_replay_of_the_same_decisions(model, seed):
     rows = [10, 11, 25, 40]
     targets = rng.dirichlet(np.ones(4), 4)
     found = mark(traded(prices, model, rows, targets), prices, model, lag=0)
-    decisions = np.full((len(prices) - 1 - 10, 4), np.nan)
-    decisions[np.array(rows) - 10] = targets
-    replay = simulate(
-        prices.values, decisions, first=10, cost=model, lag=0,
-        conditions=Conditions.of(prices, model.columns),
-    )  # fmt: skip
+    replay = replayed(prices, model, rows, targets)
     np.testing.assert_allclose(found.returns, replay.returns, atol=1e-12)
     np.testing.assert_array_equal(found.dates, prices.dates[11:])
     np.testing.assert_allclose(found.flows, 0, atol=1e-9)
@@ -102,12 +107,7 @@ def test_shorts_and_loans_equal_the_replay_of_the_same_decisions(seed):
     targets = np.column_stack([1 - assets.sum(1), assets])
     rows = [10, 11, 12, 13]
     found = mark(traded(prices, model, rows, targets), prices, model, lag=0)
-    decisions = np.full((len(prices) - 1 - 10, 4), np.nan)
-    decisions[:4] = targets
-    replay = simulate(
-        prices.values, decisions, first=10, cost=model, lag=0, long_only=False,
-        conditions=Conditions.of(prices, model.columns),
-    )  # fmt: skip
+    replay = replayed(prices, model, rows, targets, long_only=False)
     assert (targets < 0).any()
     np.testing.assert_allclose(found.returns[:4], replay.returns[:4], atol=1e-12)
 
@@ -122,12 +122,7 @@ def test_carry_is_paid_in_cash_where_the_replay_reinvests_it(rate):
         targets = np.random.default_rng(seed).dirichlet(np.ones(4), len(rows))
         records = traded(prices, model, rows, targets)
         found = mark(records, prices, model, lag=0)
-        decisions = np.full((len(prices) - 1 - 10, 4), np.nan)
-        decisions[np.array(rows) - 10] = targets
-        replay = simulate(
-            prices.values, decisions, first=10, cost=model, lag=0,
-            conditions=Conditions.of(prices, model.columns),
-        )  # fmt: skip
+        replay = replayed(prices, model, rows, targets)
         assert found.returns[0] == pytest.approx(replay.returns[0], abs=1e-12)
         off = found.returns - replay.returns
         assert 1e-6 < abs(off).max() < 6e-5

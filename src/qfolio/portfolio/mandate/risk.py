@@ -30,7 +30,7 @@ class Risk(NamedTuple):
     benchmark: Float[Array, " asset"]  # weights held by the benchmark
 
     def of(self, weights: Float[Array, " asset"]) -> Float[Array, ""]:
-        """The annual volatility of weights; at least 1e-6, so that its derivative is finite."""
+        """The annual volatility of weights; at least 1e-6, so that it can be divided by."""
         return jnp.sqrt(jnp.maximum(self.between(weights, weights), TINY))
 
     def between(
@@ -66,7 +66,7 @@ class Risk(NamedTuple):
         """
         active = weights - center
         slope = self.covariance @ active
-        size = jnp.maximum(lax.stop_gradient(abs(slope).max()), TINY)
+        size = jnp.maximum(abs(slope).max(), TINY)
         row = slope / size
         return row, most * self.of(active) / size + row @ center
 
