@@ -65,7 +65,7 @@ def test_limits_are_a_reason_where_what_is_held_or_wanted_breaks_them():
     assert largest.asset == "A"
     assert largest.required == pytest.approx(-0.4, abs=1e-6)
     assert sentence(largest).startswith(
-        f"A {figure(largest.change, '+.2%')}: the mandate's limits require \N{MINUS SIGN}40.00%;"
+        f"A {figure(largest.change, '+.2%')}: the limits on weights require \N{MINUS SIGN}40.00%;"
     )
     capped = next(each for each in others if each.bounds)
     assert (capped.required, capped.bounds) == (pytest.approx(0, abs=1e-6), ("its cap of 20.00%",))
@@ -90,5 +90,7 @@ def test_the_limits_that_a_target_reaches_are_named():
     trading = feasible(settled({"trading": {"turnover": 0.3}}, "ABCD"), np.ones(4, bool))
     held = np.array([0.4, 0.3, 0.2, 0.05, 0.05])
     assert _bounds(trading, weights, held) == [("the limit of turnover",)] * 4
-    simplex = CappedSimplex(jnp.array([0.35, 1.0, 0.15, 1.0]))
-    assert _bounds(simplex, weights, held) == [(), (), ("its cap of 15.00%",), ()]
+    simplex = CappedSimplex(jnp.array([0.35, 1.0, 0.15, 0.0]))
+    without = np.array([0.45, 0.3, 0.1, 0.15, 0.0])
+    out = ("zero because it may not be held",)
+    assert _bounds(simplex, without, held) == [(), (), ("its cap of 15.00%",), out]

@@ -97,7 +97,9 @@ def _bounds(allowed: Feasible, weights: np.ndarray, held: np.ndarray) -> list[tu
     ends = (np.broadcast_to(bound, assets.shape).tolist() for bound in (low, high))
     found: list[list[str]] = [[] for _ in assets]
     for each, weight, low, high in zip(found, assets.tolist(), *ends, strict=True):
-        if weight >= high - VISIBLE and high < 1:
+        if low == high == 0:
+            each.append("zero because it may not be held")
+        elif weight >= high - VISIBLE and high < 1:
             each.append(f"its cap of {figure(high, '.2%')}")
         elif weight <= low + VISIBLE and low != 0:
             each.append(f"its floor of {figure(low, '.2%')}")
@@ -121,7 +123,7 @@ def sentence(reason: Reason) -> str:
     moving = [each for each in reason.drivers if abs(each.weight) >= VISIBLE]
     change = f"{reason.asset} {figure(reason.change, '+.2%')}:"
     if abs(reason.required) >= VISIBLE:
-        change += f" the mandate's limits require {figure(reason.required, '+.2%')};"
+        change += f" the limits on weights require {figure(reason.required, '+.2%')};"
     reached = f" The target is at {listed(reason.bounds)}." if reason.bounds else ""
     if not moving:
         return f"{change} no signal moves it, so that it is the same on a typical day.{reached}"
