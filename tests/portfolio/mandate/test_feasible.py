@@ -71,6 +71,25 @@ def test_what_a_mandate_projects_or_draws_is_allowed(trading):
     np.testing.assert_allclose(again, found, atol=2e-6)
 
 
+def test_where_turnover_gives_way_no_other_limit_does_for_the_sake_of_small_trades():
+    made = mandated(turnover=0.05, smallest_trade=0.002)
+    rng = np.random.default_rng(0)
+    wanted, held = (jnp.asarray(rng.dirichlet(np.full(9, 0.5), 300), jnp.float32) for _ in "ab")
+    found = jax.jit(jax.vmap(made.project))(wanted, held)
+    over = made.violations(found, held)
+    assert float(over.pop("turnover is too high by").max()) > 0.1  # as other limits require
+    del over["a trade is too small by"]
+    assert largest(over) <= 2e-5  # with few steps in the first round, 0.3
+
+
+def test_what_a_mandate_with_loans_draws_is_allowed():
+    limits = {"cash": {"min": -1.0, "max": -0.2}, "exposure": {"gross": 2.0}}
+    made = feasible(settled(limits, "ABCDE"), np.ones(5, bool))
+    drawn = jax.vmap(made.draw)(jax.random.split(jax.random.key(0), 100))
+    assert largest(made.violations(drawn)) <= 2e-6
+    assert float(drawn[:, 0].max()) <= -0.2 + 2e-6
+
+
 def test_no_rounding_makes_a_loan():
     fully = feasible(settled({"cash": {"max": 0.0}}, "ABCDE"), np.ones(5, bool))
     random = np.random.default_rng(1)

@@ -34,7 +34,7 @@ class Feasible(eqx.Module):
     def project(
         self, wanted: Float[Array, " entry"], held: Float[Array, " entry"]
     ) -> Float[Array, " entry"]:
-        """Weights of the set for the wanted weights (on the simplex) and the weights held.
+        """Weights of the set for the wanted weights, of sum 1, and the weights held.
 
         Weights of the set are returned unchanged; differentiable almost everywhere.
         """
@@ -149,12 +149,24 @@ class Mandated(Feasible):
         return jnp.where(asked, simplex.with_rest(weights), held)
 
     def draw(self, key: PRNGKeyArray) -> Float[Array, " entry"]:
+        """As in ``Feasible``, but for turnover, the smallest trade and limits of risk."""
         drawn = CappedSimplex(jnp.ones_like(self.limits.high)).draw(key)
-        from_anywhere = self.limits._replace(turnover=jnp.array(jnp.inf))
-        return Mandated(from_anywhere, self.names, self.holdings).project(drawn, drawn)
+        never = float("inf")
+        free = dataclasses.replace(
+            self,
+            limits=self.limits._replace(turnover=jnp.array(never)),
+            smallest_trade=0.0,
+            volatility=never,
+            tracking_error=never,
+            risk=None,
+        )
+        return free.project(drawn, drawn)
 
     def violations(self, weights: Any, held: Any = None) -> dict[str, Any]:
-        """As in ``Feasible``; given the weights held, also for turnover and the smallest trade."""
+        """As in ``Feasible``, but for limits of risk, which depend on the row.
+
+        Given the weights held, also for turnover and the smallest trade.
+        """
         xp = weights.__array_namespace__()
         low, high, rows, most, gross, turnover = (xp.asarray(x) for x in self.limits[:6])
         assets = weights[..., 1:]

@@ -5,7 +5,7 @@ weights that no limit moves, it costs next to nothing.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,10 +20,12 @@ from qfolio.core.lanes import where_needed
 from qfolio.core.market import SEARCHED
 from qfolio.portfolio.mandate.projection import (
     FEW,
+    ITERATIONS,
     Face,
     Limits,
     approximate,
     below,
+    choose,
     excess,
     face,
     nearest,
@@ -157,7 +159,7 @@ def _find(account: tuple[Weights, Weights], rules: Rules) -> Order:
         too_risky = rules.share_of_risk(weights) > 1 + BARELY
         given = wanted, held, weights, limits, within
         safer = where_needed(_safer, too_risky, given, rules)
-        weights, on, pulls = _choose(too_risky, safer, (weights, on, pulls))
+        weights, on, pulls = choose(too_risky, safer, (weights, on, pulls))
     return Order(weights, on._replace(stays=on.stays | left), pulls)
 
 
@@ -327,21 +329,23 @@ def _without_small(
         change = approximate(found, wanted, held, limits) - held
         return can_stay & (abs(change) < rules.smallest_trade - BARELY)
 
-    def leave(before: tuple[Array, Multipliers], _: None) -> tuple[tuple, tuple]:
+    def leave(before: tuple[Array, Multipliers], steps: Array) -> tuple[tuple, tuple]:
         left, found = before
         fewer = _fixed(limits, left, held)
-        found = search(wanted, held, fewer, found, FEW)
+        found = search(wanted, held, fewer, found, steps)
         return (left | small(found, fewer), found), before
 
     nothing = none_binds(limits)
     none = jnp.zeros_like(can_stay)
-    (left, found), (lefts, founds) = lax.scan(leave, (none, nothing), None, ROUNDS)
+    # The first round is the order if no later one fits, so it must be as exact as without them.
+    steps = jnp.array([ITERATIONS] + [FEW] * (ROUNDS - 1), jnp.int32)
+    (left, found), (lefts, founds) = lax.scan(leave, (none, nothing), steps)
     fewer = _fixed(limits, lefts[-1], held)
     fits = excess(approximate(found, wanted, held, fewer), held, limits).max() <= BARELY
     fits &= (left == lefts[-1]).all()
     may_stay = _obeys(rules, held)
-    otherwise = _choose(may_stay, (nothing, ~none), (founds[1], none))
-    return _choose(fits, (found, lefts[-1]), otherwise)
+    otherwise = choose(may_stay, (nothing, ~none), (founds[1], none))
+    return choose(fits, (found, lefts[-1]), otherwise)
 
 
 def _obeys(rules: Rules, held: Weights) -> Bool[Array, ""]:
@@ -351,10 +355,6 @@ def _obeys(rules: Rules, held: Weights) -> Bool[Array, ""]:
                       excess(held, held, limits).max()]).max()  # fmt: skip
     few = (abs(held) > BARELY).sum() <= rules.holdings if rules.holdings else True
     return (over <= BARELY) & few
-
-
-def _choose(first: Bool[Array, ""], one: Any, other: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)
 
 
 def _fixed(limits: Limits, which: Bool[Array, " asset"], to: Weights) -> Limits:

@@ -7,7 +7,7 @@ Newton method (Qi & Sun 1993), projected onto their bounds (Bertsekas 1982), fin
 maximum, and then its last step is exact. The piece, a face of the set, also gives the derivative.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,8 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from qfolio.core import symmetric
+
+T = TypeVar("T")
 
 LARGEST, OF_TURNOVER, OF_PLANES = 100.0, 10.0, 1.0
 """Bounds of the multipliers. That of turnover is lower than that of the other limits: where these
@@ -76,7 +78,7 @@ def search(
     held: Float[Array, " asset"],
     limits: Limits,
     start: Float[Array, " condition"] | None = None,
-    iterations: int = ITERATIONS,
+    iterations: int | Int[Array, ""] = ITERATIONS,
 ) -> Float[Array, " condition"]:
     """The multipliers of ``nearest``.
 
@@ -85,7 +87,7 @@ def search(
     """
     limits = _arrays(limits, wanted)
     start = none_binds(limits) if start is None else start
-    most = jnp.array(iterations, jnp.int32)
+    most = jnp.asarray(iterations, jnp.int32)
     given = jax.tree.map(lambda x: x[..., None], (wanted, held, limits, start, most))
     found: Array = _search(*given)[..., 0]
     return found
@@ -121,7 +123,7 @@ def _search(
         def shorter(tries: tuple[Array, _Found]) -> tuple[Array, _Found]:
             i, best = tries
             tried = at(SHORTENING ** -i.astype(wanted.dtype))
-            return i + 1, _choose(tried.value > best.value, tried, best)
+            return i + 1, choose(tried.value > best.value, tried, best)
 
         whole, done = at(jnp.ones((), wanted.dtype)), found.error <= accuracy
         # Near the maximum the differences of values are rounding errors, and errors tell more.
@@ -133,7 +135,7 @@ def _search(
             return (i < LENGTHS) & ~(well | done | (best.value > found.value)).all()
 
         best = lax.while_loop(falling, shorter, (jnp.array(1, jnp.int32), whole))[1]
-        return _choose(done & ~well, found, _choose(well, whole, best))
+        return choose(done & ~well, found, choose(well, whole, best))
 
     def going(search: tuple[Array, Array, _Found]) -> Array:
         step, last, _ = search
@@ -285,5 +287,7 @@ def _arrays(limits: Limits, like: Array) -> Limits:
     return jax.tree.map(lambda x: jnp.asarray(x, like.dtype), limits)
 
 
-def _choose(first: Array, one: _Found, other: _Found) -> _Found:
-    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)
+def choose(first: Bool[Array, "*path"], one: T, other: T) -> T:
+    """One tree of arrays where a condition holds, and another elsewhere."""
+    found: T = jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)
+    return found
