@@ -64,6 +64,7 @@ class Portfolio(Market):
     elapsed: Float[Array, " dated"]  # share of the year at each row, see Terms; no rows if unused
     benchmarks: Float[Array, "benchmarked asset"]  # a benchmark's weights; no rows without one
     covariances: Float[Array, "estimated asset asset"]  # of returns; no rows without limits on risk
+    joined: Int[Array, " asset"]  # the row of an asset's first price
     year: Float[Array, ""]  # rows in a year
     tradable: Bool[Array, "row asset"] | None  # at each row; None if all assets always are
     first_decision: Row
@@ -113,6 +114,7 @@ class Portfolio(Market):
             elapsed=jnp.zeros(0),
             benchmarks=jnp.zeros((0, assets)),
             covariances=jnp.zeros((0, assets, assets)),
+            joined=jnp.zeros(assets, jnp.int32),
             year=jnp.ones(()),
             tradable=None,
             first_decision=jnp.array(0, jnp.int32),
@@ -140,21 +142,22 @@ class Portfolio(Market):
         compared = anchors.path(risk.benchmark, prices) if risk.benchmark else logs[:0]
         year, known = np.array(prices.periods_per_year), np.zeros((0, *self.covariances.shape[1:]))
         if self.allowed is not None and self.allowed.limits_risk:
-            known = covariances(logs, risk.rows, prices.periods_per_year)
+            known = covariances(logs, prices.first_rows, risk.rows, prices.periods_per_year)
         given = (logs, extra, followed, then, passed, compared, known, year)
         arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), given)
         decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)
         decides[-1:] = True  # tomorrow's weights may be asked for on any day
         tradable, patterns = prices.tradable, None
+        joined = prices.first_rows.astype(np.int32)
         if tradable is not None and self.mandate:
             patterns = Patterns.of(self.mandate, tradable, self.max_weight)[0].in_float32()
         return eqx.tree_at(
             lambda t: (
                 t.log_relatives, t.extra, t.anchors, t.conditions, t.elapsed, t.benchmarks,
-                t.covariances, t.year, t.decides, t.tradable, t.patterns,
+                t.covariances, t.year, t.joined, t.decides, t.tradable, t.patterns,
             ),
             self,
-            (*arrays, *jax.tree.map(jnp.asarray, (decides, tradable, patterns))),
+            (*arrays, *jax.tree.map(jnp.asarray, (joined, decides, tradable, patterns))),
             is_leaf=lambda x: x is None,
         )  # fmt: skip
 
@@ -343,7 +346,15 @@ class Portfolio(Market):
 
     def _past(self, market: Row) -> Past:
         rows = self.written.risk.rows
-        return Past(self.log_relatives, self.covariances, self.benchmarks, market, self.year, rows)
+        return Past(
+            self.log_relatives,
+            self.joined,
+            self.covariances,
+            self.benchmarks,
+            market,
+            self.year,
+            rows,
+        )
 
     def _limits(self, market: Row) -> Float[Array, " asset"]:
         """The largest weights at a row."""

@@ -120,6 +120,26 @@ def test_no_order_is_nearer(risk):
         assert max(ratios) < 1.005
 
 
+@pytest.mark.parametrize("room", [2**24, 0])
+def test_the_risk_of_an_asset_that_joins_comes_from_its_own_days(monkeypatch, room):
+    monkeypatch.setattr("qfolio.portfolio.mandate.risk.ROOM", room)
+    prices, first = table(), 300
+    values = np.array(prices.values)
+    values[:first, 2] = np.nan
+    members = np.ones_like(values, bool)
+    members[:50, 0] = False
+    late = Prices(prices.dates, ASSETS, values, members=members)
+    task = Portfolio.blank(5, 0, mandate=settled({"risk": {"volatility": 0.2}}, ASSETS)).on(late)
+    for row in (first + 10, ROWS - 1):
+        found = np.asarray(task.risk_at(jnp.array(row)).covariance)
+        for i in range(5):
+            past = min(252, row - first * (i == 2))
+            assert found[i, i] == pytest.approx(
+                volatility(prices, row, np.eye(5)[i], past) ** 2, rel=1e-4
+            )
+        assert np.linalg.eigvalsh(found).min() > 0
+
+
 def test_other_limits_hold_and_both_risks_are_met_where_they_can_be():
     prices, rng = table(), np.random.default_rng(3)
     limits = {"assets": {"cap": 0.5, "floor": {"A": 0.05}}, "cash": {"min": 0.02},

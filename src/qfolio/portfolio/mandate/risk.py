@@ -1,7 +1,8 @@
 """Limits on volatility and tracking error.
 
 Both are estimated from the last returns, of which squares are averaged: a mean of returns is lost
-in the noise of so few.
+in the noise of so few. A sum of products of two assets' returns is divided by the geometric mean of
+how many returns of each are known, so that the estimate is positive semidefinite where assets join.
 
 Weights with so little risk form an ellipsoid. A tangent plane of it is one more row of linear
 limits, and a line to a safe portfolio stays within all convex limits and meets the ellipsoid at the
@@ -74,7 +75,8 @@ class Risk(NamedTuple):
 class Past(eqx.Module):
     """What is known of returns at a row; risk is estimated from it where it is needed."""
 
-    log_relatives: Float[Array, "row asset"]  # those of the first row are not known
+    log_relatives: Float[Array, "row asset"]  # 0 up to an asset's first price
+    joined: Int[Array, " asset"]  # the row of this price
     covariances: Float[Array, "estimated asset asset"]  # of each row, if there is room for them
     benchmarks: Float[Array, "benchmarked asset"]  # weights; no rows without a benchmark
     row: Int[Array, ""]
@@ -91,23 +93,29 @@ class Past(eqx.Module):
             return Risk(known, weights)
         size = min(self.rows, len(self.log_relatives))
         start = jnp.maximum(self.row + 1 - size, 0)
-        rows = start + jnp.arange(size)
-        known = (rows > 0) & (rows <= self.row)
+        past = start + jnp.arange(size) <= self.row
         logs = lax.dynamic_slice_in_dim(self.log_relatives, start, size)
-        returns = jnp.where(known[:, None], jnp.expm1(logs), 0.0)
-        return Risk(self.year / jnp.maximum(known.sum(), 1) * (returns.T @ returns), weights)
+        returns = jnp.where(past[:, None], jnp.expm1(logs), 0.0)
+        returns *= jnp.sqrt(self.year / jnp.clip(self.row - self.joined, 1, self.rows))
+        return Risk(returns.T @ returns, weights)
 
 
 def covariances(
-    log_relatives: Float[np.ndarray, "row asset"], past: int, year: float
+    log_relatives: Float[np.ndarray, "row asset"],
+    joined: Int[np.ndarray, " asset"],
+    past: int,
+    year: float,
 ) -> Float[np.ndarray, "estimated asset asset"]:
     """What ``Past`` estimates at each row; no rows if they need more numbers than ``ROOM``."""
     rows, assets = log_relatives.shape
     if rows * assets**2 > ROOM:
         return np.zeros((0, assets, assets))
     returns = np.expm1(log_relatives)
-    returns[:1] = 0.0
     products = returns[:, :, None] * returns[:, None]
     sums = np.cumsum(products, axis=0, out=products)
     sums[past:] -= sums[:-past].copy()
-    return np.asarray(sums * (year / np.clip(np.arange(rows), 1, past))[:, None, None])
+    # A sum of fewer returns than past is scaled up; so is that of an asset with a short history.
+    scale = np.sqrt(year / np.clip(np.arange(rows)[:, None] - joined, 1, past))
+    sums *= scale[:, :, None]
+    sums *= scale[:, None]
+    return np.asarray(sums)
