@@ -205,8 +205,8 @@ def test_tracking_error_is_against_the_benchmark_of_the_backtest():
     own, message = np.zeros(200), "tracking error cannot be measured against the benchmark '"
     with pytest.raises(QfolioError, match=message + "benchmark', which is no asset"):
         against({"risk": risk}, benchmark=own)
-    with pytest.raises(QfolioError, match=message + "B'"):
-        against({"risk": risk}, strategies={"B": own}, benchmark="B")
+    with pytest.raises(QfolioError, match=message + "house'"):
+        against({"risk": risk}, strategies={"house": own}, benchmark="house")
 
 
 def test_without_a_mandate_the_program_is_as_before():

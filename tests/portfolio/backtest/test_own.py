@@ -273,7 +273,8 @@ def test_a_return_on_a_day_between_rows_is_refused():
         ("equal-weight at 0.3", None, "already"), ("/b", None, "cannot be called '/b'"),
         ("pathwise/0", None, "already has a strategy pathwise/0"), ("_b", None, "cannot be called"),
         ("mine", "pathwise", "benchmark pathwise is an agent"),
-        ("mine", "min", r"'min' is not a strategy .* an asset or a file \(did you mean 'mine'\?\)"),
+        ("mine", "min", r"'min' is no baseline.*, and no file \(did you mean 'mine'\?\)"),
+        ("A", None, "The table has an asset A; give your strategy of this name another one"),
     ],
 )  # fmt: skip
 def test_names_that_are_refused(name, benchmark, message):

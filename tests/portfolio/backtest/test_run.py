@@ -97,6 +97,32 @@ def test_all_strategies_are_replayed_on_the_same_days(finished):
     assert assessment.strategies["dqn"].to_reference.reference == "equal-weight"
 
 
+@pytest.mark.parametrize(
+    ("settings", "cost"),
+    [
+        ({}, 0.002), ({"cost_model": "itemized(cost=0.003)"}, 0.003),
+        ({"mandate": {"costs": {"cost": 0.0005}}}, 0.0005),
+        ({"mandate": {"costs": {"cost": 0.0005}}, "cost_model": "itemized(cost=0.003)"}, 0.003),
+    ],
+)  # fmt: skip
+def test_the_cost_that_is_stated_is_charged(settings, cost):
+    backtest = create(cost=0.002, **settings)
+    assert backtest.config.cost == cost
+    assert f"{cost * 1e4:g} bp" in backtest._repr_html_()
+    charged = backtest.replay.task.costs
+    assert charged.cost == cost
+
+
+def test_the_test_may_be_judged_from_a_date_on(finished):
+    entries, _ = finished.entries()
+    whole, half = finished.assess(entries), finished.assess(entries, str(finished.dates[60])[:10])
+    assert half.strategies["dqn"].measures != whole.strategies["dqn"].measures
+    with pytest.raises(QfolioError, match="'soon' is no date"):
+        finished.assess(entries, "soon")
+    with pytest.raises(QfolioError, match=r"The test ends on .*, before 2999-01-01"):
+        finished.assess(entries, "2999-01-01")
+
+
 def test_a_backtest_says_what_it_is(finished):
     first, last = (str(date)[:10] for date in finished.dates[[0, -1]])
     assert repr(finished) == (
@@ -370,6 +396,7 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
         ({"train": "300d"}, "nothing to test"), ({"test": "1 year"}, "like 5y"),
         ({"train": "25d"}, "rows are too few"), ({"cost": 0.5}, "cost is 0.5"),
         ({"lag": -1}, "lag is -1"), ({"agents": {}}, "at least one agent"),
+        ({"cap": 1.5}, "The cap is 1.5; it must be above 0"), ({"cap": np.nan}, "The cap is nan"),
     ],
 )  # fmt: skip
 def test_backtests_that_cannot_be(settings, message, tmp_path):

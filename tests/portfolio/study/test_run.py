@@ -208,6 +208,8 @@ def test_a_fold_may_end_on_a_holiday():
         ({"tables": {"a": TABLES["one"], "b": TABLES["one"]}}, "a and b are the same table"),
         ({"lags": (1, 1)}, "lag of 1 with a cost of 10 bp is given twice"),
         ({"baselines": ["equl-weight"]}, "one: .*equl-weight"),
+        ({"costs": (0.001, 0.002), "mandate": {"costs": {"cost": 0.0005}}}, "sets a cost of 5 bp"),
+        ({"costs": (0.001, 0.002), "cost_model": "itemized(cost=0.003)"}, "sets a cost of 30 bp"),
         ({"train": "five"}, "A length is 'five'"),
         ({"after": ["nowhere"]}, "nowhere is no study"),
     ],

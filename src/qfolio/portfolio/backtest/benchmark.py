@@ -72,6 +72,10 @@ def field_of(
         own[name] = source if isinstance(source, Own) else read_own(name, source, prices)
 
     for name, source in strategies.items():
+        if name in prices.assets:
+            raise QfolioError(
+                f"The table has an asset {name}; give your strategy of this name another one."
+            )
         add(name, source)
     if benchmark is None:
         return Field(EQUAL_WEIGHT, rules, own)
@@ -94,16 +98,14 @@ def field_of(
     if not Path(name).exists():
         known = [*own, *BASELINES, *prices.assets]
         raise QfolioError(
-            f"The benchmark {quote(name)} is not a strategy of the backtest, an asset or a "
-            f"file{hint(name, known)}."
+            f"The benchmark {quote(name)} is no baseline, asset or strategy of the backtest, and "
+            f"no file{hint(name, known)}."
         )
     add(Path(name).stem, Path(name))
     return Field(Path(name).stem, rules, own)
 
 
-def tracked(
-    mandate: Mandate, benchmark: Any, field: Field, prices: Prices, strategies: Mapping[str, Any]
-) -> Mandate:
+def tracked(mandate: Mandate, benchmark: Any, field: Field, prices: Prices) -> Mandate:
     """The mandate, whose tracking error is against the backtest's benchmark if it names none.
 
     Args:
@@ -111,7 +113,6 @@ def tracked(
         benchmark: As ``field_of`` takes it.
         field: What ``field_of`` makes of it.
         prices: The table of the backtest.
-        strategies: The user's own strategies by name.
 
     Raises:
         QfolioError: The benchmark is neither an asset nor a baseline.
@@ -121,7 +122,7 @@ def tracked(
     if benchmark is None or risk.tracking_error is None or named is not None:
         return mandate
     name = str(benchmark) if isinstance(benchmark, str | Path) else field.benchmark
-    if name in strategies or name not in {*prices.assets, *BASELINES, *field.baselines}:
+    if name not in {*prices.assets, *BASELINES, *field.baselines}:
         raise QfolioError(
             f"The mandate's tracking error cannot be measured against the benchmark {quote(name)}, "
             "which is no asset of the table and no baseline; set risk.benchmark to one, or to "

@@ -39,6 +39,7 @@ from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow, updates_of
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
+from qfolio.portfolio.backtest.terms import PROPORTIONAL, Terms
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold, preparing
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.mandate import Mandate, reach, settled
@@ -48,9 +49,6 @@ from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.growth import require_grown
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.task import Portfolio
-
-PROPORTIONAL = "proportional"
-"""The default cost model."""
 
 SMALL = 10**6
 """Number of prices below which two agents are replayed or explained side by side. Compiling their
@@ -161,10 +159,11 @@ class Backtest:
             cap: Largest weight of one asset; with 1, a mandate that allows loans or short sales
                 may set a cap above it.
             mandate: Limits that all orders obey, of agents and of baselines: a ``Mandate``, the
-                path of a file, or a dictionary of its sections. Its costs, calendar and benchmark
-                apply where the arguments of these names have their defaults.
+                path of a file, or a dictionary of its sections. Its cost always applies, its cost
+                model, calendar and benchmark where the arguments of these names have defaults.
             cost_model: Cost of trading and holding, in training and replay: a name of the registry,
-                or your own as ``module:Name``, with its settings as in "itemized(fixed=5)".
+                or your own as ``module:Name``, with its settings as in "itemized(fixed=5)"; a cost
+                among them precedes all others.
             calendar: When all strategies may trade: weekly, monthly, quarterly or yearly, on the
                 first row of each period; every so many rows; or "drift:0.05", when some weight is
                 more than 0.05 from its target (default: at every row, and baselines by their own
@@ -189,15 +188,16 @@ class Backtest:
         """
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")
-        terms = None if mandate is None else Mandate.of(mandate)
-        if terms is not None:
-            benchmark = terms.benchmark if benchmark is None else benchmark
-            calendar = calendar or terms.trading.calendar
-            cost = float(terms.costs.get("cost", cost))
-            cost_model = (cost_model == PROPORTIONAL and terms.cost_model) or cost_model
-        field = field_of(prices, agents, baselines, strategies or {}, benchmark)
-        if terms is not None:
-            terms = tracked(terms, benchmark, field, prices, strategies or {})
+        if not 0 < cap <= 1:
+            raise QfolioError(
+                f"The cap is {cap:g}; it must be above 0 and at most 1. A mandate that allows "
+                "loans or short sales may set one above 1 (assets.cap)."
+            )
+        terms = Terms.of(mandate, cost, cost_model, calendar, benchmark)
+        field = field_of(prices, agents, baselines, strategies or {}, terms.benchmark)
+        limits = terms.mandate
+        if limits is not None:
+            limits = tracked(limits, terms.benchmark, field, prices)
         config = BacktestConfig(
             prices=describe(prices),
             assets=list(prices.assets),
@@ -206,11 +206,11 @@ class Backtest:
             test=test,
             expanding=expanding,
             lag=int(lag),
-            cost=float(cost),
+            cost=terms.cost,
             cap=float(cap),
-            mandate=terms,
-            cost_model=cost_model,
-            calendar=calendar,
+            mandate=limits,
+            cost_model=terms.cost_model,
+            calendar=terms.calendar,
             baselines=field.baselines,
             strategies=tuple(field.own),
             benchmark=field.benchmark,
@@ -462,10 +462,19 @@ class Backtest:
         """Any agent's task; costs, lag and limits are the same for all."""
         return next(iter(self.tasks.values()))
 
+    def _since(self, date: str) -> int:
+        """The first row of the test at or after a date."""
+        try:
+            first = int(np.searchsorted(self.dates, np.datetime64(date)))
+        except ValueError:
+            raise QfolioError(f"{date!r} is no date; write one such as 2020-01-01.") from None
+        if first == len(self.dates):
+            raise QfolioError(f"The test ends on {day(self.dates[-1])}, before {date}.")
+        return first
+
     def assess(self, entries: dict[str, Entry], since: str | None = None) -> assessment.Assessment:
         """The statistics of all strategies, over the whole test or from a date on."""
-        first = 0 if since is None else int(np.searchsorted(self.dates, np.datetime64(since)))
-        days, table = slice(first, None), self.prices
+        days, table = slice(0 if since is None else self._since(since), None), self.prices
         assessed = assessment.assess(
             {name: entry.track(days) for name, entry in entries.items()},
             self.dates[days],

@@ -34,6 +34,7 @@ from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe
+from qfolio.portfolio.backtest.terms import PROPORTIONAL, Terms
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.study.folder import (
     NAME,
@@ -100,9 +101,11 @@ class Study:
             options: Further arguments of ``Backtest.create``: expanding, seeds, baselines, ….
 
         Raises:
-            QfolioError: A name or a table is given twice, all tables are too short, or a backtest
-                refuses its arguments.
+            QfolioError: A name or a table is given twice, all tables are too short, several costs
+                are given although a mandate or a cost model sets it, or a backtest refuses its
+                arguments.
         """
+        costs = _charged(costs, options)
         variants = [Variant(int(lag), float(cost)) for lag, cost in itertools.product(lags, costs)]
         _require_plan(tables, variants)
         earlier = list(dict.fromkeys(look for folder in after for look in looks_of(folder)))
@@ -377,6 +380,21 @@ def _table_config(prices: Prices, trials: int) -> TableConfig:
 
 def _count(looks: Sequence[Look], digest: str) -> int:
     return sum(len(look.agents) for look in looks if look.digest == digest)
+
+
+def _charged(costs: Sequence[float], options: Mapping[str, Any]) -> list[float]:
+    """The costs that backtests with these options will charge.
+
+    Raises QfolioError if several are given, and the mandate or the cost model sets one for all.
+    """
+    mandate, model = options.get("mandate"), options.get("cost_model", PROPORTIONAL)
+    charged = [Terms.of(mandate, cost, model).cost for cost in costs]
+    if len(set(costs)) > len(set(charged)):
+        raise QfolioError(
+            f"The mandate or the cost model sets a cost of {charged[0] * 1e4:g} bp, so a study "
+            "cannot vary it; leave the cost out there, or give a single cost."
+        )
+    return charged
 
 
 def _require_plan(tables: Mapping[str, Prices], variants: Sequence[Variant]) -> None:

@@ -1,0 +1,45 @@
+"""What orders cost and when they are due, from the arguments of a backtest and its mandate."""
+
+from typing import Any, NamedTuple
+
+from qfolio.core.settings import called
+from qfolio.portfolio.mandate.mandate import Mandate
+
+PROPORTIONAL = "proportional"
+"""The default cost model."""
+
+
+class Terms(NamedTuple):
+    """The arguments of ``Backtest.create`` of these names, where a mandate has had its say."""
+
+    mandate: Mandate | None
+    cost: float
+    cost_model: str
+    calendar: str
+    benchmark: Any
+
+    @staticmethod
+    def of(
+        mandate: Any, cost: float, cost_model: str, calendar: str = "", benchmark: Any = None
+    ) -> "Terms":
+        """A mandate's cost always applies, its other terms where an argument has its default.
+
+        A cost that is written into a cost model precedes both. Raises QfolioError if the mandate
+        is invalid.
+        """
+        if mandate is not None:
+            mandate = Mandate.of(mandate)
+            cost = _number(mandate.costs.get("cost"), cost)
+            cost_model = (cost_model == PROPORTIONAL and mandate.cost_model) or cost_model
+            calendar = calendar or mandate.trading.calendar
+            benchmark = mandate.benchmark if benchmark is None else benchmark
+        written = called(cost_model)[1].get("cost")
+        return Terms(mandate, _number(written, cost), cost_model, calendar, benchmark)
+
+
+def _number(written: float | str | None, otherwise: float) -> float:
+    """A cost that may be written; one that is no number is for its cost model to judge."""
+    try:
+        return float(otherwise if written is None else written)
+    except ValueError:
+        return otherwise
