@@ -72,9 +72,12 @@ def test_single_keys_take_precedence_over_a_file():
         "trading.turnover": "--limits has 'trading.turnover'; it must be a key and a value",
         "trading turnover=1": "it must be a key and a value",
         "trading.turnover=much": "--limits: trading.turnover: expected float",
+        "assets.floor.A=0.1": "sets assets.floor.A, but the mandate has a floor of 0.05 for all",
     }.items():
         with pytest.raises(QfolioError, match=message):
-            given.changed([wrong])
+            given.changed(["assets.floor=0.05"]).changed([wrong])
+    assert given.changed(["trading.calendar=5"]).trading.calendar == "5"
+    assert Mandate.of({"trading": {"calendar": 5}}).trading.calendar == "5"
 
 
 def test_a_file_says_the_limits(tmp_path):
@@ -154,6 +157,9 @@ GROUP = {"assets": ["XLE", "XOM"]}
          r"the floors of assets \(6%\) and sector E of at most 10% clash"),
         ({"groups": {"a": {"E": {**GROUP, "cap": 0.1}}, "b": {"F": {**GROUP, "floor": 0.2}}}},
          "a E of at most 10% and b F of at least 20% clash"),
+        ({"groups": {"a": {"E": {**GROUP, "cap": -0.5}}}, "assets": {"floor": -0.1}},
+         r"the floors of assets \(-10%\) and a E of at most -50% clash"),
+        ({"groups": {"a": {"E": {**GROUP, "cap": -0.5}}}}, "no weights have a E of at most -50%."),
         ({"assets": {"floor": 0.3}, "cash": {"min": 0.1}},
          r"the floors of assets \(30%\) and cash of at least 10% clash"),
         ({"assets": {"floor": {"SPY": 0.3}, "cap": 0.2}}, "floor of SPY, 30%, is above its cap"),
@@ -188,6 +194,8 @@ def test_what_is_unusual_is_said():
     notes = checks.require(settled(bound, ASSETS), ALL)
     assert "no choice for s E: its floor, 20%" in notes[1]
     assert checks.require(settled({"cash": {"max": 0.1}}, ASSETS), ALL) == []
+    [note] = checks.require(settled({"trading": {"smallest_trade": 0.3}}, ASSETS), ALL)
+    assert note.startswith("The smallest trade, 30%, is more than an equal weight, 25%")
     [note] = checks.unusual("", np.ones(15, bool), 0.05)
     assert note == "The cap of 5% for each of 15 assets forces at least 25% cash."
     assert checks.unusual("", ALL, 0.25) == checks.unusual("", ALL) == []

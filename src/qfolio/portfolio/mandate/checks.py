@@ -39,6 +39,8 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
             rest = [other for other in clash if other != i]
             if _found(made.limits, rest) is None:
                 clash = rest
+        if len(clash) == 1:
+            raise QfolioError(f"The mandate cannot be met: no weights have {said[clash[0]]}.")
         both = " and ".join(said[i] for i in clash)
         raise QfolioError(f"The mandate cannot be met: {both} clash; change one of them.")
     cash, margin = parse(text)[1].cash, parse(text)[1].exposure.margin
@@ -75,6 +77,12 @@ def unusual(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
         return [f"{said} forces at least {_percent(left)} cash."] if left > TINY else []
     made, notes = feasible(text, usable, most), []
     limits = made.limits
+    equal = 1 / int(usable.sum())
+    if made.smallest_trade > equal:
+        notes.append(
+            f"The smallest trade, {_percent(made.smallest_trade)}, is more than an equal weight, "
+            f"{_percent(equal)}, so that many orders are not carried out."
+        )
     left = 1 - _most_held(made)
     if left > max(parse(text)[1].cash.min, 0.0) + TINY:
         notes.append(f"The mandate forces at least {_percent(left)} cash: caps allow no more.")
@@ -213,7 +221,7 @@ def _found(
     count, rows = limits.low.size, limits.most.size
     keep = range(rows + 3) if kept is None else kept
     high = limits.high if 0 in keep else np.where(limits.high > 0, 10.0, limits.high)
-    low = limits.low if 1 in keep else np.minimum(limits.low, 0.0)
+    low = limits.low if 1 in keep else np.where(limits.low < 0, -10.0, 0.0)
     table = np.vstack([limits.rows, np.ones((1, count))])
     other = np.vstack([-limits.rows, np.ones((1, count))])
     both = np.hstack([table, other, -np.eye(rows + 1, rows)])
@@ -297,7 +305,8 @@ def _said(text: str, made: Mandated, most: float) -> list[str]:
                 f"cash of at {'most' if falls else 'least'} {_percent(_cash(bound, falls))}"
             )
         else:
-            said.append(f"{what} of at {'least' if falls else 'most'} {_percent(abs(bound))}")
+            given = f"least {_percent(-bound)}" if falls else f"most {_percent(bound)}"
+            said.append(f"{what} of at {given}")
     return [*said, f"gross exposure of at most {_percent(float(made.limits.gross))}"]
 
 

@@ -198,7 +198,7 @@ class Mandate(Section, frozen=True):
                     f"--limits has {quote(assignment)}; it must be a key and a value of a mandate, "
                     "such as trading.turnover=0.3."
                 )
-            _merge(content, read)
+            _merge(content, read, key.strip())
         return _converted(content, "--limits")
 
     @property
@@ -359,6 +359,9 @@ def _named(given: float | dict[str, float] | None) -> Sequence[str]:
 
 def _converted(content: Any, source: str) -> Mandate:
     """The mandate in a dictionary; source: where it comes from, for the message."""
+    trading = content.get("trading") if isinstance(content, dict) else None
+    if isinstance(trading, dict) and type(trading.get("calendar")) is int:  # every so many rows
+        content = content | {"trading": trading | {"calendar": str(trading["calendar"])}}
     try:
         return msgspec.convert(content, Mandate)
     except msgspec.ValidationError as error:
@@ -376,11 +379,22 @@ def _converted(content: Any, source: str) -> Mandate:
         ) from None
 
 
-def _merge(content: dict[str, Any], others: dict[str, Any]) -> None:
-    """Puts values into a dictionary of dictionaries, in place."""
+def _merge(content: dict[str, Any], others: dict[str, Any], place: str, within: str = "") -> None:
+    """Puts values into a dictionary of dictionaries, in place.
+
+    place: the key that is assigned. within: the keys of the dictionary, each with a dot behind it.
+    Raises QfolioError if a number for one asset would replace one for all.
+    """
     for key, value in others.items():
-        if isinstance(value, dict) and isinstance(content.get(key), dict):
-            _merge(content[key], value)
+        old, here = content.get(key), within + key
+        if isinstance(value, dict) and isinstance(old, dict):
+            _merge(old, value, place, f"{here}.")
+        elif isinstance(value, dict) and type(old) in (int, float) and here != place:
+            raise QfolioError(
+                f"--limits sets {place}, but the mandate has a {key} of {old:g} for all assets, "
+                f"which the others would lose; write {here}={{A = 0.1, B = 0.2}} with all assets "
+                "that have one."
+            )
         else:
             content[key] = value
 
