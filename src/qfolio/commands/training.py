@@ -100,8 +100,8 @@ def train(
     if live and on != "here":
         raise QfolioError("--live shows a training in this process; leave out --on, or --live.")
     executor = executor_of(on)
-    if live and task not in (None, "pendulum"):
-        raise QfolioError(f"--live shows the pendulum; there is nothing to see of {task}.")
+    if live and task is not None:
+        _require_seen(task)
     with _window(live) as show:
         if resume is None:
             task, preset = task or "pendulum", preset or "fast"
@@ -115,6 +115,8 @@ def train(
             raise QfolioError("--resume keeps the run's settings; add only --episodes or --steps.")
         else:
             run, folder = Run.open(resume), resume
+            if live:
+                _require_seen(run.config.task)
         budget = budget or run.budget
         console.say(console.describe_run(run, budget))
         with tracked(*following):
@@ -250,7 +252,8 @@ def _train(
     from qfolio.core.evaluation import start_keys
     from qfolio.experiments.executor import Here
 
-    if not isinstance(executor, Here):
+    # A run that other processes began goes on in their groups of seeds, wherever it is resumed.
+    if not isinstance(executor, Here) or run.groups.begun:
         with console.bar("") as update:
             run.train(budget, executor=executor, listen=JobsProgress(update))
         return
@@ -353,6 +356,11 @@ def _command(run: "Run") -> str:
     words += ["--seeds", str(config.seeds), "--seed", str(config.seed)]
     words += ["--set", *map(shlex.quote, changed)] if changed else []
     return f"{' '.join(words)}\n{resume}"
+
+
+def _require_seen(task: str) -> None:
+    if task != "pendulum":
+        raise QfolioError(f"--live shows the pendulum; there is nothing to see of {task}.")
 
 
 @contextlib.contextmanager

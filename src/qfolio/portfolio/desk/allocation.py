@@ -241,7 +241,8 @@ def require_fresh(prices: Prices, as_of: str | None) -> None:
     last = prices.dates[-1].astype("datetime64[D]").item()
     if last > today:
         raise QfolioError(
-            f"The prices end on {last}, after {today}; leave out the later rows, or set --as-of."
+            f"The prices end on {last}, after {today}; leave out the later rows, or set "
+            "a later --as-of."
         )
     if today - last > MAX_AGE:
         raise QfolioError(

@@ -129,9 +129,11 @@ def _check_names(
         )  # fmt: skip
     for name in dict.fromkeys((*features, *([] if date is None else [date]))):
         if name not in places and not columns_of_kind(table, name):
+            # A cash rate, say, may come from another file, which has to be named each time.
+            other = "" if name == date else f"; for another file, write --columns {name}=FILE"
             findings.error(
                 f"there is no column {quote(name)}{hint(name, names)}",
-                advice=f"The columns are {listing(names)}.",
+                advice=f"The columns are {listing(names)}{other}.",
             )
     if len(set(features)) < len(features) or date in features:
         findings.error("a column is named twice among the features and the dates")

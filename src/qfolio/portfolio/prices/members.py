@@ -8,6 +8,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.cells import is_missing, label, numbers
 from qfolio.portfolio.prices.dates import read_dates
+from qfolio.portfolio.prices.findings import listing
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, plain
@@ -30,6 +31,7 @@ def membership(source: Any, dates: np.ndarray, assets: tuple[str, ...]) -> np.nd
     """
     table = read(source, lambda names: {0, *range(len(names))} if _spans(names) else {0})
     try:
+        _require_kind(table.names)
         found = _of_spans if _spans(table.names) else _of_rows
         return found(table, dates, assets)
     except QfolioError as error:
@@ -38,6 +40,16 @@ def membership(source: Any, dates: np.ndarray, assets: tuple[str, ...]) -> np.nd
 
 def _spans(names: tuple[str, ...]) -> bool:
     return set(SPANS) <= {plain(name) for name in names}
+
+
+def _require_kind(names: tuple[str, ...]) -> None:
+    """Raises QfolioError if there is a column of assets, but not both ends of their spans."""
+    kind = next((name for name in names if plain(name) in ASSET_NAMES), None)
+    if kind is not None and not _spans(names):
+        raise QfolioError(
+            f"there is a column {quote(kind)}, but not both from and to; the columns are "
+            f"{listing(names)}."
+        )
 
 
 def _of_rows(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.ndarray:
