@@ -128,7 +128,7 @@ def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
     for more, message in (
         (["--resume", "run", "--benchmark", "A"], "--resume keeps the backtest's settings"),
         ([*options[:-len(own) - len(tiny)], "--strategy", "mine"], "it must be NAME=FILE"),
-        ([*options[:-len(own) - len(tiny)], "--benchmark", "Z"], "an asset or a file"),
+        ([*options[:-len(own) - len(tiny)], "--benchmark", "Z"], "and no file"),
     ):  # fmt: skip
         assert qfolio(monkeypatch, "backtest", *more) == 2
         assert message in capsys.readouterr().err

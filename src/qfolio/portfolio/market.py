@@ -149,7 +149,8 @@ class Menu(eqx.Module):
     @staticmethod
     def tilted(signalled: Signalled, tilt: Float[Array, " signal"]) -> Float[Array, " entry"]:
         """The anchor times exp(signals·tilt), with the anchor's sum."""
-        weights = signalled.anchor * jnp.exp(signalled.signals @ tilt)
+        # The other order would give all choices' weights by asset, to be transposed.
+        weights = signalled.anchor * jnp.exp(tilt @ signalled.signals.T)
         weights = weights * signalled.anchor.sum() / jnp.maximum(weights.sum(), 1e-9)
         return jnp.append(1 - weights.sum(), weights)
 
