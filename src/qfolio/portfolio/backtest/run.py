@@ -17,16 +17,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from qfolio.core import devices, settings
+from qfolio.core import devices
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
 from qfolio.core.registry import BASELINES, short
 from qfolio.core.text import amount, near
-from qfolio.experiments.budget import Budget, seed_range
-from qfolio.experiments.described import agent_of
-from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, at_once, carry_out
+from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Row
 from qfolio.experiments.log import Log
 from qfolio.experiments.presets import Preset
@@ -34,10 +32,10 @@ from qfolio.portfolio.backtest import assessment, memory
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.benchmark import field_of, tracked
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
-from qfolio.portfolio.backtest.folds import Fold, latest, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
-from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow, updates_of
+from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow
 from qfolio.portfolio.backtest.own import Own, place
+from qfolio.portfolio.backtest.plan import Plan
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.terms import PROPORTIONAL, Terms
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold, preparing
@@ -48,14 +46,10 @@ from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.growth import require_grown
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
-from qfolio.portfolio.task import Portfolio
 
 SMALL = 10**6
 """Number of prices below which two agents are replayed or explained side by side. Compiling their
 programs takes one core each, so this saves time; but the arrays of both are in memory."""
-
-FOLDS_AT_ONCE = 8
-"""Folds that train at once if members advance in lockstep; results are kept after each group."""
 
 
 class Backtest:
@@ -81,43 +75,24 @@ class Backtest:
         trained: for each table so far, the number of updates of the policies for tomorrow before
             they were trained on it, and its number of rows (default: one table).
         """
-        self._trained = list(trained) or [(0, len(prices))]
         if len(prices) > config.prices["rows"]:
             config = msgspec.structs.replace(config, prices=describe(prices))
         self.prices, self.config, self._kept = prices, config, Kept(folder)
         self._given_own = own or {}
-        dates, length, expanding = prices.dates, config.train, config.expanding
-        folds = walk_forward(dates, length, config.test, config.lag, expanding)
-        last = [latest(tomorrow(n), dates[:rows], length, expanding) for n, rows in self._trained]
-        every = [*folds, *last]
-        if prices.tradable is None:  # else agents also learn from assets that come and go
-            every = [fold.complete(prices.values) for fold in every]
-        self.folds = every[: len(folds)]
-        self._jobs = [*self.folds, every[-1]]
-        given = agents or {}
-        self.agents = {
-            name: given[name] if name in given else agent_of(entry.agent, entry.settings)
-            for name, entry in config.agents.items()
-        }
-        self.tasks = {name: self._task(name) for name in self.agents}
+        self._plan = plan = Plan(prices, config, agents or {}, trained)
+        self.folds, self.agents, self.tasks = plan.folds, plan.agents, plan.tasks
         self.baselines = {short(name): baseline(name) for name in config.baselines}
         if both := self.agents.keys() & self.baselines.keys():
             raise QfolioError(
                 f"{min(both)} is an agent and a baseline; give the agent another name."
             )
-        task = next(iter(self.tasks.values()))
-        days = slice(self.folds[0].decisions.start, self.folds[-1].decisions.stop)
+        task, days = plan.any_task, plan.decisions
         most = config.cap if task.feasible.long_only else reach(task.mandate, config.cap)
         self._own = {
             name: place(name, each, prices, days, task, most)
             for name, each in self._given_own.items()
         }
         self.interrupted = False
-        self._parts = {
-            (name, fold.name): self._part(task, fold)
-            for name, task in self.tasks.items()
-            for fold in every
-        }
 
     @classmethod
     def create(
@@ -264,16 +239,9 @@ class Backtest:
         if len(prices) == len(self.prices):
             return self
         prices = dataclasses.replace(prices, source=self.prices.source, note=self.prices.note)
-        updates = 1 + max(self._kept.updates(name) for name in self.agents)
-        earlier = [each for each in self._trained if each[0] < updates]
-        trained = [*earlier, (updates, len(prices))]
+        trained = self._plan.grown(self._kept, len(prices))
         longer = Backtest(prices, self.config, None, self.agents, self._given_own, trained)
-        before = [fold.name for fold in self.folds]
-        if [fold.name for fold in longer.folds[: len(before)]] != before:
-            raise QfolioError(
-                "The new rows are less than a day apart and the earlier ones are not; start a new "
-                "backtest."
-            )
+        longer._plan.require_begins_with(self.folds)
         memory.require(prices, longer.config)
         longer._kept = self._kept
         if self.folder is not None:
@@ -290,9 +258,9 @@ class Backtest:
         )
 
     def _repr_html_(self) -> str:
-        trained = sum(self._kept.has(a, f.name) for a in self.agents for f in self._jobs)
+        every = [(agent, fold.name) for agent in self.agents for fold in self._plan.trainings]
         facts = [
-            f"{trained} of {len(self.agents) * len(self._jobs)} trainings done",
+            f"{sum(self._kept.has(*each) for each in every)} of {len(every)} trainings done",
             f"{self._counts}, {day(self.dates[0])} to {day(self.dates[-1])}",
             f"{self.config.cost * 1e4:g} bp",
             f"lag {self.config.lag}",
@@ -338,11 +306,6 @@ class Backtest:
             self.interrupted = carry_out(executor, jobs, listen, self.store, log)
 
     @property
-    def _latest(self) -> str:
-        """The policies for tomorrow that are trained on the whole table."""
-        return tomorrow(self._trained[-1][0])
-
-    @property
     def _counts(self) -> str:
         return f"{amount(len(self.prices.assets), 'asset')}, {amount(len(self.folds), 'fold')}"
 
@@ -359,16 +322,11 @@ class Backtest:
 
     def jobs(self, executor: Executor) -> list[FoldsJob]:
         """The training that is missing, in jobs that fill a worker; results go to ``store``."""
-        return [job for name in self.agents for job in self._missing(name, executor)]
+        return self._plan.jobs(self._kept, executor)
 
     def store(self, job: Job[dict[str, TrainedFold]], trained: dict[str, TrainedFold]) -> None:
         """Keeps what a job has trained."""
-        agent = job.name.partition("/")[0]
-        for fold, result in trained.items():
-            policy = result.kept
-            if fold == self._latest:
-                policy = learning(policy, self._trained[-1][0], self.prices.dates[-1])
-            self._kept.write(agent, fold, result.rows, policy)
+        self._plan.store(self._kept, job, trained)
 
     @property
     def parts(self) -> list[object]:
@@ -383,8 +341,7 @@ class Backtest:
         """
         name = self._name(agent)
         stored = self.newest(name) if stored is None else stored
-        base = max(n for n, _ in self._trained if n <= updates_of(stored))
-        task, trained = self._parts[name, tomorrow(base)], self.agents[name]
+        task, trained = self._plan.part(name, stored), self.agents[name]
         state = state_template(task, trained, self.config.seeds)
         kept = self._kept.policy(name, stored, learning(state, 0, self.prices.dates[-1]))
         return Policy(
@@ -412,7 +369,7 @@ class Backtest:
         task, trained = self.tasks[agent], self.agents[agent]
         members = trained.weights(state_template(task, trained, self.config.seeds))
         return [
-            Stretch(self._parts[agent, f.name], self._kept.policy(agent, f.name, members), f)
+            Stretch(self._plan.part(agent, f.name), self._kept.policy(agent, f.name, members), f)
             for f in self.folds
         ]
 
@@ -448,33 +405,16 @@ class Backtest:
     @cached_property
     def replay(self) -> Replay:
         """The rules that hold for all strategies."""
-        return Replay(self.prices, self.folds, self._task_of_all, self.config.cap)
+        return Replay(self.prices, self.folds, self._plan.any_task, self.config.cap)
 
     @property
     def dates(self) -> np.ndarray:
         """Dates of the test's returns, shape (day,)."""
-        shift = self.config.lag + 1
-        first, last = self.folds[0].decisions.start, self.folds[-1].decisions.stop
-        return self.prices.dates[first + shift : last + shift]
-
-    @property
-    def _task_of_all(self) -> Portfolio:
-        """Any agent's task; costs, lag and limits are the same for all."""
-        return next(iter(self.tasks.values()))
-
-    def _since(self, date: str) -> int:
-        """The first row of the test at or after a date."""
-        try:
-            first = int(np.searchsorted(self.dates, np.datetime64(date)))
-        except ValueError:
-            raise QfolioError(f"{date!r} is no date; write one such as 2020-01-01.") from None
-        if first == len(self.dates):
-            raise QfolioError(f"The test ends on {day(self.dates[-1])}, before {date}.")
-        return first
+        return self._plan.dates
 
     def assess(self, entries: dict[str, Entry], since: str | None = None) -> assessment.Assessment:
         """The statistics of all strategies, over the whole test or from a date on."""
-        days, table = slice(0 if since is None else self._since(since), None), self.prices
+        days, table = slice(0 if since is None else self._plan.since(since), None), self.prices
         assessed = assessment.assess(
             {name: entry.track(days) for name, entry in entries.items()},
             self.dates[days],
@@ -483,7 +423,7 @@ class Backtest:
             earlier_trials=self.config.trials + trials_on(table.source),
             risk_free=self.replay.growth[days, 0] - 1,
         )
-        if not self._task_of_all.feasible.long_only:
+        if not self._plan.any_task.feasible.long_only:
             return assessed  # accounts with debts may exceed a bound for weights without debts
         bound = constant_bound(self.replay.growth[days], table.periods_per_year)
         return dataclasses.replace(assessed, bound=bound)
@@ -494,43 +434,3 @@ class Backtest:
         if name not in self.agents:
             raise QfolioError(f"The backtest has no agent {name!r}; {near(name, self.agents)}")
         return name
-
-    # Training ------------------------------------------------------------------------------------
-
-    def _task(self, name: str) -> Portfolio:
-        config = self.config
-        own = {
-            "lag": config.lag,
-            "cost": config.cost,
-            "cost_model": config.cost_model,
-            "max_weight": config.cap,
-            "calendar": config.calendar,
-            "mandate": settled(config.mandate, config.assets),
-        }
-        entry = config.agents[name].task
-        task = Portfolio.of(self.prices, **settings.convert(Portfolio, {**entry, **own}))
-        return task.deciding_at(self.folds[0].decisions.start)
-
-    def _part(self, task: Portfolio, job: Fold) -> Portfolio:
-        still = self.prices.tradable is None
-        usable = job.tradable(self.prices.values) if still else None
-        return task.part(job.train.start, job.train.stop - 1, usable)
-
-    def _missing(self, name: str, executor: Executor) -> list[FoldsJob]:
-        """The folds that are still to be trained, in groups that fill a worker's devices."""
-        missing = [fold for fold in self._jobs if not self._kept.has(name, fold.name)]
-        size = at_once(executor, FOLDS_AT_ONCE)
-        most = min(size, len(missing))
-        return [self._job(name, missing[i : i + size], most) for i in range(0, len(missing), size)]
-
-    def _job(self, name: str, folds: Sequence[Fold], most: int) -> FoldsJob:
-        return FoldsJob(
-            name,
-            self.agents[name],
-            tuple(fold.name for fold in folds),
-            tuple(self._parts[name, fold.name] for fold in folds),
-            tuple(seed_range(self.config.seeds, self.config.seed)),
-            Budget(self.config.agents[name].episodes),
-            self._latest,
-            most,
-        )
