@@ -24,7 +24,7 @@ from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.feasible import exactly
-from qfolio.portfolio.mandate.mandate import feasible, settled
+from qfolio.portfolio.mandate.limits import feasible, settled
 from qfolio.portfolio.market import Holding
 from qfolio.portfolio.prices.gaps import cash_outs
 from qfolio.portfolio.prices.table import Prices, check, load

@@ -81,7 +81,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         render_mode: str | None = None,
         **task: Any,
     ) -> None:
-        from qfolio.portfolio.mandate.mandate import settled
+        from qfolio.portfolio.mandate.limits import settled
         from qfolio.portfolio.task import Portfolio
 
         if render_mode not in (None, "ansi"):

@@ -105,7 +105,7 @@ def allocate(
     from qfolio.portfolio.desk.holdings import cashed_out, read_holdings
     from qfolio.portfolio.desk.orders_csv import order_rows
     from qfolio.portfolio.desk.standing import Standing
-    from qfolio.portfolio.mandate.mandate import lots
+    from qfolio.portfolio.mandate.limits import lots
     from qfolio.portfolio.policy import Policy
     from qfolio.portfolio.prices.findings import day
 

@@ -28,14 +28,8 @@ from qfolio.portfolio.costs import cashed
 from qfolio.portfolio.execution import Plan, Terms
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import CappedSimplex, Feasible, Mandated
-from qfolio.portfolio.mandate.mandate import (
-    Mandate,
-    feasible,
-    largest_weight,
-    parse,
-    reach,
-    settled,
-)
+from qfolio.portfolio.mandate.limits import feasible, largest_weight, parse, reach, settled
+from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.mandate.risk import Past, Risk, covariances
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
 from qfolio.portfolio.prices.table import Prices
@@ -91,7 +85,7 @@ class Portfolio(Market):
 
     @staticmethod
     def of(prices: Prices, **settings: Any) -> "Portfolio":
-        """A task on all rows of a table; mandate: anything that ``mandate.settled`` takes."""
+        """A task on all rows of a table; mandate: anything that ``limits.settled`` takes."""
         if "mandate" in settings:
             settings["mandate"] = settled(settings["mandate"], prices.assets)
         task = Portfolio.blank(len(prices.assets), len(prices.feature_names), **settings)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated
-from qfolio.portfolio.mandate.mandate import feasible
+from qfolio.portfolio.mandate.limits import feasible
 
 TINY = 1e-9
 

@@ -12,7 +12,7 @@ from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.itemized import Itemized
-from qfolio.portfolio.mandate.mandate import feasible
+from qfolio.portfolio.mandate.limits import feasible
 from qfolio.portfolio.prices.table import Prices
 
 ASSETS = ("A", "B", "C", "D", "E")

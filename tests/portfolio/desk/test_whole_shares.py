@@ -7,7 +7,7 @@ import pytest
 
 from qfolio.portfolio.costs import Proportional
 from qfolio.portfolio.desk.allocation import Allocation
-from qfolio.portfolio.mandate.mandate import settled
+from qfolio.portfolio.mandate.limits import settled
 from qfolio.portfolio.prices.table import Prices
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qfolio.portfolio.mandate.feasible import CappedSimplex
-from qfolio.portfolio.mandate.mandate import feasible, settled
+from qfolio.portfolio.mandate.limits import feasible, settled
 from qfolio.portfolio.mandate.projection import excess, nearest
 
 LIMITS = [0.4, 0.0, 0.7]

@@ -5,15 +5,8 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate import checks
-from qfolio.portfolio.mandate.mandate import (
-    Mandate,
-    feasible,
-    largest_weight,
-    lots,
-    parse,
-    reach,
-    settled,
-)
+from qfolio.portfolio.mandate.limits import feasible, largest_weight, lots, parse, reach, settled
+from qfolio.portfolio.mandate.mandate import Mandate
 
 ASSETS = ["SPY", "TLT", "XLE", "XOM"]
 ALL = np.ones(4, bool)

@@ -14,7 +14,8 @@ from jaxtyping import Array
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated, exactly
-from qfolio.portfolio.mandate.mandate import Mandate, feasible, settled
+from qfolio.portfolio.mandate.limits import feasible, settled
+from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.mandate.risk import Risk
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio

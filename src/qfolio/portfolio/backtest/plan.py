@@ -14,7 +14,7 @@ from qfolio.portfolio.backtest.folder import BacktestConfig
 from qfolio.portfolio.backtest.folds import Fold, latest, walk_forward
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow, updates_of
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
-from qfolio.portfolio.mandate.mandate import settled
+from qfolio.portfolio.mandate.limits import settled
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio

@@ -27,7 +27,7 @@ from qfolio.portfolio.execution import Terms
 from qfolio.portfolio.following import begin, follow, ordered
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated
-from qfolio.portfolio.mandate.mandate import feasible, largest_weight
+from qfolio.portfolio.mandate.limits import feasible, largest_weight
 from qfolio.portfolio.prices.findings import first_of, listing
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio

@@ -40,7 +40,8 @@ from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
 from qfolio.portfolio.backtest.terms import PROPORTIONAL, Terms
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold, preparing
 from qfolio.portfolio.mandate import checks
-from qfolio.portfolio.mandate.mandate import Mandate, reach, settled
+from qfolio.portfolio.mandate.limits import reach, settled
+from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day

@@ -14,7 +14,7 @@ from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import Context, CostModel
 from qfolio.portfolio.desk.whole_shares import whole_shares as rounded
 from qfolio.portfolio.itemized import Itemized
-from qfolio.portfolio.mandate.mandate import lots
+from qfolio.portfolio.mandate.limits import lots
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 

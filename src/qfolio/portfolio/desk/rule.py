@@ -17,7 +17,7 @@ from qfolio.portfolio.backtest.orders import TOLERANCE, obeying
 from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.mandate import checks
-from qfolio.portfolio.mandate.mandate import feasible, largest_weight
+from qfolio.portfolio.mandate.limits import feasible, largest_weight
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import listed, near, quote
 from qfolio.portfolio.mandate.feasible import Mandated
-from qfolio.portfolio.mandate.mandate import feasible, parse
+from qfolio.portfolio.mandate.limits import feasible, parse
 from qfolio.portfolio.mandate.projection import Limits
 from qfolio.portfolio.mandate.risk import Risk
 
@@ -24,7 +24,7 @@ GAP, VERTICES = 0.01, 200
 
 
 def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> list[str]:
-    """What is unusual about a mandate, a sentence each; arguments as for ``mandate.feasible``.
+    """What is unusual about a mandate, a sentence each; arguments as for ``limits.feasible``.
 
     Raises QfolioError with limits that clash, if no weights obey it: without any one of those that
     it names, the others could be met, or an asset of a group that the table does not have.
@@ -68,7 +68,7 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
 def unusual(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> list[str]:
     """What is unusual about caps, or about a mandate that can be met, a sentence each.
 
-    Arguments are as for ``mandate.feasible``; the text is empty without a mandate.
+    Arguments are as for ``limits.feasible``; the text is empty without a mandate.
     """
     if not text:
         count = int(usable.sum())
@@ -103,7 +103,7 @@ def unusual(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
 def require_safe(text: str, starts: Iterable[Mandated], most: float = 1.0) -> None:
     """Raises QfolioError if a limit on risk can be met at none of some rows.
 
-    text, most: as for ``mandate.feasible``. starts: the sets at these rows, which know their risk.
+    text, most: as for ``limits.feasible``. starts: the sets at these rows, which know their risk.
     Turnover and the number of holdings do not count, and each limit on risk counts by itself: with
     them there may be even more risk.
     """

@@ -81,7 +81,7 @@ class CappedSimplex(Feasible):
 
 
 class Mandated(Feasible):
-    """Weights that obey a mandate, made by ``mandate.feasible``.
+    """Weights that obey a mandate, made by ``limits.feasible``.
 
     An order is the point of the set that is nearest to the weights wanted, in the weights of the
     assets; cash is the rest. With a number of holdings, the largest weights of that point are kept,

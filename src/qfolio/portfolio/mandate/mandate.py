@@ -32,7 +32,8 @@
     minimum = 1.0
     cash_rate = 0.03
 
-docs/guides/mandate.md describes every key. ``checks.py`` says whether the limits can be met.
+docs/guides/mandate.md describes every key. ``limits.py`` makes arrays of the limits, and
+``checks.py`` says whether they can be met.
 """
 
 import csv
@@ -40,19 +41,14 @@ import json
 import re
 import tomllib
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
-from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES
 from qfolio.core.text import near, quote
-from qfolio.portfolio.mandate.feasible import Mandated
-from qfolio.portfolio.mandate.projection import Limits
 
 Weight = Annotated[float, msgspec.Meta(ge=-3, le=3)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -210,7 +206,7 @@ class Mandate(Section, frozen=True):
         return f"{self.costs.get('model', 'itemized')}({chosen})"
 
     def text(self, assets: Sequence[str]) -> str:
-        """The limits for a table's assets, in order, as JSON; ``feasible`` takes it.
+        """The limits for a table's assets, in order, as JSON; ``limits.feasible`` takes it.
 
         Raises QfolioError if it names an asset that the table does not have.
         """
@@ -250,107 +246,6 @@ class Mandate(Section, frozen=True):
     def every_group(self) -> list[tuple[str, str, Group]]:
         """Column, value and limits of each group."""
         return [(c, v, group) for c, values in self.groups.items() for v, group in values.items()]
-
-
-def settled(given: Any, assets: Sequence[str]) -> str:
-    """The text of a mandate.
-
-    given: what ``Mandate.of`` takes, such a text, or nothing.
-    """
-    if not given:
-        return ""
-    if isinstance(given, str) and given.startswith("["):
-        _, mandate = parse(given)
-        return mandate.text(assets)
-    return Mandate.of(given).text(assets)
-
-
-@lru_cache(64)
-def parse(text: str) -> tuple[list[str], Mandate]:
-    """The assets and the mandate of a text. Raises QfolioError if the text is none."""
-    try:
-        return msgspec.json.decode(text, type=tuple[list[str], Mandate])
-    except msgspec.MsgspecError as error:
-        raise QfolioError(f"mandate is no mandate: {error}.") from None
-
-
-def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> Mandated:
-    """The set of weights that a mandate allows, in float64.
-
-    usable: assets that can be traded; the others have weight 0, and no floor. most: the largest
-    weight of each asset, beside its cap; 1 limits none that the mandate lets be above it.
-    """
-    assets, mandate = parse(text)
-    can = usable & ~np.isin(assets, mandate.assets.forbidden)
-    cap, floor = (_by_asset(x, assets, default) for x, default in _bounds(mandate.assets))
-    long = mandate.cash.min >= 0 and bool(floor.min() >= 0)
-    most = most if long or most < 1 else np.inf
-    high, low = np.where(can, np.minimum(cap, most), 0.0), np.where(can, floor, 0.0)
-    rows, limits, names = [], [], []
-
-    def limit(row: np.ndarray, at_most: float, name: str) -> None:
-        rows.append(row)
-        limits.append(at_most)
-        names.append(name)
-
-    ones = np.ones(len(assets))
-    limit(ones, 1 - mandate.cash.min, "cash is below its minimum by")
-    if mandate.cash.max < 1 or low.min() < 0:
-        limit(-ones, mandate.cash.max - 1, "cash is above its maximum by")
-    for column, value, group in mandate.every_group:
-        members = 1.0 * np.isin(assets, group.assets)
-        if group.cap is not None:
-            limit(members, group.cap, f"{column} {value} is above its cap by")
-        if group.floor is not None:
-            limit(-members, -group.floor, f"{column} {value} is below its floor by")
-    trading, exposure = mandate.trading, mandate.exposure.gross
-    most_gross = float(np.maximum(abs(cap), abs(floor)).sum())
-    return Mandated(
-        Limits(
-            low,
-            high,
-            np.array(rows),
-            np.array(limits),
-            np.array(exposure or np.inf),
-            np.array(trading.turnover or np.inf),
-        ),
-        tuple(names),
-        trading.holdings or 0,
-        trading.smallest_trade,
-        1.0 if long else min(exposure or most_gross, most_gross),
-        long,
-        mandate.risk.volatility or np.inf,
-        mandate.risk.tracking_error or np.inf,
-    )
-
-
-def lots(text: str) -> Float[np.ndarray, " asset"] | None:
-    """Shares of each asset that are traded together (default: 1); None if there is no such rule."""
-    if not text or (lot := parse(text)[1].trading.lot) is None:
-        return None
-    return _by_asset(lot, parse(text)[0], 1.0)
-
-
-def largest_weight(text: str) -> float:
-    """The highest cap of an asset, at most 1, for those that neither borrow nor sell short."""
-    assets, mandate = parse(text)
-    return min(1.0, float(_by_asset(mandate.assets.cap, assets, 1.0).max()))
-
-
-def reach(text: str, most: float = 1.0) -> float:
-    """The largest size of an asset's weight, of either sign; most: as for ``feasible``."""
-    low, high, *_ = feasible(text, np.ones(len(parse(text)[0]), bool), most).limits
-    return float(abs(np.array([low, high])).max())
-
-
-def _bounds(assets: Assets) -> tuple[tuple[float | dict[str, float], float], ...]:
-    return (assets.cap, 1.0), (assets.floor, 0.0)
-
-
-def _by_asset(given: float | dict[str, float], assets: Sequence[str], default: float) -> np.ndarray:
-    if isinstance(given, dict):
-        return np.array([given.get(name, default) for name in assets])
-    return np.full(len(assets), given)
 
 
 def _named(given: float | dict[str, float] | None) -> Sequence[str]:

@@ -14,7 +14,7 @@ from qfolio.portfolio.backtest.attribution.drivers import (
 )
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.mandate.feasible import CappedSimplex
-from qfolio.portfolio.mandate.mandate import feasible, settled
+from qfolio.portfolio.mandate.limits import feasible, settled
 from qfolio.portfolio.policy import Policy
 
 from planted import ASSETS, Known, four_folds, planted
