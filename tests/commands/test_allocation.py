@@ -147,6 +147,20 @@ def records(folder):
     return [json.loads(path.read_text()) for path in sorted((folder / "ledger").glob("*.json"))]
 
 
+def test_prices_that_end_early_are_read_as_in_the_backtest(folder, monkeypatch, capsys, tmp_path):
+    prices = write_table(tmp_path / "prices.csv")
+    options = ["--prices", prices, "--capital", 100, "--dry-run", "--delisting-haircut", 0.3]
+    assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *options) == 2
+    assert "ended=cash-out (--ended cash-out)" in capsys.readouterr().err
+    assert allocation(folder, monkeypatch, capsys, *options, "--ended", "cash-out")["assets"]
+
+
+@pytest.mark.parametrize("command", ["allocate", "follow"])
+def test_the_help_names_what_may_be_typed_of_prices_that_end(command, monkeypatch, capsys):
+    assert qfolio(monkeypatch, command, "--help") == 0
+    assert "--ended {gap,cash-out}" in capsys.readouterr().out
+
+
 def test_the_ledger_has_one_record_for_the_same_inputs(copy, monkeypatch, capsys, tmp_path):
     shutil.rmtree(copy / "ledger", ignore_errors=True)
     plan = allocation(copy, monkeypatch, capsys, "--capital", 1000)

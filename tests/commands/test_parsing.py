@@ -201,10 +201,13 @@ def test_a_narrow_terminal_folds_names_and_cuts_no_number(monkeypatch, capsys):
         (["backtest", "--late", "x"], "--late is 'x'; choose from error, drop-asset, trim, join."),
         (["backtest", "--sedes", "2"], "there is no option --sedes; did you mean --seeds?"),
         (["backtest", "a.csv", "b.csv"], "there is no argument b.csv."),
+        (["allocate", "run", "--ended", "None"],
+         "--ended is 'None'; choose from gap, cash-out."),
+        (["follow", "run", "--ended", "cashout"], "--ended is 'cashout'; did you mean cash-out?"),
         (["train", "--seeds"], "--seeds needs a value."),
         (["evaluate"], "PATH is missing: folder of a run."),
     ],
-)
+)  # fmt: skip
 def test_wrong_words_are_one_sentence_that_names_the_help(words, said, monkeypatch, capsys):
     assert typed(monkeypatch, *words) == 2
     assert capsys.readouterr().err == f"qfolio: {said} See qfolio {words[0]} --help.\n"

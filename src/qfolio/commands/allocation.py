@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import File, Modules, Name, Names
+from qfolio.commands.arguments import File, Modules, Name
 from qfolio.commands.parsing import Document
-from qfolio.commands.tables import Ended, Missing, Returns
+from qfolio.commands.tables import LATEST, ReadLatest, Returns
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
@@ -34,14 +34,8 @@ def allocate(
     dry_run: bool = False,
     reproduce: Date = None,
     trust: Modules = (),
-    missing: Missing = "error",
-    ended: Ended | None = None,
-    delisting_haircut: float = 0.0,
-    members: File = None,
-    features: Names = (),
-    columns: Names = (),
+    latest: ReadLatest = LATEST,
     returns: Returns = None,
-    date: Name = None,
 ) -> Document:
     """Compute tomorrow's target weights, and the trades to reach them.
 
@@ -77,17 +71,8 @@ def allocate(
         reproduce: Recompute the allocation that the ledger records for this date and compare the
             two, with the inputs stored there or, if given, --prices and --holdings.
         trust: Modules of your own code that the folder may name (default: none).
-        missing: How to treat missing prices.
-        ended: How to treat prices that end early: as missing ones, or as a delisting (default:
-            cash-out, if assets come and go in the backtest).
-        delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
-        members: Table of the assets that may be bought at each date (default: all).
-        features: Columns that hold features (default: those of the backtest).
-        columns: Columns of the whole market; NAME=FILE reads one from a file (default: those of
-            the backtest, in --prices).
         returns: Unit of the numbers in --prices, if they are returns; holdings in shares, whole
             shares and orders need prices (default: they are prices).
-        date: Column of dates (default: found by its name).
     """
     import msgspec
     import numpy as np
@@ -114,16 +99,7 @@ def allocate(
             "--returns gives no share prices; leave out --holdings, --whole-shares and --orders, "
             "or give a table of prices."
         )
-    universe = {"ended": ended, "delisting_haircut": delisting_haircut, "members": members}
-    desk = Desk.open(
-        folder,
-        missing=missing,
-        features=features,
-        columns=columns,
-        returns=returns,
-        date=date,
-        **universe,
-    )
+    desk = Desk.open(folder, returns=returns, **latest.reading)
     if reproduce is not None:
         if agent is not None or update or orders is not None:
             raise QfolioError(
@@ -205,13 +181,7 @@ def follow(
     benchmark: File = None,
     out: File = None,
     trust: Modules = (),
-    missing: Missing = "error",
-    ended: Ended | None = None,
-    delisting_haircut: float = 0.0,
-    members: File = None,
-    features: Names = (),
-    columns: Names = (),
-    date: Name = None,
+    latest: ReadLatest = LATEST,
 ) -> Document:
     """Show what the allocations of a ledger have earned, compared with the backtest.
 
@@ -230,15 +200,6 @@ def follow(
         out: CSV file with a row for each row of the prices (default: follow.csv in the folder); a
             page is written beside it, with the suffix html.
         trust: Modules of your own code that the folder may name (default: none).
-        missing: How to treat missing prices.
-        ended: How to treat prices that end early: as missing ones, or as a delisting (default:
-            cash-out, if assets come and go in the backtest).
-        delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
-        members: Table of the assets that may be bought at each date (default: all).
-        features: Columns that hold features (default: those of the backtest).
-        columns: Columns of the whole market; NAME=FILE reads one from a file (default: those of
-            the backtest, in --prices).
-        date: Column of dates (default: found by its name).
     """
     import numpy as np
 
@@ -253,10 +214,7 @@ def follow(
     from qfolio.portfolio.desk.follow import follow as marked
     from qfolio.report.follow import LiveRows, render_following
 
-    universe = {"ended": ended, "delisting_haircut": delisting_haircut, "members": members}
-    desk = Desk.open(
-        folder, missing=missing, features=features, columns=columns, date=date, **universe
-    )
+    desk = Desk.open(folder, **latest.reading)
     following = marked(desk, prices, benchmark)
     path = folder / "follow.csv" if out is None else out
     following.write(path)

@@ -2,9 +2,10 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from tyro.conf import arg
+from tyro.constructors import PrimitiveConstructorSpec
 
 from qfolio.commands.arguments import File, Name, Names
 
@@ -14,6 +15,17 @@ if TYPE_CHECKING:
 Missing = Literal["error", "drop-asset", "forward-fill"]
 Late = Literal["error", "drop-asset", "trim", "join"]
 Ended = Literal["gap", "cash-out"]
+EndedAsBefore = Annotated[
+    Ended | None,
+    PrimitiveConstructorSpec(  # tyro's own would take the word None
+        nargs=1,
+        metavar=f"{{{','.join(get_args(Ended))}}}",
+        choices=get_args(Ended),
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: value is None or value in get_args(Ended),
+        str_from_instance=lambda value: [str(value)],
+    ),
+]
 Returns = Annotated[
     Literal["percent", "fraction"] | None, arg(metavar="percent|fraction", help_behavior_hint="")
 ]
@@ -72,4 +84,40 @@ class Reading:
 READING = Reading()
 
 Read = Annotated[Reading, arg(name="")]
+"""The options, without a prefix on the command line."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Latest:
+    """How the latest prices of a backtest's assets are read.
+
+    Args:
+        missing: How to treat missing prices.
+        ended: How to treat prices that end early: as missing ones, or as a delisting (default:
+            cash-out, if assets come and go in the backtest).
+        delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
+        members: Table of the assets that may be bought at each date (default: all).
+        features: Columns that hold features (default: those of the backtest).
+        columns: Columns of the whole market; NAME=FILE reads one from a file (default: those of
+            the backtest, in --prices).
+        date: Column of dates (default: found by its name).
+    """
+
+    missing: Missing = "error"
+    ended: EndedAsBefore = None
+    delisting_haircut: float = 0.0
+    members: File = None
+    features: Names = ()
+    columns: Names = ()
+    date: Name = None
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """The options, as ``Desk.open`` takes them."""
+        return dict(vars(self))
+
+
+LATEST = Latest()
+
+ReadLatest = Annotated[Latest, arg(name="")]
 """The options, without a prefix on the command line."""
