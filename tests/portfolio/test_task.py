@@ -310,7 +310,7 @@ def test_menus_that_are_none(menu):
         ({"reward": "profit"}, "no reward 'profit'"), ({"max_weight": 0.0}, "max_weight is 0"),
         ({"cost_model": "free"}, "no cost 'free'"),
         ({"reward": "crra", "risk_aversion": -1.0}, "risk_aversion is -1.0"),
-        ({"window": 58}, "60 rows are too few"),
+        ({"window": 58}, r"60 rows are too few: .*lower window or horizon \(--set horizon=…\)"),
     ],
 )  # fmt: skip
 def test_settings_that_do_not_fit(settings, message):

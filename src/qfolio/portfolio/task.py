@@ -192,8 +192,8 @@ class Portfolio(Market):
             raise QfolioError(
                 f"{last - first + 1} rows are too few: a window of {self.window}, a lag of "
                 f"{self.lag} and an episode of {self.horizon} need at least "
-                f"{self.window + self.lag + self.horizon + 1}; lower window or horizon, or give "
-                "more rows."
+                f"{self.window + self.lag + self.horizon + 1}; lower window or horizon "
+                "(--set horizon=…), or give more rows."
             )
         rows = slice(first + 1, last + 1)
         usable = np.ones(self.limits.shape[0], bool) if tradable is None else tradable

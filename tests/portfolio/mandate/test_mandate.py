@@ -159,6 +159,8 @@ GROUP = {"assets": ["XLE", "XOM"]}
         ({"cash": {"min": 0.3, "max": 0.2}}, "minimum of cash, 30%, is above its maximum, 20%"),
         ({"assets": {"cap": 0.3}, "trading": {"holdings": 2}, "cash": {"max": 0.1}},
          "2 holdings at their caps leave 40% in cash"),
+        ({"assets": {"cap": 0.3}, "trading": {"holdings": 1}, "cash": {"max": 0.1}},
+         "1 holding at its cap leaves 70% in cash, and cash is at most 10%"),
         ({"assets": {"cap": 2}, "cash": {"min": -3, "max": -2}, "exposure": {"gross": 2}},
          "cash of at most -200% and gross exposure of at most 200% clash"),
         ({"assets": {"floor": 0.1}, "trading": {"holdings": 3}}, "4 assets have a floor"),

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import listed, near, quote
+from qfolio.core.text import amount, listed, near, quote
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.limits import feasible, parse
 from qfolio.portfolio.mandate.projection import Limits
@@ -52,8 +52,9 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
         )
     left = 1 - _most_held(made)
     if left > cash.max + TINY:
+        at = "at its cap leaves" if made.holdings == 1 else "at their caps leave"
         raise QfolioError(
-            f"The mandate cannot be met: {made.holdings} holdings at their caps leave "
+            f"The mandate cannot be met: {amount(made.holdings, 'holding')} {at} "
             f"{_percent(left)} in cash, and cash is at most {_percent(cash.max)}; change one of "
             "them."
         )
