@@ -134,7 +134,7 @@ def carry_out(
         return stop.is_set()
 
 
-class _Kept:
+class _Persistent:
     """An executor that keeps its workers from one ``map`` to the next."""
 
     def __init__(self, executor: Executor) -> None:
@@ -161,11 +161,11 @@ class _Kept:
 
 
 @contextlib.contextmanager
-def kept(executor: Executor) -> Iterator[Executor]:
+def persistent(executor: Executor) -> Iterator[Executor]:
     """Keeps the workers of an executor from one ``map`` to the next; ``Here`` has none to keep."""
     if isinstance(executor, Here):
         yield executor
         return
-    workers = _Kept(executor)
+    workers = _Persistent(executor)
     with contextlib.closing(workers.results):
         yield workers

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.executor import Executor, Here, Job, kept
+from qfolio.experiments.executor import Executor, Here, Job, persistent
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.processes import Processes
@@ -70,7 +70,7 @@ def test_long_lived_workers_get_a_large_array_once():
 
 
 def test_workers_are_kept_between_maps():
-    with kept(Processes(1)) as executor:
+    with persistent(Processes(1)) as executor:
         places = set[int]()
         for number in range(3):
             work = [Add(f"{number}{name}", number) for name in "ab"]

@@ -29,7 +29,7 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
-from qfolio.experiments.executor import Executor, Here, Job, carry_out, kept
+from qfolio.experiments.executor import Executor, Here, Job, carry_out, persistent
 from qfolio.experiments.fit import Listener, Row, Training
 from qfolio.experiments.log import Log
 from qfolio.experiments.tuning import search
@@ -225,7 +225,11 @@ class Tuning:
         preset = {dim.name: search.own_value(self.agent, dim) for dim in self.space}
         batch, total = self.config.batch, self.config.trials
         self.interrupted = False
-        with self._log() as log, self.journal.at_work(), kept(executor or Here()) as workers:
+        with (
+            self._log() as log,
+            self.journal.at_work(),
+            persistent(executor or Here()) as workers,
+        ):
             while not self.interrupted and (asked := self.journal.ask(batch, total, preset)):
                 try:
                     now = self._train(asked, log, chunk_listener, workers)

@@ -214,7 +214,7 @@ class BacktestFolder:
         return [path.stem for path in (self.path / "policies" / agent).glob("*.safetensors")]
 
     def policy_file(self, agent: str, name: str) -> Path:
-        return self._policy(agent, name)
+        return self.path / "policies" / agent / f"{name}.safetensors"
 
     def read_own(self, config: BacktestConfig) -> dict[str, Own]:
         """The user's own strategies; raises QfolioError if they are damaged."""
@@ -234,13 +234,13 @@ class BacktestFolder:
             ) from None
 
     def has_policy(self, agent: str, fold: str) -> bool:
-        return self._policy(agent, fold).exists()
+        return self.policy_file(agent, fold).exists()
 
     def write_policy(self, agent: str, fold: str, tree: Any) -> None:
-        write_tree(self._policy(agent, fold), tree)
+        write_tree(self.policy_file(agent, fold), tree)
 
     def read_policy(self, agent: str, fold: str, template: Any) -> Any:
-        return read_tree(self._policy(agent, fold), template)
+        return read_tree(self.policy_file(agent, fold), template)
 
     def write_records(self, agent: str, fold: str, rows: Sequence[Row]) -> None:
         header = list(rows[0]) if rows else []
@@ -322,9 +322,6 @@ class BacktestFolder:
     def read_why(self) -> dict[str, Any]:
         """The content of why.json; raises QfolioError if it is missing or not a JSON object."""
         return read_json(self.path / "why.json")
-
-    def _policy(self, agent: str, fold: str) -> Path:
-        return self.path / "policies" / agent / f"{fold}.safetensors"
 
     def _records(self, agent: str, fold: str) -> Path:
         return self.path / "training" / agent / f"{fold}.csv"

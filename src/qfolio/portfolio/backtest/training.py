@@ -58,12 +58,12 @@ class FoldsJob:
     def run(self, listeners: Sequence[Listener]) -> dict[str, TrainedFold] | None:
         """The trained folds by name; None if Ctrl-C stopped it."""
         population = Population(*self._population)
-        kept = _RowsByFold(self)
-        training = fit(population, self.budget, [kept, *listeners], config={"job": self.name})
+        records = _RowsByFold(self)
+        training = fit(population, self.budget, [records, *listeners], config={"job": self.name})
         if training.interrupted and not training.finished:
             return None
         return {
-            fold: TrainedFold(self._kept(population, i), kept.rows[i])
+            fold: TrainedFold(self._of_fold(population, i), records.rows[i])
             for i, fold in enumerate(self.folds)
         }
 
@@ -78,7 +78,7 @@ class FoldsJob:
         seeds, room = self.seeds * len(self.folds), self.most * len(self.seeds)
         return tasks, self.agent, seeds, room
 
-    def _kept(self, population: Population, fold: int) -> PyTree:
+    def _of_fold(self, population: Population, fold: int) -> PyTree:
         whole = self.folds[fold] == self.whole
         members = population.fetch().agent if whole else population.weights()
         first, count = fold * len(self.seeds), len(self.seeds)

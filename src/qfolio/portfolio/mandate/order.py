@@ -335,16 +335,16 @@ def _without_small(
         found = search(wanted, held, fewer, found, steps)
         return (left | small(found, fewer), found), before
 
-    nothing = none_binds(limits)
-    none = jnp.zeros_like(can_stay)
+    unmoved, nobody = none_binds(limits), jnp.zeros_like(can_stay)
+    everybody = ~nobody
     # The first round is the order if no later one fits, so it must be as exact as without them.
     steps = jnp.array([ITERATIONS] + [FEW] * (ROUNDS - 1), jnp.int32)
-    (left, found), (lefts, founds) = lax.scan(leave, (none, nothing), steps)
+    (left, found), (lefts, founds) = lax.scan(leave, (nobody, unmoved), steps)
     fewer = _fixed(limits, lefts[-1], held)
     fits = excess(approximate(found, wanted, held, fewer), held, limits).max() <= BARELY
     fits &= (left == lefts[-1]).all()
     may_stay = _obeys(rules, held)
-    otherwise = choose(may_stay, (nothing, ~none), (founds[1], none))
+    otherwise = choose(may_stay, (unmoved, everybody), (founds[1], nobody))
     return choose(fits, (found, lefts[-1]), otherwise)
 
 
