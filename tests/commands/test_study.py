@@ -73,7 +73,7 @@ def test_resuming_a_finished_study_reports_again(place, monkeypatch, capsys):
         (["one.csv", "--after", "nowhere"], "nowhere is no study"),
         (
             ["one.csv", "--train", "80d", "--test", "40d", "--benchmark", "Z"],
-            "one: The benchmark 'Z' is not a strategy",
+            "one: The benchmark 'Z' is no baseline",
         ),
         (["one.csv", "--strategy", "mine"], "it must be NAME=FILE"),
         (["one.csv", "--train", "80d", "--test", "40d", "--mandate", "none.toml"], "none.toml"),

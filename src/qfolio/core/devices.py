@@ -28,10 +28,11 @@ LOCKSTEP = {"gpu", "tpu"}
 """Platforms that step their members in lockstep."""
 
 
-SMALL_LOOP = 100_000_000
+SMALL_LOOP = 20_000_000
 """Most bytes that a loop may touch for XLA to compile it into one CPU function. It launches each
 operation of a larger loop separately, and splits those over threads that have a large operand. If a
-step reads a few rows of a large table, that takes as long as the operations."""
+step reads a few rows of a large table, that takes as long as the operations. With 100 MB, loops
+with a mandate's projections would take minutes to compile."""
 
 
 def configure() -> None:
