@@ -37,7 +37,7 @@ from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.plan import Plan
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
-from qfolio.portfolio.backtest.terms import PROPORTIONAL, Terms
+from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold, preparing
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.limits import reach, settled
@@ -169,7 +169,7 @@ class Backtest:
                 f"The cap is {cap:g}; it must be above 0 and at most 1. A mandate that allows "
                 "loans or short sales may set one above 1 (assets.cap)."
             )
-        terms = Terms.of(mandate, cost, cost_model, calendar, benchmark)
+        terms = TradingTerms.of(mandate, cost, cost_model, calendar, benchmark)
         field = field_of(prices, agents, baselines, strategies or {}, terms.benchmark)
         limits = terms.mandate
         if limits is not None:

@@ -34,7 +34,7 @@ from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe
-from qfolio.portfolio.backtest.terms import PROPORTIONAL, Terms
+from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
 from qfolio.portfolio.prices.table import Prices, describe, trials_on
 from qfolio.portfolio.study.folder import (
     NAME,
@@ -388,7 +388,7 @@ def _charged(costs: Sequence[float], options: Mapping[str, Any]) -> list[float]:
     Raises QfolioError if several are given, and the mandate or the cost model sets one for all.
     """
     mandate, model = options.get("mandate"), options.get("cost_model", PROPORTIONAL)
-    charged = [Terms.of(mandate, cost, model).cost for cost in costs]
+    charged = [TradingTerms.of(mandate, cost, model).cost for cost in costs]
     if len(set(costs)) > len(set(charged)):
         raise QfolioError(
             f"The mandate or the cost model sets a cost of {charged[0] * 1e4:g} bp, so a study "

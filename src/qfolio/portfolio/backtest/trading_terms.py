@@ -9,7 +9,7 @@ PROPORTIONAL = "proportional"
 """The default cost model."""
 
 
-class Terms(NamedTuple):
+class TradingTerms(NamedTuple):
     """The arguments of ``Backtest.create`` of these names, where a mandate has had its say."""
 
     mandate: Mandate | None
@@ -21,7 +21,7 @@ class Terms(NamedTuple):
     @staticmethod
     def of(
         mandate: Any, cost: float, cost_model: str, calendar: str = "", benchmark: Any = None
-    ) -> "Terms":
+    ) -> "TradingTerms":
         """A mandate's cost always applies, its other terms where an argument has its default.
 
         A cost that is written into a cost model precedes both. Raises QfolioError if the mandate
@@ -34,7 +34,7 @@ class Terms(NamedTuple):
             calendar = calendar or mandate.trading.calendar
             benchmark = mandate.benchmark if benchmark is None else benchmark
         written = called(cost_model)[1].get("cost")
-        return Terms(mandate, _number(written, cost), cost_model, calendar, benchmark)
+        return TradingTerms(mandate, _number(written, cost), cost_model, calendar, benchmark)
 
 
 def _number(written: float | str | None, otherwise: float) -> float:
