@@ -165,6 +165,10 @@ def test_columns_of_the_market_must_be_finite_and_named_once():
         load(table, columns=("rate",), features=("rate",))
     with pytest.raises(QfolioError, match="there is no column 'rates'"):
         load(table, columns=("rates",))
+    with pytest.raises(QfolioError, match=r"write --columns rates=FILE"):
+        load(table, columns=("rates",))
+    with pytest.raises(QfolioError, match=r"no column 'volume'.* The columns are [^;]*\.$"):
+        load(table, features=("volume",))
     values = prices().to_numpy()
     with pytest.raises(QfolioError, match="do not fit"):
         Prices(DAYS.to_numpy(), ("A", "B", "C"), values, market=values, market_names=("r",))

@@ -72,7 +72,7 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Findin
     """The arguments of ``Prices`` (none if the table has errors), and all findings."""
     findings = Findings()
     features, shared = tuple(choices.features), choices.own_columns
-    columns = find_columns(table, features + shared, choices.date, findings)
+    columns = find_columns(table, features, shared, choices.date, findings)
     grid = None if columns is None else arrange(table, columns, findings)
     if grid is None:
         return {}, findings

@@ -55,10 +55,18 @@ def text_columns(names: tuple[str, ...], date: str | None) -> set[int]:
 
 
 def find_columns(
-    table: Table, features: tuple[str, ...], date: str | None, findings: Findings
+    table: Table,
+    features: tuple[str, ...],
+    shared: tuple[str, ...],
+    date: str | None,
+    findings: Findings,
 ) -> Columns | None:
-    """The columns that matter; None after an error."""
-    columns = _check_names(table, features, date, findings)
+    """The columns that matter; None after an error.
+
+    shared: columns of the whole market, which come after the features.
+    """
+    columns = _check_names(table, features, shared, date, findings)
+    features += shared
     if findings.bad:
         return None
     when = _date_column(table, columns, date)
@@ -104,7 +112,11 @@ def find_columns(
 
 
 def _check_names(
-    table: Table, features: tuple[str, ...], date: str | None, findings: Findings
+    table: Table,
+    features: tuple[str, ...],
+    shared: tuple[str, ...],
+    date: str | None,
+    findings: Findings,
 ) -> list[int]:
     """The columns that matter: all but those that have neither a name nor content."""
     names = table.names
@@ -127,15 +139,16 @@ def _check_names(
             "the first line holds values instead of column names", row=table.first_row - 1,
             advice="Put a line of names on top, such as date,AAPL,MSFT.",
         )  # fmt: skip
-    for name in dict.fromkeys((*features, *([] if date is None else [date]))):
+    wanted = features + shared
+    for name in dict.fromkeys((*wanted, *([] if date is None else [date]))):
         if name not in places and not columns_of_kind(table, name):
             # A cash rate, say, may come from another file, which has to be named each time.
-            other = "" if name == date else f"; for another file, write --columns {name}=FILE"
+            other = f"; for another file, write --columns {name}=FILE" if name in shared else ""
             findings.error(
                 f"there is no column {quote(name)}{hint(name, names)}",
                 advice=f"The columns are {listing(names)}{other}.",
             )
-    if len(set(features)) < len(features) or date in features:
+    if len(set(wanted)) < len(wanted) or date in wanted:
         findings.error("a column is named twice among the features and the dates")
     return columns
 
