@@ -4,10 +4,17 @@ import re
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+
+from qfolio.commands.training import _train
+from qfolio.experiments.budget import Budget
+from qfolio.experiments.executor import Here
 
 from shell import TINY, qfolio
 
@@ -103,6 +110,27 @@ def test_live_shows_episodes_while_training(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "run" / "contrast").exists()
+
+
+def test_live_shows_no_other_task_that_is_resumed(monkeypatch, capsys, tmp_path):
+    options = ["--episodes", "4", "--seeds", "1", "--no-compare", "--out", tmp_path / "run"]
+    assert qfolio(monkeypatch, "train", "finite/cliff", *options) == 0
+    monkeypatch.setattr("qfolio.commands.training._window", lambda live: nullcontext(print))
+    assert qfolio(monkeypatch, "train", "--resume", tmp_path / "run", "--live") == 2
+    assert "there is nothing to see of finite/cliff" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("begun", [True, False])
+def test_progress_here_is_that_of_groups_of_seeds_where_a_run_has_some(begun):
+    listeners: dict[str, Any] = {}
+    run: Any = SimpleNamespace(
+        groups=SimpleNamespace(begun=begun),
+        task=SimpleNamespace(optimum=lambda: None),
+        train=lambda budget, these=(), **others: listeners.update(others, these=these),
+    )
+    _train(run, Budget(4), Here())
+    assert ("listen" in listeners) == begun
+    assert bool(listeners["these"]) != begun
 
 
 @pytest.mark.parametrize(
