@@ -33,6 +33,7 @@ def test_describe_and_build_are_inverse():
 
 def test_parse():
     assert settings.parse(["a=1", "learning-rate = 2"]) == {"a": "1", "learning_rate": "2"}
+    assert settings.parse(["my-agent.learning-rate=2"]) == {"my-agent.learning_rate": "2"}
 
 
 @pytest.mark.parametrize("assignment", ["discount", "=1", "discount="])

@@ -24,7 +24,7 @@ from qfolio.commands.arguments import (
 from qfolio.commands.tables import READING, Reading
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import hint
+from qfolio.core.text import hint, near
 
 if TYPE_CHECKING:
     from qfolio.experiments.presets import Preset
@@ -247,7 +247,9 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
             *(registry.find("agent", preset.agent) for preset in presets.values()),
         ]
         known = set().union(*map(settings.names, kinds)) - own_options
-        name = key.rpartition(".")[2]
+        who, dot, name = key.rpartition(".")
+        if dot and who not in presets:
+            raise QfolioError(f"--set {key}: no agent is named {who}; {near(who, presets)}")
         raise QfolioError(
             f"--set {key}: neither {', '.join(presets)} nor the portfolio task has this setting"
             f"{hint(name, known)}; its lag, costs, cap and mandate have options of their own."

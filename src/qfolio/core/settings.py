@@ -53,7 +53,7 @@ def convert(kind: type, settings: Mapping[str, Any]) -> dict[str, Any]:
 def parse(assignments: Iterable[str]) -> dict[str, str]:
     """``["name=value", …]`` as a dictionary; hyphens in names become underscores.
 
-    Raises QfolioError for anything else.
+    In "agent.name=value" the agent keeps its hyphens. Raises QfolioError for anything else.
     """
     pairs = {}
     for assignment in assignments:
@@ -62,7 +62,8 @@ def parse(assignments: Iterable[str]) -> dict[str, str]:
             raise QfolioError(
                 f"--set takes name=value, for example discount=0.99; not {assignment!r}."
             )
-        pairs[name.strip().replace("-", "_")] = value.strip()
+        agent, dot, setting = name.strip().rpartition(".")
+        pairs[agent + dot + setting.replace("-", "_")] = value.strip()
     return pairs
 
 
