@@ -422,6 +422,8 @@ def test_the_first_policy_is_the_same_everywhere():
         (A2C, {"gae_lambda": -1.0}, "gae_lambda is -1"),
         (A2C, {"rollout_length": 0}, "rollout_length is 0"),
         (REINFORCE, {"initial_std": 0.0}, "initial_std is 0"),
+        (REINFORCE, {"episode_steps": 2**31}, "must be from 0 to 2³¹ − 1"),
+        (A2C, {"hidden": (0,)}, "must be one or more layer sizes from 1 to"),
         (REINFORCE, {"network": "tree"}, "network is tree"),
     ],
 )

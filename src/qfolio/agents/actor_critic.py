@@ -167,7 +167,7 @@ class ActorCritic(Agent, Generic[L]):
         self._normalization.check(self.input_gain)
         self._schedule.check()
         require(self, "gradient_steps", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
         require(self, "actor_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
         require(self, "discount tau noise_theta", lambda x: 0 <= x <= 1, "between 0 and 1")

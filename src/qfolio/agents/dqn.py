@@ -129,7 +129,7 @@ class DQN(Agent):
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "importance_steps", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "epsilon_steps", lambda x: 0 <= x <= 1e30, "from 0 to 1e30")
         fractions = "discount tau epsilon_start epsilon_end epsilon_decay persistence"
@@ -142,7 +142,7 @@ class DQN(Agent):
             )
         if self.all_actions:
             hindsight.require_plain({name: getattr(self, name) for name in hindsight.PLAIN})
-        require(self, "outcomes", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "outcomes", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
         require(self, "bootstrap_heads", lambda x: 1 <= x <= 1000, "from 1 to 1,000")
         require(self, "caution", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
         if self.bootstrap_heads > 1 and not self.all_actions:

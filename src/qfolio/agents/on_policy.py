@@ -102,7 +102,7 @@ class OnPolicy(Agent):
 
     def __check_init__(self) -> None:
         require(self, "num_envs rollout_length", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
         require(self, "discount", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
         coefficients = "value_coef entropy_coef saturation_penalty"

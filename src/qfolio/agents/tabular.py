@@ -85,7 +85,7 @@ class Tabular(Agent):
 
     def __check_init__(self) -> None:
         require(self, "num_envs", lambda x: 1 <= x <= 4096, "from 1 to 4096")
-        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
         fractions = "discount learning_rate epsilon_start epsilon_end epsilon_decay"
         require(self, fractions, lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "learning_rate_decay", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")

@@ -65,4 +65,4 @@ def require_static(instance: Any) -> None:
 def require_sizes(instance: Any, name: str = "hidden") -> None:
     """Raises QfolioError unless a setting holds one or more layer sizes of at least 1."""
     holds = lambda x: len(x) > 0 and min(x) >= 1 and max(x) < 2**31  # noqa: E731
-    require(instance, name, holds, "one or more layer sizes")
+    require(instance, name, holds, "one or more layer sizes from 1 to 2³¹ − 1")

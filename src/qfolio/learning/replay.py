@@ -87,7 +87,7 @@ class ReplayConfig(NamedTuple):
         counts = "num_envs batch_size n_steps"
         require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
         require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
-        require(self, "learning_starts", lambda x: 0 <= x < 2**31, "at least 0")
+        require(self, "learning_starts", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
         joined = self.n_steps * self.num_envs
         if max(self.learning_starts, joined) > self.replay_capacity:
             raise QfolioError(

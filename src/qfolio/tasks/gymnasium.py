@@ -42,7 +42,7 @@ class GymnasiumTask(HostTask):
             self.horizon = self.facts.limit
 
     def __check_init__(self) -> None:
-        require(self, "horizon", lambda x: 1 <= x < 2**31, "at least 0")
+        require(self, "horizon", lambda x: 1 <= x < 2**31, "from 0 to 2³¹ − 1")
 
     @property
     def name(self) -> str:
