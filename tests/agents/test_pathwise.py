@@ -112,6 +112,20 @@ def test_paths_start_anywhere_and_in_the_band_and_so_do_their_images():
     np.testing.assert_allclose(both.next_market.mean(), mean, atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"num_envs": 0}, {"num_envs": 10**20}, {"rollout_length": 2**31},
+        {"gradient_steps": 2**31}, {"episode_steps": 2**31}, {"tail": -1}, {"max_grad_norm": 0.0},
+        {"slope_learning_rate_ratio": float("inf")}, {"simplex_penalty": -1.0},
+        {"simplex_penalty": float("inf")},
+    ],
+)  # fmt: skip
+def test_settings_out_of_range_are_named(settings):
+    with pytest.raises(QfolioError, match=next(iter(settings))):
+        Pathwise(**settings)
+
+
 def test_a_rollout_needs_a_second_decision_to_learn_slopes():
     with pytest.raises(QfolioError, match="must be 2 or more"):
         Pathwise(bootstrap=True, rollout_length=20, tail=19)

@@ -197,10 +197,13 @@ class Pathwise(OnPaths):
             raise QfolioError(
                 f"network is {self.network!r}; it must be one of {', '.join(SHARED)}."
             )
-        require(self, "num_envs rollout_length gradient_steps", lambda x: x >= 1, "at least 1")
-        require(self, "episode_steps tail", lambda x: x >= 0, "at least 0")
-        positive = "max_grad_norm slope_learning_rate_ratio"
-        require(self, positive, lambda x: x > 0, "greater than 0")
+        counts = "num_envs rollout_length gradient_steps"
+        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require(self, "episode_steps tail", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
+        require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
+        ratio = "slope_learning_rate_ratio"
+        require(self, ratio, lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")
+        require(self, "simplex_penalty", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         self._schedule.check()
         require_sizes(self)
