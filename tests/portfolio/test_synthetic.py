@@ -278,6 +278,12 @@ def test_interest_depends_on_the_sign_of_cash():
     assert after.weights.tolist() == [1, 0, 0, 0]
 
 
+@pytest.mark.parametrize("loading", [float("inf"), -1e20])
+def test_loadings_that_make_no_sense(loading):
+    with pytest.raises(QfolioError, match=r"^loading is "):
+        GarleanuPedersen(loading=loading)
+
+
 def test_sales_that_make_no_sense():
     with pytest.raises(QfolioError, match=r"^temporary is 2\.5"):
         Liquidation(permanent=5.0)

@@ -297,7 +297,9 @@ def test_the_reference_is_the_reward_of_holding_the_anchor():
     assert signalling().reference(row, row + 1) is None
 
 
-@pytest.mark.parametrize("menu", ["grid", "grid:0", "grid:1.5", "tilts:1", "tilts:x", "grid:400"])
+@pytest.mark.parametrize(
+    "menu", ["grid", "grid:0", "grid:1.5", "grid:inf", "tilts:1", "tilts:x", "grid:400"]
+)
 def test_menus_that_are_none(menu):
     with pytest.raises(QfolioError, match="menu"):
         _ = portfolio(menu=menu).actions
@@ -310,6 +312,8 @@ def test_menus_that_are_none(menu):
         ({"reward": "profit"}, "no reward 'profit'"), ({"max_weight": 0.0}, "max_weight is 0"),
         ({"cost_model": "free"}, "no cost 'free'"),
         ({"reward": "crra", "risk_aversion": -1.0}, "risk_aversion is -1.0"),
+        ({"risk_aversion": float("inf")}, "risk_aversion is inf; it must be finite"),
+        ({"sharpe_rate": float("-inf")}, "sharpe_rate is -inf; it must be finite"),
         ({"window": 58}, r"60 rows are too few: .*lower window or horizon \(--set horizon=…\)"),
     ],
 )  # fmt: skip

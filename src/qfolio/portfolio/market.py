@@ -102,7 +102,7 @@ class Menu(eqx.Module):
             value = float(size)
         except ValueError:
             value = -1.0
-        if kind == "grid" and value >= 1 and value == int(value):
+        if kind == "grid" and value >= 1 and value.is_integer():
             if comb(int(value) + assets, assets) > MENU_LIMIT:
                 raise QfolioError(
                     f"menu={text} has more than {MENU_LIMIT:,} allocations of {assets} assets; "

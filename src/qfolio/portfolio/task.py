@@ -167,6 +167,8 @@ class Portfolio(Market):
         require(self, "max_weight", lambda x: 0 < x <= 1, "above 0 and at most 1")
         require(self, "cost", lambda x: 0 <= x <= 0.2, "from 0 to 0.2")
         require(self, "tracking_aversion", lambda x: 0 <= x <= 1e4, "from 0 to 10,000")
+        # Whatever the reward: it may use neither, and folders hold finite numbers only.
+        require(self, "risk_aversion sharpe_rate", np.isfinite, "finite")
         _ = decision_rows(self.calendar, np.zeros(0, "datetime64[s]"))
         _ = self.parts  # which check their own settings
         if self.active and not self.anchor:

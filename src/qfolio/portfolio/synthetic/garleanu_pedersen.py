@@ -127,6 +127,7 @@ class GarleanuPedersen(QuadraticCosts):
     variance: float = number(0.04)  # variance of the return, per step
 
     def __check_init__(self) -> None:
+        require(self, "loading", lambda x: -1e6 <= x <= 1e6, "from -1e6 to 1e6")
         require(self, "phi", lambda x: 0 < x <= 1, "above 0 and at most 1")
         require(self, "noise cost_scale variance", lambda x: 1e-6 <= x <= 1e6, "from 1e-6 to 1e6")
 
