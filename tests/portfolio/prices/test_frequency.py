@@ -33,5 +33,21 @@ def test_bars_around_the_clock():
     )
 
 
+@pytest.mark.parametrize(
+    ("week", "expected"),
+    [
+        ("Sun Mon Tue Wed Thu", 252),  # Riyadh, and Tel Aviv until 2025
+        ("Sat Sun Mon Tue Wed", 252),  # Tehran
+        ("Mon Tue Wed Thu Fri Sat", 313),  # New York until 1952
+        ("Sun Mon Tue Wed Thu Fri Sat", 365),
+    ],
+)
+def test_weeks_that_include_a_day_of_the_weekend(week: str, expected: float):
+    dates = pd.bdate_range("2001-01-01", periods=2000, freq="C", weekmask=week)
+    assert periods_per_year(days(dates)) == expected
+    bars = np.concatenate([days(dates + pd.Timedelta(hours=k)) for k in (10, 11, 12)])
+    assert periods_per_year(np.sort(bars)) == 3 * expected
+
+
 def days(index: pd.DatetimeIndex) -> np.ndarray:
     return index.to_numpy("datetime64[s]")

@@ -13,26 +13,46 @@ def spacing(dates: np.ndarray) -> tuple[np.ndarray, float]:
     return steps, float(np.sort(steps)[(len(steps) - 1) // 2])
 
 
-def every_day(dates: np.ndarray) -> bool:
-    """True if weekends have rows, too."""
+def days_a_week(dates: np.ndarray) -> int:
+    """On how many days of the week a market is open: 5, 6 or 7.
+
+    It is 5 without rows on weekends, but also from Sunday to Thursday; it was 6 in New York, which
+    traded on Saturdays until 1952.
+    """
+    if not len(dates):
+        return 5
     weekday = (dates.astype("datetime64[D]").astype(np.int64) + 3) % 7  # 1970-01-01: Thursday
-    return float((weekday >= 5).mean()) > 0.1 if len(dates) else False
+    shares = np.bincount(weekday, minlength=7) / len(dates)
+    if shares[5:].sum() <= 0.1:
+        return 5
+    return max(5, int((shares > 0.05).sum()))
+
+
+def every_day(dates: np.ndarray) -> bool:
+    """True if there are rows on all days of the week."""
+    return days_a_week(dates) == 7
 
 
 def periods_per_year(dates: np.ndarray) -> float:
     """Rows per year: 252 for business days, 365 for all days, 52, 12, 4 or 1 for longer periods.
 
-    For intraday rows it is the median number of bars per day times the days per year, and for any
-    other spacing the mean number of rows per year.
+    For intraday rows it is the median number of bars per day times the days per year. For any other
+    spacing it is the mean number of rows per year, and for six days a week that number of days.
     """
     if len(dates) < 2:
         return TRADING_DAYS
-    steps, usual = spacing(dates)
+    _, usual = spacing(dates)
     if usual <= 1.1:
-        _, bars = np.unique(dates.astype("datetime64[D]"), return_counts=True)
-        days = 365.0 if every_day(dates) else TRADING_DAYS
+        open_on, bars = np.unique(dates.astype("datetime64[D]"), return_counts=True)
+        days = {5: TRADING_DAYS, 7: 365.0}.get(days_a_week(dates)) or round(_a_year(open_on))
         return days * (float(np.median(bars)) if usual < 0.9 else 1.0)
     for low, high, periods in YEARLY:
         if low <= usual <= high:
             return periods
+    return _a_year(dates)
+
+
+def _a_year(dates: np.ndarray) -> float:
+    """The mean number of dates per year."""
+    steps, _ = spacing(dates.astype("datetime64[s]"))
     return float(365.25 * len(steps) / steps.sum())
