@@ -191,6 +191,11 @@ def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
     assert "frozen" in capsys.readouterr().out
 
 
+def test_a_change_without_a_value_is_named_by_its_option(monkeypatch, capsys):
+    assert qfolio(monkeypatch, "continual", "--change", "mass") == 2
+    assert "--change takes name=value, for example mass=2; not 'mass'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

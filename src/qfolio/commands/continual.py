@@ -124,11 +124,12 @@ def _plan(
         raise QfolioError(
             "--change is missing: name the task's new numbers, for example --change mass=2."
         )
+    changes = settings.parse(change, "--change", "mass=2")
     before, chosen = settings.divide(settings.parse(assignments), task_class, agent_class)
     before = {**preset.task, **before}
     return Plan(
         task=settings.build(task_class, before),
-        changed=settings.build(task_class, {**before, **settings.parse(change)}),
+        changed=settings.build(task_class, {**before, **changes}),
         agent=preset.build(**chosen),
         episodes=preset.episodes if episodes is None else episodes,
         seeds=preset.seeds if seeds is None else seeds,

@@ -50,17 +50,22 @@ def convert(kind: type, settings: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _convert(name, types[name], value) for name, value in settings.items()}
 
 
-def parse(assignments: Iterable[str]) -> dict[str, str]:
+def parse(
+    assignments: Iterable[str],
+    option: str = "--set",
+    example: str = "discount=0.99",
+) -> dict[str, str]:
     """``["name=value", …]`` as a dictionary; hyphens in names become underscores.
 
-    In "agent.name=value" the agent keeps its hyphens. Raises QfolioError for anything else.
+    In "agent.name=value" the agent keeps its hyphens. Raises QfolioError for anything else, which
+    names the option that they were given to.
     """
     pairs = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
         if not (name.strip() and equals and value.strip()):
             raise QfolioError(
-                f"--set takes name=value, for example discount=0.99; not {assignment!r}."
+                f"{option} takes name=value, for example {example}; not {assignment!r}."
             )
         agent, dot, setting = name.strip().rpartition(".")
         pairs[agent + dot + setting.replace("-", "_")] = value.strip()
