@@ -172,6 +172,7 @@ def test_what_is_usually_searched_surrounds_the_agents_own_values():
         (["discount=near-one:0.9..1"], "must be below 1"),
         (["discount=cubic:0.9..1"], "no scale 'cubic'"),
         (["discount=0.9"], "leaves nothing to search"),
+        (["discount=0.9-0.99"], r"give a range \(low..high\)"),
         (["discount=0.9|0.90"], "different choices"),
         (["hidden=8|x"], "whole numbers"),
         (["batch_size=32..64"], r"list the values: batch_size=32\|64"),

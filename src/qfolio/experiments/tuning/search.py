@@ -155,8 +155,9 @@ def dimension(name: str, text: str, kind: type["Agent"]) -> Dimension:
     scale, body = (prefix.strip(), rest) if colon else ("", text)
     low, dots, high = body.partition("..")
     if not dots:
-        choices = [_canonical(kind, name, choice.strip()) for choice in body.split("|")]
-        if colon or len(choices) < 2 or len(set(choices)) < len(choices):
+        parts = [] if colon or "|" not in body else body.split("|")
+        choices = [_canonical(kind, name, choice.strip()) for choice in parts]
+        if not choices or len(set(choices)) < len(choices):
             raise QfolioError(
                 f"{name}={text} leaves nothing to search; give a range (low..high) or different "
                 "choices (a|b|c), or fix it with --set."
