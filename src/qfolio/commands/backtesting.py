@@ -136,7 +136,9 @@ class Options(Reading):
 
         if self.mandate is None and not self.limits:
             return None
-        return (Mandate.read(self.mandate) if self.mandate else Mandate()).changed(self.limits)
+        if self.mandate is None:
+            return Mandate().changed(self.limits)
+        return Mandate.read(self.mandate, self.limits)
 
     def settings(self) -> dict[str, Any]:
         """The other arguments of ``Backtest.create``, except lag, cost and folder."""

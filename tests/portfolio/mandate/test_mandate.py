@@ -202,6 +202,25 @@ def test_a_floor_for_all_assets_is_for_those_that_may_be_held():
     np.testing.assert_allclose(feasible(text, ALL).limits.low, [0.1, 0, 0.1, 0.1])
 
 
+def test_every_way_to_give_a_mandate_may_name_a_file_of_groups(tmp_path, monkeypatch):
+    mandate = Mandate.read(written(tmp_path), ["groups.sector.Index.floor=0.02", "cash.max=1.0"])
+    assert mandate.cash.max == 1
+    alone = Mandate.read(tmp_path / "mandate.toml").groups["sector"]["Energy"]
+    assert mandate.groups["sector"]["Energy"] == alone
+    index = mandate.groups["sector"]["Index"]
+    assert (index.floor, index.assets) == (0.02, ("SPY",))
+    monkeypatch.chdir(tmp_path)
+    made = Mandate().changed(["groups.file=groups.csv", "groups.sector.Index.floor=0.02"])
+    given = {"groups": {"file": "groups.csv", "sector": {"Index": {"floor": 0.02}}}}
+    assert made == Mandate.of(given)
+    assert made.groups["sector"]["Index"].assets == ("SPY",)
+    assert given["groups"]["file"] == "groups.csv"
+    with pytest.raises(QfolioError, match=r"--limits: .* has the sector 'Bond'; .* mean Bonds"):
+        Mandate().changed(["groups.file=groups.csv", "groups.sector.Bond.floor=0.02"])
+    with pytest.raises(QfolioError, match=r"none.csv cannot be read: No such file"):
+        Mandate().changed(["groups.file=none.csv", "groups.sector.Index.floor=0.02"])
+
+
 def test_a_file_of_groups_may_name_assets_of_other_tables(tmp_path):
     mandate = Mandate.read(written(tmp_path)).changed(["cash.max=1.0"])
     assert "other" in mandate.groups["sector"]["Energy"].assets

@@ -146,8 +146,11 @@ class Mandate(Section, frozen=True):
     risk: Limited = Limited()
 
     @staticmethod
-    def read(path: Path | str) -> "Mandate":
-        """The mandate in a file. Raises QfolioError if there is none, or one that is wrong."""
+    def read(path: Path | str, limits: Sequence[str] = ()) -> "Mandate":
+        """The mandate in a file, with other values of some keys, as ``changed`` takes them.
+
+        Raises QfolioError if there is none, or one that is wrong.
+        """
         path = Path(path)
         try:
             content = tomllib.loads(path.read_text("utf-8"))
@@ -158,20 +161,17 @@ class Mandate(Section, frozen=True):
                 f"{path} is not valid TOML: {error}; see docs/guides/mandate.md."
             ) from None
         groups = content.get("groups")
-        file = groups.pop("file", None) if isinstance(groups, dict) else None
-        mandate = _converted(content, str(path))
-        if file is None:
-            return mandate
-        if not isinstance(file, str):
-            raise QfolioError(f"{path}: groups.file must be the name of a CSV file.")
-        return _with_members(mandate, path.parent / file, str(path))
+        if isinstance(groups, dict) and isinstance(groups.get("file"), str):
+            groups["file"] = str(path.parent / groups["file"])
+        mandate = _made(content, str(path))
+        return _made(_assigned(content, limits), "--limits") if limits else mandate
 
     @staticmethod
     def of(given: "Mandate | Path | str | dict[str, Any]") -> "Mandate":
         """A mandate, from one, from the path of a file, or from a dictionary of its sections."""
         if isinstance(given, Mandate):
             return given
-        return _converted(given, "mandate") if isinstance(given, dict) else Mandate.read(given)
+        return _made(given, "mandate") if isinstance(given, dict) else Mandate.read(given)
 
     def changed(self, assignments: Sequence[str]) -> "Mandate":
         """The mandate with other values of some keys, such as "trading.turnover=0.3".
@@ -179,23 +179,7 @@ class Mandate(Section, frozen=True):
         Keys and values are those of the file; text needs no quotes. Raises QfolioError for a key
         that does not exist, or a value that does not fit.
         """
-        content = msgspec.to_builtins(self)
-        for assignment in assignments:
-            key, equals, value = assignment.partition("=")
-            try:
-                read = tomllib.loads(f"{key} = {value}")
-            except tomllib.TOMLDecodeError:
-                try:
-                    read = tomllib.loads(f"{key} = {json.dumps(value.strip())}")
-                except tomllib.TOMLDecodeError:
-                    equals = ""
-            if not equals:
-                raise QfolioError(
-                    f"--limits has {quote(assignment)}; it must be a key and a value of a mandate, "
-                    "such as trading.turnover=0.3."
-                )
-            _merge(content, read, key.strip())
-        return _converted(content, "--limits")
+        return _made(_assigned(msgspec.to_builtins(self), assignments), "--limits")
 
     @property
     def cost_model(self) -> str:
@@ -250,6 +234,38 @@ class Mandate(Section, frozen=True):
 
 def _named(given: float | dict[str, float] | None) -> Sequence[str]:
     return list(given) if isinstance(given, dict) else []
+
+
+def _made(content: Any, source: str) -> Mandate:
+    """The mandate in a dictionary, with the assets of groups from its CSV, if it names one."""
+    groups = content.get("groups") if isinstance(content, dict) else None
+    if not (isinstance(groups, dict) and "file" in groups):
+        return _converted(content, source)
+    if not isinstance(groups["file"], str):
+        raise QfolioError(f"{source}: groups.file must be the name of a CSV file.")
+    others = {column: values for column, values in groups.items() if column != "file"}
+    mandate = _converted(content | {"groups": others}, source)
+    return _with_members(mandate, Path(groups["file"]), source)
+
+
+def _assigned(content: dict[str, Any], assignments: Sequence[str]) -> dict[str, Any]:
+    """The dictionary of a mandate, in which the values of some keys are replaced."""
+    for assignment in assignments:
+        key, equals, value = assignment.partition("=")
+        try:
+            read = tomllib.loads(f"{key} = {value}")
+        except tomllib.TOMLDecodeError:
+            try:
+                read = tomllib.loads(f"{key} = {json.dumps(value.strip())}")
+            except tomllib.TOMLDecodeError:
+                equals = ""
+        if not equals:
+            raise QfolioError(
+                f"--limits has {quote(assignment)}; it must be a key and a value of a mandate, "
+                "such as trading.turnover=0.3."
+            )
+        _merge(content, read, key.strip())
+    return content
 
 
 def _converted(content: Any, source: str) -> Mandate:
@@ -308,7 +324,8 @@ def _with_members(mandate: Mandate, file: Path, source: str) -> Mandate:
         with file.open(encoding="utf-8-sig", newline="") as lines:
             table = list(csv.DictReader(lines))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise QfolioError(f"{source}: groups.file {file} cannot be read: {error}.") from None
+        why = error.strerror if isinstance(error, OSError) else error
+        raise QfolioError(f"{source}: groups.file {file} cannot be read: {why}.") from None
     columns = list(table[0]) if table else []
     if "asset" not in columns or len(columns) < 2:
         raise QfolioError(
