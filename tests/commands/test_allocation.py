@@ -183,6 +183,9 @@ def test_the_ledger_has_one_record_for_the_same_inputs(copy, monkeypatch, capsys
     assert [record["supersedes"] for record in records(copy)] == [None, 1]
     # Back to the first inputs: the last record counts, and it has others.
     assert allocation(copy, monkeypatch, capsys, "--capital", 1000)["record"] == 3
+    words = ["allocate", copy, *AS_OF, "--capital", 1000, "--agent", "equal-weight"]
+    assert qfolio(monkeypatch, *words) == 0
+    assert "which had another agent and another policy." in capsys.readouterr().out
 
 
 def test_any_order_is_reproduced_after_an_update(copy, monkeypatch, capsys, tmp_path):

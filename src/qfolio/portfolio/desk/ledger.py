@@ -16,7 +16,7 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, read_arrays, read_json, write_arrays, write_json
-from qfolio.core.text import quote
+from qfolio.core.text import listed, quote
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.prices.table import Prices
 
@@ -151,9 +151,10 @@ class Ledger:
             differing = [
                 key for key, value in _inputs(record).items() if value != _inputs(before)[key]
             ]
+            others = [f"{'other' if key[-1] == 's' else 'another'} {key}" for key in differing]
             said += (
-                f" It supersedes record {before.number} of the same date, which had other "
-                f"{' and '.join(differing).replace('_', ' ')}."
+                f" It supersedes record {before.number} of the same date, which had "
+                f"{listed(others)}."
             )
         return record, said
 
