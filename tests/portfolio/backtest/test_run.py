@@ -397,6 +397,7 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
         ({"train": "25d"}, "rows are too few"), ({"cost": 0.5}, "cost is 0.5"),
         ({"lag": -1}, "lag is -1"), ({"agents": {}}, "at least one agent"),
         ({"cap": 1.5}, "The cap is 1.5; it must be above 0"), ({"cap": np.nan}, "The cap is nan"),
+        ({"baselines": "momentum"}, "baselines is 'momentum'; it must be a list"),
     ],
 )  # fmt: skip
 def test_backtests_that_cannot_be(settings, message, tmp_path):

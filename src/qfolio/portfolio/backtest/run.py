@@ -164,6 +164,8 @@ class Backtest:
         """
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")
+        if isinstance(baselines, str):
+            raise QfolioError(f"baselines is {baselines!r}; it must be a list of names.")
         if not 0 < cap <= 1:
             raise QfolioError(
                 f"The cap is {cap:g}; it must be above 0 and at most 1. A mandate that allows "
