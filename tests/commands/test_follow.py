@@ -5,6 +5,7 @@ import json
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from shell import qfolio
@@ -70,6 +71,20 @@ def test_follow_shows_live_beside_the_backtest(folder, monkeypatch, capsys, tmp_
     assert page.count("<svg") == 2
     assert "Live returns are consistent with the backtest" in page
     assert "pathwise, live and in the backtest" in page
+
+
+def test_follow_reads_a_table_of_returns_as_allocate_does(folder, monkeypatch, capsys, tmp_path):
+    prices, returns = table(tmp_path / "later.csv", 335), tmp_path / "returns.csv"
+    frame = pd.read_csv(prices, index_col=0)
+    frame.pct_change().iloc[1:].to_csv(returns)
+    found = []
+    for words in (["--prices", prices], ["--prices", returns, "--returns", "fraction"]):
+        assert qfolio(monkeypatch, "follow", folder, *words, "--json") == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[1]["growth"] == pytest.approx(found[0]["growth"])
+    assert found[1]["flows"] == pytest.approx(found[0]["flows"])
+    assert qfolio(monkeypatch, "follow", folder, "--prices", returns) == 2
+    assert "(--returns)" in capsys.readouterr().err
 
 
 def test_a_loss_at_every_row_raises_the_alarm(folder, monkeypatch, capsys, tmp_path):

@@ -178,6 +178,7 @@ def follow(
     folder: Positional[Path],
     *,
     prices: File = None,
+    returns: Returns = None,
     benchmark: File = None,
     out: File = None,
     trust: Modules = (),
@@ -195,6 +196,7 @@ def follow(
         folder: Folder of a backtest with a ledger.
         prices: Prices with all rows since the first allocation, CSV or Parquet (default: the
             prices of the backtest).
+        returns: Unit of the numbers in --prices, if they are returns (default: they are prices).
         benchmark: Latest file of the backtest's benchmark, if that is a strategy of your own
             (default: the data that the backtest read).
         out: CSV file with a row for each row of the prices (default: follow.csv in the folder); a
@@ -214,7 +216,7 @@ def follow(
     from qfolio.portfolio.desk.follow import follow as marked
     from qfolio.report.follow import LiveRows, render_following
 
-    desk = Desk.open(folder, **latest.reading)
+    desk = Desk.open(folder, returns=returns, **latest.reading)
     following = marked(desk, prices, benchmark)
     path = folder / "follow.csv" if out is None else out
     following.write(path)
