@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from qfolio.core.fields import constant, number, require, sizes, static
+from qfolio.core.fields import constant, number, require, require_counts, sizes, static
 from qfolio.core.mdp import Actions, Agent, Discrete, Metrics, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.exploration import OrnsteinUhlenbeck, uniform
@@ -166,8 +166,8 @@ class ActorCritic(Agent, Generic[L]):
         self._networks.check()
         self._normalization.check(self.input_gain)
         self._schedule.check()
-        require(self, "gradient_steps", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
+        require_counts(self, "gradient_steps")
+        require_counts(self, "episode_steps", 0)
         require(self, "actor_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "huber_delta", lambda x: x >= 1e-30, "greater than 0")
         require(self, "discount tau noise_theta", lambda x: 0 <= x <= 1, "between 0 and 1")

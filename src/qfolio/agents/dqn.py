@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from qfolio.agents import hindsight
 from qfolio.agents.hindsight import Move
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import constant, number, require, sizes, static
+from qfolio.core.fields import constant, number, require, require_counts, sizes, static
 from qfolio.core.mdp import Agent, Discrete, ExogenousTask, Metrics, Task, Transition
 from qfolio.learning import heads, optimizer
 from qfolio.learning.bootstrapped import Heads, cautious, samples
@@ -125,11 +125,10 @@ class DQN(Agent):
         self._schedule.check()
         self._optimizer.check()
         self._value_config.check()
-        counts = "train_freq gradient_steps target_update_interval"
-        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require_counts(self, "train_freq gradient_steps target_update_interval")
         require(self, "importance_steps", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
         require(self, "reward_scale", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
-        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
+        require_counts(self, "episode_steps", 0)
         require(self, "noise_scale", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "epsilon_steps", lambda x: 0 <= x <= 1e30, "from 0 to 1e30")
         fractions = "discount tau epsilon_start epsilon_end epsilon_decay persistence"
@@ -142,7 +141,7 @@ class DQN(Agent):
             )
         if self.all_actions:
             hindsight.require_plain({name: getattr(self, name) for name in hindsight.PLAIN})
-        require(self, "outcomes", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
+        require_counts(self, "outcomes", 0)
         require(self, "bootstrap_heads", lambda x: 1 <= x <= 1000, "from 1 to 1,000")
         require(self, "caution", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
         if self.bootstrap_heads > 1 and not self.all_actions:

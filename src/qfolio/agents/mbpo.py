@@ -22,7 +22,15 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 from qfolio.agents.actor_critic import ActorCriticState, State
 from qfolio.agents.sac import SAC, Learned
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import constant, number, require, require_sizes, sizes, static
+from qfolio.core.fields import (
+    constant,
+    number,
+    require,
+    require_counts,
+    require_sizes,
+    sizes,
+    static,
+)
 from qfolio.core.mdp import Actions, Discrete, Metrics, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.encoders import MLP
@@ -175,8 +183,7 @@ class MBPO(SAC):
     real_ratio: float = constant(0.0)  # share of real steps in a batch of soft actor-critic
 
     def __check_init__(self) -> None:
-        counts = "ensemble_size model_updates model_rollout_batch model_rollout_length"
-        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require_counts(self, "ensemble_size model_updates model_rollout_batch model_rollout_length")
         require(self, "model_replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
         require(self, "model_learning_rate_ratio", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         wanted = "from 0 to ensemble_size"

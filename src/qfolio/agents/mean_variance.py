@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from qfolio.agents.paths import Onlooker
 from qfolio.core import quadratic
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require, static
+from qfolio.core.fields import number, require, require_counts, static
 from qfolio.core.market import View
 from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
@@ -133,14 +133,14 @@ class MeanVariance(Onlooker):
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 
     def __check_init__(self) -> None:
-        require(self, "num_envs units blocks", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require_counts(self, "num_envs units blocks")
         require_members(self.members, self.blocks)
-        require(self, "rollout_length", lambda x: 2 <= x < 2**31, "from 2 to 2³¹ − 1")
+        require_counts(self, "rollout_length", 2)
         require(self, "head", lambda x: 0 <= x < self.rollout_length, "at least 0 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
         require(self, "every", lambda x: x >= 1 and self.rollout_length % x == 0, "a divisor of "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
-        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
+        require_counts(self, "episode_steps", 0)
         require(self, "risk_aversion", lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")
         require(self, "ridge", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "threshold", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from qfolio.core.fields import constant, number, require, sizes, static
+from qfolio.core.fields import constant, number, require, require_counts, sizes, static
 from qfolio.core.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
@@ -101,8 +101,8 @@ class OnPolicy(Agent):
     normalize_rewards: bool = static(False)  # by the running deviation of discounted returns
 
     def __check_init__(self) -> None:
-        require(self, "num_envs rollout_length", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
+        require_counts(self, "num_envs rollout_length")
+        require_counts(self, "episode_steps", 0)
         require(self, "discount", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
         coefficients = "value_coef entropy_coef saturation_penalty"

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from qfolio.agents.paths import OnPaths
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require, require_sizes, sizes, static
+from qfolio.core.fields import number, require, require_counts, require_sizes, sizes, static
 from qfolio.core.market import View
 from qfolio.core.mdp import (
     Box,
@@ -197,9 +197,8 @@ class Pathwise(OnPaths):
             raise QfolioError(
                 f"network is {self.network!r}; it must be one of {', '.join(SHARED)}."
             )
-        counts = "num_envs rollout_length gradient_steps"
-        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
-        require(self, "episode_steps tail", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
+        require_counts(self, "num_envs rollout_length gradient_steps")
+        require_counts(self, "episode_steps tail", 0)
         require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
         ratio = "slope_learning_rate_ratio"
         require(self, ratio, lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, explained_variance
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require, static
+from qfolio.core.fields import number, require, require_counts, static
 from qfolio.core.mdp import Metrics, Transition
 from qfolio.learning.targets import Scalar
 
@@ -29,7 +29,7 @@ class PPO(OnPolicy):
     clip_range: float = number(0.2)  # ε: largest rewarded change of a probability ratio
 
     def __check_init__(self) -> None:
-        require(self, "epochs batch_size", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require_counts(self, "epochs batch_size")
         require(self, "gae_lambda", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "clip_range", lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")
         if self.num_envs * self.rollout_length % self.batch_size:

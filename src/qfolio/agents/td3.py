@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.agents.actor_critic import Batch, Critics
 from qfolio.agents.ddpg import DDPG, Learned
-from qfolio.core.fields import number, require, static
+from qfolio.core.fields import number, require, require_counts, static
 from qfolio.core.mdp import Metrics
 from qfolio.learning.targets import smallest
 
@@ -32,7 +32,7 @@ class TD3(DDPG):
 
     def __check_init__(self) -> None:
         require(self, "target_noise target_noise_clip", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "policy_delay", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require_counts(self, "policy_delay")
 
     def update(self, learned: Learned, batch: Batch, key: PRNGKeyArray) -> tuple[Learned, Metrics]:
         learned, metrics = self.evaluate(learned, batch, key)

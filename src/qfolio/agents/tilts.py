@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from qfolio.agents.paths import AT_ONCE, Onlooker
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number, require, static
+from qfolio.core.fields import number, require, require_counts, static
 from qfolio.core.market import View
 from qfolio.core.mdp import Box, Discrete, ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
@@ -167,12 +167,12 @@ class Tilts(Onlooker):
     def __check_init__(self) -> None:
         kinds = ", ".join(("linear", *NETWORKS))
         require(self, "network", lambda x: x in ("linear", *NETWORKS), f"one of {kinds}")
-        require(self, "blocks num_envs units", lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require_counts(self, "blocks num_envs units")
         require_members(self.members, self.blocks)
-        require(self, "rollout_length", lambda x: 2 <= x < 2**31, "from 2 to 2³¹ − 1")
+        require_counts(self, "rollout_length", 2)
         require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
-        require(self, "episode_steps", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
+        require_counts(self, "episode_steps", 0)
         require(self, "tracking_aversion ridge", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
         require(self, "threshold", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
         require(self, "memory", lambda x: 0 <= x < 1, "at least 0 and below 1")

@@ -49,6 +49,14 @@ def require(instance: Any, names: str, holds: Callable[[Any], bool], wanted: str
             raise QfolioError(f"{name} is {value}; it must be {wanted}.")
 
 
+def require_counts(instance: Any, names: str, least: int = 1) -> None:
+    """Raises QfolioError for the first setting that is below ``least`` or does not fit 32 bits.
+
+    names: of the settings, separated by spaces.
+    """
+    require(instance, names, lambda x: least <= x < 2**31, f"from {least} to 2³¹ − 1")
+
+
 def require_static(instance: Any) -> None:
     """Raises QfolioError if an integer setting is not declared as ``static``.
 

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import require
+from qfolio.core.fields import require, require_counts
 from qfolio.core.market import View
 from qfolio.core.mdp import Position, Task, Transition
 from qfolio.learning.priorities import Priorities
@@ -84,10 +84,9 @@ class ReplayConfig(NamedTuple):
 
     def check(self) -> None:
         """Raises QfolioError if the settings are invalid."""
-        counts = "num_envs batch_size n_steps"
-        require(self, counts, lambda x: 1 <= x < 2**31, "from 1 to 2³¹ − 1")
+        require_counts(self, "num_envs batch_size n_steps")
         require(self, "replay_capacity", lambda x: 1 <= x <= 2**23, "from 1 to 2²³")
-        require(self, "learning_starts", lambda x: 0 <= x < 2**31, "from 0 to 2³¹ − 1")
+        require_counts(self, "learning_starts", 0)
         joined = self.n_steps * self.num_envs
         if max(self.learning_starts, joined) > self.replay_capacity:
             raise QfolioError(

@@ -34,10 +34,11 @@ def every_day(dates: np.ndarray) -> bool:
 
 
 def periods_per_year(dates: np.ndarray) -> float:
-    """Rows per year: 252 for business days, 365 for all days, 52, 12, 4 or 1 for longer periods.
+    """Rows per year: 252 for five days a week, 365 for seven, 52, 12, 4 or 1 for longer periods.
 
-    For intraday rows it is the median number of bars per day times the days per year. For any other
-    spacing it is the mean number of rows per year, and for six days a week that number of days.
+    For six days a week it is the table's mean number of days per year. For intraday rows it is the
+    median number of bars per day times the days per year, and for any other spacing the mean number
+    of rows per year.
     """
     if len(dates) < 2:
         return TRADING_DAYS
