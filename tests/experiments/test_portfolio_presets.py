@@ -11,22 +11,23 @@ from qfolio.experiments.presets import PRESETS
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
-AGENTS = [agent for task, agent in PRESETS if task == "portfolio"]
+NAMES = [(agent, name) for (on, agent), of in PRESETS.items() if on == "portfolio" for name in of]
 
 
 def test_every_kind_of_agent_has_one():
-    assert {"dqn", "pathwise", "ppo", "a2c", "reinforce", "ddpg", "td3", "sac"} <= {*AGENTS}
+    agents = {agent for agent, name in NAMES if name == "fast"}
+    assert {"dqn", "pathwise", "ppo", "a2c", "reinforce", "ddpg", "td3", "sac"} <= agents
 
 
-@pytest.mark.parametrize("name", AGENTS)
-def test_its_actions_are_those_of_the_task(name):
+@pytest.mark.parametrize(("agent_name", "name"), NAMES)
+def test_its_actions_are_those_of_the_task(agent_name, name):
     values = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (600, 3)).cumsum(0))
     prices = Prices(np.datetime64("2020-01-01") + np.arange(600), ("a", "b", "c"), values)
-    preset = PRESETS["portfolio", name]["fast"]
+    preset = PRESETS["portfolio", agent_name][name]
     task = Portfolio.of(prices, **settings.convert(Portfolio, preset.task))
     agent = preset.build()
     assert preset.episodes % agent.num_envs == 0
-    assert isinstance(task.actions, Discrete if name == "dqn" else Simplex)
+    assert isinstance(task.actions, Discrete if agent_name == "dqn" else Simplex)
 
     def decide(key):
         state = agent.init(task, key)
@@ -37,4 +38,4 @@ def test_its_actions_are_those_of_the_task(name):
 
     targets, actions = jax.eval_shape(decide, jax.random.key(0))
     assert targets.shape == (agent.num_envs, 4)
-    assert actions.dtype == (jnp.int32 if name == "dqn" else jnp.float32)
+    assert actions.dtype == (jnp.int32 if agent_name == "dqn" else jnp.float32)

@@ -70,6 +70,22 @@ def test_a_column_of_weights():
         anchors.path("nothing", table())
 
 
+def test_several_baselines_are_averaged_at_each_row():
+    both = anchors.path("volatility-timing+minimum-variance", table())
+    each = [anchors.path(name, table()) for name in ("volatility-timing", "minimum-variance")]
+    np.testing.assert_allclose(both, (each[0] + each[1]) / 2)
+    assert np.abs(each[0] - each[1]).max() > 0.1
+    with pytest.raises(QfolioError, match="no baseline 'nothing'"):
+        anchors.path("equal-weight+nothing", table())
+    with pytest.raises(QfolioError, match="no baseline ''"):
+        anchors.path("equal-weight+", table())
+
+
+def test_a_task_checks_each_baseline_of_its_anchor():
+    with pytest.raises(QfolioError, match="no baseline 'olmer'; did you mean olmar"):
+        Portfolio.of(table(), window=1, horizon=10, anchor="equal-weight+olmer")
+
+
 def test_what_cannot_be_traded_goes_to_the_others():
     task = Portfolio.of(table(), window=1, horizon=10, anchor="equal-weight")
     part = task.part(0, 200, np.array([True, True, True, False]))

@@ -195,13 +195,13 @@ def _known(kind: registry.Kind, name: str) -> str:
 
 
 def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
-    """The signals, baseline or reward that a setting of the task names, each with its kind."""
-    from qfolio.portfolio.signals import COLUMN, names
+    """The signals, baselines or reward that a setting of the task names, each with its kind."""
+    from qfolio.portfolio import anchors, signals
 
     if setting == "signals":
-        return [("signal", name) for name in names(value)]
-    if setting == "anchor" and value and not value.startswith(COLUMN):
-        return [("baseline", value)]
+        return [("signal", name) for name in signals.names(value)]
+    if setting == "anchor":
+        return [("baseline", name) for name in anchors.names(value)]
     return [("reward", value)] if setting == "reward" else []
 
 

@@ -1,7 +1,8 @@
 """Anchors: weights at each row of a table that a policy may depart from.
 
-An anchor is a baseline, followed on the whole table, or a column of the table with a benchmark's
-weights. The benchmark of tracking error may also be a single asset.
+An anchor is a baseline, followed on the whole table, or the mean of several, joined by +, or a
+column of the table with a benchmark's weights. The benchmark of tracking error may also be a single
+asset.
 """
 
 import warnings
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.baselines import Baseline, History, baseline
+from qfolio.portfolio.backtest.baselines import History, baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
 from qfolio.portfolio.backtest.orders import checked
 from qfolio.portfolio.costs import drift
@@ -23,12 +24,12 @@ MONTHS = 60
 Weights = NDArray[np.float64]
 
 
-def made(name: str) -> Baseline | None:
-    """The baseline that an anchor names; None for a column. Raises QfolioError if it is unknown."""
-    return None if name.startswith(COLUMN) else baseline(name)
+def names(anchor: str) -> list[str]:
+    """The baselines whose mean an anchor is; none for a column, or without an anchor."""
+    return [] if not anchor or anchor.startswith(COLUMN) else anchor.split("+")
 
 
-def path(name: str, prices: Prices) -> Weights:
+def path(anchor: str, prices: Prices) -> Weights:
     """The weights of an anchor at each row, of shape (row, asset); the rest is cash.
 
     The weights at a row depend on no later row. A baseline decides every month, or at every row if
@@ -39,11 +40,16 @@ def path(name: str, prices: Prices) -> Weights:
     Raises QfolioError if there is no such baseline or column, if a baseline gives invalid weights,
     or if a column's weights are not at least 0, with a sum of at most 1.
     """
-    if name in prices.assets:
-        return np.where(np.isnan(prices.values), 0.0, np.array(prices.assets) == name)
-    chosen = made(name)
-    if chosen is None:
-        return _column(name.removeprefix(COLUMN), prices)
+    if anchor in prices.assets:
+        return np.where(np.isnan(prices.values), 0.0, np.array(prices.assets) == anchor)
+    if anchor.startswith(COLUMN):
+        return _column(anchor.removeprefix(COLUMN), prices)
+    return np.asarray(np.mean([_followed(name, prices) for name in names(anchor)], axis=0))
+
+
+def _followed(name: str, prices: Prices) -> Weights:
+    """The weights of a baseline at each row."""
+    chosen = baseline(name)
     month, values = prices.month, prices.values
     # A target that is held at every row is decided again at each one if assets come and go.
     anew = prices.tradable is not None and chosen.calendar == "fold"

@@ -22,6 +22,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Box, Position, Simplex
 from qfolio.portfolio import anchors, signals, universe
+from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.calendars import band, decision_rows, elapsed
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import cashed
@@ -228,9 +229,8 @@ class Portfolio(Market):
     @property
     def parts(self) -> list[object]:
         """Cost model, reward, signals and anchor, any of which may be a user's own."""
-        anchor = anchors.made(self.anchor) if self.anchor else None
-        named = [*signals.parse(self.signals), *([] if anchor is None else [anchor])]
-        return [self.costs, self.reward_function, *named]
+        anchored = map(baseline, anchors.names(self.anchor))
+        return [self.costs, self.reward_function, *signals.parse(self.signals), *anchored]
 
     @property
     def written(self) -> Mandate:
