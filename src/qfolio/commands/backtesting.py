@@ -206,10 +206,12 @@ def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
 
 
 def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
+    """The preset of an agent, or the one that its name ends with, as in tilts@low-risk."""
     from qfolio.experiments import presets
 
-    registry.find("agent", name)
-    chosen = presets.preset(preset, "portfolio", name)
+    agent, at, own = name.partition("@")
+    registry.find("agent", agent)
+    chosen = presets.preset(own if at else preset, "portfolio", agent)
     return chosen if episodes is None else chosen._replace(episodes=episodes)
 
 
