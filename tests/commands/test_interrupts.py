@@ -1,6 +1,7 @@
 """Ctrl-C and broken pipes, as a shell sees them."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from jobs import alive
+from shell import qfolio
 from tables import write_table
 
 TRAIN = ["train", "pendulum", "--no-compare", "--seeds", "2", "--episodes", "100000",
@@ -100,6 +102,31 @@ def test_ctrl_c_with_workers(tmp_path, count):
     while any(map(alive, workers)):
         assert time.perf_counter() < end
         time.sleep(0.05)
+
+
+def test_ctrl_c_during_the_report_says_how_to_go_on(folder, monkeypatch, tmp_path):
+    run = shutil.copytree(folder, tmp_path / "run")
+    written = {name: (run / name).read_bytes() for name in ("returns.csv", "summary.json")}
+    for name in ("report.html", *written):
+        (run / name).unlink()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "qfolio", "backtest", "--resume", str(run)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    end = time.perf_counter() + 120
+    while not (run / "returns.csv").exists():  # of all results the first
+        assert time.perf_counter() < end
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert err == f"qfolio: interrupted. Resume with: qfolio backtest --resume {run}\n"
+    assert not (run / "report.html").exists()
+    assert qfolio(monkeypatch, "backtest", "--resume", run) == 0
+    assert (run / "report.html").exists()
+    assert {name: (run / name).read_bytes() for name in written} == written
 
 
 def children(parent):

@@ -73,6 +73,7 @@ def compare(
     from qfolio.commands import console
     from qfolio.commands.progress import stop
     from qfolio.experiments.comparison.run import Comparison
+    from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on as executor_of
 
@@ -101,10 +102,12 @@ def compare(
     )
     with tracked(*following):
         _train(run, executor)
+    parts = [part for one in run.entrants.values() for part in (one.task, one.agent)]
+    command = again("qfolio compare --resume", run.folder, *parts, on=on)
     if run.interrupted:
-        parts = [part for one in run.entrants.values() for part in (one.task, one.agent)]
-        stop(again("qfolio compare --resume", run.folder, *parts, on=on))
-    return outcome(run.folder, _finish(run))
+        stop(command)
+    with resumable(command):
+        return outcome(run.folder, _finish(run))
 
 
 def _entrants(

@@ -77,6 +77,7 @@ def continual(
     from qfolio.commands import console
     from qfolio.commands.progress import BarProgress, stop
     from qfolio.experiments import continual, presets
+    from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.report.continual import verdict, write_continual_report
 
@@ -95,9 +96,11 @@ def continual(
         folder = resume
     with console.bar("compiling") as update, tracked(*following):
         content = continual.compare(folder, lambda name: BarProgress(update, name))
+    command = f"qfolio continual --resume {folder}"
     if content is None:
-        stop(f"qfolio continual --resume {folder}")
-    write_continual_report(folder, content)
+        stop(command)
+    with resumable(command):
+        write_continual_report(folder, content)
     _print_ways(content)
     console.tell(verdict(content))
     console.say(f"Report: {folder / PAGE}")

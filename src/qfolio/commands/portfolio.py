@@ -65,6 +65,7 @@ def backtest(
     from qfolio.commands import console
     from qfolio.commands.progress import JobsProgress, stop
     from qfolio.core.files import read_json
+    from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.backtest.run import Backtest
@@ -96,9 +97,11 @@ def backtest(
         console.tell(note)
     with console.bar("compiling") as update, tracked(*following):
         run.run(JobsProgress(update), executor)
+    resume = again("qfolio backtest --resume", folder, *run.parts, on=options.on)
     if run.interrupted:
-        stop(again("qfolio backtest --resume", folder, *run.parts, on=options.on))
-    with console.console.status("Replaying all strategies, drawing histories, writing the report"):
+        stop(resume)
+    status = "Replaying all strategies, drawing histories, writing the report"
+    with resumable(resume), console.console.status(status):
         found = finish(run)
     console.print_assessment(found.assessment)
     for sentences in found.why.diagnosis.values():

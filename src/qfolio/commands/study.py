@@ -54,6 +54,7 @@ def study(
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import JobsProgress, stop
+    from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
     from qfolio.portfolio.study.run import Study
@@ -88,10 +89,11 @@ def study(
             return JobsProgress(update)
 
         run.run(listen, write_page, executor)
+    parts = run.backtest(next(iter(run.config.tables))).parts
+    resume = again("qfolio study --resume", run.folder, *parts, on=options.on)
     if run.interrupted:
-        parts = run.backtest(next(iter(run.config.tables))).parts
-        stop(again("qfolio study --resume", run.folder, *parts, on=options.on))
-    with console.console.status("Pooling the evidence, writing the report"):
+        stop(resume)
+    with resumable(resume), console.console.status("Pooling the evidence, writing the report"):
         result = run.result()
         write_study_report(run)
     console.print_study(result)

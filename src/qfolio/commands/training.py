@@ -91,6 +91,7 @@ def train(
     from qfolio.commands import console
     from qfolio.commands.progress import stop
     from qfolio.experiments import presets
+    from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on as executor_of
     from qfolio.experiments.run import Run
@@ -121,14 +122,14 @@ def train(
         console.say(console.describe_run(run, budget))
         with tracked(*following):
             _train(run, budget, executor, show)
+    command = _resume(run, folder, on)
     if run.interrupted:
-        stop(_resume(run, folder, on))
-    contrast = None
-    if compare:
-        contrast = _contrast(run, folder, executor)
+        stop(command)
+    contrast = _contrast(run, folder, executor) if compare else None
     if contrast is not None and contrast.interrupted:
-        stop(_resume(run, folder, on))
-    return outcome(folder, _finish(run, folder, contrast))
+        stop(command)
+    with resumable(command):
+        return outcome(folder, _finish(run, folder, contrast))
 
 
 train.__doc__ = (train.__doc__ or "").replace("{markets}", listed(registry.of("market"), "or"))

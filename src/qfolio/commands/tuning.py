@@ -90,6 +90,7 @@ def tune(
     from qfolio.commands import console
     from qfolio.commands.progress import SearchProgress, stop
     from qfolio.experiments import presets
+    from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on as executor_of
 
@@ -121,7 +122,8 @@ def tune(
         )
         return {"folder": work.folder, "report": None}
     try:
-        return outcome(work.folder, _conclude(work, resume, executor))
+        with resumable(resume):
+            return outcome(work.folder, _conclude(work, resume, executor))
     except KeyboardInterrupt:
         stop(resume)
 

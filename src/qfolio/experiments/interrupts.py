@@ -15,11 +15,16 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+from qfolio.core.text import printable
+
 EXIT_CODE = 130
 """The conventional exit code of a program that Ctrl-C ended."""
 
 _trainings: list[threading.Event] = []
 """The stop request of the training in the main thread, if there is one."""
+
+_resumes: list[str] = []
+"""The command that goes on with the work in the main thread, if it can be resumed."""
 
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -48,6 +53,19 @@ def interruptible() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, previous)
 
 
+@contextlib.contextmanager
+def resumable(command: str) -> Iterator[None]:
+    """Within the block, Ctrl-C that ends the process says that ``command`` goes on.
+
+    For what follows a training, such as a report: it leaves no state of its own to stop at.
+    """
+    _resumes.append(command)
+    try:
+        yield
+    finally:
+        _resumes.remove(command)
+
+
 def exit_on_ctrl_c() -> None:
     """Makes Ctrl-C end the process with ``EXIT_CODE``, unless it stops a training first."""
     receiver, sender = socket.socketpair()
@@ -64,8 +82,9 @@ def _leave() -> None:
     of a pipe would hold the lock.
     """
     cursor = _SHOW_CURSOR if sys.stderr.isatty() else ""
+    advice = f". Resume with: {printable(_resumes[-1])}" if _resumes else ""
     with contextlib.suppress(OSError):
-        os.write(2, f"{cursor}qfolio: interrupted\n".encode())
+        os.write(2, f"{cursor}qfolio: interrupted{advice}\n".encode())
     os._exit(EXIT_CODE)
 
 
