@@ -135,6 +135,11 @@ def test_growing_less_is_said_first(assessment: Assessment) -> None:
 def test_digits_tell_an_end_from_zero(assessment: Assessment) -> None:
     near = about(growth=Contrast(0.008, (0.00004, 0.02), 0.01, 0.01, "better"))
     assert "+0.800% (95% interval +0.004% to +2.000%;" in said(assessment, None, near)[0]
+    rounding = Contrast(1e-17, (-1e-16, 3e-9), 1.0, 1.0, "none")
+    (same,) = said(assessment, None, about(growth=rounding, sharpe=rounding, volatility=rounding))
+    assert same.count("is 0.0% (95% interval 0.0% to 0.0%;") == 1
+    assert "in Sharpe ratio 0.00 (95% interval 0.00 to 0.00;" in same
+    assert "in volatility 0.0% (95% interval 0.0% to 0.0%;" in same
 
 
 UNKNOWN = Contrast(-math.inf, (-math.inf, math.inf), 1.0, 1.0, "none")

@@ -160,14 +160,22 @@ def shown(key: Measured, contrast: Contrast) -> tuple[float, float, float]:
     return low, middle, high
 
 
+def telling(value: float, digits: int) -> int:
+    """The number of decimals, at least ``digits``, that keeps a small number from rounding to 0.
+
+    One that five decimals do not show is taken for rounding, such as that of a file.
+    """
+    if value == 0 or not math.isfinite(value):
+        return digits
+    return next((d for d in range(digits, 6) if round(value, d)), digits)
+
+
 def _numbers(key: Measured, contrast: Contrast, p: str) -> str:
     """A difference with its interval and p-value in words."""
     percent, unit = key != "sharpe", "%" if key != "sharpe" else ""
     least = 1 if percent else 2
     scaled = [100 * value if percent else value for value in shown(key, contrast)]
-    # Enough digits to tell an end from zero.
-    ends = [abs(end) for end in scaled[1:] if end and math.isfinite(end)]
-    digits = next((d for d in range(least, 7) if all(round(end, d) for end in ends)), 7)
+    digits = max(telling(end, least) for end in scaled[1:])
     middle, left, right = (f"{_number(value, digits, sign=True)}{unit}" for value in scaled)
     text = f"{middle} (95% interval {left} to {right}"
     return text + (")" if contrast.p_holm is None else f"; {p} {p_value(contrast.p_holm)})")

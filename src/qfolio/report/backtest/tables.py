@@ -13,7 +13,7 @@ from qfolio.portfolio.backtest.differences import Difference
 from qfolio.portfolio.backtest.estimates import MEASURED, Measured
 from qfolio.portfolio.backtest.measures import monthly
 from qfolio.portfolio.backtest.sampled import Measure
-from qfolio.portfolio.backtest.verdict import comparable, luck, shown, wiped_out
+from qfolio.portfolio.backtest.verdict import comparable, luck, shown, telling, wiped_out
 from qfolio.report.backtest.data import BacktestData, main_names
 from qfolio.report.rendering import number, percent
 
@@ -145,7 +145,7 @@ def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None
                 continue
             write, scale, digits = (number, 1, 2) if key == "sharpe" else (percent, 100, 1)
             value, *interval = shown(key, contrast)
-            ends = (write(end, _telling(scale * end, digits), sign=True) for end in interval)
+            ends = (write(end, telling(scale * end, digits), sign=True) for end in interval)
             cells.append(
                 {
                     "value": write(value, digits, sign=True),
@@ -215,13 +215,6 @@ def capacity_table(data: BacktestData) -> tuple[list[str], list[tuple[str, list[
     headings = [number(capital, 0) for capital in data.capacity.capitals]
     rows = data.capacity.growth.items()
     return headings, [(name, [percent(x) for x in growth]) for name, growth in rows]
-
-
-def _telling(value: float, digits: int) -> int:
-    """The number of decimals, at least ``digits``, that keeps a small number from rounding to 0."""
-    if value == 0 or not math.isfinite(value):
-        return digits
-    return next((d for d in range(digits, 6) if round(value, d)), digits)
 
 
 def luck_rows(names: list[str], data: BacktestData) -> list[dict[str, Any]]:
