@@ -1,6 +1,14 @@
 """What ``import qfolio`` offers."""
 
+import json
+import subprocess
+import sys
+
+import pytest
+
 import qfolio
+
+from tables import write_table
 
 
 def test_dir_lists_what_there_is():
@@ -9,3 +17,58 @@ def test_dir_lists_what_there_is():
     )
     for name in dir(qfolio):
         assert getattr(qfolio, name) is not None
+
+
+WRONG_TYPES = {
+    "Backtest.create(prices, 'tilts')": "agents is 'tilts'; it must be a dictionary of presets",
+    "Backtest.create(prices, [tilts])": "agents is [Preset(agent=",
+    "Backtest.create(prices, {'tilts': 'fast'})": "agents['tilts'] is 'fast'; it must be a preset",
+    "Backtest.create(prices, {'tilts': [tilts]})": "agents['tilts'] is [Preset(",
+    "Backtest.create(prices, agents, train=4)": "A length is 4; it must be like 5y",
+    "Backtest.create(prices, agents, seeds='3')": "seeds is '3'; it must be a whole number.",
+    "Backtest.create(prices, agents, lag=1.5)": "lag is 1.5; it must be a whole number.",
+    "Backtest.create(prices, agents, cap='1')": "cap is '1'; it must be a number.",
+    "Backtest.create(prices, agents, mandate=3)": "mandate is 3; it must be a path, or",
+    "Backtest.create(prices, agents, baselines=3)": "baselines is 3; it must be a list of names.",
+    "Backtest.create(prices, agents, strategies='my.csv')": "strategies is 'my.csv'; it must be a",
+    "Study.create(prices, agents, out='nowhere')": "tables is Prices(",
+    "Study.create({'a': prices}, agents, train=4, out='nowhere')": "A length is 4; it must be",
+    "Portfolio.of('prices.csv')": "prices is 'prices.csv'; it must be a table that",
+    "finish('runs/mine')": "backtest is 'runs/mine'; it must be a backtest, such as",
+    "policy.weights(prices, 'my.csv')": "holdings is 'my.csv'; it must be a dictionary",
+    "train('pendulum', DQN(), episodes=1)": "task is 'pendulum'; it must be a task, such as",
+    "train(Pendulum(), 'dqn', episodes=1)": "agent is 'dqn'; it must be an agent, such as",
+    "train(Pendulum(), DQN, episodes=1)": "agent is <class 'qfoli",
+    "train(Pendulum(), DQN(), episodes='3')": "episodes is '3'; it must be a whole number.",
+    "preset('fast', Pendulum())": "task is Pendulum(); it must be text.",
+}
+
+
+@pytest.fixture(scope="module")
+def said(tmp_path_factory):
+    """What each of these calls answers, in a process where types are not checked."""
+    folder = tmp_path_factory.mktemp("types")
+    write_table(folder / "prices.csv")
+    script = f"""if True:
+        import json, qfolio
+        names = {{name: getattr(qfolio, name) for name in dir(qfolio)}}
+        names["prices"] = qfolio.load_prices("prices.csv")
+        names["tilts"] = qfolio.preset("fast", "portfolio", "tilts")
+        names["agents"] = {{"tilts": names["tilts"]}}
+        task = qfolio.Portfolio.of(names["prices"])
+        names["policy"] = qfolio.Policy(task, qfolio.Tilts(), None, names["prices"].assets)
+        said = {{}}
+        for call in {list(WRONG_TYPES)}:
+            try:
+                eval(call, names)
+            except Exception as error:
+                said[call] = f"{{type(error).__name__}}: {{error}}"
+        print(json.dumps(said))"""
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=folder, check=True, stdout=subprocess.PIPE)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("call", WRONG_TYPES)
+def test_a_wrong_type_is_said_in_a_sentence(said, call):
+    assert said.get(call, "").startswith(f"QfolioError: {WRONG_TYPES[call]}")

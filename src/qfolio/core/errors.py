@@ -1,5 +1,6 @@
-"""The exception for errors that a user can fix."""
+"""The exception for errors that a user can fix, and a check that raises it."""
 
+import reprlib
 import traceback
 from pathlib import PurePath
 
@@ -9,6 +10,15 @@ class QfolioError(Exception):
 
     The command line prints it without a traceback and exits with code 2.
     """
+
+
+def require_type(name: str, value: object, kinds: type | tuple[type, ...], wanted: str) -> None:
+    """Raises QfolioError unless an argument has one of some types.
+
+    wanted: what it must be, for the message.
+    """
+    if not isinstance(value, kinds):
+        raise QfolioError(f"{name} is {reprlib.repr(value)}; it must be {wanted}.")
 
 
 def one_line(error: BaseException) -> str:

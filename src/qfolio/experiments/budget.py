@@ -1,9 +1,10 @@
 """Training budgets and seeds."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from numbers import Integral
+from typing import TYPE_CHECKING, Any
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 
 if TYPE_CHECKING:
     from qfolio.core.population import Population
@@ -58,6 +59,7 @@ def seed_range(seeds: int, seed: int) -> range:
     return range(seed, seed + seeds)
 
 
-def _require(name: str, value: int, low: int, high: int) -> None:
+def _require(name: str, value: Any, low: int, high: int) -> None:
+    require_type(name, value, Integral, "a whole number")
     if not low <= value <= high:
         raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")

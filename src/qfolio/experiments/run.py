@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from qfolio.core import devices
+from qfolio.core.errors import require_type
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, require_new
 from qfolio.core.host import population_of
@@ -80,6 +81,8 @@ class Run:
             preset: Name of the preset, for readers.
             out: A new or empty folder; without it, nothing is written.
         """
+        require_type("task", task, Task, "a task, such as qfolio.Pendulum()")
+        require_type("agent", agent, Agent, "an agent, such as qfolio.DQN()")
         budget = budget or Budget(episodes, steps)
         config = RunConfig(
             **describe(task, agent),

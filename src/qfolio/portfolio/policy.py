@@ -4,6 +4,7 @@ The policy is the mean over the agents of all seeds. ``policy_folder.py`` stores
 """
 
 import dataclasses
+import reprlib
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from qfolio.core import settings
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.mdp import Agent
 from qfolio.core.population import Population
 from qfolio.core.text import amount
@@ -68,6 +69,7 @@ def train(
         episodes = agent.episodes if episodes is None else episodes
         seeds = agent.seeds if seeds is None else seeds
         agent = agent.build()
+    require_type("agent", agent, Agent, "an agent, such as qfolio.Pathwise(), or a preset")
     if episodes is None:
         raise QfolioError("An agent without a preset needs episodes, the length of its training.")
     count = 5 if seeds is None else seeds
@@ -271,7 +273,13 @@ class Policy:
     def holdings(self, holdings: Mapping[str, Any] | None) -> np.ndarray:
         """Weights with cash first, from weights by asset."""
         held, long_only = np.zeros(1 + len(self.assets)), self.task.feasible.long_only
-        given = {} if holdings is None else dict(holdings)
+        try:
+            given = {} if holdings is None else dict(holdings)
+        except (TypeError, ValueError):
+            raise QfolioError(
+                f"holdings is {reprlib.repr(holdings)}; it must be a dictionary of the weights "
+                f"held by asset, such as {{{self.assets[0]!r}: 0.5}}."
+            ) from None
         for name, weight in given.items():
             if name != "cash" and name not in self.assets:
                 raise QfolioError(f"The holdings name {name!r}, which the policy does not know.")

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from qfolio.core import simplex
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Box, Position, Simplex
 from qfolio.portfolio import anchors, signals, universe
@@ -87,6 +87,7 @@ class Portfolio(Market):
     @staticmethod
     def of(prices: Prices, **settings: Any) -> "Portfolio":
         """A task on all rows of a table; mandate: anything that ``limits.settled`` takes."""
+        require_type("prices", prices, Prices, "a table that qfolio.load_prices has read")
         if "mandate" in settings:
             settings["mandate"] = settled(settings["mandate"], prices.assets)
         task = Portfolio.blank(len(prices.assets), len(prices.feature_names), **settings)

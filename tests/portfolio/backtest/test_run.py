@@ -21,9 +21,10 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.backtest.training import FoldsJob
 from qfolio.portfolio.following import begin, follow
-from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices
+from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices, load
 
 from listeners import Interrupt
+from tables import write_table
 
 AGENTS = {
     "dqn": Preset(
@@ -129,6 +130,11 @@ def test_a_backtest_says_what_it_is(finished):
         f"<Backtest: {', '.join(finished.agents)} on {len(finished.prices.assets)} assets, "
         f"{len(finished.folds)} folds from {first} to {last}, 2 seeds, in {finished.folder}>"
     )
+
+
+def test_a_table_may_be_given_by_its_path(tmp_path):
+    path = write_table(tmp_path / "prices.csv")
+    assert np.array_equal(create(prices=path).prices.values, load(path).values)
 
 
 def test_costs_are_charged(finished):

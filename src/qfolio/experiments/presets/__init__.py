@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from qfolio.core import settings
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.registry import AGENTS, GYM, TASKS
 from qfolio.core.text import listed, near
 from qfolio.experiments.presets import finite, gymnasium, markets, pendulum, portfolio
@@ -56,6 +56,8 @@ def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
     Raises:
         QfolioError: There is no such preset; the message lists those that exist.
     """
+    for argument, value in {"name": name, "task": task, "agent": agent}.items():
+        require_type(argument, value, str, "text")
     presets = presets_of(task, agent)
     if not presets:
         raise QfolioError(f"{agent} has no preset for {task}; {_fitting(task, agent)}.")

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from itertools import groupby
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import msgspec
 import numpy as np
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
@@ -46,7 +47,7 @@ from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.growth import require_grown
-from qfolio.portfolio.prices.table import Prices, describe, trials_on
+from qfolio.portfolio.prices.table import Prices, describe, load, trials_on
 
 SMALL = 10**6
 """Number of prices below which two agents are replayed or explained side by side. Compiling their
@@ -98,7 +99,7 @@ class Backtest:
     @classmethod
     def create(
         cls,
-        prices: Prices,
+        prices: Any,
         agents: Mapping[str, Preset | Agent],
         *,
         train: str = "5y",
@@ -125,7 +126,7 @@ class Backtest:
         """A backtest before its first fold.
 
         Args:
-            prices: The table.
+            prices: A table, or anything else that ``load_prices`` reads.
             agents: The agents to train, by name: presets, whose task settings include window, menu,
                 reward, …, or agents of your own.
             train, test: Lengths such as "5y", "6m" or "500d"; with ``expanding``, training keeps
@@ -162,15 +163,18 @@ class Backtest:
             QfolioError: There is no agent, a name or a setting is invalid, the arguments do not fit
                 the table, or the machine has too little memory.
         """
+        _require_types(agents, strategies, lag=lag, seeds=seeds, seed=seed, trials=trials)
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")
-        if isinstance(baselines, str):
+        if isinstance(baselines, str) or not isinstance(baselines, Sequence):
             raise QfolioError(f"baselines is {baselines!r}; it must be a list of names.")
+        require_type("cap", cap, Real, "a number")
         if not 0 < cap <= 1:
             raise QfolioError(
                 f"The cap is {cap:g}; it must be above 0 and at most 1. A mandate that allows "
                 "loans or short sales may set one above 1 (assets.cap)."
             )
+        prices = load(prices)
         terms = TradingTerms.of(mandate, cost, cost_model, calendar, benchmark)
         field = field_of(prices, agents, baselines, strategies or {}, terms.benchmark)
         limits = terms.mandate
@@ -238,6 +242,7 @@ class Backtest:
             QfolioError: The table does not begin with the backtest's rows; the error names the
                 first row and column that differ.
         """
+        require_type("prices", prices, Prices, "a table that qfolio.load_prices has read")
         require_grown(self.prices, prices)
         if len(prices) == len(self.prices):
             return self
@@ -437,3 +442,19 @@ class Backtest:
         if name not in self.agents:
             raise QfolioError(f"The backtest has no agent {name!r}; {near(name, self.agents)}")
         return name
+
+
+def _require_types(agents: object, strategies: object, **numbers: object) -> None:
+    """Raises QfolioError for agents, strategies or whole numbers of another type."""
+    one = 'qfolio.preset("fast", "portfolio", "tilts")'
+    by_name = f'presets or agents by name, such as {{"tilts": {one}}}'
+    require_type("agents", agents, Mapping, f"a dictionary of {by_name}")
+    assert isinstance(agents, Mapping)
+    for name, agent in agents.items():
+        wanted = f"a preset, such as {one}, or an agent, such as qfolio.Tilts()"
+        require_type(f"agents[{name!r}]", agent, (Preset, Agent), wanted)
+    if strategies is not None:
+        wanted = 'a dictionary of files or tables by name, such as {"mine": "mine.csv"}'
+        require_type("strategies", strategies, Mapping, wanted)
+    for name, number in numbers.items():
+        require_type(name, number, Integral, "a whole number")

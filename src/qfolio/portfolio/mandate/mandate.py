@@ -46,7 +46,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.registry import BASELINES
 from qfolio.core.text import near, quote
 
@@ -169,6 +169,8 @@ class Mandate(Section, frozen=True):
     @staticmethod
     def of(given: "Mandate | Path | str | dict[str, Any]") -> "Mandate":
         """A mandate, from one, from the path of a file, or from a dictionary of its sections."""
+        kinds = (Mandate, Path, str, dict)
+        require_type("mandate", given, kinds, "a path, or a dictionary of the file's sections")
         if isinstance(given, Mandate):
             return given
         return _made(given, "mandate") if isinstance(given, dict) else Mandate.read(given)

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
@@ -29,13 +29,13 @@ from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.bootstrap import LEVEL
-from qfolio.portfolio.backtest.folds import require_fold
+from qfolio.portfolio.backtest.folds import parse_length, require_fold
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
-from qfolio.portfolio.prices.table import Prices, describe, trials_on
+from qfolio.portfolio.prices.table import Prices, describe, load, trials_on
 from qfolio.portfolio.study.folder import (
     NAME,
     Look,
@@ -71,7 +71,7 @@ class Study:
     @classmethod
     def create(
         cls,
-        tables: Mapping[str, Prices],
+        tables: Mapping[str, Any],
         agents: Mapping[str, Preset | Agent],
         *,
         lags: Sequence[int] = (1,),
@@ -89,7 +89,8 @@ class Study:
         Tables without one whole fold are left out (``config.left_out`` says why).
 
         Args:
-            tables: Price tables by name; names become folders.
+            tables: Price tables by name, or anything else that ``load_prices`` reads; names become
+                folders.
             agents: The agents to train, by name, as ``Backtest.create`` takes them.
             lags, costs: Every lag is combined with every cost (a fraction of the value traded); the
                 first of each make the main variant.
@@ -105,6 +106,11 @@ class Study:
                 are given although a mandate or a cost model sets it, or a backtest refuses its
                 arguments.
         """
+        wanted = 'a dictionary of tables by name, such as {"us": qfolio.load_prices("us.csv")}'
+        require_type("tables", tables, Mapping, wanted)
+        tables = {name: load(table) for name, table in tables.items()}
+        for length in (train, test):  # or it would be the reason why tables are left out
+            parse_length(length)
         costs = _charged(costs, options)
         variants = [Variant(int(lag), float(cost)) for lag, cost in itertools.product(lags, costs)]
         _require_plan(tables, variants)

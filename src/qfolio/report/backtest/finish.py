@@ -5,7 +5,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.attribution.why import Why
@@ -33,6 +33,8 @@ def finish(backtest: Backtest) -> Finished:
     Raises:
         QfolioError: The backtest has no folder.
     """
+    wanted = "a backtest, such as qfolio.Backtest.open(folder)"
+    require_type("backtest", backtest, Backtest, wanted)
     if backtest.folder is None:
         raise QfolioError("The backtest has no folder to write to; create it with out=FOLDER.")
     entries, notes = backtest.entries()
