@@ -39,6 +39,7 @@ docs/guides/mandate.md describes every key. ``limits.py`` makes arrays of the li
 import csv
 import json
 import re
+import reprlib
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,7 +49,7 @@ import msgspec
 
 from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.registry import BASELINES
-from qfolio.core.text import near, quote
+from qfolio.core.text import listed, near, quote
 
 Weight = Annotated[float, msgspec.Meta(ge=-3, le=3)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -278,18 +279,69 @@ def _converted(content: Any, source: str) -> Mandate:
     try:
         return msgspec.convert(content, Mandate)
     except msgspec.ValidationError as error:
-        text, _, place = str(error).replace("`", "").partition(" - at $")
-        where = place.lstrip(".")
+        text, _, at = str(error).replace("`", "").partition(" - at ")
+        kind, _, place = at.partition("$")
+        key, value = _culprit(content, place, str(error))
         if unknown := re.fullmatch(r"Object contains unknown field (.+)", text):
-            known = _fields(where)
-            inside = f"[{where}]" if where else "the mandate"
+            known = _fields(key)
+            inside = f"[{key}]" if key else "the mandate"
             raise QfolioError(
                 f"{source}: {inside} has no key {quote(unknown[1])}; {near(unknown[1], known)}"
             ) from None
+        key = key or "the mandate"
+        if kind == "key in ":  # from Python, whose dictionaries may have other keys than text
+            key, value = f"a key in {key}", next(x for x in value if not isinstance(x, str))
         raise QfolioError(
-            f"{source}: {where or 'the mandate'}: {text[:1].lower()}{text[1:]}; see "
-            "docs/guides/mandate.md."
+            f"{source}: {key} is {reprlib.repr(value)}; it must be {_wanted(text)} (see "
+            "docs/guides/mandate.md)."
         ) from None
+
+
+_KINDS = {"float": "a number", "int": "a whole number", "str": "text", "bool": "true or false",
+          "array": "a list", "object": "a table of keys and values"}  # fmt: skip
+_BOUNDS = {"<=": "at most", ">=": "at least", "<": "below", ">": "above"}
+
+
+def _wanted(text: str) -> str:
+    """What a value must be, by msgspec's text, such as "Expected float | null, got str"."""
+    if bound := re.fullmatch(r"Expected \w+ ([<>]=?) (.+)", text):
+        return f"{_BOUNDS[bound[1]]} {float(bound[2]):g}"
+    kinds = text.removeprefix("Expected ").partition(",")[0].split(" | ")
+    return listed([_KINDS.get(kind, kind) for kind in kinds if kind != "null"], "or")
+
+
+def _culprit(content: Any, place: str, said: str) -> tuple[str, Any]:
+    """The full key of a wrong value, and the value.
+
+    place: the key in msgspec's words, which has [...] for any key of a dictionary. said: all of
+    msgspec's words; the key is the one that leads to them without the dictionary's other keys.
+    """
+    names: list[Any] = []
+    value = content
+    for part in re.findall(r"\w+|\.\.\.", place):
+        if part == "...":
+            name = next(each for each in value if _refusal(_only(content, names, each)) == said)
+        else:
+            name = int(part) if isinstance(value, Sequence) else part
+        names.append(name)
+        value = value[name]
+    return ".".join(map(str, names)), value
+
+
+def _only(content: dict[str, Any], names: list[Any], name: str) -> dict[str, Any]:
+    """The dictionary, in which the one at ``names`` has no key but ``name``."""
+    if not names:
+        return {name: content[name]}
+    return content | {names[0]: _only(content[names[0]], names[1:], name)}
+
+
+def _refusal(content: dict[str, Any]) -> str:
+    """What msgspec says of a dictionary that is no mandate."""
+    try:
+        msgspec.convert(content, Mandate)
+    except msgspec.ValidationError as error:
+        return str(error)
+    return ""
 
 
 def _merge(content: dict[str, Any], others: dict[str, Any], place: str, within: str = "") -> None:
