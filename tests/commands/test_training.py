@@ -79,6 +79,11 @@ def test_resume_goes_on(run, monkeypatch, capsys):
     assert qfolio(monkeypatch, "train", "--resume", folder, "--episodes", "12") == 0
     assert json.loads((folder / "summary.json").read_text())["episodes"] == 12
     assert len((folder / "metrics.csv").read_text().splitlines()) == 1 + 24
+    assert "Nothing is left" not in capsys.readouterr().out
+    assert qfolio(monkeypatch, "train", "--resume", folder) == 0
+    out = capsys.readouterr().out
+    assert "Nothing is left to train: each seed has had 12 episodes already" in out
+    assert f"Report: {folder}" in out
 
 
 def test_watch_without_a_display_writes_a_gif(run, monkeypatch, capsys):

@@ -23,7 +23,7 @@ from qfolio.commands.arguments import (
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import listed
+from qfolio.core.text import amount, listed
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -120,6 +120,12 @@ def train(
                 _require_seen(run.config.task)
         budget = budget or run.budget
         console.say(console.describe_run(run, budget))
+        if not budget.left(run.population):
+            trained = amount(run.done(budget.unit), budget.unit.removesuffix("s"))
+            console.say(
+                f"Nothing is left to train: each seed has had {trained} already; set a larger "
+                f"total with --{budget.unit}."
+            )
         with tracked(*following):
             _train(run, budget, executor, show)
     command = _resume(run, folder, on)
