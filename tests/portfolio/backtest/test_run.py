@@ -60,6 +60,11 @@ def create(folder=None, prices=None, agents=AGENTS, **settings):
     return Backtest.create(prices, agents, out=folder, **options)
 
 
+def changed(name, **task):
+    """An agent alone, with other settings of the task."""
+    return {name: AGENTS[name]._replace(task={**AGENTS[name].task, **task})}
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("backtests") / "run"
@@ -404,6 +409,8 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
         ({"lag": -1}, "lag is -1"), ({"agents": {}}, "at least one agent"),
         ({"cap": 1.5}, "The cap is 1.5; it must be above 0"), ({"cap": np.nan}, "The cap is nan"),
         ({"baselines": "momentum"}, "baselines is 'momentum'; it must be a list"),
+        ({"agents": changed("dqn", menu="nonsense")}, "menu is 'nonsense'; it must be like"),
+        ({"agents": changed("pathwise", horizon=13)}, "rollout_length is .* must divide the 13"),
     ],
 )  # fmt: skip
 def test_backtests_that_cannot_be(settings, message, tmp_path):

@@ -1,7 +1,9 @@
 """The plan of a backtest: its folds, what each agent trains on, and which trainings are missing."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
+import jax
 import numpy as np
 
 from qfolio.core import settings
@@ -115,6 +117,15 @@ class Plan:
         updates = 1 + max(kept.updates(name) for name in self.agents)
         earlier = [each for each in self._trained if each[0] < updates]
         return [*earlier, (updates, rows)]
+
+    def require_able(self) -> None:
+        """Raises QfolioError if an agent cannot begin, such as one with a wrong menu or rollout.
+
+        Agents judge some settings only as they meet a task; here nothing of it is computed.
+        """
+        for name, agent in self.agents.items():
+            task = self.part(name, self.folds[0].name)
+            jax.eval_shape(partial(agent.init, task), jax.random.key(0))
 
     def require_begins_with(self, folds: Sequence[Fold]) -> None:
         """Raises QfolioError unless its first folds are those of a table before it grew."""

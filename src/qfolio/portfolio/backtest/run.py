@@ -215,6 +215,7 @@ class Backtest:
         backtest = cls(prices, config, None, given, field.own)
         if config.mandate is not None:
             checks.require_safe(backtest.replay.task.mandate, backtest.replay.starts(), config.cap)
+        backtest._plan.require_able()
         if out is not None:
             with new_folder(Path(out)) as folder:
                 BacktestFolder(folder).write(config, prices, field.own)
