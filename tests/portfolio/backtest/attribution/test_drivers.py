@@ -73,6 +73,24 @@ def test_limits_are_a_reason_where_what_is_held_or_wanted_breaks_them():
     assert sentence(capped).endswith(". The target is at its cap of 20.00%.")
 
 
+def test_an_order_that_exceeds_the_limit_of_turnover_is_not_said_to_be_at_it():
+    """60% of A must become 20%, which is more turnover than there may be, or just as much."""
+    prices = planted()
+    shares = np.eye(ASSETS)[0] * 600 / prices.values[-1]
+    for turnover, last in {
+        0.1: " The order is beyond the limit of turnover, which yields to the other limits.",
+        0.4: " The target is at its cap of 20.00% and the limit of turnover.",
+    }.items():
+        limits = {"assets": {"cap": 0.2}, "trading": {"turnover": turnover}}
+        stretch = four_folds(prices, mandate=limits)[-1]
+        policy = Policy(stretch.task, Known("momentum"), jnp.array([0.4, 0.6]), prices.assets)
+        allocation = Allocation.of(policy, prices, shares, 400.0)
+        largest = reasons(policy, prices, allocation)[0]
+        assert largest.asset == "A"
+        assert largest.change == pytest.approx(-0.4, abs=1e-4)
+        assert sentence(largest).endswith(last)
+
+
 def test_the_limits_that_a_target_reaches_are_named():
     mandate = {
         "assets": {"cap": 0.4, "floor": {"B": 0.1}},

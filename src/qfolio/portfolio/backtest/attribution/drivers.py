@@ -51,6 +51,7 @@ class Reason(msgspec.Struct, frozen=True):
     rest: float  # with a typical observation, the weight would change by this
     required: float = 0.0  # part of the rest that the limits on weights require
     bounds: tuple[str, ...] = ()  # the limits that the target reaches
+    beyond: bool = False  # whether the order exceeds the limit of turnover, as others require
 
 
 def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reason]:
@@ -70,6 +71,8 @@ def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reas
     allowed, nearest = _allowed(task, row[0], held[0])
     required = (np.asarray(nearest, float) - allocation.held)[1:]
     bounds = _bounds(allowed, allocation.weights, allocation.held)
+    over = _over(allowed, allocation.weights, allocation.held)
+    beyond = over.get("turnover is too high by", 0.0) > VISIBLE
     moved = np.asarray(integrated(task, policy.agent, policy.members, row, held)[0])[0]
     names = channel_names(policy.task, policy.features)
     found = []
@@ -78,7 +81,7 @@ def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reas
             drivers = [Driver(names[c], float(moved[c, i])) for c in np.argsort(-abs(moved[:, i]))]
             rest = float(change[i] - moved[:, i].sum())
             asset, by, needs = allocation.assets[i], float(change[i]), float(required[i])
-            found.append(Reason(asset, by, drivers, rest, needs, bounds[i]))
+            found.append(Reason(asset, by, drivers, rest, needs, bounds[i], beyond))
     return found
 
 
@@ -87,6 +90,11 @@ def _allowed(task: Portfolio, row: jax.Array, held: jax.Array) -> tuple[Feasible
     """The weights that may be ordered at a row, and the nearest of them to those held."""
     allowed = task.feasible_at(row)
     return allowed, allowed.project(held, held)
+
+
+def _over(allowed: Feasible, weights: np.ndarray, held: np.ndarray) -> dict[str, float]:
+    """By how much each limit of a mandate is exceeded; negative below it."""
+    return allowed.violations(weights, held) if isinstance(allowed, Mandated) else {}
 
 
 def _bounds(allowed: Feasible, weights: np.ndarray, held: np.ndarray) -> list[tuple[str, ...]]:
@@ -104,7 +112,7 @@ def _bounds(allowed: Feasible, weights: np.ndarray, held: np.ndarray) -> list[tu
         elif weight <= low + VISIBLE and low != 0:
             each.append(f"its floor of {figure(low, '.2%')}")
     if isinstance(allowed, Mandated):
-        over = allowed.violations(weights, held)
+        over = _over(allowed, weights, held)
         for name, members in zip(allowed.names, limits.rows != 0, strict=True):
             if over[name] >= -VISIBLE and not name.startswith("cash is"):
                 group, _, side = name.rpartition(" is ")
@@ -112,7 +120,7 @@ def _bounds(allowed: Feasible, weights: np.ndarray, held: np.ndarray) -> list[tu
                 for member in np.flatnonzero(members):
                     found[member].append(f"the {side} of {group}")
         for said in ("gross exposure", "turnover"):
-            if over[f"{said} is too high by"] >= -VISIBLE:
+            if abs(over[f"{said} is too high by"]) <= VISIBLE:
                 for each in found:
                     each.append(f"the limit of {said}")
     return [tuple(each) for each in found]
@@ -125,6 +133,8 @@ def sentence(reason: Reason) -> str:
     if abs(reason.required) >= VISIBLE:
         change += f" the limits on weights require {figure(reason.required, '+.2%')};"
     reached = f" The target is at {listed(reason.bounds)}." if reason.bounds else ""
+    if reason.beyond:
+        reached += " The order is beyond the limit of turnover, which yields to the other limits."
     if not moving:
         return f"{change} no signal moves it, so that it is the same on a typical day.{reached}"
     shown = [f"{each.name} {figure(each.weight, '+.2%')}" for each in moving[:SHOWN]]
