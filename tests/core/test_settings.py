@@ -31,6 +31,19 @@ def test_describe_and_build_are_inverse():
     assert settings.build(DQN, settings.describe(agent)) == agent
 
 
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    low: float = -math.inf
+    high: float = math.inf
+    levels: tuple[float, ...] = (-math.inf, 0.5)
+
+
+def test_infinities_are_described_as_text():
+    described = settings.describe(Bounds())
+    assert described == {"low": "-inf", "high": "inf", "levels": ["-inf", 0.5]}
+    assert settings.build(Bounds, described) == Bounds()
+
+
 def test_parse():
     assert settings.parse(["a=1", "learning-rate = 2"]) == {"a": "1", "learning_rate": "2"}
     assert settings.parse(["my-agent.learning-rate=2"]) == {"my-agent.learning_rate": "2"}

@@ -14,10 +14,15 @@ T = TypeVar("T")
 
 
 def describe(instance: Any) -> dict[str, Any]:
-    """The settings of an agent or task as JSON values; infinity becomes the text "inf"."""
-    values = {name: getattr(instance, name) for name in _types(type(instance))}
-    return {k: "inf" if v == math.inf else list(v) if isinstance(v, tuple) else v
-            for k, v in values.items()}  # fmt: skip
+    """The settings of an agent or task as JSON values; infinities become "inf" and "-inf"."""
+    return {name: _described(getattr(instance, name)) for name in _types(type(instance))}
+
+
+def _described(value: Any) -> Any:
+    """A setting as a JSON value; JSON has no infinity."""
+    if isinstance(value, tuple):
+        return list(map(_described, value))
+    return str(value) if isinstance(value, float) and math.isinf(value) else value
 
 
 def names(kind: type) -> set[str]:
