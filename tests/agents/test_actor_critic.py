@@ -485,7 +485,7 @@ def test_entropy_to_come_is_believed_where_no_reward_has_been_seen(wanted, entro
     np.testing.assert_allclose(target, 0.9 * forever, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("spread", "rises"), [(0.01, False), (2.0, True)])
+@pytest.mark.parametrize(("spread", "rises"), [(0.01, False), (0.99, True)])
 def test_the_temperature_goes_where_the_entropy_is_wanted(spread, rises):
     agent = SAC(hidden=(8,), spread=spread)
     start = begun(agent)
@@ -646,7 +646,8 @@ def test_fits_markets(kind, network, task):
         (DDPG, {"exploration_noise": -0.1}), (DDPG, {"batch_size": 0}), (TD3, {"policy_delay": 0}),
         (DDPG, {"noise_theta": 1.5}), (DDPG, {"critic_weight_decay": -0.1}),
         (DDPG, {"last_layer_bound": -0.1}),
-        (TD3, {"target_noise": -1.0}), (SAC, {"spread": 0.0}), (SAC, {"initial_temperature": 0.0}),
+        (TD3, {"target_noise": -1.0}), (SAC, {"spread": 0.0}), (SAC, {"spread": 15.5}),
+        (SAC, {"initial_temperature": 0.0}),
         (SAC, {"discount": 1.5}), (SAC, {"learning_starts": 100, "replay_capacity": 50}),
         (SAC, {"network": "mpl"}), (SAC, {"hidden": ()}),
     ],
@@ -654,6 +655,17 @@ def test_fits_markets(kind, network, task):
 def test_refuses_what_makes_no_sense(kind, settings):
     with pytest.raises(QfolioError, match=next(iter(settings))):
         kind(**settings)
+
+
+def test_a_spread_that_no_policy_has_is_refused():
+    """At the largest one the policy has its largest standard deviation, or is uniform."""
+    most = 0.5 * math.log(2 * math.pi * math.e) + sac.LOG_STD[1]
+    assert float(sac.target_entropy(Box(1), sac.MOST_SPREAD)) < most
+    assert float(sac.target_entropy(Box(1), sac.MOST_SPREAD + 0.5)) > most
+    for task in (Aim(1.0), OneState()):
+        with pytest.raises(QfolioError, match=r"spread is 1\.0; it must be below 1: no"):
+            SAC(**SMALL, spread=1.0).init(task, jax.random.key(0))
+    SAC(**SMALL, spread=1.0).init(Aim(math.inf), jax.random.key(0))
 
 
 @pytest.mark.slow

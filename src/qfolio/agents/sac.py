@@ -25,7 +25,7 @@ from qfolio.agents.actor_critic import (
 )
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require
-from qfolio.core.mdp import Actions, Discrete, Metrics, Simplex, Task
+from qfolio.core.mdp import Actions, Box, Discrete, Metrics, Simplex, Task
 from qfolio.learning import optimizer
 from qfolio.learning.distributions import Categorical, Gaussian, LogisticNormal, Squashed
 from qfolio.learning.networks import Outputs, outputs_of
@@ -33,6 +33,11 @@ from qfolio.learning.targets import Scalar, Scale, follow, smallest
 
 LOG_STD = (-10.0, 2.0)
 """Bounds of a normal number's log standard deviation."""
+
+MOST_SPREAD = 15
+"""The largest ``spread``: half of exp of a normal number's entropy at the larger bound, or less.
+
+No policy is as random as more would ask for, so that the temperature would rise forever."""
 
 
 class Actor(actor_critic.Actor):
@@ -125,8 +130,8 @@ class SAC(ActorCritic[Learned]):
     initial_temperature: float = number(1.0)  # weight of the entropy at the start
 
     def __check_init__(self) -> None:
-        scales = "spread initial_temperature"
-        require(self, scales, lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        require(self, "initial_temperature", lambda x: 1e-30 <= x <= 1e30, "from 1e-30 to 1e30")
+        require(self, "spread", lambda x: 1e-30 <= x <= MOST_SPREAD, f"from 1e-30 to {MOST_SPREAD}")
         require(self, "noise_theta", lambda x: 0 < x <= 1, "above 0 and at most 1")
 
     def init(self, task: Task, key: PRNGKeyArray) -> ActorCriticState[Learned]:
@@ -135,6 +140,9 @@ class SAC(ActorCritic[Learned]):
                 f"noise_theta is {self.noise_theta}, for continuous actions, but those of "
                 f"{task.name} are numbered; set noise_theta=1."
             )
+        if not isinstance(task.actions, Box) or math.isfinite(task.actions.bound):
+            wanted = f"below 1: no actions of {task.name} are more random than uniform ones"
+            require(self, "spread", lambda x: x < 1, wanted)
         return super().init(task, key)
 
     def begin(self, task: Task, observation: PyTree, key: PRNGKeyArray) -> Learned:
