@@ -41,7 +41,7 @@ def values(layers, rows):
 def update(replay, state, key):
     layers, target, moments = state
     share = BATCH // DEVICES
-    index = jax.random.randint(key, BATCH, 0, ROWS - 1)
+    index = jax.random.randint(key, (BATCH,), 0, ROWS - 1)
     index = lax.dynamic_slice(index, (lax.axis_index("device") * share,), (share,))
     now, then = replay[index], replay[index + 1]
 
@@ -57,11 +57,11 @@ def update(replay, state, key):
 
 
 def main():
-    replay, *keys = jax.random.split(jax.random.key(0), len(SIZES))
-    replay = jax.random.normal(replay, (ROWS, SIZES[0]))
+    first, *rest = jax.random.split(jax.random.key(0), len(SIZES))
+    replay = jax.random.normal(first, (ROWS, SIZES[0]))
     layers = [
         (jax.random.normal(key, (a, b)) / a**0.5, jnp.zeros(b))
-        for key, a, b in zip(keys, SIZES[:-1], SIZES[1:], strict=True)
+        for key, a, b in zip(rest, SIZES[:-1], SIZES[1:], strict=True)
     ]
     mesh, whole = Mesh(np.array(jax.devices()), ("device",)), PartitionSpec()
 

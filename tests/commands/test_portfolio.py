@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
+from qfolio.commands.backtesting import Options
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.attribution.why import Why
@@ -135,6 +136,18 @@ def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.slow
+def test_an_agent_may_name_its_preset():
+    options = Options(agents="tilts,tilts@low-risk", assignments=("tilts@low-risk.ridge=2",))
+    chosen = options.presets()
+    assert list(chosen) == ["tilts", "tilts@low-risk"]
+    assert [each.task["anchor"] for each in chosen.values()] == [
+        "equal-weight", "equal-weight+minimum-variance-nonlinear",
+    ]  # fmt: skip
+    assert [each.build().ridge for each in chosen.values()] == [0.3, 2]
+    with pytest.raises(QfolioError, match="no preset 'low-risk' for dqn on portfolio"):
+        Options(agents="dqn@low-risk").presets()
+
+
 def test_backtest_obeys_a_mandate(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     write_table(tmp_path / "prices.csv")

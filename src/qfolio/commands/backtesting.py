@@ -39,8 +39,9 @@ class Options(Reading):
 
     Args:
         agents: Agents, separated by commas: tilts, mean-variance-learned, minimum-variance-learned,
-            dqn, pathwise, ppo, a2c, reinforce, sac, ddpg, td3, or your own as module:Name.
-        preset: Preset of the agents.
+            dqn, pathwise, ppo, a2c, reinforce, sac, ddpg, td3, or your own as module:Name; a preset
+            may follow, as in tilts,tilts@low-risk.
+        preset: Preset of the agents that name none.
         cost_bps: Cost of buying or selling, in basis points of the value traded.
         lag: Rows between the close that a decision sees and the close at which it trades.
         train: Length of the first training window: 5y, 6m, 8w or 500d (d counts rows).

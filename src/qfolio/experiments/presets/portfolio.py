@@ -21,13 +21,13 @@ SHORT_SIGNALS = "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,moving
 _ON_ANCHOR = {"window": 1, "horizon": 84, "signals": SIGNALS, "anchor": "equal-weight"}
 
 
-# Against risk instead of for growth. The mean of two anchors of low risk, because there is little
-# evidence for tilts of minimum variance alone.
+# Averse to risk. The anchor is not minimum variance alone, which holds so few assets that there is
+# little evidence for tilts.
 _ON_LOW_RISK = {
     **_ON_ANCHOR,
     "reward": "crra",
     "risk_aversion": 20.0,
-    "anchor": "volatility-timing+minimum-variance-nonlinear",
+    "anchor": "equal-weight+minimum-variance-nonlinear",
 }
 
 
