@@ -401,6 +401,11 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
         np.testing.assert_array_equal(x, y)
 
 
+def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):
+    create(tmp_path / "run", agents={"pathwise@fast": AGENTS["pathwise"]})
+    assert list(Backtest.open(tmp_path / "run").agents) == ["pathwise@fast"]
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -411,6 +416,7 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
         ({"baselines": "momentum"}, "baselines is 'momentum'; it must be a list"),
         ({"agents": changed("dqn", menu="nonsense")}, "menu is 'nonsense'; it must be like"),
         ({"agents": changed("pathwise", horizon=13)}, "rollout_length is .* must divide the 13"),
+        ({"agents": {"../dqn": AGENTS["dqn"]}}, "called '../dqn'; use letters, digits, -, _ and @"),
     ],
 )  # fmt: skip
 def test_backtests_that_cannot_be(settings, message, tmp_path):

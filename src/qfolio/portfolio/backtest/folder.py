@@ -10,6 +10,7 @@ summary.json, why.json (what explains the agents) and the report. ledger/ has th
 
 import csv
 import math
+import re
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -31,6 +32,7 @@ from qfolio.core.files import (
 )
 from qfolio.core.mdp import Agent
 from qfolio.core.registry import BASELINES, name_of
+from qfolio.core.text import quote
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Row
 from qfolio.experiments.presets import Preset
@@ -44,8 +46,8 @@ EQUAL_WEIGHT = "equal-weight"
 TOGETHER = "-together"
 """Suffix of an agent's ensemble: the mean of all its seeds, which is the policy for tomorrow."""
 
-# Names become folders.
-AgentName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]+$")]
+_NAME = r"^[A-Za-z0-9_@-]+$"  # names become folders
+AgentName = Annotated[str, msgspec.Meta(pattern=_NAME)]
 
 
 STRATEGIES = "strategies.safetensors"
@@ -83,7 +85,12 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
     def of(
         name: str, agent: Preset | Agent, episodes: int | None, task: Mapping[str, Any]
     ) -> "AgentConfig":
-        """The configuration of an agent; episodes and task are those of one without a preset."""
+        """The configuration of an agent; episodes and task are those of one without a preset.
+
+        Raises QfolioError if the name cannot be that of a folder, or there are no episodes.
+        """
+        if not (isinstance(name, str) and re.fullmatch(_NAME, name)):
+            raise QfolioError(f"An agent is called {quote(name)}; use letters, digits, -, _ and @.")
         if isinstance(agent, Preset):
             described = settings.describe(agent.build())
             return AgentConfig(
