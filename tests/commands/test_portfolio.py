@@ -143,7 +143,7 @@ def test_an_agent_may_name_its_preset():
     assert [each.task["anchor"] for each in chosen.values()] == [
         "equal-weight", "equal-weight+minimum-variance-nonlinear",
     ]  # fmt: skip
-    assert [each.build().ridge for each in chosen.values()] == [0.3, 2]
+    assert [each.settings.get("ridge") for each in chosen.values()] == [None, 2]
     with pytest.raises(QfolioError, match="no preset 'low-risk' for dqn on portfolio"):
         Options(agents="dqn@low-risk").presets()
 
