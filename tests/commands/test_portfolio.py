@@ -137,15 +137,15 @@ def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
 
 @pytest.mark.slow
 def test_an_agent_may_name_its_preset():
-    options = Options(agents="tilts,tilts@low-risk", assignments=("tilts@low-risk.ridge=2",))
+    options = Options(agents="tilts,tilts:low-risk", assignments=("tilts:low-risk.ridge=2",))
     chosen = options.presets()
-    assert list(chosen) == ["tilts", "tilts@low-risk"]
+    assert list(chosen) == ["tilts", "tilts:low-risk"]
     assert [each.task["anchor"] for each in chosen.values()] == [
         "equal-weight", "equal-weight+minimum-variance-nonlinear",
     ]  # fmt: skip
     assert [each.settings.get("ridge") for each in chosen.values()] == [None, 2]
     with pytest.raises(QfolioError, match="no preset 'low-risk' for dqn on portfolio"):
-        Options(agents="dqn@low-risk").presets()
+        Options(agents="dqn:low-risk").presets()
 
 
 def test_backtest_obeys_a_mandate(monkeypatch, capsys, tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,8 +40,8 @@ class Options(Reading):
 
     Args:
         agents: Agents, separated by commas: tilts, mean-variance-learned, minimum-variance-learned,
-            dqn, pathwise, ppo, a2c, reinforce, sac, ddpg, td3, or your own as module:Name; a preset
-            may follow, as in tilts,tilts@low-risk.
+            dqn, pathwise, ppo, a2c, reinforce, sac, ddpg, td3, or your own as module:Name, each
+            with an optional preset after a colon, as in tilts,tilts:low-risk.
         preset: Preset of the agents that name none.
         cost_bps: Cost of buying or selling, in basis points of the value traded.
         lag: Rows between the close that a decision sees and the close at which it trades.
@@ -123,10 +124,10 @@ class Options(Reading):
         return self.out or Path("runs") / f"{kind}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
 
     def presets(self) -> "dict[str, Preset]":
-        """The agents by their short names, with all settings; imports their modules."""
+        """The agents by their names in tables, with all settings; imports their modules."""
         chosen = {
-            name: _preset(agent, self.preset, self.episodes)
-            for name, agent in _split(self.agents).items()
+            name: _preset(entry, self.preset, self.episodes)
+            for name, entry in _split(self.agents, registry.entrant).items()
         }
         observed = {} if self.signals is None else {"signals": self.signals}
         return _assign(chosen, observed | settings.parse(self.assignments))
@@ -156,7 +157,9 @@ class Options(Reading):
             "benchmark": self.benchmark,
             "baselines": list(registry.BASELINES)
             if self.baselines is None
-            else [_known("baseline", name) for name in _split(self.baselines).values()],
+            else [
+                _known("baseline", name) for name in _split(self.baselines, registry.short).values()
+            ],
             "seeds": max(seeds, default=1) if self.seeds is None else self.seeds,
             "seed": self.seed,
             "trials": self.trials,
@@ -180,11 +183,11 @@ def basis_points(option: str, value: float) -> float:
     return value * BASIS_POINT
 
 
-def _split(text: str) -> dict[str, str]:
-    """The names in a comma-separated option, by their short names in the backtest."""
-    agents = [name.strip() for name in text.split(",") if name.strip()]
-    names = {registry.short(agent): agent for agent in agents}
-    if len(names) < len(agents):
+def _split(text: str, short: Callable[[str], str]) -> dict[str, str]:
+    """The entries of a comma-separated option, by their short names in the backtest."""
+    entries = [entry.strip() for entry in text.split(",") if entry.strip()]
+    names = {short(entry): entry for entry in entries}
+    if len(names) < len(entries):
         raise QfolioError(f"{text} has a name twice; give each once.")
     return names
 
@@ -206,13 +209,13 @@ def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
     return [("reward", value)] if setting == "reward" else []
 
 
-def _preset(name: str, preset: str, episodes: int | None) -> "Preset":
-    """The preset of an agent, or the one that its name ends with, as in tilts@low-risk."""
+def _preset(entry: str, preset: str, episodes: int | None) -> "Preset":
+    """The preset of an agent: its own if the entry names one, as in tilts:low-risk."""
     from qfolio.experiments import presets
 
-    agent, at, own = name.partition("@")
+    agent, own = registry.parted(entry)
     registry.find("agent", agent)
-    chosen = presets.preset(own if at else preset, "portfolio", agent)
+    chosen = presets.preset(own or preset, "portfolio", agent)
     return chosen if episodes is None else chosen._replace(episodes=episodes)
 
 

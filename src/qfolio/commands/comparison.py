@@ -122,7 +122,7 @@ def _entrants(
     entrants: dict[str, Entrant] = {}
     chosen: dict[tuple[str, str], str] = {}
     for entry in filter(None, map(str.strip, agents.split(","))):
-        agent, own = _parts(entry)
+        agent, own = registry.parted(entry)
         registry.find("agent", agent)
         known = presets.presets_of(task, agent)
         default = "fast" if "fast" in known else next(iter(known), "fast")
@@ -133,20 +133,13 @@ def _entrants(
             )
         chosen[agent, name] = entry
         settled = presets.preset(name, task, agent)
-        entrants[":".join(filter(None, (registry.short(agent), own)))] = Entrant(
+        entrants[registry.entrant(entry)] = Entrant(
             settings.build(task_class, settled.task),
             settled.build(),
             name,
             budget or settled.budget,
         )
     return entrants
-
-
-def _parts(entry: str) -> tuple[str, str]:
-    """The agent and the preset of an entry such as dqn:fast or module:Name:fast; "" without one."""
-    parts = entry.split(":")
-    count = 1 if registry.is_known("agent", parts[0]) else 2
-    return ":".join(parts[:count]), ":".join(parts[count:])
 
 
 def _train(run: "Comparison", executor: "Executor") -> None:

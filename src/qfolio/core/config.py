@@ -2,13 +2,23 @@
 
 import re
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json, write_json
 from qfolio.core.version import __version__
+
+AGENT_NAME = r"^[\w-]+(:[\w-]+)?$"
+"""Pattern of the names that agents have in a comparison or a backtest, such as dqn or dqn:fast."""
+
+AgentName = Annotated[str, msgspec.Meta(pattern=AGENT_NAME)]
+
+
+def agent_folder(name: str) -> str:
+    """The name of an agent's folder; some systems allow no colon there."""
+    return name.replace(":", "-")
 
 
 class Config(msgspec.Struct, kw_only=True, frozen=True):

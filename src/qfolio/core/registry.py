@@ -216,6 +216,19 @@ def short(name: str) -> str:
     return name if name.startswith(GYM) else name.rpartition(":")[2]
 
 
+def parted(entry: str) -> tuple[str, str]:
+    """The agent and the preset of an entry such as dqn:fast or module:Name:fast; "" without one."""
+    parts = entry.split(":")
+    count = 1 if is_known("agent", parts[0]) else 2
+    return ":".join(parts[:count]), ":".join(parts[count:])
+
+
+def entrant(entry: str) -> str:
+    """The name of such an entry in tables: the agent's short name, and the preset if it has one."""
+    agent, preset = parted(entry)
+    return ":".join(filter(None, (short(agent), preset)))
+
+
 def own_modules(*instances: object) -> list[str]:
     """The modules that must be trusted before ``build`` can make these objects again."""
     names = [name_of(instance).removeprefix(GYM) for instance in instances]

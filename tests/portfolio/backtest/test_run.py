@@ -402,8 +402,8 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
 
 
 def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):
-    create(tmp_path / "run", agents={"pathwise@fast": AGENTS["pathwise"]})
-    assert list(Backtest.open(tmp_path / "run").agents) == ["pathwise@fast"]
+    create(tmp_path / "run", agents={"pathwise:fast": AGENTS["pathwise"]})
+    assert list(Backtest.open(tmp_path / "run").agents) == ["pathwise:fast"]
 
 
 @pytest.mark.parametrize(
@@ -416,7 +416,8 @@ def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):
         ({"baselines": "momentum"}, "baselines is 'momentum'; it must be a list"),
         ({"agents": changed("dqn", menu="nonsense")}, "menu is 'nonsense'; it must be like"),
         ({"agents": changed("pathwise", horizon=13)}, "rollout_length is .* must divide the 13"),
-        ({"agents": {"../dqn": AGENTS["dqn"]}}, "called '../dqn'; use letters, digits, -, _ and @"),
+        ({"agents": {"../dqn": AGENTS["dqn"]}}, "called '../dqn'; use letters, digits, - and _"),
+        ({"agents": {"dqn:a": AGENTS["dqn"], "dqn-a": AGENTS["dqn"]}}, "would share a folder"),
     ],
 )  # fmt: skip
 def test_backtests_that_cannot_be(settings, message, tmp_path):

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from qfolio.core import devices, settings
-from qfolio.core.config import Config, read_config, write_config
+from qfolio.core.config import AgentName, Config, agent_folder, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, read_json
@@ -88,10 +88,6 @@ class EntrantConfig(msgspec.Struct, kw_only=True):
     steps: int | None
 
 
-# Names become folders.
-EntrantName = Annotated[str, msgspec.Meta(pattern=r"^[\w-]+(:[\w-]+)?$")]
-
-
 class ComparisonConfig(Config, frozen=True):
     """The content of comparison.json: what is compared, and the results so far."""
 
@@ -103,7 +99,7 @@ class ComparisonConfig(Config, frozen=True):
     seed: int
     command: str
     note: str
-    agents: dict[EntrantName, EntrantConfig]
+    agents: dict[AgentName, EntrantConfig]
     device: str
     started: str
     results: dict[str, Result] = msgspec.field(default_factory=dict)
@@ -209,7 +205,7 @@ class Comparison:
 
     def place(self, name: str) -> Path:
         """The run folder of an agent."""
-        return self.folder / "agents" / _folder_name(name)
+        return self.folder / "agents" / agent_folder(name)
 
     def run(self, listen: ListenToJob | None = None, executor: Executor | None = None) -> None:
         """Trains and grades every agent that has no result yet.
@@ -375,10 +371,6 @@ class Comparison:
                 "notes": self.notes(),
             }
         write_config(self.folder / FILE, msgspec.structs.replace(self.config, **content))
-
-
-def _folder_name(name: str) -> str:
-    return name.replace(":", "-")
 
 
 def _require_fit(name: str, entrant: Entrant, seeds: int) -> None:

@@ -19,7 +19,14 @@ import msgspec
 import numpy as np
 
 from qfolio.core import settings
-from qfolio.core.config import Config, read_config, write_config
+from qfolio.core.config import (
+    AGENT_NAME,
+    AgentName,
+    Config,
+    agent_folder,
+    read_config,
+    write_config,
+)
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import (
     read_arrays,
@@ -45,10 +52,6 @@ EQUAL_WEIGHT = "equal-weight"
 
 TOGETHER = "-together"
 """Suffix of an agent's ensemble: the mean of all its seeds, which is the policy for tomorrow."""
-
-_NAME = r"^[A-Za-z0-9_@-]+$"  # names become folders
-AgentName = Annotated[str, msgspec.Meta(pattern=_NAME)]
-
 
 STRATEGIES = "strategies.safetensors"
 
@@ -89,8 +92,11 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
 
         Raises QfolioError if the name cannot be that of a folder, or there are no episodes.
         """
-        if not (isinstance(name, str) and re.fullmatch(_NAME, name)):
-            raise QfolioError(f"An agent is called {quote(name)}; use letters, digits, -, _ and @.")
+        if not (isinstance(name, str) and re.fullmatch(AGENT_NAME, name)):
+            raise QfolioError(
+                f"An agent is called {quote(name)}; use letters, digits, - and _, and at most one "
+                "colon within, as in tilts:low-risk."
+            )
         if isinstance(agent, Preset):
             described = settings.describe(agent.build())
             return AgentConfig(
@@ -151,6 +157,10 @@ class BacktestConfig(Config, frozen=True):
             if name in BASELINES:
                 raise QfolioError(
                     f"an agent cannot have the name of the baseline {name}; give it another."
+                )
+            if agent_folder(name) in self.agents.keys() - {name}:
+                raise QfolioError(
+                    f"{name} and {agent_folder(name)} would share a folder; rename one."
                 )
 
 
@@ -218,10 +228,10 @@ class BacktestFolder:
 
     def policies(self, agent: str) -> list[str]:
         """The names of an agent's policies."""
-        return [path.stem for path in (self.path / "policies" / agent).glob("*.safetensors")]
+        return [path.stem for path in self._policies(agent).glob("*.safetensors")]
 
     def policy_file(self, agent: str, name: str) -> Path:
-        return self.path / "policies" / agent / f"{name}.safetensors"
+        return self._policies(agent) / f"{name}.safetensors"
 
     def read_own(self, config: BacktestConfig) -> dict[str, Own]:
         """The user's own strategies; raises QfolioError if they are damaged."""
@@ -331,7 +341,10 @@ class BacktestFolder:
         return read_json(self.path / "why.json")
 
     def _records(self, agent: str, fold: str) -> Path:
-        return self.path / "training" / agent / f"{fold}.csv"
+        return self.path / "training" / agent_folder(agent) / f"{fold}.csv"
+
+    def _policies(self, agent: str) -> Path:
+        return self.path / "policies" / agent_folder(agent)
 
 
 def _own_arrays(own: Mapping[str, Own]) -> dict[str, np.ndarray]:

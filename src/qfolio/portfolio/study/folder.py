@@ -12,10 +12,10 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 import numpy as np
 
-from qfolio.core.config import Config, read_config, write_config
+from qfolio.core.config import AgentName, Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json, write_csv
-from qfolio.portfolio.backtest.folder import AgentName, BacktestFolder, followed
+from qfolio.portfolio.backtest.folder import BacktestFolder, followed
 from qfolio.portfolio.study.pooling import Pools, TableReturns
 
 FILE = "study.json"
