@@ -161,7 +161,7 @@ PRESETS: Presets = {
     ),
     ("gym:LunarLander-v3", "ppo"): _ppo(
         "LunarLander-v3",
-        1_000_000,
+        2_000_000,
         num_envs=16,
         rollout_length=256,
         discount=0.999,
