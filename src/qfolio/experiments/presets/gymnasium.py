@@ -141,7 +141,7 @@ PRESETS: Presets = {
     # push costs, so a high initial temperature would drown what the first goals pay.
     ("gym:MountainCarContinuous-v0", "sac"): _sac(
         "MountainCarContinuous-v0",
-        60_000,
+        80_000,
         noise_theta=0.03,
         input_gain=3.0,
         tau=0.01,
