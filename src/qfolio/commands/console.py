@@ -101,8 +101,9 @@ def describe_run(run: "Run", budget: "Budget") -> str:
         f"{seeds} · {config.device}"
     ) + (
         f"\n{budget.amount:,} steps become {planned:,}: {short(config.agent)} takes "
-        f"{run.agent.rollout_steps:,} steps in each of {run.agent.num_envs:,} environments at once."
-        if budget.steps and planned > budget.amount
+        f"{amount(run.agent.rollout_steps, 'step')} in each of "
+        f"{amount(run.agent.num_envs, 'environment')} at once."
+        if budget.steps and planned > budget.amount and budget.left(run.population)
         else ""
     )
 
