@@ -40,6 +40,9 @@ def test_active_share_counts_cash() -> None:
 def test_limits() -> None:
     itself = relative(OTHER, OTHER, 252)
     assert (itself["tracking_error"], itself["information_ratio"]) == (0, 0)
+    rounded = relative(OTHER + np.array([1e-9, 1e-10, 0, 1e-10]), OTHER, 252)
+    assert rounded["tracking_error"] > 0
+    assert rounded["information_ratio"] == 0
     assert itself["beta"] == itself["up_capture"] == itself["down_capture"] == pytest.approx(1)
     rising = relative(RETURNS, [0.01, 0.011, 0.01, 0.01], 252)
     assert np.isnan(rising["down_capture"])

@@ -61,6 +61,8 @@ def test_the_information_ratio_by_hand():
     assert found.growth == pytest.approx(252 * 0.0005)
     assert found.tracking_error == pytest.approx(spread)
     assert found.information_ratio == pytest.approx(252 * 0.0005 / spread)
+    copied = evidence(constant([1e-9, -1e-10]), "a").to_reference
+    assert (copied.information_ratio, copied.t, copied.z) == (0, 0, 0)
     assert evidence(constant([0.002]), "a").years == pytest.approx(40 / 252)
 
 

@@ -12,6 +12,7 @@ import math
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from qfolio.portfolio.backtest.bootstrap import LEVEL
 from qfolio.portfolio.backtest.measures import (
@@ -28,6 +29,11 @@ Measured = Literal["growth", "sharpe", "volatility"]
 
 MARGIN = 1e-6
 """Smaller differences are rounding errors: in annual log growth, Sharpe ratio, log volatility."""
+
+
+def clear(difference: ArrayLike) -> Floats:
+    """A difference, 0 where it is a rounding error, so that no ratio of it is one of noise."""
+    return np.where(np.abs(difference) <= MARGIN, 0.0, difference)
 
 
 class Tails(NamedTuple):

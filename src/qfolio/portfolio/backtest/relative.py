@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qfolio.portfolio.backtest.bootstrap import histories
+from qfolio.portfolio.backtest.estimates import clear
 from qfolio.portfolio.backtest.measures import Floats, paired_difference, ratio_or_zero
 
 Bools = NDArray[np.bool_]
@@ -38,7 +39,7 @@ def relative(
 
         - active_return: mean of the differences in returns, annualized;
         - tracking_error: their standard deviation (n − 1), annualized;
-        - information_ratio: active return over tracking error;
+        - information_ratio: active return over tracking error, 0 if the former is a rounding error;
         - beta: covariance with the benchmark over its variance;
         - up_capture, down_capture: geometric mean of the returns over that of the benchmark, in
           the periods in which the benchmark rises, or falls; NaN if there are none;
@@ -120,7 +121,7 @@ def _from_moments(
     return {
         "active_return": active,
         "tracking_error": error,
-        "information_ratio": ratio_or_zero(active, error),
+        "information_ratio": ratio_or_zero(clear(active), error),
         "beta": beta,
         "up_capture": up,
         "down_capture": down,

@@ -17,7 +17,7 @@ from qfolio.portfolio.backtest.bootstrap import (
     percentile_interval,
     stationary_bootstrap_indices,
 )
-from qfolio.portfolio.backtest.estimates import MARGIN, Estimate, estimate
+from qfolio.portfolio.backtest.estimates import Estimate, clear, estimate
 from qfolio.portfolio.backtest.measures import (
     Floats,
     log_growth,
@@ -207,8 +207,6 @@ def z_of(difference: Estimate) -> float:
 
     if not difference.known:
         return math.nan
-    if abs(difference.value) <= MARGIN:
-        return 0.0
     tail = float(stdtr(difference.freedom, -abs(_t(difference))))
     return math.copysign(float(ndtri(tail)), difference.value)
 
@@ -320,7 +318,7 @@ def _active(tested: TableReturns, agent: str, name: str, shown: Estimate, z: flo
         low=finite(low),
         high=finite(high),
         tracking_error=finite(spread),
-        information_ratio=finite(float(ratio_or_zero(shown.value, spread))),
+        information_ratio=finite(float(ratio_or_zero(clear(shown.value), spread))),
         t=finite(_t(shown)),
         z=finite(z),
     )
@@ -336,7 +334,9 @@ def _sharpe(returns: Floats) -> float:
 
 
 def _t(difference: Estimate) -> float:
-    return float(ratio_or_zero(difference.value, difference.error)) if difference.known else 0.0
+    if not difference.known:
+        return 0.0
+    return float(ratio_or_zero(clear(difference.value), difference.error))
 
 
 def _known(value: float | None) -> float:
