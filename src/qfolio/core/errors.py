@@ -2,7 +2,9 @@
 
 import reprlib
 import traceback
+from collections.abc import Collection
 from pathlib import PurePath
+from types import UnionType
 
 
 class QfolioError(Exception):
@@ -18,6 +20,19 @@ def require_type(name: str, value: object, kinds: type | tuple[type, ...], wante
     wanted: what it must be, for the message.
     """
     if not isinstance(value, kinds):
+        raise QfolioError(f"{name} is {reprlib.repr(value)}; it must be {wanted}.")
+
+
+def require_list(name: str, value: object, kinds: type | UnionType, wanted: str) -> None:
+    """Raises QfolioError unless an argument is a list, a tuple, … of elements of some types.
+
+    A text is none, although its letters are elements. wanted: as for ``require_type``.
+    """
+    if (
+        not isinstance(value, Collection)
+        or isinstance(value, str | bytes)
+        or not all(isinstance(each, kinds) for each in value)
+    ):
         raise QfolioError(f"{name} is {reprlib.repr(value)}; it must be {wanted}.")
 
 

@@ -27,6 +27,7 @@ from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener, Row, Training, fit
 from qfolio.experiments.grading import grade
 from qfolio.experiments.log import JobLog, Log, add_result, seed_names
+from qfolio.experiments.machines.choice import on
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder, curve_point
 from qfolio.experiments.seed_groups import SeedGroups, SeedsJob, TrainedSeeds
 
@@ -174,7 +175,7 @@ class Run:
         budget: Budget | None = None,
         listeners: Sequence[Listener] = (),
         *,
-        executor: Executor | None = None,
+        executor: Executor | str | None = None,
         listen: ListenToJob | None = None,
         log: JobLog | None = None,
     ) -> None:
@@ -193,7 +194,7 @@ class Run:
                 this one; returns its listeners (default: ``listeners``).
             log: Log of the experiment that the run is a part of (default: the folder's own).
         """
-        budget, executor = budget or self.budget, executor or Here()
+        budget, executor = budget or self.budget, on(executor)
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
             if isinstance(executor, Here) and not self.groups.begun:
                 self._train(budget, listeners, log)
@@ -396,7 +397,7 @@ def train(
     seed: int = 0,
     out: Path | str | None = None,
     listeners: Sequence[Listener] = (),
-    executor: Executor | None = None,
+    executor: Executor | str | None = None,
 ) -> Run:
     """Train agents of one kind on a task, side by side.
 
@@ -419,6 +420,7 @@ def train(
             or a loss is not finite.
     """
     devices.configure()
+    executor = on(executor)
     run = Run.create(task, agent, episodes=episodes, steps=steps, seeds=seeds, seed=seed, out=out)
     run.train(listeners=listeners, executor=executor)
     return run

@@ -36,6 +36,7 @@ from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.log import JobLog, Log, add_result, seed_names
+from qfolio.experiments.machines.choice import on
 from qfolio.experiments.run import Run
 from qfolio.experiments.seed_groups import SeedsJob, TrainedSeeds
 
@@ -207,7 +208,9 @@ class Comparison:
         """The run folder of an agent."""
         return self.folder / "agents" / agent_folder(name)
 
-    def run(self, listen: ListenToJob | None = None, executor: Executor | None = None) -> None:
+    def run(
+        self, listen: ListenToJob | None = None, executor: Executor | str | None = None
+    ) -> None:
         """Trains and grades every agent that has no result yet.
 
         A first Ctrl-C stops after the current chunk and sets ``interrupted``; with an executor,
@@ -220,7 +223,7 @@ class Comparison:
             executor: Where groups of seeds train (default: one agent after another in this
                 process); see ``qfolio.on``.
         """
-        listen, executor = listen or (lambda job, done, share: ()), executor or Here()
+        listen, executor = listen or (lambda job, done, share: ()), on(executor)
         missing = [name for name in self.entrants if name not in self.results]
         self.interrupted = False
         if not missing:

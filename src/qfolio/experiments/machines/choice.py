@@ -1,23 +1,29 @@
 """Executors by name, as ``--on`` takes them."""
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.experiments.executor import Executor, Here
 
 MOST = 1024
 """The largest number of processes on one machine."""
 
 
-def on(text: str) -> Executor:
+def on(text: Executor | str | None) -> Executor:
     """The executor that a text names.
 
     Args:
         text: "here" for this process, "processes:4" for four processes of this machine, "ray" for
             the Ray cluster of this machine (started if there is none), "ray://HOST:10001" for a
-            cluster reached through Ray Client.
+            cluster reached through Ray Client. None stands for "here", and an executor for itself.
 
     Raises:
         QfolioError: The text names no executor, or the number of processes is out of range.
     """
+    if text is None:
+        return Here()
+    if not isinstance(text, str):
+        wanted = 'text such as "processes:4", or an executor, such as qfolio.on("processes:4")'
+        require_type("executor", text, Executor, wanted)
+        return text
     kind, _, rest = text.partition(":")
     if text == "here":
         return Here()

@@ -29,9 +29,10 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
-from qfolio.experiments.executor import Executor, Here, Job, carry_out, persistent
+from qfolio.experiments.executor import Executor, Job, carry_out, persistent
 from qfolio.experiments.fit import Listener, Row, Training
 from qfolio.experiments.log import Log
+from qfolio.experiments.machines.choice import on
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
 from qfolio.experiments.tuning.search import Value
@@ -213,7 +214,7 @@ class Tuning:
         self,
         listener: Callable[[Progress], None] | None = None,
         chunk_listener: Callable[[float], None] | None = None,
-        executor: Executor | None = None,
+        executor: Executor | str | None = None,
     ) -> None:
         """Trains one batch after another until the configured number of trials is reached.
 
@@ -228,7 +229,7 @@ class Tuning:
         with (
             self._log() as log,
             self.journal.at_work(),
-            persistent(executor or Here()) as workers,
+            persistent(on(executor)) as workers,
         ):
             while not self.interrupted and (asked := self.journal.ask(batch, total, preset)):
                 try:
@@ -256,7 +257,7 @@ class Tuning:
         keys: Key[Array, " start"],
         log: Log | None = None,
         listener: Callable[[float], None] | None = None,
-        executor: Executor | None = None,
+        executor: Executor | str | None = None,
     ) -> tuple[Float[np.ndarray, "agent seed"], float]:
         """Trains agents; returns mean greedy returns by agent and seed, NaN if the loss diverged.
 
@@ -265,7 +266,7 @@ class Tuning:
 
         agents: by their names in the log.
         """
-        executor, config = executor or Here(), self.config
+        executor, config = on(executor), self.config
         starts = np.asarray(jax.random.key_data(keys))
         jobs = trials_jobs(self.task, agents, seeds, config.budget, starts, executor)
         found, seconds_compile = dict[str, np.ndarray](), 0.0
@@ -287,7 +288,7 @@ class Tuning:
     def conclude(
         self,
         listener: Callable[[float], None] | None = None,
-        executor: Executor | None = None,
+        executor: Executor | str | None = None,
     ) -> dict[str, Any]:
         """Trains the best configuration and the preset with fresh seeds, and grades both.
 
@@ -333,7 +334,7 @@ class Tuning:
         asked: Sequence[Asked],
         log: Log | None = None,
         listener: Callable[[float], None] | None = None,
-        executor: Executor | None = None,
+        executor: Executor | str | None = None,
     ) -> Progress:
         """Trains a batch and records its returns."""
         start = perf_counter()

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError, require_type
+from qfolio.core.errors import QfolioError, require_list, require_type
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
@@ -28,6 +28,7 @@ from qfolio.core.text import amount, near
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Row
 from qfolio.experiments.log import Log
+from qfolio.experiments.machines.choice import on
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest import assessment, memory
 from qfolio.portfolio.backtest.baselines import baseline
@@ -166,8 +167,7 @@ class Backtest:
         _require_types(agents, strategies, lag=lag, seeds=seeds, seed=seed, trials=trials)
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")
-        if isinstance(baselines, str) or not isinstance(baselines, Sequence):
-            raise QfolioError(f"baselines is {baselines!r}; it must be a list of names.")
+        require_list("baselines", baselines, str, "a list of names")
         require_type("cap", cap, Real, "a number")
         if not 0 < cap <= 1:
             raise QfolioError(
@@ -291,7 +291,7 @@ class Backtest:
     def run(
         self,
         listen: ListenToJob = lambda job, done, share: (),
-        executor: Executor | None = None,
+        executor: Executor | str | None = None,
     ) -> None:
         """Trains every fold of every agent that is not trained yet.
 
@@ -303,7 +303,7 @@ class Backtest:
                 this job; returns the listeners of its training.
             executor: Where the jobs run (default: in this process); see ``qfolio.on``.
         """
-        executor = executor or Here()
+        executor = on(executor)
         jobs = self.jobs(executor)
         self.interrupted = False
         if not jobs:

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+from qfolio.core.errors import require_type
 from qfolio.core.settings import called
 from qfolio.portfolio.mandate.mandate import Mandate
 
@@ -25,7 +26,7 @@ class TradingTerms(NamedTuple):
         """A mandate's cost always applies, its other terms where an argument has its default.
 
         A cost that is written into a cost model precedes both. Raises QfolioError if the mandate
-        is invalid.
+        or the type of the cost model is invalid.
         """
         if mandate is not None:
             mandate = Mandate.of(mandate)
@@ -33,13 +34,14 @@ class TradingTerms(NamedTuple):
             cost_model = (cost_model == PROPORTIONAL and mandate.cost_model) or cost_model
             calendar = calendar or mandate.trading.calendar
             benchmark = mandate.benchmark if benchmark is None else benchmark
+        require_type("cost_model", cost_model, str, 'text, such as "itemized(fixed=5)"')
         written = called(cost_model)[1].get("cost")
         return TradingTerms(mandate, _number(written, cost), cost_model, calendar, benchmark)
 
 
 def _number(written: float | str | None, otherwise: float) -> float:
-    """A cost that may be written; one that is no number is for its cost model to judge."""
+    """A cost that may be written; one that is no number is judged later."""
     try:
         return float(otherwise if written is None else written)
-    except ValueError:
+    except (TypeError, ValueError):
         return otherwise

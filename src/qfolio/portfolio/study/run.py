@@ -7,23 +7,26 @@ trained, so that nothing is chosen after a result is known.
 
 import contextlib
 import itertools
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError, require_type
+from qfolio.core.errors import QfolioError, require_list, require_type
 from qfolio.core.files import locked, new_folder
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
 from qfolio.core.statistics import holm
 from qfolio.core.text import amount, near
-from qfolio.experiments.executor import Executor, Here
+from qfolio.experiments.executor import Executor
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
+from qfolio.experiments.machines.choice import on
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.explain import explain
@@ -108,6 +111,10 @@ class Study:
         """
         wanted = 'a dictionary of tables by name, such as {"us": qfolio.load_prices("us.csv")}'
         require_type("tables", tables, Mapping, wanted)
+        require_list("lags", lags, Integral, "a list of whole numbers, such as [1, 2]")
+        require_list("costs", costs, Real, "a list of numbers, such as [0.001, 0.005]")
+        require_list("after", after, str | os.PathLike, 'a list of folders, such as ["runs/study"]')
+        require_type("trials", trials, Integral, "a whole number")
         tables = {name: load(table) for name, table in tables.items()}
         for length in (train, test):  # or it would be the reason why tables are left out
             parse_length(length)
@@ -206,7 +213,7 @@ class Study:
         self,
         listen: Listen | None = None,
         report: Report | None = None,
-        executor: Executor | None = None,
+        executor: Executor | str | None = None,
     ) -> None:
         """Runs every backtest that is not finished.
 
@@ -220,7 +227,7 @@ class Study:
                 main variant, attributions, before it counts as finished.
             executor: Where training runs (default: in this process); see ``qfolio.on``.
         """
-        executor = executor or Here()
+        executor = on(executor)
         missing = [place for place in self.places if not self.finished(*place)]
         if not missing:
             return
