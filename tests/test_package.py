@@ -49,6 +49,14 @@ WRONG_TYPES = {
     "train(Pendulum(), DQN(), episodes='3')": "episodes is '3'; it must be a whole number.",
     "train(Pendulum(), DQN(), episodes=1, executor=3)": "executor is 3; it must be text such as",
     "train(Pendulum(), DQN(), episodes=1, executor='two')": "--on is 'two'; it must be here,",
+    "DQN(batch_size=64.5)": "batch_size is 64.5; it must be a whole number.",
+    "DQN(batch_size=[64])": "batch_size is [64]; it must be a whole number.",
+    "DQN(hidden=3)": "hidden is 3; it must be whole numbers separated by commas, for",
+    "DQN(hidden=(64, 0.5))": "hidden is [64, 0.5]; it must be whole numbers separated by",
+    "DQN(double='no')": 'double is "no"; it must be true or false.',
+    "DQN(learning_rate='x')": 'learning_rate is "x"; it must be a number.',
+    "Pendulum(mass=None)": "mass is null; it must be a number.",
+    "Portfolio.of(prices, anchor=3)": "anchor is 3; it must be text.",
     "preset('fast', Pendulum())": "task is Pendulum(); it must be text.",
 }
 

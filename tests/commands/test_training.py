@@ -89,9 +89,7 @@ def test_resume_goes_on(run, monkeypatch, capsys):
     assert "Nothing is left to train" in out
     assert "become" not in out
     assert qfolio(monkeypatch, "train", "--resume", folder, "--steps", "481") == 0
-    assert re.search(
-        r"481 steps become 48\d: dqn takes 1 step in each of", capsys.readouterr().out
-    )
+    assert re.search(r"481 steps become 48\d: dqn takes 1 step in each of", capsys.readouterr().out)
 
 
 def test_watch_without_a_display_writes_a_gif(run, monkeypatch, capsys):

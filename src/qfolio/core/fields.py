@@ -1,41 +1,53 @@
 """How agents and tasks declare and check their settings."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.settings import SCALARS, converted
 
 
 def static(default: Any) -> Any:
     """A setting that is fixed when the program is compiled: members of a population share it."""
-    return eqx.field(static=True, default=default)
+    return _field(default, static=True)
 
 
 def number(default: float) -> Any:
     """A number that is an input of the program: members of a population may differ in it."""
-    return eqx.field(converter=float, default=default)
+    return _field(default, float)
 
 
 def constant(default: float) -> Any:
     """A number that is fixed when the program is compiled."""
-    return eqx.field(static=True, converter=float, default=default)
+    return _field(default, float, static=True)
 
 
 def sizes(*default: int) -> Any:
     """Layer sizes, fixed when the program is compiled."""
-    return eqx.field(static=True, converter=tuple, default=default)
+    return _field(default, tuple[int, ...], static=True)
 
 
 def numbers(*default: float) -> Any:
     """Several numbers, fixed when the program is compiled; a single number becomes a tuple."""
-    return eqx.field(static=True, converter=_floats, default=default)
+    return _field(default, tuple[float, ...], static=True)
 
 
-def _floats(values: float | Iterable[float]) -> tuple[float, ...]:
-    return tuple(map(float, values if isinstance(values, Iterable) else (values,)))
+def _field(default: Any, kind: Any = None, *, static: bool = False) -> Any:
+    """A setting that takes the values that ``settings.converted`` takes.
+
+    kind: its type (default: the annotation; values of other types than ``SCALARS`` are not judged).
+    """
+
+    def convert(value: Any) -> Any:
+        wanted = kind or SCALARS.get(getattr(field.type, "__name__", field.type))
+        judged = wanted is not None and value is not field.default  # repr leaves defaults out
+        return converted(field.name, wanted, value) if judged else value
+
+    field = eqx.field(converter=convert, static=static, default=default)
+    return field
 
 
 def require(instance: Any, names: str, holds: Callable[[Any], bool], wanted: str) -> None:

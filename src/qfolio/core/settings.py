@@ -12,6 +12,9 @@ from qfolio.core.text import listed, near
 
 T = TypeVar("T")
 
+SCALARS = {"bool": bool, "int": int, "float": float, "str": str}
+"""Types of settings that are one value, by name."""
+
 
 def describe(instance: Any) -> dict[str, Any]:
     """The settings of an agent or task as JSON values; infinities become "inf" and "-inf"."""
@@ -33,7 +36,7 @@ def names(kind: type) -> set[str]:
 def _types(kind: type) -> dict[str, Any]:
     """Types of the settings; fields that hold arrays are not settings."""
     hints = typing.get_type_hints(kind)
-    kinds = (bool, int, float, str, tuple[int, ...], tuple[float, ...])
+    kinds = (*SCALARS.values(), tuple[int, ...], tuple[float, ...])
     return {f.name: hints[f.name] for f in dataclasses.fields(kind) if hints[f.name] in kinds}
 
 
@@ -52,7 +55,7 @@ def convert(kind: type, settings: Mapping[str, Any]) -> dict[str, Any]:
     for name in settings:
         if name not in known:
             raise QfolioError(f"{kind.__name__} has no setting {name!r}; {near(name, known)}")
-    return {name: _convert(name, types[name], value) for name, value in settings.items()}
+    return {name: converted(name, types[name], value) for name, value in settings.items()}
 
 
 def parse(
@@ -109,7 +112,11 @@ def called(text: str) -> tuple[str, dict[str, str]]:
     return name.strip(), chosen
 
 
-def _convert(name: str, kind: Any, value: Any) -> Any:
+def converted(name: str, kind: Any, value: Any) -> Any:
+    """A setting's value, which may be text, as one of its type.
+
+    Raises QfolioError if it does not fit.
+    """
     try:
         if kind is bool:
             return {"true": True, "false": False}[str(value).lower()]
@@ -132,7 +139,7 @@ def _convert(name: str, kind: Any, value: Any) -> Any:
             value = value.strip("()[] ").rstrip(",").split(",")
         elif item_kind is float and isinstance(value, int | float):
             value = [value]
-        return tuple(_convert(name, item_kind, item) for item in value)
+        return tuple(converted(name, item_kind, item) for item in value)
     except (ValueError, TypeError, KeyError, OverflowError, QfolioError):
         examples = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
         examples[tuple[float, ...]] = "numbers separated by commas, for example 0.9,0.98"
