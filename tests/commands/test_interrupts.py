@@ -94,9 +94,9 @@ def test_ctrl_c_with_workers(tmp_path, count):
         time.sleep(0.01)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
-    assert err in ("", "qfolio: interrupted\n")
+    resume = f"qfolio backtest --resume {tmp_path / 'run'} --on processes:2"
+    assert err in ("", f"qfolio: interrupted. Resume with: {resume}\n")
     if count == 1:
-        resume = f"qfolio backtest --resume {tmp_path / 'run'} --on processes:2"
         assert out.splitlines()[-1] == f"Stopped. Resume with: {resume}"
     end = time.perf_counter() + 10
     while any(map(alive, workers)):

@@ -95,14 +95,15 @@ def backtest(
     console.say(console.describe_backtest(run))
     for note in run.replay.mandated():
         console.tell(note)
-    with console.bar("compiling") as update, tracked(*following):
-        run.run(JobsProgress(update), executor)
     resume = again("qfolio backtest --resume", folder, *run.parts, on=options.on)
-    if run.interrupted:
-        stop(resume)
     status = "Replaying all strategies, drawing histories, writing the report"
-    with resumable(resume), console.console.status(status):
-        found = finish(run)
+    with resumable(resume):
+        with console.bar("compiling") as update, tracked(*following):
+            run.run(JobsProgress(update), executor)
+        if run.interrupted:
+            stop(resume)
+        with console.console.status(status):
+            found = finish(run)
     console.print_assessment(found.assessment)
     for sentences in found.why.diagnosis.values():
         for sentence in sentences:

@@ -81,7 +81,9 @@ def study(
             "--resume keeps the study's settings; add only --on, --track and --trust."
         )
     console.say(console.describe_study(run))
-    with console.bar("") as update, tracked(*following):
+    parts = run.backtest(next(iter(run.config.tables))).parts
+    resume = again("qfolio study --resume", run.folder, *parts, on=options.on)
+    with resumable(resume), console.bar("") as update, tracked(*following):
 
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1
@@ -89,8 +91,6 @@ def study(
             return JobsProgress(update)
 
         run.run(listen, write_page, executor)
-    parts = run.backtest(next(iter(run.config.tables))).parts
-    resume = again("qfolio study --resume", run.folder, *parts, on=options.on)
     if run.interrupted:
         stop(resume)
     with resumable(resume), console.console.status("Pooling the evidence, writing the report"):

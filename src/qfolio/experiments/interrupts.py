@@ -57,7 +57,8 @@ def interruptible() -> Iterator[threading.Event]:
 def resumable(command: str) -> Iterator[None]:
     """Within the block, Ctrl-C that ends the process says that ``command`` goes on.
 
-    For what follows a training, such as a report: it leaves no state of its own to stop at.
+    For a second Ctrl-C in a training, and for what follows it, such as a report, which has no state
+    of its own to stop at.
     """
     _resumes.append(command)
     try:
