@@ -10,6 +10,7 @@ import pytest
 
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
+from qfolio.agents.tilts import Tilts
 from qfolio.core import population
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio import policy as module
@@ -95,6 +96,13 @@ def test_it_comes_back_from_disk(policy, tmp_path):
     assert Policy.open(tmp_path / "updated").updates == 1
     with pytest.raises(QfolioError, match="not empty"):
         policy.save(tmp_path / "kept")
+
+
+def test_one_with_an_anchor_comes_back_from_disk(tmp_path):
+    changes = {"window": 1, "anchor": "equal-weight+minimum-variance", "episodes": 2, "seeds": 1}
+    kept = learned("pathwise", Tilts(rollout_length=10, head=1), **changes)
+    kept.save(tmp_path / "kept")
+    assert Policy.open(tmp_path / "kept").weights(table()) == kept.weights(table())
 
 
 def test_a_damaged_folder_is_refused(policy, tmp_path):

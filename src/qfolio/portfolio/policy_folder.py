@@ -109,9 +109,13 @@ def _blank(config: PolicyConfig) -> Portfolio:
     """The task without its prices."""
     chosen = settings.convert(Portfolio, config.task)
     task = Portfolio.blank(len(config.assets), len(config.features), **chosen)
-    shown = jax.tree.map(
-        lambda x: jnp.zeros((task.window, *x.shape[1:])), (task.log_relatives, task.extra)
-    )
+    rows = (task.log_relatives, task.extra, task.anchors, task.benchmarks)
+    shown = jax.tree.map(lambda x: jnp.zeros((task.window, *x.shape[1:])), rows)
     last = jnp.array(config.rows - task.lag - 2, jnp.int32)
-    where = lambda t: (t.log_relatives, t.extra, t.first_decision, t.last_decision)  # noqa: E731
-    return eqx.tree_at(where, task, (*shown, jnp.array(task.window, jnp.int32), last))
+    return eqx.tree_at(
+        lambda t: (
+            t.log_relatives, t.extra, t.anchors, t.benchmarks, t.first_decision, t.last_decision,
+        ),
+        task,
+        (*shown, jnp.array(task.window, jnp.int32), last),
+    )  # fmt: skip
