@@ -79,6 +79,9 @@ def test_several_baselines_are_averaged_at_each_row():
         anchors.path("equal-weight+nothing", table())
     with pytest.raises(QfolioError, match="no baseline ''"):
         anchors.path("equal-weight+", table())
+    weights = np.tile([0.4, 0.3, 0.2, 0.1], (ROWS, 1))
+    found = anchors.path("equal-weight+feature:weight", table(features=weights))
+    np.testing.assert_allclose(found, (weights + 0.25) / 2)
 
 
 def test_a_task_checks_each_baseline_of_its_anchor():

@@ -205,7 +205,7 @@ def _named(setting: str, value: str) -> list[tuple[registry.Kind, str]]:
     if setting == "signals":
         return [("signal", name) for name in signals.names(value)]
     if setting == "anchor":
-        return [("baseline", name) for name in anchors.names(value)]
+        return [("baseline", name) for name in anchors.baselines(value)]
     return [("reward", value)] if setting == "reward" else []
 
 

@@ -1,7 +1,7 @@
 """Anchors: weights at each row of a table that a policy may depart from.
 
-An anchor is a baseline, followed on the whole table, or the mean of several, joined by +, or a
-column of the table with a benchmark's weights. The benchmark of tracking error may also be a single
+An anchor is a baseline, followed on the whole table, or a column of the table with a benchmark's
+weights, or the mean of several, joined by +. The benchmark of tracking error may also be a single
 asset.
 """
 
@@ -24,9 +24,10 @@ MONTHS = 60
 Weights = NDArray[np.float64]
 
 
-def names(anchor: str) -> list[str]:
-    """The baselines whose mean an anchor is; none for a column, or without an anchor."""
-    return [] if not anchor or anchor.startswith(COLUMN) else anchor.split("+")
+def baselines(anchor: str) -> list[str]:
+    """The baselines that an anchor names; none without an anchor."""
+    named = _names(anchor) if anchor else []
+    return [name for name in named if not name.startswith(COLUMN)]
 
 
 def path(anchor: str, prices: Prices) -> Weights:
@@ -42,9 +43,18 @@ def path(anchor: str, prices: Prices) -> Weights:
     """
     if anchor in prices.assets:
         return np.where(np.isnan(prices.values), 0.0, np.array(prices.assets) == anchor)
-    if anchor.startswith(COLUMN):
-        return _column(anchor.removeprefix(COLUMN), prices)
-    return np.asarray(np.mean([_followed(name, prices) for name in names(anchor)], axis=0))
+    each = [
+        _column(name.removeprefix(COLUMN), prices)
+        if name.startswith(COLUMN)
+        else _followed(name, prices)
+        for name in _names(anchor)
+    ]
+    return np.asarray(np.mean(each, axis=0))
+
+
+def _names(anchor: str) -> list[str]:
+    """What an anchor is the mean of. A column that comes first may have a + in its name."""
+    return [anchor] if anchor.startswith(COLUMN) else anchor.split("+")
 
 
 def _followed(name: str, prices: Prices) -> Weights:

@@ -230,7 +230,7 @@ class Portfolio(Market):
     @property
     def parts(self) -> list[object]:
         """Cost model, reward, signals and anchor, any of which may be a user's own."""
-        anchored = map(baseline, anchors.names(self.anchor))
+        anchored = map(baseline, anchors.baselines(self.anchor))
         return [self.costs, self.reward_function, *signals.parse(self.signals), *anchored]
 
     @property
