@@ -249,7 +249,7 @@ def _assign(presets: dict[str, "Preset"], chosen: dict[str, str]) -> dict[str, "
             settings={**preset.settings, **settings.convert(kind, own)},
             task={**preset.task, **settings.convert(Portfolio, task)},
         )
-    for key in chosen.keys() - used:
+    for key in chosen.keys() - used if presets else ():  # no agent is an error of its own
         kinds: list[type] = [
             Portfolio,
             *(registry.find("agent", preset.agent) for preset in presets.values()),
