@@ -72,7 +72,7 @@ def reasons(policy: Policy, prices: Prices, allocation: Allocation) -> list[Reas
     required = (np.asarray(nearest, float) - allocation.held)[1:]
     bounds = _bounds(allowed, allocation.weights, allocation.held)
     over = _over(allowed, allocation.weights, allocation.held)
-    beyond = over.get("turnover is too high by", 0.0) > VISIBLE
+    beyond = bool(over.get("turnover is too high by", 0.0) > VISIBLE)
     moved = np.asarray(integrated(task, policy.agent, policy.members, row, held)[0])[0]
     names = channel_names(policy.task, policy.features)
     found = []
