@@ -416,6 +416,7 @@ def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):
         ({"baselines": "momentum"}, "baselines is 'momentum'; it must be a list"),
         ({"agents": changed("dqn", menu="nonsense")}, "menu is 'nonsense'; it must be like"),
         ({"agents": changed("pathwise", horizon=13)}, "rollout_length is .* must divide the 13"),
+        ({"episodes": 3}, "are for agents without a preset; change those of a preset with"),
         ({"agents": {"../dqn": AGENTS["dqn"]}}, "called '../dqn'; use letters, digits, - and _"),
         ({"agents": {"dqn:a": AGENTS["dqn"], "dqn-a": AGENTS["dqn"]}}, "would share a folder"),
     ],

@@ -167,6 +167,12 @@ class Backtest:
         _require_types(agents, strategies, lag=lag, seeds=seeds, seed=seed, trials=trials)
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")
+        preset = all(isinstance(agent, Preset) for agent in agents.values())
+        if preset and (episodes is not None or task):
+            raise QfolioError(
+                "episodes and task are for agents without a preset; change those of a preset with "
+                "preset._replace(episodes=…, task=…)."
+            )
         require_list("baselines", baselines, str, "a list of names")
         require_type("cap", cap, Real, "a number")
         if not 0 < cap <= 1:
