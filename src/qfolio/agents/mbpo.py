@@ -191,8 +191,8 @@ class MBPO(SAC):
         require(self, "real_ratio", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "n_steps", lambda x: x == 1, "1: imagined steps are single")
         require(self, "noise_theta", lambda x: x == 1, "1: imagined steps have no order")
-        for name in ("normalize_observations", "normalize_rewards"):
-            require(self, name, lambda x: not x, "false: a model imagines steps as they are")
+        normalized = "normalize_observations normalize_rewards"
+        require(self, normalized, lambda x: not x, "false: a model imagines steps as they are")
         require_sizes(self, "model_hidden")
 
     def init(self, task: Task, key: PRNGKeyArray) -> MBPOState:

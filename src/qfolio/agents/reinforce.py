@@ -15,6 +15,7 @@ from qfolio.agents.on_policy import OnPolicy, OnPolicyState, explained_variance
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import static
 from qfolio.core.mdp import Metrics, Task, Transition
+from qfolio.core.training import episode_steps
 
 
 class REINFORCE(OnPolicy):
@@ -23,7 +24,7 @@ class REINFORCE(OnPolicy):
     rollout_length: int = static(200)  # steps learned from at once: whole episodes
 
     def init(self, task: Task, key: PRNGKeyArray) -> OnPolicyState:
-        episode = min(self.episode_steps or task.horizon, task.horizon)
+        episode = episode_steps(task, self)
         if self.rollout_length % episode:
             raise QfolioError(
                 f"rollout_length is {self.rollout_length}; it must be a multiple of the {episode} "

@@ -4,7 +4,7 @@ The learning rate follows a cosine (Loshchilov & Hutter 2017).
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,9 +15,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.core.fields import require
 from qfolio.core.mdp import Metrics
-from qfolio.learning.targets import Scalar
-
-Weights = TypeVar("Weights", bound=PyTree)
+from qfolio.learning.targets import Scalar, Weights
 
 KINDS = ("adam", "rmsprop", "rmsprop-centered", "sgd")
 """Optimizers by name: RMSProp as in Mnih et al. (2016), or centered as in Mnih et al. (2015)."""
