@@ -37,8 +37,9 @@ class Following:
     these, or "". band: growth of wealth that the backtest leads one to expect, shape (3, rows).
     evidence: evidence against the backtest. learned: date of the last row that the policy learned
     from; None without one. overdue: whether the newest policy learned a test length ago or more.
-    test: the test length. newer: as ``learned``, of a newer policy that no allocation has used yet;
-    None without one.
+    test: the test length. called: gross exposure, relative to the wealth, above which the margin
+    calls. newer: as ``learned``, of a newer policy that no allocation has used yet; None without
+    one.
     """
 
     agent: str
@@ -130,12 +131,9 @@ class Following:
                 f"{until}, and a newer one, which the next allocation will use, up to "
                 f"{day(self.newer)}"
             )
-        why = self._reasons()
-        return (
-            f"{until}; a retrain is due because of {' and '.join(why)}."
-            if why
-            else (f"{until}; no retrain is due before it is {self.test} old.")
-        )
+        if why := self._reasons():
+            return f"{until}; a retrain is due because of {' and '.join(why)}."
+        return f"{until}; no retrain is due before it is {self.test} old."
 
     def _reasons(self) -> list[str]:
         """Why a retrain is due; an alarm is answered by a policy that has learned from its row."""
@@ -229,23 +227,23 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
         newer = run.policy(agent).learned
     latest = learned if newer is None else newer
     return Following(
-        agent,
-        records,
-        live,
-        tested,
-        _earned_by_cash(table, known.costs, live.first, count),
-        run.replay.growth[: len(tested), 0] - 1,
-        other,
-        theirs,
-        note,
-        band,
-        evidence,
-        table.periods_per_year,
-        learned,
-        latest is not None and overdue(latest, run.config.test, table.dates),
-        run.config.test,
-        known.task.terms.called,
-        newer,
+        agent=agent,
+        records=records,
+        live=live,
+        tested=tested,
+        cash=_earned_by_cash(table, known.costs, live.first, count),
+        tested_cash=run.replay.growth[: len(tested), 0] - 1,
+        benchmark=other,
+        reference=theirs,
+        note=note,
+        band=band,
+        evidence=evidence,
+        periods_per_year=table.periods_per_year,
+        learned=learned,
+        overdue=latest is not None and overdue(latest, run.config.test, table.dates),
+        test=run.config.test,
+        called=known.task.terms.called,
+        newer=newer,
     )
 
 
