@@ -34,6 +34,9 @@ from qfolio.portfolio.task import Portfolio
 UPDATE_RATE = 0.1
 """Learning rate of an update, as a fraction of the one in training."""
 
+MOST = 100.0
+"""Largest weight that may be held, long or short, where debts are allowed."""
+
 UNKNOWN = np.datetime64("NaT", "s")
 
 
@@ -86,10 +89,6 @@ def train(
         learner,
         learned=table.dates[-1],
     )
-
-
-MOST = 100.0
-"""Largest weight that may be held, long or short, where debts are allowed."""
 
 
 class Policy:

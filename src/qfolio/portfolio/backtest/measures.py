@@ -144,11 +144,11 @@ def from_moments(
         excess = np.where(np.abs(excess) > 1e-12 * np.abs(center), excess, 0)  # cash itself
         excess_spread = np.sqrt(bessel * _variance(over_square, over, center))
     with np.errstate(over="ignore", invalid="ignore"):
-        growth, free = (
+        growth, uncharged = (
             np.where(ruined > 0, -1, np.expm1(periods_per_year * log))
             for log in (log_net, log_free)
         )
-        drag = free - growth
+        drag = uncharged - growth
     annual = math.sqrt(periods_per_year)
     return {
         "growth": growth,
