@@ -46,11 +46,7 @@ def growth_optimal(
         x.ndim == 2 and x.size > 0 and bool(np.all(np.isfinite(x) & (x >= 0))),
         "relatives must be a table (scenario, asset) of finite numbers that are not negative",
     )
-    p = np.full(len(x), 1 / len(x)) if probabilities is None else np.asarray(probabilities, float)
-    require(
-        p.shape == (len(x),) and bool(np.all(p >= 0)) and abs(p.sum() - 1) < 1e-9,
-        f"probabilities must be {len(x)} numbers, not negative, that sum to 1",
-    )
+    p = _chances(probabilities, len(x))
     x, p = x[p > 0], p[p > 0]
     best = x.max(1, keepdims=True)
     require(bool(np.all(best > 0)), "in one scenario every asset is worthless; add cash")
@@ -136,9 +132,8 @@ def _newton_on_support(
             break
         wanted = held | (slope > tol)
         # Redundant assets leave the step undetermined; the shortest one will do.
-        step = np.linalg.lstsq(_curvature(x[:, wanted], p, b[wanted]), slope[wanted], rcond=1e-13)[
-            0
-        ]
+        curvature = _curvature(x[:, wanted], p, b[wanted])
+        step = np.linalg.lstsq(curvature, slope[wanted], rcond=1e-13)[0]
         b[wanted] = np.maximum(b[wanted] + step, 0.0)
         held = b > 0
     return b
@@ -221,11 +216,7 @@ def leveraged_optimal(
         x.ndim == 2 and x.size > 0 and bool(np.all(np.isfinite(x) & (x > 0))),
         "relatives must be a table (scenario, asset) of finite numbers above 0",
     )
-    p = np.full(len(x), 1 / len(x)) if probabilities is None else np.asarray(probabilities, float)
-    require(
-        p.shape == (len(x),) and bool(np.all(p >= 0)) and abs(p.sum() - 1) < 1e-9,
-        f"probabilities must be {len(x)} numbers, not negative, that sum to 1",
-    )
+    p = _chances(probabilities, len(x))
     require(0 < risk_aversion < math.inf, f"risk aversion must be positive; not {risk_aversion}")
     debt = cash if debt is None else debt
     require(0 < cash < math.inf, f"the relative of cash must be positive; not {cash}")
@@ -344,3 +335,13 @@ def drift_and_covariance(drift: ArrayLike, covariance: ArrayLike) -> tuple[np.nd
         "covariance must be symmetric and positive definite, else risk-free profit has no optimum",
     )
     return mean, sigma
+
+
+def _chances(probabilities: ArrayLike | None, count: int) -> Float[np.ndarray, " s"]:
+    """The scenarios' probabilities as an array; raises QfolioError if invalid."""
+    p = np.full(count, 1 / count) if probabilities is None else np.asarray(probabilities, float)
+    require(
+        p.shape == (count,) and bool(np.all(p >= 0)) and abs(p.sum() - 1) < 1e-9,
+        f"probabilities must be {count} numbers, not negative, that sum to 1",
+    )
+    return p

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qfolio.solvers.shared import require
+from qfolio.solvers.shared import require, square
 from qfolio.solvers.sifting import Floats, sift
 
 
@@ -26,11 +26,7 @@ def minimum_variance(covariance: ArrayLike, cap: float = 1.0, tol: float = 1e-12
     Raises:
         QfolioError: The covariance is invalid, the cap is too low, or there is no convergence.
     """
-    sigma = np.asarray(covariance, dtype=float)
-    require(
-        sigma.ndim == 2 and sigma.shape[0] == sigma.shape[1] and bool(np.isfinite(sigma).all()),
-        f"a covariance must be a square table of finite numbers; this one has shape {sigma.shape}",
-    )
+    sigma = square(covariance)
     count, scale = len(sigma), float(np.trace(sigma)) / len(sigma)
     require(scale > 0, "a covariance needs some variance, else every portfolio has the least")
     require(cap * count >= 1 - 1e-12, f"a cap of {cap:g} is too low for {count} assets")

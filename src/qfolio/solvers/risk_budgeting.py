@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qfolio.solvers.shared import require
+from qfolio.solvers.shared import require, square
 
 
 def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> NDArray[np.float64]:
@@ -23,11 +23,7 @@ def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> NDArray[np.float64]
     Raises:
         QfolioError: The covariance is invalid, or the tolerance is not reached.
     """
-    sigma = np.asarray(covariance, dtype=float)
-    require(
-        sigma.ndim == 2 and sigma.shape[0] == sigma.shape[1] and bool(np.isfinite(sigma).all()),
-        f"a covariance must be a square table of finite numbers; this one has shape {sigma.shape}",
-    )
+    sigma = square(covariance)
     deviations = np.sqrt(np.maximum(np.diag(sigma), 0))
     require(bool((deviations > 0).all()), "every asset needs some variance to contribute to risk")
     # In units of each asset's deviation the problem is one in correlations.

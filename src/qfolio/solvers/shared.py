@@ -10,6 +10,7 @@ price, the buyer pays the price divided by 1 − c.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.errors import QfolioError
 
@@ -25,6 +26,16 @@ def gauss(points: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss–Hermite nodes and probabilities of a standard normal variable."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(points)
     return nodes, weights / weights.sum()
+
+
+def square(covariance: ArrayLike) -> NDArray[np.float64]:
+    """A covariance as an array; raises QfolioError unless it is square and finite."""
+    sigma = np.asarray(covariance, dtype=float)
+    require(
+        sigma.ndim == 2 and sigma.shape[0] == sigma.shape[1] and bool(np.isfinite(sigma).all()),
+        f"a covariance must be a square table of finite numbers; this one has shape {sigma.shape}",
+    )
+    return sigma
 
 
 def require(holds: bool, sentence: str) -> None:
