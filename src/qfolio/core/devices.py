@@ -27,7 +27,6 @@ from qfolio.core.files import cache_directory
 LOCKSTEP = {"gpu", "tpu"}
 """Platforms that step their members in lockstep."""
 
-
 SMALL_LOOP = 20_000_000
 """Most bytes that a loop may touch for XLA to compile it into one CPU function. It launches each
 operation of a larger loop separately, and splits those over threads that have a large operand. If a
@@ -41,10 +40,8 @@ def configure() -> None:
     Has an effect only before jax first computes; settings that the user has made are kept.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    known = hasattr(os, "sched_getaffinity")
-    count = len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
     wanted = {
-        "--xla_force_host_platform_device_count": str(count),
+        "--xla_force_host_platform_device_count": str(len(cores())),
         "--xla_cpu_multi_thread_eigen": "false",
         "--xla_backend_extra_options": f"xla_cpu_small_while_loop_byte_threshold={SMALL_LOOP}",
     }
@@ -54,6 +51,12 @@ def configure() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "programs"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def cores() -> list[int]:
+    """The numbers of the CPU cores that this process may use."""
+    known = hasattr(os, "sched_getaffinity")
+    return sorted(os.sched_getaffinity(0)) if known else list(range(os.cpu_count() or 1))
 
 
 def describe() -> str:

@@ -6,7 +6,6 @@ has its own share of the cores and ends when the driver does, even if the driver
 
 import contextlib
 import multiprocessing
-import os
 import pickle
 import signal
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -17,7 +16,7 @@ from typing import TypeVar
 
 import jax
 
-from qfolio.core.devices import LOCKSTEP
+from qfolio.core.devices import LOCKSTEP, cores
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.executor import Job
 from qfolio.experiments.fit import Listener
@@ -55,7 +54,7 @@ class Processes:
 
     @property
     def devices(self) -> int:
-        return self.cores or max(1, len(_cores()) // self.count)
+        return self.cores or max(1, len(cores()) // self.count)
 
     def map(
         self, jobs: Iterable[Job[R] | None], listen: Callable[[Job[R]], Sequence[Listener]]
@@ -77,8 +76,8 @@ class _Pool:
 
     def start(self, worker: int) -> None:
         ours, theirs = _SPAWN.Pipe()
-        cores, first = _cores(), worker * self._devices
-        mine = [cores[i % len(cores)] for i in range(first, first + self._devices)]
+        usable, first = cores(), worker * self._devices
+        mine = [usable[i % len(usable)] for i in range(first, first + self._devices)]
         process = _SPAWN.Process(target=serve, args=(theirs, mine, self._environment), daemon=True)
         process.start()
         theirs.close()  # only the worker's copy is left, so the pipe closes when it ends
@@ -142,12 +141,6 @@ def _opened(executor: Processes) -> Iterator[_Pool]:
         yield pool
     finally:
         pool.close()
-
-
-def _cores() -> list[int]:
-    """The cores that this process may use."""
-    known = hasattr(os, "sched_getaffinity")
-    return sorted(os.sched_getaffinity(0)) if known else list(range(os.cpu_count() or 1))
 
 
 def _require_cores() -> None:
