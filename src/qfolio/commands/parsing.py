@@ -6,7 +6,6 @@ import functools
 import inspect
 import io
 import json
-import math
 import re
 import shutil
 import sys
@@ -21,7 +20,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg, configure
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import near
+from qfolio.core.text import finite, near
 
 PAGE = "report.html"
 
@@ -201,18 +200,9 @@ def _report(command: Callable[..., Any], given: dict[str, Any], as_json: bool) -
             document = command(**given)
         except Failed as failure:
             failed, document = failure, failure.document
-    print(json.dumps(_finite(document), indent=2, allow_nan=False, default=str))
+    print(json.dumps(finite(document), indent=2, allow_nan=False, default=str))
     if failed is not None:
         raise failed
-
-
-def _finite(value: Any) -> Any:
-    """The document with None in place of numbers that JSON lacks: NaN and infinities."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _meanings(part: Any) -> dict[str, str]:

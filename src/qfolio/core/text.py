@@ -1,6 +1,7 @@
-"""Text that comes from files, made safe for messages, the terminal and CSV cells."""
+"""Text and values made safe for messages, the terminal, CSV cells and JSON."""
 
 import difflib
+import math
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
@@ -80,6 +81,15 @@ def near(name: str, known: Iterable[str]) -> str:
         return f"did you mean {close}?"
     more = ", …" if len(names) > MENTIONED else "."
     return f"choose from {', '.join(names[:MENTIONED])}{more}"
+
+
+def finite(value: Any) -> Any:
+    """A document with None in place of numbers that JSON lacks: NaN and infinities."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def csv_cell(value: Any) -> Any:

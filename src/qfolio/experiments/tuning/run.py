@@ -26,6 +26,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import new_folder, read_json, write_json
 from qfolio.core.mdp import Agent, Task
+from qfolio.core.text import finite
 from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
@@ -316,7 +317,7 @@ class Tuning:
         def optimum(keys: Key[Array, " start"]) -> float | None:
             return None if solution is None else float(solution.returns(keys).mean())
 
-        best, preset = [[x if math.isfinite(x) else None for x in row] for row in returns.tolist()]
+        best, preset = finite(returns.tolist())
         summary = {
             "best": found.values,
             "return_tuned_on": found.value,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import finite
 from qfolio.portfolio.backtest.bootstrap import (
     LEVEL,
     block_length,
@@ -111,7 +112,7 @@ class Assessment:
 
     def to_json(self) -> dict[str, Any]:
         """The statistics as JSON values; numbers that are not finite become None."""
-        plain: dict[str, Any] = _plain(dataclasses.asdict(self))
+        plain: dict[str, Any] = finite(dataclasses.asdict(self))
         return plain
 
 
@@ -344,14 +345,6 @@ def _canonical(track: Floats) -> Floats:
 
 def _seed_order(track: Floats) -> list[int]:
     return sorted(range(track.shape[1]), key=lambda seed: track[:, seed].tobytes())
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _tracks(

@@ -1,8 +1,8 @@
 """Writes the files of a finished backtest, except for its report."""
 
-import math
 from collections.abc import Mapping
 
+from qfolio.core.text import finite
 from qfolio.experiments.log import add_result
 from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
@@ -46,10 +46,7 @@ def write_tables(
     add_result(
         backtest.folder,
         {
-            name: {
-                key: measure.mean if math.isfinite(measure.mean) else None
-                for key, measure in strategy.measures.items()
-            }
+            name: {key: finite(measure.mean) for key, measure in strategy.measures.items()}
             for name, strategy in assessed.strategies.items()
             if strategy.kind != "rebalancing"
         },
