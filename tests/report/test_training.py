@@ -28,10 +28,18 @@ from qfolio.experiments.run import Run, train
 from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen, Signals
 from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.portfolio.synthetic.regime import Regime
-from qfolio.report import Curve, Episode, Maps, ReportData, write_report
 from qfolio.report.animation import FADE_FRAMES, SIZE, pendulum_frames, pendulum_gif
 from qfolio.report.collect import constant_weights, report_data, responses
-from qfolio.report.data import MarketData, Responses, Weights, decimals
+from qfolio.report.data import (
+    Curve,
+    Episode,
+    Maps,
+    MarketData,
+    ReportData,
+    Responses,
+    Weights,
+    decimals,
+)
 from qfolio.report.figures.curves import (
     DECADES,
     LEAST_REGRET,
@@ -49,6 +57,7 @@ from qfolio.report.training import (
     render_page,
     setting_groups,
     verdict,
+    write_report,
 )
 from qfolio.tasks.catch import Catch
 

@@ -23,6 +23,7 @@ from qfolio.report.figures.style import (
     LEAD,
     NARROW,
     WIDE,
+    dashes,
     new_figure,
     percent_axis,
     percent_tick,
@@ -247,9 +248,7 @@ def _draw_curve(axes: Axes, data: ComparisonData, name: str, pace: float, log: b
     )
     axes.fill_between(x, low, high, color=color, alpha=0.16, linewidth=0)
     style: dict[str, Any] = {
-        "linestyle": (0, tuple(float(part) / 1.8 for part in look.dash.split()))
-        if look.dash
-        else "solid",
+        "linestyle": dashes(look.dash, 1.8),
         "marker": palette.MARKERS[look.symbol],
         "markevery": (look.symbol % 4, 4) if len(x) > 6 else 1,
         "markersize": 5,

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from qfolio.report import palette
-from qfolio.report.figures.style import legend_above, new_figure, svgs
+from qfolio.report.figures.style import NARROW, legend_above, new_figure, svgs
 from qfolio.report.rendering import number, percent, render
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH = 8.6
+"""Width of the figure in inches, on wide pages."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def draw_following(rows: LiveRows, width: float) -> Figure:
     """Draw wealth with its band above; below, evidence with its alarm level on a log axis."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
-    few = width < 5
+    few = width <= NARROW
     figure = new_figure(width, 4.6 if few else 5.0)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.3))
     low, middle, high = 100 * (rows.band - 1)
@@ -90,5 +91,5 @@ def draw_following(rows: LiveRows, width: float) -> Figure:
     below.xaxis.set_major_locator(ticks)
     below.xaxis.set_major_formatter(ConciseDateFormatter(ticks, show_offset=False))
     marks = {"live": live, rows.benchmark_name: other, "backtest, median": median, "95%": shade}
-    legend_above(figure, marks, few=few)
+    legend_above(figure, marks)
     return figure

@@ -8,7 +8,7 @@ from qfolio.report import palette
 from qfolio.report.backtest.data import BacktestData, faint_names, shown_order
 from qfolio.report.backtest.looks import looks_of
 from qfolio.report.backtest.paths import across_seeds, median_drawdown, wealth_paths
-from qfolio.report.figures.style import new_figure
+from qfolio.report.figures.style import dashes, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,10 +35,7 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
         style: dict[str, Any] = {
             "color": color,
             "linewidth": 0.75 * look.width,
-            # Lengths are in units of the line's width.
-            "linestyle": (0, tuple(float(part) / look.width for part in look.dash.split()))
-            if look.dash
-            else "solid",
+            "linestyle": dashes(look.dash, look.width),
         }
         if look.symbol is not None:
             start = (0.03 + 0.05 * look.symbol) % 0.14

@@ -78,7 +78,7 @@ def _draw_responses(drawn: Responses, width: float) -> Figure:
         panel.set_xlabel(f"{noun} held")
     for panel in axes[:, 0]:
         panel.set_ylabel(f"target {noun}")
-    legend_above(figure, lines, few=width <= NARROW)
+    legend_above(figure, lines)
     return figure
 
 
@@ -151,5 +151,5 @@ def _draw_weights(drawn: Weights, width: float) -> Figure:
         axes.set_xlim(left=0)
     axes.grid(axis="x")
     axes.set_xlabel("weight")
-    legend_above(figure, marks, few=width <= NARROW)
+    legend_above(figure, marks)
     return figure

@@ -15,9 +15,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from qfolio.report import palette
-from qfolio.report.data import (
-    ReportData,
-)
+from qfolio.report.data import ReportData
 from qfolio.report.rendering import percent
 
 if TYPE_CHECKING:
@@ -141,7 +139,8 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def legend_above(figure: Figure, marks: dict[str, Any], *, few: bool) -> None:
+def legend_above(figure: Figure, marks: dict[str, Any]) -> None:
+    """Put a legend above a figure: an artist by each name, its mark not too faint nor too large."""
     from matplotlib.lines import Line2D
 
     legend = figure.legend(
@@ -150,7 +149,7 @@ def legend_above(figure: Figure, marks: dict[str, Any], *, few: bool) -> None:
         loc="outside upper left",
         ncols=3,
         labelcolor=palette.MUTED,
-        columnspacing=1.0 if few else 1.6,
+        columnspacing=1.6 if figure.get_figwidth() > NARROW else 1.0,
         handletextpad=0.6,
         borderpad=0.3,
     )
@@ -162,15 +161,25 @@ def legend_above(figure: Figure, marks: dict[str, Any], *, few: bool) -> None:
 
 
 def end_label(axes: Axes, x: float, y: float, text: str) -> None:
+    """Write a label to the right of a line's end."""
     axes.annotate(
         text, (x, y), xytext=(4, 0), textcoords="offset points", va="center", color=palette.MUTED
     )
 
 
 def colors(name: str, colors: list[str]) -> Colormap:
+    """Return a color map that runs evenly through some colors."""
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list(name, colors)
+
+
+def dashes(lengths: str, width: float) -> Any:
+    """Return the style of a line from dash lengths as in SVG; "" is solid.
+
+    width: the line's width, the unit of matplotlib's lengths.
+    """
+    return (0, tuple(float(part) / width for part in lengths.split())) if lengths else "solid"
 
 
 def percent_axis(axis: Any) -> None:
