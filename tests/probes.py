@@ -63,16 +63,8 @@ class RewardDelay(Probe):
         return Step(state + 1.0, state, state > 0.5)
 
 
-class Endless(Probe):
+class Endless(OneState):
     """Pays 1 for ever, cut after one step: worth 1/(1 − γ), but 1 if the cut counts as the end."""
-
-    horizon: int = eqx.field(static=True, default=1)
-
-    def reset(self, key):
-        return jnp.zeros(())
-
-    def observe(self, state):
-        return jnp.ones(1)
 
     def step(self, state, action, key):
         return Step(state, jnp.array(1.0), GOES_ON)
