@@ -210,10 +210,9 @@ def test_assets_that_join_late(name: str) -> None:
         assert found[30 + first, 2] > 0.1
     without = decisions(name, FOLDS[:2], np.delete(values, 1, axis=1))
     np.testing.assert_allclose(np.delete(found[:30], 2, axis=1), without, atol=1e-12)
-    chosen = decisions(name, FOLDS, prices(), tradable=[[True, False, True, True]] * 3)
-    np.testing.assert_array_equal(chosen[:30], found[:30])
-    with pytest.raises(QfolioError, match="Fold 0 has no asset to hold, or one without a price"):
-        decisions(name, FOLDS, values, tradable=np.ones((3, 4)))
+    values[0] = np.nan
+    with pytest.raises(QfolioError, match="Fold 0 has no asset with a price in all of its"):
+        decisions(name, FOLDS, values)
 
 
 def test_failures_leave_a_note_and_equal_weights() -> None:
@@ -299,8 +298,10 @@ def test_weights_that_cannot_be(wanted: list[float], message: str) -> None:
         def decide(self, history: History, held: np.ndarray) -> np.ndarray:
             return np.array(wanted)
 
+    values = prices()
+    values[0, 3] = np.nan
     with pytest.raises(QfolioError, match=message):
-        ask(Wrong(), FOLDS, prices(), cap=0.8, tradable=[[True, True, True, False]] * 3)
+        ask(Wrong(), FOLDS, values, cap=0.8)
 
 
 def test_a_baseline_of_a_users_own_is_found_by_its_module(

@@ -286,16 +286,11 @@ class Tuning:
             raise KeyboardInterrupt
         return np.array([found[name] for name in agents]), seconds_compile
 
-    def conclude(
-        self,
-        listener: Callable[[float], None] | None = None,
-        executor: Executor | str | None = None,
-    ) -> dict[str, Any]:
+    def conclude(self, executor: Executor | str | None = None) -> dict[str, Any]:
         """Trains the best configuration and the preset with fresh seeds, and grades both.
 
         They are graded on the fixed start states, which the search never used. The result is cached
-        in summary.json for as long as the best configuration is the same. listener: called with the
-        finished share. executor: as for ``run``.
+        in summary.json for as long as the best configuration is the same. executor: as for ``run``.
         """
         trials = self.journal.trials()
         found = best_of(trials)
@@ -311,7 +306,7 @@ class Tuning:
         seeds = range(FRESH, FRESH + self.config.fresh_seeds)
         agents = {"best": self.configured(found.values), "preset": self.agent}
         with self._log() as log:
-            returns, _ = self.trained(agents, seeds, start_keys(), log, listener, executor)
+            returns, _ = self.trained(agents, seeds, start_keys(), log, executor=executor)
         solution = self.task.optimum()
 
         def optimum(keys: Key[Array, " start"]) -> float | None:

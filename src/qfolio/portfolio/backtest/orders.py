@@ -51,7 +51,6 @@ def orders(
     dates: NDArray[np.datetime64],
     values: ArrayLike,
     *,
-    tradable: ArrayLike | None = None,
     cap: float = 1.0,
     feasible: Callable[[int, int], Feasible] | None = None,
     month: int = 21,
@@ -69,17 +68,16 @@ def orders(
             training rows of a fold end with the row of its first decision or earlier.
         dates: Dates of the rows, shape (rows,).
         values: Prices of shape (rows, N); NaN before an asset's first price.
-        tradable: Which assets a fold may hold, of shape (folds, N) (default: those with prices in
-            all of its training rows).
         cap: Largest weight of one asset when it is ordered.
         feasible: The weights that a mandate allows, given the number of a fold and a row. Every
             target is projected onto them; with the calendar "fold", there is one at every row.
         month: Rows in a month.
         terms: When orders are given and how they are filled, in numpy; its rows for decisions
             replace the baseline's calendar.
-        universe: Which assets may be bought at each row, of shape (rows, N), if they come and go.
-            A baseline that estimates may hold only those of them with prices in all of the fold's
-            training rows. With the calendar "fold", it then decides at every row.
+        universe: Which assets may be bought at each row, of shape (rows, N), if they come and go
+            (default: those with prices in all of the fold's training rows). A baseline that
+            estimates may hold only those of them with prices in all of these rows. With the
+            calendar "fold", it then decides at every row.
         costs: What holding costs and earns (default: nothing), as in the replay, so that a margin
             call or a band comes at the same row for baselines as for agents.
         conditions: What the costs read at each row, and which assets are listed; holdings of
@@ -89,9 +87,9 @@ def orders(
         Decisions for all rows of the folds, and notes that name the fold.
 
     Raises:
-        QfolioError: The folds have a gap or look ahead, a fold may hold no asset, an asset that it
-            may hold has no price in its training rows, or the baseline returns weights that are off
-            the simplex, above the cap or in an asset that may not be held.
+        QfolioError: The folds have a gap or look ahead, no asset has a price in all training rows
+            of a fold, or the baseline returns weights that are off the simplex, above the cap or in
+            an asset that may not be held.
     """
     prices = np.array(values, dtype=float)
     prices.flags.writeable = False  # shared by all baselines
@@ -103,9 +101,13 @@ def orders(
     watched = plan is not None or terms.called < np.inf
     parts, notes = [], []
     for number, fold in enumerate(folds):
-        chosen = None if tradable is None else np.asarray(tradable, dtype=bool)[number]
-        may = ~np.isnan(prices[fold.train]).any(axis=0) if baseline.estimates else True
-        allowed = _tradable(fold, prices, chosen) if universe is None else universe & may
+        priced = ~np.isnan(prices[fold.train]).any(axis=0)
+        if universe is None and not priced.any():
+            raise QfolioError(
+                f"Fold {fold.name} has no asset with a price in all of its training rows; begin "
+                "later or drop the assets that start late."
+            )
+        allowed = priced if universe is None else universe & (priced | (not baseline.estimates))
         rows = range(len(prices))[fold.decisions]
         decides = terms.decides if len(terms.decides) else None
         asked = set(_asked(baseline, rows, folds[0].decisions.start, month, decides))
@@ -165,17 +167,6 @@ def _asked(
     if decides is not None:
         return [row for row in rows if decides[row]]
     return rows[(first - rows[0]) % month :: month] if baseline.calendar == "month" else rows
-
-
-def _tradable(fold: Fold, prices: Floats, chosen: Bools | None) -> Bools:
-    priced = np.asarray(~np.isnan(prices[fold.train]).any(axis=0))
-    allowed = priced if chosen is None else chosen
-    if not allowed.any() or (allowed & ~priced).any():
-        raise QfolioError(
-            f"Fold {fold.name} has no asset to hold, or one without a price in its training "
-            "rows; begin later or drop the assets that start late."
-        )
-    return allowed
 
 
 def obeying(
