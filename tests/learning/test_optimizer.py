@@ -28,7 +28,7 @@ def test_rmsprop_by_hand():
     np.testing.assert_allclose(path, [first, first + second], rtol=1e-6)
 
 
-def test_centred_rmsprop_by_hand():
+def test_centered_rmsprop_by_hand():
     """Means 1 and 0, whose squares are taken off the mean squares 2 and 1.5."""
     settings = {"optimizer": "rmsprop-centered", "rmsprop_decay": 0.5, "optimizer_epsilon": 0.25}
     first, second = -2 / 1.25**0.5, 1 / 1.75**0.5

@@ -325,7 +325,7 @@ def test_pendulum_is_drawn_as_gymnasium_does() -> None:
     # A quarter turn counter-clockwise from upright points to the left.
     states = [[0.0, 0.0], [np.pi / 2, 0.0], [np.pi, 0.0]]
     frames = pendulum_frames(states, [0.0, 0.0], [-1.0, -1.0])
-    bobs = [_centre_of(frame, (11, 99, 165)) for frame in frames]
+    bobs = [_center_of(frame, (11, 99, 165)) for frame in frames]
     np.testing.assert_allclose(bobs, [(160, 45), (62, 143), (160, 241)], atol=1.5)
 
 
@@ -344,7 +344,7 @@ def test_episode_of_wrong_shape() -> None:
         pendulum_frames(np.zeros((3, 2)), np.zeros(3), np.zeros(3))
 
 
-def _centre_of(frame: Image.Image, color: tuple[int, int, int]) -> tuple[float, float]:
+def _center_of(frame: Image.Image, color: tuple[int, int, int]) -> tuple[float, float]:
     rows, columns = np.nonzero(np.all(np.asarray(frame) == color, axis=-1))
     return float(columns.mean()), float(rows.mean())
 

@@ -17,7 +17,7 @@ FADE_FRAMES = 8
 HOLD_MILLISECONDS = 1200
 
 _SCALE = 3
-_CENTRE = (160.0, 143.0)
+_CENTER = (160.0, 143.0)
 _ROD = 98.0
 _TRAIL = 14
 
@@ -100,9 +100,9 @@ def _checked(
 def _background() -> Image.Image:
     image = Image.new("RGB", (SIZE * _SCALE, SIZE * _SCALE), palette.PAPER)
     pen = ImageDraw.Draw(image)
-    pen.ellipse(_box(*_CENTRE, _ROD), outline=palette.HAIRLINE, width=_SCALE)
+    pen.ellipse(_box(*_CENTER, _ROD), outline=palette.HAIRLINE, width=_SCALE)
     # The goal: a short mark where the bob stands upright.
-    x, y = _CENTRE
+    x, y = _CENTER
     _line(pen, [(x, y - _ROD - 19), (x, y - _ROD - 28)], palette.MUTED, 1.4)
     return image
 
@@ -131,9 +131,9 @@ def _draw_torque(pen: ImageDraw.ImageDraw, angle: float, torque: float) -> None:
 
 def _draw_pendulum(pen: ImageDraw.ImageDraw, angle: float) -> None:
     tip = _at(_ROD, angle)
-    _line(pen, [_CENTRE, tip], palette.INK, 5)
-    pen.ellipse(_box(*_CENTRE, 6), fill=palette.INK)
-    pen.ellipse(_box(*_CENTRE, 2.4), fill=palette.PAPER)
+    _line(pen, [_CENTER, tip], palette.INK, 5)
+    pen.ellipse(_box(*_CENTER, 6), fill=palette.INK)
+    pen.ellipse(_box(*_CENTER, 2.4), fill=palette.PAPER)
     pen.ellipse(_box(*tip, 13), fill=palette.ACCENT)
 
 
@@ -179,7 +179,7 @@ def _text(
 
 def _at(radius: float, angle: float) -> tuple[float, float]:
     """Return the point of the image at an angle, as Gymnasium draws it."""
-    return _CENTRE[0] - radius * sin(angle), _CENTRE[1] - radius * cos(angle)
+    return _CENTER[0] - radius * sin(angle), _CENTER[1] - radius * cos(angle)
 
 
 def _arc(
@@ -187,7 +187,7 @@ def _arc(
 ) -> None:
     # Pillow measures clockwise from three o'clock.
     start, end = sorted(degrees(-angle - pi / 2) for angle in (a, b))
-    box = _box(*_CENTRE, radius + width / 2)
+    box = _box(*_CENTER, radius + width / 2)
     pen.arc(box, start, end, fill=color, width=round(width * _SCALE))
 
 
