@@ -34,9 +34,9 @@ class Outcome(NamedTuple):
 class Reward(eqx.Module):
     """The reward of a step."""
 
-    @abc.abstractmethod
     def init(self) -> PyTree:
         """The state before the first step; None if no reward depends on earlier steps."""
+        return None
 
     @abc.abstractmethod
     def __call__(self, state: PyTree, outcome: Outcome) -> tuple[Float[Array, ""], PyTree]:
@@ -51,9 +51,6 @@ class Reward(eqx.Module):
 class Log(Reward):
     """Log growth."""
 
-    def init(self) -> None:
-        return None
-
     def __call__(self, state: None, outcome: Outcome) -> tuple[Float[Array, ""], None]:
         return jnp.log(outcome.growth), None
 
@@ -65,9 +62,6 @@ class CRRA(Reward):
 
     def __check_init__(self) -> None:
         require(self, "risk_aversion", lambda x: 0 <= x <= 100, "from 0 to 100")
-
-    def init(self) -> None:
-        return None
 
     def __call__(self, state: None, outcome: Outcome) -> tuple[Float[Array, ""], None]:
         power = 1 - jnp.asarray(self.risk_aversion)
@@ -84,9 +78,6 @@ class MeanVariance(Reward):
 
     def __check_init__(self) -> None:
         require(self, "risk_aversion", lambda x: 0 <= x <= 100, "from 0 to 100")
-
-    def init(self) -> None:
-        return None
 
     def __call__(self, state: None, outcome: Outcome) -> tuple[Float[Array, ""], None]:
         gain = outcome.growth - 1
