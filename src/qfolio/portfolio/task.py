@@ -128,18 +128,20 @@ class Portfolio(Market):
         logs = np.zeros(prices.values.shape)
         logs[1:] = np.nan_to_num(np.diff(np.log(prices.values), axis=0))
         columns = dict(zip(prices.feature_names, np.moveaxis(prices.features, -1, 0), strict=True))
-        known = prices.values if prices.listed is None else prices.known
-        computed = signals.compute(chosen, known, self.signal_scale, columns, prices.tradable)
+        computed = signals.compute(
+            chosen, prices.known, self.signal_scale, columns, prices.tradable
+        )
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
         followed = anchors.path(self.anchor, prices) if self.anchor else logs[:0]
         then = Conditions.of(prices, self.costs.columns)
         terms, risk = self.written.trading, self.written.risk
         passed = elapsed(prices.dates) if terms.turnover_a_year else np.zeros(0)
         compared = anchors.path(risk.benchmark, prices) if risk.benchmark else logs[:0]
-        year, known = np.array(prices.periods_per_year), np.zeros((0, *self.covariances.shape[1:]))
+        year = np.array(prices.periods_per_year)
+        estimated = np.zeros((0, *self.covariances.shape[1:]))
         if self.allowed is not None and self.allowed.limits_risk:
-            known = covariances(logs, prices.first_rows, risk.rows, prices.periods_per_year)
-        given = (logs, extra, followed, then, passed, compared, known, year)
+            estimated = covariances(logs, prices.first_rows, risk.rows, prices.periods_per_year)
+        given = (logs, extra, followed, then, passed, compared, estimated, year)
         arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), given)
         decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)
         decides[-1:] = True  # tomorrow's weights may be asked for on any day
