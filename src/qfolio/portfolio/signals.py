@@ -221,17 +221,17 @@ class Column(Signal):
 
 def parse(text: str) -> list[Signal]:
     """The signals that a text names; raises QfolioError if there is no such signal."""
-    return [_named(part) for part in _parts(text)]
+    return [_named(part) for part in labels(text)]
 
 
 def names(text: str) -> list[str]:
     """The names in such a text, without rows and without columns of the table."""
-    return [_split(part)[0] for part in _parts(text) if not part.startswith(COLUMN)]
+    return [_split(part)[0] for part in labels(text) if not part.startswith(COLUMN)]
 
 
 def labels(text: str) -> list[str]:
     """The signals in such a text as they are written there, in order."""
-    return _parts(text)
+    return [part.strip() for part in text.split(",") if part.strip()]
 
 
 def lookback(signals: Sequence[Signal]) -> int:
@@ -269,10 +269,6 @@ def compute(
         for s, x, same in zip(signals, values, shared, strict=True)
     ]
     return np.stack(found, -1) if found else np.zeros((*prices.shape, 0))
-
-
-def _parts(text: str) -> list[str]:
-    return [part.strip() for part in text.split(",") if part.strip()]
 
 
 def _split(text: str) -> tuple[str, dict[str, str]]:

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from qfolio.core.text import finite
 from qfolio.portfolio.backtest.bootstrap import (
     block_length,
     percentile_interval,
@@ -282,11 +283,6 @@ def p_value(z: float, *, both: bool) -> float:
     from scipy.special import ndtr
 
     return float(np.minimum(1.0, 2 * ndtr(-abs(z) if both else -z)))
-
-
-def finite(value: float) -> float | None:
-    """The number in a form that JSON can hold: None if it is not finite."""
-    return float(value) if math.isfinite(value) else None
 
 
 def _resampled_means(

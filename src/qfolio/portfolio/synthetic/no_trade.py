@@ -14,6 +14,7 @@ from qfolio.portfolio.costs import Context, grown
 from qfolio.portfolio.market import Contexts, Holding, Relatives
 from qfolio.portfolio.synthetic.base import OneAsset, require_cost
 from qfolio.solvers.no_trade import NoTradeRegion, no_trade_region_discrete
+from qfolio.solvers.shared import gauss
 
 PROBES = 1001
 """Number of holdings, from all cash to all in the asset, at which a policy is probed."""
@@ -86,8 +87,8 @@ class NoTrade(OneAsset):
         target = self.target(market, holding, action)
         at = self.contexts(market, next_market)
         remainder, _ = self.costs.trade(holding.weights, target, at.trade)
-        nodes, chances = np.polynomial.hermite_e.hermegauss(self.NODES)
-        weights = jnp.asarray(chances / chances.sum(), jnp.float32)
+        nodes, chances = gauss(self.NODES)
+        weights = jnp.asarray(chances, jnp.float32)
         # In excess of cash, so that no digits are lost where steps are short.
         interest = self.cash_rate * self.dt
         gains = jnp.expm1(self._log_relative(jnp.asarray(nodes, jnp.float32)) - interest)
