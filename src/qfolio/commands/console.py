@@ -182,6 +182,7 @@ def print_prices(facts: dict[str, Any]) -> None:
 
 
 def describe_search(work: "Tuning") -> str:
+    """What a search trains, in a line, and each searched setting with its range and scale."""
     config, budget = work.config, work.config.budget
     seeds = amount(config.seeds, "seed")
     space = "\n".join(f"  {dim.name:<20} {dim}  ({dim.scale})" for dim in work.space)
@@ -209,6 +210,7 @@ def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
 
 
 def describe_backtest(backtest: "Backtest") -> str:
+    """What a backtest trains and tests, in a line; its memory, if that is large."""
     from qfolio.portfolio.backtest import memory
 
     config, size = backtest.config, memory.needed(backtest.prices, backtest.config)
@@ -294,6 +296,7 @@ def describe_study(study: "Study") -> str:
 
 
 def spell(variant: "Variant") -> str:
+    """A variant of a study in words: lag 1, 10 bp."""
     return f"lag {variant.lag}, {variant.bps:g} bp"
 
 

@@ -6,6 +6,8 @@ from qfolio.core.registry import GYM, short
 
 
 class Words(NamedTuple):
+    """What reports say about a task; empty where there is nothing to say."""
+
     where: str  # for the title: "DQN on the pendulum"
     about: str = ""
     meaning: str = ""  # definition of a return, unless it is the plain sum of rewards

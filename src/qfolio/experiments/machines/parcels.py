@@ -38,6 +38,7 @@ class Packer:
         self._known: dict[int, tuple[Any, str]] = {}  # by id, with the object, which keeps the id
 
     def pack(self, job: Any) -> Parcel:
+        """A job as bytes, in which the digests of large arrays stand for them."""
         file, needs = io.BytesIO(), dict[str, None]()
 
         class Pickler(pickle.Pickler):

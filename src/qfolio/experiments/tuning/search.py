@@ -70,6 +70,7 @@ class Dimension:
         return f"1-{self.name}" if self.scale == "near-one" else self.name
 
     def distribution(self) -> "BaseDistribution":
+        """What Optuna draws stored values from."""
         from optuna.distributions import CategoricalDistribution, FloatDistribution
 
         if self.choices:
@@ -114,6 +115,7 @@ class Dimension:
         return _missing(there) if self.scale == "near-one" else there
 
     def covers(self, value: Value) -> bool:
+        """Whether a value is one of the choices or lies within the range."""
         if self.choices or isinstance(value, str):
             return value in self.choices
         return self.low <= value <= self.high

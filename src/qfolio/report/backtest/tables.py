@@ -218,6 +218,7 @@ def capacity_table(data: BacktestData) -> tuple[list[str], list[tuple[str, list[
 
 
 def luck_rows(names: list[str], data: BacktestData) -> list[dict[str, Any]]:
+    """The Sharpe ratio of each strategy beside what luck explains, as texts by column."""
     rows = []
     for name in names:
         entry = data.assessment.strategies[name]

@@ -87,6 +87,7 @@ class Curve:
         self._every, self._skipped = 1, 0
 
     def add(self, step: float, values: Sequence[float | None]) -> None:
+        """Adds what the members have at a step; of a long curve, only every so many are kept."""
         known = [x for x in values if x is not None and math.isfinite(x)]
         self._skipped += 1
         if not known or (self._skipped < self._every and self.points):
