@@ -6,6 +6,7 @@ All of its numbers are in study.json, so the report can be rewritten from it.
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from qfolio.portfolio.study.run import Study
 from qfolio.portfolio.study.verdict import decimal, looks_sentence, percent
 from qfolio.report import rendering
 from qfolio.report.backtest.verdicts import ticks_around
-from qfolio.report.rendering import THIN_SPACE, counted, number, render, setting_groups
+from qfolio.report.rendering import THIN_SPACE, counted, number, place, render, setting_groups
 
 REACH = 1.6
 """The axis extends this many times beyond the estimates; longer intervals are cut off."""
@@ -65,9 +66,9 @@ def write_study_report(study: Study) -> None:
     first = study.backtest(next(iter(study.config.tables))).config
     settings = {k: v for k, v in msgspec.to_builtins(first).items() if k not in HIDDEN}
     links = {
-        name: place
+        name: folder
         for name in study.config.tables
-        if (study.folder / (place := _place(name, study.config.variants[0]))).exists()
+        if (study.folder / (folder := _place(name, study.config.variants[0]))).exists()
     }
     page = render_study(study.config, result, settings, links)
     write_bytes(study.folder / "report.html", page.encode("utf-8"))
@@ -139,16 +140,13 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
     high = min(max([*points, *ends]), REACH * max(points) - 0.25 * min(points))
     ticks, digits = ticks_around(low, high)
     low, high = min(low, ticks[0]), max(high, ticks[-1])
-
-    def place(value: float) -> float:
-        share = (value - low) / (high - low) if high > low else 0.5
-        return round(100 * min(max(share, 0.0), 1.0), 2)
+    at = partial(place, low=low, high=high)
 
     def bar(growth: float | None, left: float | None, right: float | None) -> Bar | None:
         if growth is None or left is None or right is None:
             return None
-        width = round(place(right) - place(left), 2)
-        return Bar(place(left), width, place(growth), left < low, right > high)
+        width = round(at(right) - at(left), 2)
+        return Bar(at(left), width, at(growth), left < low, right > high)
 
     longest = max(known.years for known in pools.evidence.values())
     order = sorted(actives, key=lambda name: _or(actives[name].growth), reverse=True)
@@ -184,9 +182,9 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
             ],
             "label": _label(pooled.growth, pooled.low, pooled.high),
         },
-        "ticks": [(rendering.percent(tick, digits, sign=True), place(tick)) for tick in ticks],
-        "zero": place(0.0),
-        "mean": None if pooled.growth is None else place(pooled.growth),
+        "ticks": [(rendering.percent(tick, digits, sign=True), at(tick)) for tick in ticks],
+        "zero": at(0.0),
+        "mean": None if pooled.growth is None else at(pooled.growth),
         "cut": any(row.bar and (row.bar.cut_left or row.bar.cut_right) for row in rows),
     }
 

@@ -6,6 +6,7 @@ All of it compares an agent with one other strategy: the one of its first verdic
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, Literal
 
 from qfolio.core.text import listed
@@ -15,7 +16,7 @@ from qfolio.portfolio.backtest.estimates import Measured
 from qfolio.portfolio.backtest.verdict import claims, comparable, wiped_out
 from qfolio.report.backtest.data import BacktestData, followed_names, shown_order
 from qfolio.report.backtest.verdicts import ticks_around
-from qfolio.report.rendering import number, percent
+from qfolio.report.rendering import number, percent, place
 
 Standing = Literal["better", "none", "worse", "ruined"]
 
@@ -217,10 +218,7 @@ def _column(key: Measured, names: list[str], data: BacktestData) -> dict[str, An
     ]
     ticks, _ = ticks_around(min(ends, default=0.0), max(ends, default=0.0))
     low, high = min(*ends, *ticks, 0.0), max(*ends, *ticks, 0.0)
-    width = (high - low) or 1.0
-
-    def place(value: float) -> float:
-        return round(100 * min(max((value - low) / width, 0.0), 1.0), 2)
+    at = partial(place, low=low, high=high)
 
     def written(value: float) -> str:
         return number(value, 2, sign=True) if key == "sharpe" else percent(value, sign=True)
@@ -237,9 +235,9 @@ def _column(key: Measured, names: list[str], data: BacktestData) -> dict[str, An
                 **cell,
                 "apart": verdict == "none" and not left <= 0 <= right,
                 "value": written(contrast.value),
-                "span": (place(left), round(place(right) - place(left), 2), place(contrast.value)),
+                "span": (at(left), round(at(right) - at(left), 2), at(contrast.value)),
                 "label": f"{written(contrast.value)}, 95% interval "
                 f"{written(left)} to {written(right)}",
             }
         )
-    return {"cells": cells, "zero": place(0.0)}
+    return {"cells": cells, "zero": at(0.0)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +16,7 @@ from qfolio.portfolio.backtest.measures import monthly
 from qfolio.portfolio.backtest.sampled import Measure
 from qfolio.portfolio.backtest.verdict import comparable, luck, shown, telling, wiped_out
 from qfolio.report.backtest.data import BacktestData, main_names
-from qfolio.report.rendering import number, percent
+from qfolio.report.rendering import number, percent, place
 
 HEADINGS = {
     "growth": "Growth",
@@ -99,13 +100,9 @@ def _interval(
     ends = [end for each in column for end in each.over_time if math.isfinite(end)]
     if not all(map(math.isfinite, (value, *interval))):
         return None
-    low, high = min(ends), max(ends)
-
-    def place(end: float) -> float:
-        return round(min(max(100 * (end - low) / ((high - low) or 1.0), 0.0), 100.0), 1)
-
-    left, right = map(place, interval)
-    return left, round(right - left, 1), place(value)
+    at = partial(place, low=min(ends), high=max(ends))
+    left, right = map(at, interval)
+    return left, round(right - left, 2), at(value)
 
 
 def _over_seeds(measure: Measure) -> tuple[float, ...]:

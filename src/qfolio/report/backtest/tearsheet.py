@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.backtest.facts import unit_of
 from qfolio.report.backtest.why import bars
 from qfolio.report.data import Floats
-from qfolio.report.rendering import number, percent
+from qfolio.report.rendering import number, percent, place
 
 DRAWDOWNS = 5
 """Number of drawdowns listed."""
@@ -191,10 +192,7 @@ def _histogram(returns: Floats, reference: Floats, edges: Floats) -> dict[str, A
         for x in (i * width, (i + 1) * width)
     ]
     reach = float(edges[-1])
-
-    def place(value: float) -> float:
-        return round(100 * min(max((value + reach) / (2 * reach), 0.0), 1.0), 2)
-
+    at = partial(place, low=-reach, high=reach)
     var, cvar = value_at_risk(returns)
     return {
         "bars": [
@@ -205,7 +203,7 @@ def _histogram(returns: Floats, reference: Floats, edges: Floats) -> dict[str, A
         "outline": " ".join(steps),
         "reach": percent(reach),
         "highest": percent(highest / 100, 0),
-        "marks": [(place(-cvar), "CVaR"), (place(-var), "VaR")],
+        "marks": [(at(-cvar), "CVaR"), (at(-var), "VaR")],
         "label": f"95% of the returns are above {percent(-var, 2)}; "
         f"the mean of the others is {percent(-cvar, 2)}",
     }

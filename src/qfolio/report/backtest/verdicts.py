@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 from qfolio.portfolio.backtest.assessment import JUDGED
 from qfolio.portfolio.backtest.differences import Difference
 from qfolio.portfolio.backtest.verdict import claims, evidence
 from qfolio.report.backtest.data import BacktestData
-from qfolio.report.rendering import percent
+from qfolio.report.rendering import percent, place
 
 
 def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
@@ -27,19 +28,16 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
     ticks, digits = ticks_around(low, high)
     low, high = min(low, ticks[0]), max(high, ticks[-1])
     margin = 0.04 * (high - low) or 1.0  # any positive width, if there is nothing to show
-
-    def place(value: float) -> float:
-        share = (value - low + margin) / (high - low + 2 * margin)
-        return round(100 * min(max(share, 0.0), 1.0), 2)
+    at = partial(place, low=low - margin, high=high + margin)
 
     def row(claim: str, each: Difference) -> dict[str, Any]:
         growth, interval = each.growth.value, each.growth.interval
-        left, right = (place(end) for end in interval)
+        left, right = map(at, interval)
         known = all(map(math.isfinite, (growth, *interval)))
         return {
             "finding": claim,
             "numbers": f"{numbers}." if (numbers := evidence(each, test)) else "",
-            "span": (left, round(right - left, 2), place(growth)) if known else None,
+            "span": (left, round(right - left, 2), at(growth)) if known else None,
             "label": f"{percent(growth, sign=True)}, 95% interval "
             + " to ".join(percent(end, sign=True) for end in interval),
         }
@@ -48,8 +46,8 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
         "agents": [
             (name, [row(claim, each) for claim, each in claimed]) for name, claimed in agents
         ],
-        "ticks": [(percent(tick, digits, sign=True), place(tick)) for tick in ticks],
-        "zero": place(0),
+        "ticks": [(percent(tick, digits, sign=True), at(tick)) for tick in ticks],
+        "zero": at(0),
     }
 
 

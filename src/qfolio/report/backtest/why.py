@@ -7,6 +7,7 @@ stand beside them as text.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from qfolio.portfolio.backtest.attribution.importance import Worth
 from qfolio.portfolio.backtest.attribution.slices import Slice, Slices
 from qfolio.portfolio.backtest.attribution.why import AgentWhy
 from qfolio.report.backtest.data import BacktestData
-from qfolio.report.rendering import number, percent
+from qfolio.report.rendering import number, percent, place
 
 LISTED = 20
 """Number of assets, besides cash, whose parts of the return are listed; the rest is added up."""
@@ -271,24 +272,19 @@ def bars(
 ) -> list[dict[str, Any]]:
     """Positions of bars from a common zero, in percent of their track."""
     ends = [*values, *(end for pair in whiskers for end in pair), 0.0]
-    low, high = min(ends), max(ends)
-    width = (high - low) or 1.0
-
-    def place(value: float) -> float:
-        return round(100 * (value - low) / width, 2)
-
+    at = partial(place, low=min(ends), high=max(ends))
     found = []
     for i, value in enumerate(values):
-        left, right = sorted((place(0), place(value)))
+        left, right = sorted((at(0), at(value)))
         bar: dict[str, Any] = {
             "left": left,
             "width": round(right - left, 2),
-            "zero": place(0),
+            "zero": at(0),
             "side": "gain" if value >= 0 else "loss",
             "whisker": None,
         }
         if whiskers:
-            ends_of = [place(end) for end in whiskers[i]]
+            ends_of = [at(end) for end in whiskers[i]]
             bar["whisker"] = (ends_of[0], round(ends_of[1] - ends_of[0], 2))
         found.append(bar)
     return found

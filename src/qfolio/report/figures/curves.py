@@ -100,7 +100,6 @@ def draw_overestimation(data: ReportData, width: float) -> Figure:
     if clipped:
         _line_label(axes, high, "beginning off the scale", below=True, color=palette.MUTED)
     axes.legend(
-        *(),
         loc="lower left",
         bbox_to_anchor=(0, 1.0),
         ncols=2 if beside else 1,
