@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qfolio.solvers.shared import require
+from qfolio.solvers.shared import require, step_length
 from qfolio.solvers.sifting import Floats, sift
 
 
@@ -97,10 +97,7 @@ def _interior_point(mu: Floats, sigma: Floats, cap: float, tol: float) -> Floats
             break
         step_z = target / y - z - z / y * step
         step_v = pushed - v - v / s * step_s
-        length = 1.0
-        for value, change in ((y, step), (s, step_s), (z, step_z), (v, step_v)):
-            falling = change < 0
-            length = min(length, 0.99 * float(np.min(-value[falling] / change[falling], initial=2)))
+        length = step_length((y, step), (s, step_s), (z, step_z), (v, step_v))
         y, z, v = y + length * step, z + length * step_z, v + length * step_v
     require(
         solved, "the weights of the highest ratio were not found; a portfolio may be without risk"

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from qfolio.solvers.shared import gauss, require
+from qfolio.solvers.shared import gauss, require, step_length
 
 
 class GrowthOptimum(NamedTuple):
@@ -99,10 +99,7 @@ def _interior_point(
         system = _curvature(x, p, b) + np.diag(z / b)
         step_b = np.linalg.solve(system, balance - z + target / b)
         step_z = (target - z * step_b) / b - z
-        length = 1.0
-        for value, step in ((b, step_b), (z, step_z)):
-            falling = step < 0
-            length = min(length, 0.99 * float(np.min(-value[falling] / step[falling], initial=2)))
+        length = step_length((b, step_b), (z, step_z))
         while length > 1e-12:
             tried = b + length * step_b, z + length * step_z
             balance, moved = residual(*tried)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qfolio.solvers.shared import require, square
+from qfolio.solvers.shared import require, square, step_length
 from qfolio.solvers.sifting import Floats, sift
 
 
@@ -59,10 +59,7 @@ def _interior_point(sigma: Floats, cap: float, tol: float) -> Floats:
         step = moved - moved.sum() / level.sum() * level  # of sum 0
         step_z = target / w - z - z / w * step
         step_v = target / room - v + v / room * step
-        length = 1.0
-        for value, change in ((w, step), (room, -step), (z, step_z), (v, step_v)):
-            falling = change < 0
-            length = min(length, 0.99 * float(np.min(-value[falling] / change[falling], initial=2)))
+        length = step_length((w, step), (room, -step), (z, step_z), (v, step_v))
         w, z, v = w + length * step, z + length * step_z, v + length * step_v
     else:
         require(False, "the weights of least variance were not found; is the covariance positive?")

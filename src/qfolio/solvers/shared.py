@@ -1,4 +1,4 @@
-"""Shared by the solvers of markets: quadrature, checks and the log cost of a trade.
+"""Shared by the solvers of markets: quadrature, checks, steps and the log cost of a trade.
 
 In all of them, relatives are price ratios over one step, and cash has relative 1 unless a rate is
 given; costs are proportional and one way (0.001 is 10 basis points); growth is the expected
@@ -26,6 +26,18 @@ def gauss(points: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss–Hermite nodes and probabilities of a standard normal variable."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(points)
     return nodes, weights / weights.sum()
+
+
+def step_length(*moves: tuple[np.ndarray, np.ndarray]) -> float:
+    """How much of an interior-point step to take, at most 1: all values stay positive.
+
+    moves: values, and their changes in the whole step.
+    """
+    length = 1.0
+    for value, change in moves:
+        falling = change < 0
+        length = min(length, 0.99 * float(np.min(-value[falling] / change[falling], initial=2)))
+    return length
 
 
 def square(covariance: ArrayLike) -> NDArray[np.float64]:
