@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qfolio.solvers.shared import require, step_length
+from qfolio.solvers.shared import at_bounds, require, step_length
 from qfolio.solvers.sifting import Floats, sift
 
 
@@ -102,8 +102,4 @@ def _interior_point(mu: Floats, sigma: Floats, cap: float, tol: float) -> Floats
     require(
         solved, "the weights of the highest ratio were not found; a portfolio may be without risk"
     )
-    full, empty = room(y) < v, y < z
-    w = np.where(full, cap, np.where(empty, 0, y / y.sum()))
-    inside = ~full & ~empty
-    w[inside] *= (1 - w[~inside].sum()) / w[inside].sum() if inside.any() else 1
-    return w
+    return at_bounds(y / y.sum(), empty=y < z, full=room(y) < v, cap=cap)

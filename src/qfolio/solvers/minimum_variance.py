@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qfolio.solvers.shared import require, square, step_length
+from qfolio.solvers.shared import at_bounds, require, square, step_length
 from qfolio.solvers.sifting import Floats, sift
 
 
@@ -63,8 +63,5 @@ def _interior_point(sigma: Floats, cap: float, tol: float) -> Floats:
         w, z, v = w + length * step, z + length * step_z, v + length * step_v
     else:
         require(False, "the weights of least variance were not found; is the covariance positive?")
-    full, empty = cap - w < v, w < z  # at most one of each pair is not almost zero
-    w = np.where(full, cap, np.where(empty, 0, w))
-    inside = ~full & ~empty
-    w[inside] *= (1 - w[~inside].sum()) / w[inside].sum() if inside.any() else 1
-    return w
+    # At most one of each pair is not almost zero.
+    return at_bounds(w, empty=w < z, full=cap - w < v, cap=cap)

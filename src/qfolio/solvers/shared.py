@@ -40,6 +40,16 @@ def step_length(*moves: tuple[np.ndarray, np.ndarray]) -> float:
     return length
 
 
+def at_bounds(
+    weights: NDArray[np.float64], *, empty: NDArray[np.bool_], full: NDArray[np.bool_], cap: float
+) -> NDArray[np.float64]:
+    """Weights that are exactly 0 or the cap where they should be; the others fill up to 1."""
+    w = np.where(full, cap, np.where(empty, 0, weights))
+    inside = ~full & ~empty
+    w[inside] *= (1 - w[~inside].sum()) / w[inside].sum() if inside.any() else 1
+    return w
+
+
 def square(covariance: ArrayLike) -> NDArray[np.float64]:
     """A covariance as an array; raises QfolioError unless it is square and finite."""
     sigma = np.asarray(covariance, dtype=float)
