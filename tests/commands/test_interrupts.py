@@ -54,9 +54,39 @@ def test_ctrl_c_while_it_compiles(tmp_path, count):
     begun = time.perf_counter()
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
-    assert err in ("", "qfolio: interrupted\n")
+    resume = f"qfolio train --resume {tmp_path / 'run'}"
+    assert err in ("", f"qfolio: interrupted. Resume with: {resume}\n")
     if count == 2:
         assert time.perf_counter() - begun < 5
+
+
+TWICE = """
+import signal, time
+import qfolio
+
+class Twice(qfolio.Tracker):
+    def log(self, values, step):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "resume"),
+    [
+        (TRAIN, "train --resume"),
+        (["tune", "--trials", "2", "--batch", "2", *TRAIN[3:]], "tune --join"),
+        (["compare", "--agents", "dqn,dqn:best", "--seeds", "2"], "compare --resume"),
+        (["continual", "--change", "mass=2", *TRAIN[3:]], "continual --resume"),
+    ],
+)
+def test_a_second_ctrl_c_says_how_to_go_on(words, resume, tmp_path):
+    (tmp_path / "twice.py").write_text(TWICE)
+    command = [sys.executable, "-m", "qfolio", *words, "--out", "run", "--track", "twice:Twice"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 130, done.stderr
+    assert done.stderr == f"qfolio: interrupted. Resume with: qfolio {resume} run\n"
 
 
 @pytest.mark.slow

@@ -100,13 +100,13 @@ def compare(
         f"{len(run.entrants)} agents on {run.config.task} · {amount(seeds, 'seed')} "
         f"each · {run.config.device}"
     )
-    with tracked(*following):
-        _train(run, executor)
     parts = [part for one in run.entrants.values() for part in (one.task, one.agent)]
     command = again("qfolio compare --resume", run.folder, *parts, on=on)
-    if run.interrupted:
-        stop(command)
     with resumable(command):
+        with tracked(*following):
+            _train(run, executor)
+        if run.interrupted:
+            stop(command)
         return outcome(run.folder, _finish(run))
 
 

@@ -94,12 +94,12 @@ def continual(
         continual.create(plan, folder, shlex.join(["qfolio", *sys.argv[1:]]))
     else:
         folder = resume
-    with console.bar("compiling") as update, tracked(*following):
-        content = continual.compare(folder, lambda name: BarProgress(update, name))
     command = f"qfolio continual --resume {folder}"
-    if content is None:
-        stop(command)
     with resumable(command):
+        with console.bar("compiling") as update, tracked(*following):
+            content = continual.compare(folder, lambda name: BarProgress(update, name))
+        if content is None:
+            stop(command)
         write_continual_report(folder, content)
     _print_ways(content)
     console.tell(verdict(content))

@@ -126,15 +126,15 @@ def train(
                 f"Nothing is left to train: each seed has had {trained} already; set a larger "
                 f"total with --{budget.unit}."
             )
-        with tracked(*following):
+        command = _resume(run, folder, on)
+        with resumable(command), tracked(*following):
             _train(run, budget, executor, show)
-    command = _resume(run, folder, on)
     if run.interrupted:
         stop(command)
-    contrast = _contrast(run, folder, executor) if compare else None
-    if contrast is not None and contrast.interrupted:
-        stop(command)
     with resumable(command):
+        contrast = _contrast(run, folder, executor) if compare else None
+        if contrast is not None and contrast.interrupted:
+            stop(command)
         return outcome(folder, _finish(run, folder, contrast))
 
 

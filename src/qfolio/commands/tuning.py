@@ -111,7 +111,7 @@ def tune(
         work = tuning.Tuning.open(join, trials=trials, batch=batch)
     resume = again("qfolio tune --join", work.folder, work.task, work.agent, on=on)
     console.say(console.describe_search(work))
-    with SearchProgress() as progress, tracked(*following):
+    with resumable(resume), SearchProgress() as progress, tracked(*following):
         work.run(progress.batch, progress.chunk, executor)
     if work.interrupted:
         stop(resume)
