@@ -19,7 +19,7 @@ def require_type(name: str, value: object, kinds: type | tuple[type, ...], wante
 
     wanted: what it must be, for the message.
     """
-    if not isinstance(value, kinds):
+    if not _is(value, kinds):
         raise QfolioError(f"{name} is {reprlib.repr(value)}; it must be {wanted}.")
 
 
@@ -31,9 +31,14 @@ def require_list(name: str, value: object, kinds: type | UnionType, wanted: str)
     if (
         not isinstance(value, Collection)
         or isinstance(value, str | bytes)
-        or not all(isinstance(each, kinds) for each in value)
+        or not all(_is(each, kinds) for each in value)
     ):
         raise QfolioError(f"{name} is {reprlib.repr(value)}; it must be {wanted}.")
+
+
+def _is(value: object, kinds: type | UnionType | tuple[type, ...]) -> bool:
+    """Whether a value has one of some types; True and False are no numbers here."""
+    return isinstance(value, kinds) and (kinds is bool or not isinstance(value, bool))
 
 
 def one_line(error: BaseException) -> str:

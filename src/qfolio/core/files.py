@@ -20,7 +20,7 @@ from filelock import FileLock, Timeout
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.text import csv_cell
 
 UNFINISHED = ".part"
@@ -35,6 +35,12 @@ def cache_directory() -> Path:
     if path := os.environ.get("QFOLIO_CACHE"):
         return Path(path)
     return platformdirs.user_cache_path("qfolio", appauthor=False)
+
+
+def path_of(name: str, value: Path | str) -> Path:
+    """The path that an argument is; raises QfolioError for anything else."""
+    require_type(name, value, (str, os.PathLike), 'a path, such as "runs/mine"')
+    return Path(value)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

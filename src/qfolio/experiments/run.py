@@ -14,7 +14,7 @@ import numpy as np
 from qfolio.core import devices
 from qfolio.core.errors import require_type
 from qfolio.core.evaluation import start_keys
-from qfolio.core.files import locked, new_folder, require_new
+from qfolio.core.files import locked, new_folder, path_of, require_new
 from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
@@ -94,15 +94,16 @@ class Run:
             seed=seed,
             **devices.circumstances("python", "jax", "equinox", "optax", "numpy"),
         )
-        if out is not None:
-            require_new(Path(out))
+        place = None if out is None else path_of("out", out)
+        if place is not None:
+            require_new(place)
         run = cls(task, agent, config, None)
-        if out is not None:
-            with new_folder(Path(out)) as unfinished:
+        if place is not None:
+            with new_folder(place) as unfinished:
                 run._folder = RunFolder(unfinished)
                 run._folder.write_config(config)
                 run._write_checkpoint()
-            run._folder = RunFolder(Path(out))
+            run._folder = RunFolder(place)
         return run
 
     @classmethod
@@ -114,7 +115,7 @@ class Run:
         task, agent: needed only if the folder cannot restore them, because they hold arrays or
         are a user's own and their module has not been imported.
         """
-        files = RunFolder(Path(folder))
+        files = RunFolder(path_of("folder", folder))
         config = files.read_config()
         run = cls(
             task or task_of(config.task, config.task_settings),

@@ -17,6 +17,7 @@ from jaxtyping import PyTree
 
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError, require_type
+from qfolio.core.files import path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.population import Population
 from qfolio.core.text import amount
@@ -324,14 +325,14 @@ class Policy:
         """Writes the policy into a new or empty folder."""
         from qfolio.portfolio import policy_folder
 
-        policy_folder.save(self, Path(folder))
+        policy_folder.save(self, path_of("folder", folder))
 
     @classmethod
     def open(cls, folder: Path | str) -> "Policy":
         """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
         from qfolio.portfolio import policy_folder
 
-        return policy_folder.read(Path(folder))
+        return policy_folder.read(path_of("folder", folder))
 
     def _moved(self, table: Prices) -> Portfolio:
         """The task on all rows of another table, with the scale of the old one."""

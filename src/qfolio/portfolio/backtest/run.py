@@ -20,7 +20,7 @@ import numpy as np
 
 from qfolio.core import devices
 from qfolio.core.errors import QfolioError, require_list, require_type
-from qfolio.core.files import locked, new_folder
+from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
 from qfolio.core.registry import BASELINES, short
@@ -165,6 +165,9 @@ class Backtest:
                 the table, or the machine has too little memory.
         """
         _require_types(agents, strategies, lag=lag, seeds=seeds, seed=seed, trials=trials)
+        require_type("expanding", expanding, bool, "True or False")
+        require_type("title", title, str, "text")
+        place = None if out is None else path_of("out", out)
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")
         preset = all(isinstance(agent, Preset) for agent in agents.values())
@@ -222,10 +225,10 @@ class Backtest:
         if config.mandate is not None:
             checks.require_safe(backtest.replay.task.mandate, backtest.replay.starts(), config.cap)
         backtest._plan.require_able()
-        if out is not None:
-            with new_folder(Path(out)) as folder:
+        if place is not None:
+            with new_folder(place) as folder:
                 BacktestFolder(folder).write(config, prices, field.own)
-            backtest._kept.folder = BacktestFolder(Path(out))
+            backtest._kept.folder = BacktestFolder(place)
         return backtest
 
     @classmethod
@@ -234,7 +237,7 @@ class Backtest:
 
         agents: by name, those that are not registered with qfolio.
         """
-        files = BacktestFolder(Path(folder))
+        files = BacktestFolder(path_of("folder", folder))
         config = files.read_config()
         prices, trained = files.read_prices(config)
         return cls(prices, config, files, agents, files.read_own(config), trained)

@@ -18,7 +18,7 @@ import msgspec
 
 from qfolio.core import devices
 from qfolio.core.errors import QfolioError, require_list, require_type
-from qfolio.core.files import locked, new_folder
+from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
 from qfolio.core.statistics import holm
@@ -115,6 +115,7 @@ class Study:
         require_list("costs", costs, Real, "a list of numbers, such as [0.001, 0.005]")
         require_list("after", after, str | os.PathLike, 'a list of folders, such as ["runs/study"]')
         require_type("trials", trials, Integral, "a whole number")
+        place = path_of("out", out)
         tables = {name: load(table) for name, table in tables.items()}
         for length in (train, test):  # or it would be the reason why tables are left out
             parse_length(length)
@@ -141,7 +142,7 @@ class Study:
             earlier=earlier,
             **devices.circumstances(),
         )
-        with new_folder(Path(out)) as folder:
+        with new_folder(place) as folder:
             files = StudyFolder(folder)
             for (name, table), variant in itertools.product(kept.items(), variants):
                 with of_table(name):
@@ -159,7 +160,7 @@ class Study:
                     )
             files.write(config)
         own = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
-        return cls(config, Path(out), own)
+        return cls(config, place, own)
 
     @classmethod
     def open(cls, folder: Path | str, agents: Mapping[str, Agent] | None = None) -> "Study":
@@ -167,7 +168,8 @@ class Study:
 
         agents: by name, those that are not registered with qfolio.
         """
-        return cls(StudyFolder(Path(folder)).read(), Path(folder), agents)
+        place = path_of("folder", folder)
+        return cls(StudyFolder(place).read(), place, agents)
 
     def __repr__(self) -> str:
         tables = amount(len(self.config.tables), "table")
