@@ -236,6 +236,15 @@ def test_what_it_is_measured_against_must_be_known():
     )
 
 
+def test_it_may_be_measured_against_a_column_of_weights():
+    weights = np.tile([0.4, 0.3, 0.1, 0.1, 0.1], (ROWS, 1))
+    prices = dataclasses.replace(table(), features=weights[..., None], feature_names=("index",))
+    task = portfolio(prices, {"tracking_error": 0.05, "benchmark": "feature:index"})
+    np.testing.assert_allclose(task.benchmarks, weights, rtol=1e-6)
+    with pytest.raises(QfolioError, match=r"or to feature:NAME with its weights\.$"):
+        portfolio(prices, {"tracking_error": 0.05, "benchmark": "index"})
+
+
 def calmer(made: Mandated, share: float) -> Mandated:
     """The set at a row where all volatility is a share of what it is."""
     assert isinstance(made.risk, Risk)

@@ -126,6 +126,6 @@ def tracked(mandate: Mandate, benchmark: Any, field: Field, prices: Prices) -> M
         raise QfolioError(
             f"The mandate's tracking error cannot be measured against the benchmark {quote(name)}, "
             "which is no asset of the table and no baseline; set risk.benchmark to one, or to "
-            "column:NAME with its weights."
+            "feature:NAME with its weights."
         )
     return msgspec.structs.replace(mandate, risk=msgspec.structs.replace(risk, benchmark=name))

@@ -120,7 +120,7 @@ class Exposure(Section, frozen=True):
 class Limited(Section, frozen=True):
     """Limits on the risk of an order, a year, as the last ``rows`` returns show it.
 
-    benchmark: what tracking error is measured against: an asset, a baseline, or column:NAME with
+    benchmark: what tracking error is measured against: an asset, a baseline, or feature:NAME with
     its weights (default: the mandate's benchmark, or that of the backtest, or equal weights).
     """
 
@@ -222,7 +222,7 @@ class Mandate(Section, frozen=True):
         if tracked and against not in {*assets, *BASELINES} and ":" not in against:
             raise QfolioError(
                 f"The mandate's tracking error has the benchmark {quote(against)}, which is no "
-                "asset of the table and no baseline; set risk.benchmark to one, or to column:NAME "
+                "asset of the table and no baseline; set risk.benchmark to one, or to feature:NAME "
                 "with its weights."
             )
         risk = msgspec.structs.replace(risk, benchmark=against if tracked else None)
