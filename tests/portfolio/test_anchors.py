@@ -84,6 +84,15 @@ def test_several_baselines_are_averaged_at_each_row():
     np.testing.assert_allclose(found, (weights + 0.25) / 2)
 
 
+@pytest.mark.parametrize("anchor", ["column:weight", "equal-weight+column:weight"])
+def test_what_an_anchor_may_be_is_said(anchor):
+    said = (
+        "no anchor 'column:weight', because .* module column; .* as module:Name, .* as feature:NAME"
+    )
+    with pytest.raises(QfolioError, match=said):
+        Portfolio.of(table(), window=1, horizon=10, anchor=anchor)
+
+
 def test_a_task_checks_each_baseline_of_its_anchor():
     with pytest.raises(QfolioError, match="no baseline 'olmer'; did you mean olmar"):
         Portfolio.of(table(), window=1, horizon=10, anchor="equal-weight+olmer")

@@ -158,7 +158,7 @@ def find(kind: Kind, name: str) -> type[Any]:
     """
     where = _where(kind, name)
     module, _, attribute = (where or name).partition(":")
-    if not attribute or (where is None and not _exists(module)):
+    if not attribute or (where is None and not exists(module)):
         raise _unknown(kind, name)
     found = getattr(import_own(module), attribute, None)
     home, _, base = ENTRIES[kind].base.partition(":")
@@ -255,7 +255,7 @@ def import_own(module: str) -> ModuleType:
 
     Raises QfolioError if there is no such module, or importing it fails.
     """
-    if not _exists(module):
+    if not exists(module):
         raise QfolioError(
             f"{module} cannot be imported: it is neither installed nor in this folder."
         )
@@ -301,8 +301,11 @@ def _unknown(kind: Kind, name: str) -> QfolioError:
     return QfolioError(f"there is no {kind} {name!r}; {hint}")
 
 
-def _exists(module: str) -> bool:
-    """Whether there is such a module, installed or in the current directory."""
+def exists(module: str) -> bool:
+    """Whether there is such a module, installed or in the current directory.
+
+    Imports the packages that it is in.
+    """
     here = os.getcwd()
     if here not in sys.path and "" not in sys.path:
         sys.path.append(here)  # last, so that a file here cannot shadow a library

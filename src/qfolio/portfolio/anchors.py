@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.registry import exists
 from qfolio.portfolio.backtest.baselines import History, baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
 from qfolio.portfolio.backtest.orders import checked
@@ -53,8 +54,23 @@ def path(anchor: str, prices: Prices) -> Weights:
 
 
 def _names(anchor: str) -> list[str]:
-    """What an anchor is the mean of. A column that comes first may have a + in its name."""
-    return [anchor] if anchor.startswith(COLUMN) else anchor.split("+")
+    """What an anchor is the mean of. A column that comes first may have a + in its name.
+
+    Raises QfolioError for a module that does not exist.
+    """
+    if anchor.startswith(COLUMN):
+        return [anchor]
+    names = anchor.split("+")
+    for name in names:
+        module, colon, _ = name.partition(":")
+        package = module.partition(".")[0]  # which is found without running its code
+        if colon and not name.startswith(COLUMN) and not exists(package):
+            raise QfolioError(
+                f"there is no anchor {name!r}, because there is no module {package}; name a "
+                "baseline, such as equal-weight, your own as module:Name, or a column of weights "
+                f"as {COLUMN}NAME."
+            )
+    return names
 
 
 def _followed(name: str, prices: Prices) -> Weights:
