@@ -235,6 +235,7 @@ def test_the_check_of_prices_guesses_at_splits_and_escapes_names(monkeypatch, ca
     [
         (["nothing.csv"], "nothing.csv"), (["--agents", "dqm"], "no agent"),
         (["--agents", "dqn,dqn"], "twice"), (["--agents", ""], "at least one agent"),
+        (["--agents", "tilts,tilts:fast"], "tilts and tilts:fast, which have the same settings"),
         (["--agents", "", "--set", "window=2"], "at least one agent"),
         (["--preset", "quick"], "no preset"), (["--set", "lag=2"], "options of their own"),
         (["--set", "dqn.windw=2"], "has this setting"), (["--train", "90y"], "nothing to test"),

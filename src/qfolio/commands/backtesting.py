@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import itertools
 import shlex
 import sys
 from collections.abc import Callable
@@ -130,7 +131,14 @@ class Options(Reading):
             for name, entry in _split(self.agents, registry.entrant).items()
         }
         observed = {} if self.signals is None else {"signals": self.signals}
-        return _assign(chosen, observed | settings.parse(self.assignments))
+        made = _assign(chosen, observed | settings.parse(self.assignments))
+        for one, other in itertools.combinations(made, 2):
+            if made[one] == made[other]:
+                raise QfolioError(
+                    f"--agents names {one} and {other}, which have the same settings; leave one "
+                    f"out, or set one of {other} alone, as in --set {other}.horizon=250."
+                )
+        return made
 
     def terms(self) -> "Mandate | None":
         """The mandate from the file and the limits on the command line; None without either."""
