@@ -154,6 +154,8 @@ def test_odd_returns_are_refused():
             model().fit(odd)
     with pytest.raises(QfolioError, match="too few"):
         model().fit(x[:10])
+    with pytest.raises(QfolioError, match="set agent to tilts and preset to low-risk"):
+        model(agent="tilts:low-risk").fit(x)
     with pytest.raises(QfolioError, match="cost is a parameter"):
         model(settings={"cost": 0.1}).fit(x)
     with pytest.raises(QfolioError, match="did you mean horizon"):

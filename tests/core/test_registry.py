@@ -62,6 +62,7 @@ def test_a_class_in_the_current_directory(own):
         ("task", "own_parts:number", "own_parts has no class number"),
         ("task", "own_parts:Learner", "own_parts has no class Learner that inherits from .*Task"),
         ("agent", "own_parts:Mine", "there is no agent 'own_parts:Mine'"),
+        ("agent", "tilts:low-risk", "'tilts:low-risk'; set agent to tilts and preset to low-risk."),
         ("task", "own_parts:Half", "is not complete: it lacks actions, horizon, observe, step"),
         ("task", "elsewhere:Mine", "a module elsewhere is neither installed nor in this folder"),
         ("task", "broken_parts:Mine", r"broken_parts cannot be imported: AttributeError: .*"

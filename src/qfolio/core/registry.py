@@ -288,7 +288,10 @@ def _unknown(kind: Kind, name: str) -> QfolioError:
     first, colon, _ = name.partition(":")
     family, slash, own = first.partition("/")
     kin = {each.removeprefix(f"{family}/"): each for each in of(family, table)} if slash else {}
-    if kin:  # what follows the slash tells its members apart
+    agent, preset = parted(name) if kind == "agent" else (name, "")
+    if preset:
+        hint = f"set agent to {agent} and preset to {preset}."
+    elif kin:  # what follows the slash tells its members apart
         close = closest(own, kin)
         hint = f"did you mean {kin[close]}?" if close else f"choose from {', '.join(kin.values())}."
     elif close := closest(first, table):
