@@ -415,7 +415,7 @@ def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):
         ({"cap": 1.5}, "The cap is 1.5; it must be above 0"), ({"cap": np.nan}, "The cap is nan"),
         ({"baselines": "momentum"}, "baselines is 'momentum'; it must be a list"),
         ({"agents": changed("dqn", menu="nonsense")}, "menu is 'nonsense'; it must be like"),
-        ({"agents": changed("pathwise", horizon=13)}, "rollout_length is .* must divide the 13"),
+        ({"agents": changed("pathwise", horizon=13)}, "^pathwise: rollout_length .* divide the 13"),
         ({"episodes": 3}, "are for agents without a preset; change those of a preset with"),
         ({"agents": {"../dqn": AGENTS["dqn"]}}, "called '../dqn'; use letters, digits, - and _"),
         ({"agents": {"dqn:a": AGENTS["dqn"], "dqn-a": AGENTS["dqn"]}}, "would share a folder"),

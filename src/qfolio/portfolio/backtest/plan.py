@@ -125,7 +125,10 @@ class Plan:
         """
         for name, agent in self.agents.items():
             task = self.part(name, self.folds[0].name)
-            jax.eval_shape(partial(agent.init, task), jax.random.key(0))
+            try:
+                jax.eval_shape(partial(agent.init, task), jax.random.key(0))
+            except QfolioError as error:
+                raise QfolioError(f"{name}: {error}") from None
 
     def require_begins_with(self, folds: Sequence[Fold]) -> None:
         """Raises QfolioError unless its first folds are those of a table before it grew."""
