@@ -36,8 +36,13 @@ def test_a_wrong_name_gets_advice():
     assert near("xyz", known).endswith("number-16, …")
 
 
-def test_no_number_is_a_negative_zero():
-    assert [figure(x, "+.2%") for x in (-1e-9, 0.0, -0.5)] == ["+0.00%", "+0.00%", "−50.00%"]
+def test_zero_has_no_sign():
+    assert [figure(x, "+.2%") for x in (-1e-9, 0.0, -0.5, 0.5)] == [
+        "0.00%",
+        "0.00%",
+        "−50.00%",
+        "+50.00%",
+    ]
     assert [figure(x, ",.1f") for x in (-0.04, -1234.5, None, math.nan)] == [
         "0.0",
         "−1,234.5",

@@ -43,12 +43,14 @@ def plural(noun: str, count: int) -> str:
 def figure(value: float | None, form: str) -> str:
     """A number in one of Python's formats, such as ``+.1%``, as the terminal shows it.
 
-    Negative numbers have a true minus sign; zero has none. A dash stands for NaN and None.
+    Negative numbers have a true minus sign; zero has no sign. A dash stands for NaN and None.
     """
     if value is None or value != value:
         return "–"
-    sign, rest = (form[:1], form[1:]) if form[:1] in "+-" else ("", form)
-    return f"{value:{sign}z{rest}}".replace("-", "\N{MINUS SIGN}")
+    text = f"{value:{form}}"
+    if not text.strip("+-0.,%"):
+        text = text.lstrip("+-")
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def listed(names: Sequence[str], word: str = "and") -> str:
