@@ -89,13 +89,13 @@ PRESETS: Presets = {
     # beyond the rollout. All gradients are clipped, so that the large first ones, far from the
     # region, do not outweigh the later ones in Adam's mean of squares.
     ("market/no-trade", "pathwise"): _pathwise(
-        6400,
+        12_800,
         num_envs=16,
         rollout_length=480,
         bootstrap=True,
         slope_learning_rate_ratio=40.0,
         learning_rate=1e-3,
-        learning_rate_steps=400.0,
+        learning_rate_steps=800.0,
         reward_scale=100.0,
         max_grad_norm=1e-4,
     ),
