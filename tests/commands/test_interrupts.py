@@ -69,16 +69,22 @@ class Twice(qfolio.Tracker):
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
         time.sleep(60)
+
+class Mine(qfolio.DQN):
+    pass
 """
 
 
 @pytest.mark.parametrize(
     ("words", "resume"),
     [
-        (TRAIN, "train --resume"),
-        (["tune", "--trials", "2", "--batch", "2", *TRAIN[3:]], "tune --join"),
-        (["compare", "--agents", "dqn,dqn:best", "--seeds", "2"], "compare --resume"),
-        (["continual", "--change", "mass=2", *TRAIN[3:]], "continual --resume"),
+        (TRAIN, "train --resume run"),
+        (["tune", "--trials", "2", "--batch", "2", *TRAIN[3:]], "tune --join run"),
+        (["compare", "--agents", "dqn,dqn:best", "--seeds", "2"], "compare --resume run"),
+        (
+            ["continual", "--change", "mass=2", "--agent", "twice:Mine", *TRAIN[3:]],
+            "continual --resume run --trust twice",
+        ),
     ],
 )
 def test_a_second_ctrl_c_says_how_to_go_on(words, resume, tmp_path):
@@ -86,7 +92,7 @@ def test_a_second_ctrl_c_says_how_to_go_on(words, resume, tmp_path):
     command = [sys.executable, "-m", "qfolio", *words, "--out", "run", "--track", "twice:Twice"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 130, done.stderr
-    assert done.stderr == f"qfolio: interrupted. Resume with: qfolio {resume} run\n"
+    assert done.stderr == f"qfolio: interrupted. Resume with: qfolio {resume}\n"
 
 
 @pytest.mark.slow

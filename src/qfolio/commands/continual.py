@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Trackers
+from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Trackers, again
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
@@ -93,8 +93,8 @@ def continual(
         folder = out or Path("runs") / name
         continual.create(plan, folder, shlex.join(["qfolio", *sys.argv[1:]]))
     else:
-        folder = resume
-    command = f"qfolio continual --resume {folder}"
+        folder, plan = resume, continual.read(resume).plan()
+    command = again("qfolio continual --resume", folder, plan.task, plan.agent)
     with resumable(command):
         with console.bar("compiling") as update, tracked(*following):
             content = continual.compare(folder, lambda name: BarProgress(update, name))

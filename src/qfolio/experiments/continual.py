@@ -225,6 +225,11 @@ def create(plan: Plan, folder: Path, command: str = "") -> None:
         write_config(place / FILE, config)
 
 
+def read(folder: Path) -> ContinualConfig:
+    """The plan of a folder, and its results so far; raises QfolioError if it is no such folder."""
+    return read_config(folder / FILE, ContinualConfig)
+
+
 def compare(folder: Path, listen: Callable[[str], Listener] | None = None) -> dict[str, Any] | None:
     """Trains, changes the world and adapts in every way; returns the report's data as JSON values.
 
@@ -234,9 +239,9 @@ def compare(folder: Path, listen: Callable[[str], Listener] | None = None) -> di
     listen: called with the name of each training; returns its listener.
     """
     if not (folder / FILE).is_file():
-        read_config(folder / FILE, ContinualConfig)  # raises if this is no such folder
+        read(folder)  # raises if this is no such folder
     with locked(folder):
-        state = read_config(folder / FILE, ContinualConfig)
+        state = read(folder)
         about = {"kind": state.kind, "task": state.task, "agents": [state.agent]}
         with Log(folder).opened(**about, seeds=state.seeds) as log:
             result = _compare(folder, state, listen, log)
