@@ -382,5 +382,5 @@ def _prices(returns: np.ndarray, assets: tuple[str, ...], first: int = 0) -> Pri
             "return must be above -1."
         )
     values = np.cumprod(np.concatenate([np.ones((1, len(assets))), 1 + returns]), axis=0)
-    days = np.datetime64("1970-01-01") + first + np.arange(len(values))
+    days = np.arange(first, first + len(values)).astype("datetime64[D]")
     return Prices(days, assets, values)
