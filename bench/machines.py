@@ -22,7 +22,7 @@ from qfolio.portfolio.prices.table import Prices
 def table(rows: int = 1500, assets: int = 36) -> Prices:
     rng = np.random.default_rng(0)
     values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, assets)), axis=0))
-    dates = np.datetime64("2015-01-01") + np.arange(rows)
+    dates = np.datetime64("2015-01-01") + np.arange(rows, dtype="m8[D]")
     return Prices(dates, tuple(f"A{i}" for i in range(assets)), values)
 
 

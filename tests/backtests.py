@@ -74,7 +74,7 @@ def make_data(
             {
                 "name": first,
                 "train_first": "1999-01-04",
-                "train_last": str(dates[0].astype("datetime64[D]") - 2),
+                "train_last": str(dates[0] - np.timedelta64(2, "D")),
                 "test_first": first,
                 "test_last": last,
             }

@@ -7,7 +7,7 @@ from qfolio.portfolio.backtest.assessment import Strategy
 
 
 def days(count: int) -> np.ndarray:
-    return np.datetime64("2001-01-01") + np.arange(count)
+    return np.datetime64("2001-01-01") + np.arange(count, dtype="m8[D]")
 
 
 def strategy(

@@ -16,7 +16,7 @@ def write_table(
 ) -> Path:
     rng = np.random.default_rng(seed)
     values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0)) * scale
-    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["date", *names])

@@ -39,7 +39,7 @@ def prices(tmp_path, monkeypatch):
     """A table of prices in the current directory."""
     monkeypatch.chdir(tmp_path)
     relatives = np.random.default_rng(0).normal(3e-4, 0.01, (400, 3))
-    days = np.datetime64("2020-01-01") + np.arange(400)
+    days = np.datetime64("2020-01-01") + np.arange(400, dtype="m8[D]")
     with open("prices.csv", "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["date", "AAPL", "B", "C"])

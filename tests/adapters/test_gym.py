@@ -22,7 +22,7 @@ CAPPED = {"assets": {"cap": 0.5}, "cash": {"max": 0.2}}
 def table(seed=0, rows=ROWS, features=0):
     rng = np.random.default_rng(seed)
     values = np.exp(np.cumsum(rng.normal(0, 0.02, (rows, 3)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
     names = tuple(f"f{i}" for i in range(features))
     return Prices(dates, ("a", "b", "c"), values, rng.normal(size=(rows, 3, features)), names)
 

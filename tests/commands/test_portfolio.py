@@ -93,7 +93,7 @@ def test_a_backtest_goes_on_and_its_ledger_is_still_reproduced(
 def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     write_table(tmp_path / "prices.csv")
-    days = (np.datetime64("2020-01-01") + np.arange(260)).astype(str)
+    days = (np.datetime64("2020-01-01") + np.arange(260, dtype="m8[D]")).astype(str)
     index = ["date,level", *(f"{day},{100 + i % 7}" for i, day in enumerate(days))]
     (tmp_path / "world.csv").write_text("\n".join(index))
     (tmp_path / "mine.csv").write_text("date,A,cash\n2020-06-01,0.5,0.5\n")

@@ -22,7 +22,9 @@ def test_every_kind_of_agent_has_one():
 @pytest.mark.parametrize(("agent_name", "name"), NAMES)
 def test_its_actions_are_those_of_the_task(agent_name, name):
     values = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (600, 3)).cumsum(0))
-    prices = Prices(np.datetime64("2020-01-01") + np.arange(600), ("a", "b", "c"), values)
+    prices = Prices(
+        np.datetime64("2020-01-01") + np.arange(600, dtype="m8[D]"), ("a", "b", "c"), values
+    )
     preset = PRESETS["portfolio", agent_name][name]
     task = Portfolio.of(prices, **settings.convert(Portfolio, preset.task))
     agent = preset.build()

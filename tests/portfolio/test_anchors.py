@@ -19,7 +19,7 @@ def table(rows=ROWS, features=None, late=False):
     values = 100 * np.exp(np.cumsum(rng.normal(0, 0.01, (ROWS, 4)) * [1, 2, 1, 3], 0))
     if late:
         values[:60, 3] = np.nan
-    dates = np.datetime64("2020-01-01") + np.arange(ROWS)
+    dates = np.datetime64("2020-01-01") + np.arange(ROWS, dtype="m8[D]")
     if features is None:
         return Prices(dates[:rows], tuple("abcd"), values[:rows])
     return Prices(dates[:rows], tuple("abcd"), values[:rows], features[..., None], ("weight",))

@@ -239,7 +239,7 @@ class WithInterest(CostModel):
 def test_training_and_replay_charge_what_a_model_of_ones_own_says(lag: int) -> None:
     """By hand: shares keep their number, cash earns, and who waits for a trade earns on."""
     values = np.exp(np.cumsum(np.random.default_rng(0).normal(0, 0.02, (30, 2)), axis=0))
-    prices = Prices(np.datetime64("2020-01-01") + np.arange(30), ("a", "b"), values)
+    prices = Prices(np.datetime64("2020-01-01") + np.arange(30, dtype="m8[D]"), ("a", "b"), values)
     task = Portfolio.of(
         prices, window=5, horizon=10, lag=lag, cost=0.01, cost_model=f"{__name__}:WithInterest"
     )

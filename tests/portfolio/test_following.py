@@ -21,7 +21,7 @@ ROWS, LAG = 40, 3
 def prices():
     rng = np.random.default_rng(0)
     values = 100 * np.exp(np.cumsum(rng.normal(0, 0.02, (ROWS, 3)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(ROWS)
+    dates = np.datetime64("2020-01-01") + np.arange(ROWS, dtype="m8[D]")
     return Prices(dates, ("a", "b", "c"), values)
 
 

@@ -40,7 +40,7 @@ def table(rows=ROWS, seed=0, features=1):
     values = 100 * np.exp(np.cumsum(rng.normal(0.003, 0.02, (rows, 3)), axis=0))
     extra = rng.normal(3, 2, (rows, 3, features))
     names = tuple(f"f{i}" for i in range(features))
-    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
     return Prices(dates, ("a", "b", "c"), values, extra, names)
 
 

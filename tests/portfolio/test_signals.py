@@ -157,7 +157,9 @@ def test_a_signal_of_ones_own_is_checked(wrong, says):
 
 def table(rows=60):
     values = prices()[:rows, :3]
-    return Prices(np.datetime64("2020-01-01") + np.arange(rows), ("a", "b", "c"), values)
+    return Prices(
+        np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]"), ("a", "b", "c"), values
+    )
 
 
 def test_a_portfolio_observes_them():

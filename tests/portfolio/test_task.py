@@ -25,7 +25,7 @@ ROWS, ASSETS, WINDOW = 60, 3, 5
 def table(seed=0, rows=ROWS, features=0):
     rng = np.random.default_rng(seed)
     values = 100 * np.exp(np.cumsum(rng.normal(0, 0.02, (rows, ASSETS)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
     names = tuple(f"f{i}" for i in range(features))
     extra = rng.normal(3, 2, (rows, ASSETS, features))
     return Prices(dates, ("a", "b", "c"), values, extra, names)
@@ -256,7 +256,9 @@ def test_a_menu_of_signals_by_hand():
 
 def signalling(**settings):
     values = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (160, 3)).cumsum(0))
-    prices = Prices(np.datetime64("2020-01-01") + np.arange(160), ("a", "b", "c"), values)
+    prices = Prices(
+        np.datetime64("2020-01-01") + np.arange(160, dtype="m8[D]"), ("a", "b", "c"), values
+    )
     given = {"window": 1, "signals": "momentum:5,volatility:21", "menu": "signals:0.5"}
     return Portfolio.of(prices, **given, **settings)
 

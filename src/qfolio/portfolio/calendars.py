@@ -46,7 +46,8 @@ def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bo
 def elapsed(dates: NDArray[np.datetime64]) -> NDArray[np.float64]:
     """The share of its calendar year that has passed at each row, of shape (row,)."""
     begin = dates.astype("datetime64[Y]")
-    length = (begin + 1).astype("datetime64[D]") - begin.astype("datetime64[D]")
+    end = begin + np.timedelta64(1, "Y")
+    length = end.astype("datetime64[D]") - begin.astype("datetime64[D]")
     return np.asarray((dates - begin) / length)
 
 

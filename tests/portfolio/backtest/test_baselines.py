@@ -41,7 +41,7 @@ def prices(rows: int = 90, assets: int = 4) -> np.ndarray:
 
 
 def days(rows: int) -> np.ndarray:
-    return np.datetime64("2020-01-01") + np.arange(rows)
+    return np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
 
 
 MONTH = 5

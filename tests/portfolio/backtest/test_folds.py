@@ -80,7 +80,7 @@ def test_a_table_that_is_too_short():
 
 def test_all_dates_of_a_long_table_are_spelled_at_once() -> None:
     """One by one, each would look at the whole table: minutes for 100,000 rows."""
-    minutes = np.datetime64("2020-01-01T09:30:00") + 60 * np.arange(100_000)
+    minutes = np.datetime64("2020-01-01T09:30") + np.arange(100_000, dtype="m8[m]")
     begun = time.process_time()
     texts = spell_all(minutes, minutes)
     assert time.process_time() - begun < 5

@@ -23,7 +23,7 @@ def table(rows=ROWS):
     rng = np.random.default_rng(3)
     values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (ROWS, 3)), axis=0))
     volumes = rng.uniform(1, 2, (ROWS, 3, 1))
-    dates = np.datetime64("2020-01-01") + np.arange(ROWS)
+    dates = np.datetime64("2020-01-01") + np.arange(ROWS, dtype="m8[D]")
     prices = Prices(dates, ("A", "B", "C"), values, volumes, ("volume",), "made up")
     return prices.between(0, rows)
 

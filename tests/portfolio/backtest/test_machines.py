@@ -42,7 +42,7 @@ DQN = {
 def table(seed=0, rows=200):
     rng = np.random.default_rng(seed)
     values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 30)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
     return Prices(dates, tuple(f"A{i}" for i in range(30)), values, source=f"made up {seed}")
 
 

@@ -42,7 +42,7 @@ def table(late: int = 0) -> Prices:
     rng = np.random.default_rng(0)
     values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.02, (200, 5)), axis=0))
     values[:late, 3] = np.nan
-    dates = np.datetime64("2020-01-01") + np.arange(200)
+    dates = np.datetime64("2020-01-01") + np.arange(200, dtype="m8[D]")
     return Prices(dates, ASSETS, values, note="made up")
 
 

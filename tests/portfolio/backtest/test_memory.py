@@ -14,7 +14,7 @@ GIB = 2**30
 
 
 def table(assets: int = 40, rows: int = 600) -> Prices:
-    dates = np.datetime64("2020-01-01", "D") + np.arange(rows)
+    dates = np.datetime64("2020-01-01", "D") + np.arange(rows, dtype="m8[D]")
     moves = np.random.default_rng(0).normal(0, 0.01, (rows, assets))
     return Prices(dates, tuple(f"A{j}" for j in range(assets)), np.exp(moves.cumsum(0)))
 

@@ -69,7 +69,7 @@ def test_histories_are_measured_as_the_days_that_they_draw() -> None:
 
 def test_an_assessment_compares_with_its_reference() -> None:
     rng = np.random.default_rng(1)
-    dates = np.datetime64("2001-01-01") + np.arange(60)
+    dates = np.datetime64("2001-01-01") + np.arange(60, dtype="m8[D]")
 
     def made(kind: str, seeds: int, known: bool = True) -> Strategy:
         returns = rng.normal(0, 0.01, (seeds, 60))

@@ -43,7 +43,7 @@ AGENTS = {
 def table(rows=260, seed=0):
     rng = np.random.default_rng(seed)
     values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 0.01, (rows, 3)), axis=0))
-    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
     return Prices(dates, ("A", "B", "=<b>C"), values, note="made up")
 
 

@@ -20,7 +20,7 @@ NAMES = ("A", "B", "C")
 def table(rows=60, seed=0):
     rng = np.random.default_rng(seed)
     values = 50 * np.exp(rng.normal(0, 0.02, (rows, 3)).cumsum(0))
-    return Prices(np.datetime64("2024-01-01") + np.arange(rows), NAMES, values)
+    return Prices(np.datetime64("2024-01-01") + np.arange(rows, dtype="m8[D]"), NAMES, values)
 
 
 class Fixed:
@@ -137,7 +137,11 @@ def test_carry_is_paid_in_cash_where_the_replay_reinvests_it(rate):
 
 
 def by_hand(values, shares, cash, trades):
-    prices = Prices(np.datetime64("2024-01-01") + np.arange(len(values)), ("A",), np.array(values))
+    prices = Prices(
+        np.datetime64("2024-01-01") + np.arange(len(values), dtype="m8[D]"),
+        ("A",),
+        np.array(values),
+    )
     plan = Allocation(
         "2024-01-01", ("A",), prices.values[0], np.array([shares]), cash,
         np.array([0.5, 0.5]), np.array([trades]), {}, 0.0,

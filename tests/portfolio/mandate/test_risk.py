@@ -29,7 +29,7 @@ def table(seed: int = 0, rows: int = ROWS) -> Prices:
     rng = np.random.default_rng(seed)
     scale = rng.uniform(0.005, 0.03, 5) * np.exp(rng.normal(0, 0.3, (rows, 1)))
     values = 50 * np.exp(np.cumsum(rng.normal(3e-4, 1, (rows, 5)) * scale, axis=0))
-    return Prices(np.datetime64("2020-01-01") + np.arange(rows), ASSETS, values)
+    return Prices(np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]"), ASSETS, values)
 
 
 def portfolio(prices: Prices, risk: dict, **limits) -> Portfolio:

@@ -19,7 +19,7 @@ from studies import made_up
 
 
 def days(first, count):
-    dates = np.datetime64("2001-01-01") + np.arange(first, first + count)
+    dates = np.datetime64("2001-01-01") + np.arange(first, first + count, dtype="m8[D]")
     return tuple(map(str, dates))
 
 

@@ -82,7 +82,7 @@ def _of_spans(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.nd
     for i, name in enumerate(labels):
         if name in assets:
             after = np.isnat(begin[i]) | (dates >= begin[i])
-            until = np.isnat(end[i]) | (dates < end[i].astype("datetime64[D]") + 1)
+            until = np.isnat(end[i]) | (dates.astype("datetime64[D]") <= end[i])
             members[:, assets.index(name)] |= after & until
     return members
 

@@ -12,7 +12,7 @@ from qfolio.portfolio.backtest.baselines.optimizers import HierarchicalRiskParit
 
 def history(prices: np.ndarray, month: int = 21, cap: float = 1.0) -> History:
     rows, assets = prices.shape
-    dates = np.datetime64("2020-01-01") + np.arange(rows)
+    dates = np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]")
     return History(dates, prices, slice(0, rows), np.ones(assets, bool), cap, month)
 
 
