@@ -127,9 +127,12 @@ def changed(**columns):
     return dataclasses.replace(table(), **columns)
 
 
-def moved(array, *place):
+SECOND = np.timedelta64(1, "s")
+
+
+def moved(array, *place, by=1):
     array = array.copy()
-    array[place] = array[place] + 1
+    array[place] += by
     return array
 
 
@@ -138,7 +141,10 @@ def moved(array, *place):
     [
         (lambda: changed(values=moved(table().values, 7, 1)), "for 'B' on 2020-01-08 where"),
         (lambda: changed(features=moved(table().features, 9, 2, 0)), "'volume of C' on 2020-01-10"),
-        (lambda: changed(dates=moved(table().dates, 4)), "of 2020-01-05 00:00:01 where .*-05;"),
+        (
+            lambda: changed(dates=moved(table().dates, 4, by=SECOND)),
+            "of 2020-01-05 00:00:01 where .*-05;",
+        ),
         (lambda: table().between(1, None), "of 2020-01-02 where .* 2020-01-01"),
         (lambda: table().select(["A", "C"]), "no asset 'B'"),
         (lambda: changed(assets=("A", "C", "B")), "assets in another order"),

@@ -54,8 +54,8 @@ class Dimension:
 
     name: str
     scale: str
-    low: float = math.nan
-    high: float = math.nan
+    low: float = -math.inf
+    high: float = math.inf
     choices: tuple[str, ...] = ()
 
     def __str__(self) -> str:
