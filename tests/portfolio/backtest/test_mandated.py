@@ -178,6 +178,18 @@ def test_caps_above_1_hold_for_agents_and_baselines():
     assert not any("more than the cap" in note for note in notes)
 
 
+def test_baselines_leave_no_cash_in_place_of_assets_that_may_not_be_held(tmp_path):
+    mandate = {"assets": {"forbidden": ["E"], "cap": {"A": 0}}}
+    backtest = create(mandate, tmp_path / "run", agents={"pathwise": AGENTS["pathwise"]})
+    entries, _ = backtest.replay.others(backtest.baselines, {}, "equal-weight")
+    for name, entry in entries.items():
+        ordered = entry.decisions[0][~np.isnan(entry.decisions[0]).any(1)]
+        np.testing.assert_allclose(ordered[:, [0, 1, 5]], 0, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(entries["equal-weight"].decisions[0, :, 2:5], 1 / 3)
+    target = Desk.open(tmp_path / "run").followed("equal-weight").weights(backtest.prices)
+    assert list(target.values()) == pytest.approx([0, 0, 1 / 3, 1 / 3, 1 / 3, 0])
+
+
 def test_a_mandate_that_cannot_be_met_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(QfolioError, match=r"caps of assets \(10%\) and cash of at most 5% clash"):
         create({"assets": {"cap": 0.1}, "cash": {"max": 0.05}}, tmp_path / "run")

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -71,6 +72,7 @@ def orders(
         cap: Largest weight of one asset when it is ordered.
         feasible: The weights that a mandate allows, given the number of a fold and a row. Every
             target is projected onto them; with the calendar "fold", there is one at every row.
+            Assets of which it allows no weight above 0 may not be held.
         month: Rows in a month.
         terms: When orders are given and how they are filled, in numpy; its rows for decisions
             replace the baseline's calendar.
@@ -96,6 +98,7 @@ def orders(
     _check(folds)
     conditions = Conditions(np.empty(0), {}, {}) if conditions is None else conditions
     growth = Growth(filled_in(prices)[0], costs or Proportional(), conditions)
+    limited = lru_cache(1)(feasible) if feasible is not None else lambda *_: None
     nothing = np.eye(prices.shape[1] + 1)[0]
     last, row_last, plan = nothing, folds[0].decisions.start, terms.begin(nothing)
     watched = plan is not None or terms.called < np.inf
@@ -124,7 +127,8 @@ def orders(
                 called = terms.calls(held)
                 if row in asked or (called and not stands):
                     known = slice(0, row + 1)
-                    open_to = allowed if universe is None else allowed[row]
+                    mandated = limited(number, row)
+                    open_to = holdable(allowed if universe is None else allowed[row], mandated)
                     history = History(dates[known], prices[known], fold.train, open_to, cap, month)
                     wanted = baseline.decide(history, held) if open_to.any() else nothing
                 elif not stands:
@@ -132,7 +136,7 @@ def orders(
                 due = trading[row - rows[0]] or called or not (again or watched or each)
                 order, given = held, False
                 if called or (wanted is not None and due):
-                    mandated = None if feasible is None else feasible(number, row)
+                    mandated = limited(number, row)
                     left = terms.unspent(plan)
                     if left is not None and isinstance(mandated, Mandated):
                         mandated = mandated.spending(left)
@@ -167,6 +171,11 @@ def _asked(
     if decides is not None:
         return [row for row in rows if decides[row]]
     return rows[(first - rows[0]) % month :: month] if baseline.calendar == "month" else rows
+
+
+def holdable(tradable: Bools, mandated: Feasible | None) -> Bools:
+    """Those of the tradable assets of which a mandate, if there is one, allows a weight above 0."""
+    return tradable & (mandated.limits.high > 0) if isinstance(mandated, Mandated) else tradable
 
 
 def obeying(

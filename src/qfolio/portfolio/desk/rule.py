@@ -13,7 +13,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.folds import latest
-from qfolio.portfolio.backtest.orders import TOLERANCE, obeying
+from qfolio.portfolio.backtest.orders import TOLERANCE, holdable, obeying
 from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.mandate import checks
@@ -113,7 +113,8 @@ class Rule(Untrained):
                 mandated = mandated.knowing(self.task.on(table).risk_at(last))
             left = terms.unspent(terms.begin(held, spent))
             mandated = mandated if left is None else mandated.spending(left)
-        history = History(table.dates, table.values, fold.train, tradable, cap, table.month)
+        open_to = holdable(tradable, mandated)
+        history = History(table.dates, table.values, fold.train, open_to, cap, table.month)
         wanted = self.baseline.decide(history, held)
         target = held
         if wanted is not None:
