@@ -1,5 +1,6 @@
 """The page of a backtest in a real browser: legends, pointer, choices, phones."""
 
+import dataclasses
 import shutil
 import subprocess
 from pathlib import Path
@@ -98,6 +99,20 @@ def test_choosing_a_strategy(browser: Browser, folder: Path) -> None:
     picture = "Plotly.toImage(document.getElementById('wealth'), {format: 'png'})"
     assert browser.evaluate(picture).startswith("data:image/png;base64,")
     assert browser.complaints == []
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_ends_of_long_names_are_seen(browser: Browser, tmp_path: Path, width: int) -> None:
+    data = usual(60)
+    names = tuple(f"A company with a very long name, class {i}" for i in range(len(data.assets)))
+    page = render_backtest(dataclasses.replace(data, assets=names))
+    (tmp_path / "report.html").write_text(page, encoding="utf-8")
+    browser.show((tmp_path / "report.html").as_uri(), width, DRAWN, phone=width < 500)
+    rows = "[...document.querySelectorAll('#weights-list .row')]"
+    assert set(browser.evaluate(f"{rows}.map(row => row.textContent)")) == {*names, "Cash"}
+    seen = "row.lastChild.getBoundingClientRect().right <= row.getBoundingClientRect().right + 1"
+    assert browser.evaluate(f"{rows}.every(row => {seen})")
+    assert browser.evaluate(f"{rows}.every(row => row.scrollWidth <= row.clientWidth)")
 
 
 OVERLAPS = """

@@ -60,6 +60,10 @@
     high.textContent = percent(edge) + (alone ? "" : ", against the reference");
   }
 
+  /** The start of a name, which gives way where room is short, and its end, where names differ. */
+  const parts = (name) => [name.slice(0, -10), name.slice(-10)].map((text) =>
+    Object.assign(document.createElement("bdi"), { textContent: text }));
+
   /** Names at the left of the rows, and weights at the right. */
   function list(order) {
     const place = byId("weights-list"), chart = byId("weights");
@@ -69,7 +73,7 @@
     const add = (text, kind, at, left, wide) => {
       const span = document.createElement("span");
       span.className = kind;
-      span.textContent = text;
+      span.append(...parts(text));
       Object.assign(span.style,
         { top: `${at}px`, left: `${left}px`, width: `${wide}px` });
       place.append(span);
