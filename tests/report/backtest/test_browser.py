@@ -18,6 +18,8 @@ from browser import Browser
 
 DRAWN = "location.protocol === 'file:' && document.querySelectorAll('.chart .main-svg').length >= 3"
 
+TURNED = "[...document.querySelectorAll('.xtick text')].map(t => t.getAttribute('transform'))"
+
 VISIBLE = """
 (index) => document.getElementById('%s').data.filter(
   (trace) => trace.meta === index).map((trace) => trace.visible)
@@ -101,6 +103,13 @@ def test_choosing_a_strategy(browser: Browser, folder: Path) -> None:
     assert browser.complaints == []
 
 
+@pytest.mark.parametrize("days", [60, 250, 516])
+def test_dates_are_level_on_a_phone(browser: Browser, tmp_path: Path, days: int) -> None:
+    (tmp_path / "report.html").write_text(render_backtest(usual(days)), encoding="utf-8")
+    browser.show((tmp_path / "report.html").as_uri(), 390, DRAWN, phone=True)
+    assert not any("rotate" in (each or "") for each in browser.evaluate(TURNED))
+
+
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_ends_of_long_names_are_seen(browser: Browser, tmp_path: Path, width: int) -> None:
     data = usual(60)
@@ -143,8 +152,7 @@ def test_titles_and_numbers_of_charts_keep_apart(
         browser.wait("document.getElementById('costs').layout.width === 660")
     assert browser.evaluate("document.querySelectorAll('.chart .annotation-text').length") == 8
     assert browser.evaluate(OVERLAPS) == []
-    turned = "[...document.querySelectorAll('.xtick text')].map(t => t.getAttribute('transform'))"
-    assert not any("rotate" in (each or "") for each in browser.evaluate(turned))
+    assert not any("rotate" in (each or "") for each in browser.evaluate(TURNED))
 
 
 def test_tables_stay_whole_on_paper(browser: Browser, folder: Path) -> None:
