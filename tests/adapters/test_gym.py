@@ -298,8 +298,11 @@ def test_it_says_what_is_wrong():
     with pytest.raises(QfolioError, match="reset"):
         env.unwrapped.step(CASH)
     env.reset(seed=0)
-    for action in ([1.0, 0, 0], [np.nan, 0, 0, 0], "cash", None):
-        with pytest.raises(QfolioError, match="4 finite numbers"):
+    for action, said in (
+        ([1.0, 0, 0], r"has the shape \(3,\)"), ([np.nan, 0, 0, 0], "is not finite"),
+        ("cash", "has the shape"), (None, "has the shape"),
+    ):  # fmt: skip
+        with pytest.raises(QfolioError, match=f"4 finite numbers, cash first; this one {said}"):
             env.unwrapped.step(action)
     menu = environment(menu="tilts:0.1")
     menu.reset(seed=0)

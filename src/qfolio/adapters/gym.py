@@ -193,9 +193,10 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             scores = np.empty(0)
         if scores.shape != space.shape or not np.isfinite(scores).all():
             wanted = "cash first" if self.task.feasible.long_only else "the weights of the assets"
+            right = scores.shape == space.shape
+            found = "is not finite" if right else f"has the shape {scores.shape}"
             raise QfolioError(
-                f"An action must be {space.shape[0]} finite numbers, {wanted}; this one has the "
-                f"shape {scores.shape}."
+                f"An action must be {space.shape[0]} finite numbers, {wanted}; this one {found}."
             )
         return scores
 
