@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 from qfolio.commands.backtesting import Options
+from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.conditions import Conditions
@@ -49,6 +50,23 @@ def test_a_backtest_keeps_what_it_computed(tmp_path, table):
     assert kept.digest == prices.digest
     assert kept.market_names == ("rate",)
     np.testing.assert_array_equal(kept.market[:, 0], np.linspace(0.01, 0.03, 260))
+
+
+def test_a_backtest_says_what_is_implausible_in_its_table(tmp_path, capsys):
+    moves = np.random.default_rng(0).normal(0, 0.01, (260, 3))
+    moves[200, 1] = np.log(0.5)
+    prices = pd.DataFrame(np.exp(moves.cumsum(0)), pd.date_range("2020-01-01", periods=260), NAMES)
+    path = tmp_path / "prices.csv"
+    prices.rename_axis("date").to_csv(path)
+    Options().load(path)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Warning: prices.csv, row 202 (2020-07-19), column 'B': the price" in printed
+    assert "close to 1/2: perhaps a split that was not adjusted" in printed
+    prices["C"] = np.nan
+    prices.rename_axis("date").to_csv(path)
+    with pytest.raises(QfolioError, match=r"'prices.csv': column 'C': .* \(--missing"):
+        Options().load(path)
+    assert not capsys.readouterr().out
 
 
 def test_costs_read_a_column_of_the_market(table):

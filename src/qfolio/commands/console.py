@@ -166,6 +166,13 @@ def print_findings(findings: "list[Finding]") -> None:
         say(f"{', '.join(said)}.")
 
 
+def print_warnings(file: str, findings: "list[Finding]") -> None:
+    """The warnings on a price table, each with the name of its file."""
+    for finding in findings:
+        if finding.severity == "warning":
+            tell(f"Warning: {file}, {finding}. {finding.advice}".rstrip())
+
+
 def print_prices(facts: dict[str, Any]) -> None:
     """The content of a price table, from ``prices.describe``."""
     say(

@@ -75,10 +75,18 @@ class Reading:
         )
 
     def load(self, file: Path | None) -> "Prices":
-        """Reads a price table; without a file, the 20 US stocks that come with skfolio."""
-        from qfolio.portfolio.prices.table import load
+        """Reads a price table, and says what is implausible in it.
 
-        return load(file, **self.reading)
+        Without a file, the table is the 20 US stocks that come with skfolio.
+        """
+        from qfolio.commands import console
+        from qfolio.portfolio.prices.table import accepted, inspect
+
+        prices, findings = inspect(file, **self.reading)
+        table = accepted(prices, findings, file)
+        if file is not None:
+            console.print_warnings(file.name, findings)
+        return table
 
 
 READING = Reading()

@@ -276,6 +276,11 @@ def load(
         source, missing=missing, late=late, ended=ended, delisting_haircut=delisting_haircut,
         members=members, features=features, columns=columns, returns=returns, date=date,
     )  # fmt: skip
+    return accepted(prices, findings, source)
+
+
+def accepted(prices: Prices | None, findings: Sequence[Finding], source: Any) -> Prices:
+    """The prices that ``inspect`` found in a source; a QfolioError with its errors if none."""
     if prices is None:
         errors = [finding for finding in findings if finding.severity == "error"]
         shown = "; ".join(str(finding) for finding in errors[:2])
