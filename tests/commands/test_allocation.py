@@ -55,6 +55,20 @@ def test_allocate_on_newer_prices(folder, monkeypatch, capsys, tmp_path):
     assert plan["date"] == "2020-09-26"
 
 
+def test_a_split_since_the_backtest_is_named(folder, monkeypatch, capsys, tmp_path):
+    newer = write_table(tmp_path / "newer.csv", rows=270, names=("A", "B", "C"))
+    head, *rows = [line.split(",") for line in newer.read_text().split()]
+    for halved in (rows[100:], rows[265:]):  # the first is in rows that the backtest saw
+        for row in halved:
+            row[2] = str(float(row[2]) / 2)
+    newer.write_text("\n".join(",".join(row) for row in [head, *rows]))
+    options = ["--prices", newer, "--as-of", "2020-09-26", "--capital", 100, "--dry-run"]
+    assert qfolio(monkeypatch, "allocate", folder, *options) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("perhaps a split that was not adjusted") == 1
+    assert "Warning: newer.csv, row 267 (2020-09-22), column 'B': the price is" in said
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -117,6 +117,8 @@ def allocate(
             "The mandate has lots, but --returns gives no share prices; give a table of prices."
         )
     table = desk.table(followed, prices)
+    if prices is not None:
+        console.print_warnings(prices.name, desk.news(prices))
     require_fresh(table, as_of)
     held = read_holdings(holdings, table.assets, capital, debts=desk.debts)
     shares, cash, gone = cashed_out(*held, table)
@@ -218,6 +220,8 @@ def follow(
 
     desk = Desk.open(folder, returns=returns, **latest.reading)
     following = marked(desk, prices, benchmark)
+    if prices is not None:
+        console.print_warnings(prices.name, desk.news(prices))
     path = folder / "follow.csv" if out is None else out
     following.write(path)
     page, live = path.with_suffix(".html"), following.live

@@ -30,7 +30,7 @@ def found(values: np.ndarray) -> list[Finding]:
 @pytest.mark.parametrize(
     ("factor", "ratio"), [(0.5, "1/2"), (2.0, "2"), (1 / 3, "1/3"), (1.5, "3/2"), (2 / 3, "2/3"),
                           (0.4, "2/5"), (10.0, "10"), (0.1, "1/10"), (0.01, "1/100"),
-                          (0.502, "1/2"), (0.498, "1/2")],
+                          (0.502, "1/2"), (0.498, "1/2"), (0.505, "1/2"), (0.33, "1/3")],
 )  # fmt: skip
 @pytest.mark.parametrize("assets", [2, 4])
 def test_splits(factor: float, ratio: str, assets: int):
@@ -66,6 +66,12 @@ def doubling(values: np.ndarray) -> None:
     values[AT:, 1] *= 1.97
 
 
+def bad_news(values: np.ndarray) -> None:
+    """A fall by far more or less than a usual day beside a split."""
+    values[AT:, 1] *= 0.55
+    values[AT + 50 :, 2] *= 0.45
+
+
 def slow_return(values: np.ndarray) -> None:
     """A squeeze that fades over many rows is a price that was paid."""
     values[AT : AT + 40, 1] *= np.exp(np.linspace(1.0, 0, 40))
@@ -84,7 +90,7 @@ def thin_penny_stock(values: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [crash, flash_crash, doubling, slow_return, penny_stock, thin_penny_stock]
+    "change", [crash, flash_crash, doubling, bad_news, slow_return, penny_stock, thin_penny_stock]
 )
 def test_jumps_that_are_no_splits(change: Callable[[np.ndarray], None]):
     values = market()

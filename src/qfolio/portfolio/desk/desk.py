@@ -3,7 +3,7 @@
 import datetime
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
 from qfolio.portfolio.desk.rule import Kind, Ordered, Rule, Untrained
 from qfolio.portfolio.policy import Policy
-from qfolio.portfolio.prices.findings import day
-from qfolio.portfolio.prices.table import Prices, load
+from qfolio.portfolio.prices.findings import Finding, day
+from qfolio.portfolio.prices.table import Prices, check, load
 
 SAME = 1e-6
 """How far reproduced weights may be off: policies decide in float32, which differs by machine."""
@@ -32,12 +32,13 @@ SAME = 1e-6
 class Desk:
     """A run whose agents, baselines and strategies of the user's own are followed.
 
-    load: how prices are read, from the options of the command line.
+    load and check: how prices are read and checked, with the options of the command line.
     """
 
     run: Backtest
     folder: Path
     load: Callable[..., Prices] = field(default=load)
+    check: Callable[..., list[Finding]] = field(default=check)
 
     @staticmethod
     def open(folder: Path | str, **options: Any) -> "Desk":
@@ -48,7 +49,8 @@ class Desk:
         ends = "gap" if run.prices.tradable is None else "cash-out"
         known["ended"] = options.get("ended") or ends
         # Policies and baselines look at the last rows only; assets may start at any row before.
-        return Desk(run, Path(folder), lambda source: load(source, late="join", **known))
+        known["late"] = "join"
+        return Desk(run, Path(folder), partial(load, **known), partial(check, **known))
 
     @property
     def ledger(self) -> Ledger:
@@ -110,6 +112,11 @@ class Desk:
                 "memberships with --members."
             )
         return followed.table(table)
+
+    def news(self, prices: Path) -> list[Finding]:
+        """The findings on those rows of a table that are later than the backtest's."""
+        last = day(self.run.prices.dates[-1])
+        return [found for found in self.check(prices) if found.date and found.date > last]
 
     def hindsight(self, followed: Policy | Untrained, table: Prices) -> str:
         """Says so if a policy has learned from later rows than a table's last one; else ""."""

@@ -22,7 +22,8 @@ AROUND = 30  # rows before and after a jump: in a crisis large moves are usual
 TICKS = 10  # a jump of fewer price ticks says nothing: the next price above 0.02 is 0.03
 BRIEF = 3  # rows that a bad tick lasts at most
 SPLITS = (1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 100, 1000)
-EXACT = 0.005  # how far a split's ratio may be from one of these
+EXACT = 0.005  # how far a jump's ratio may be from one of these
+LOOSE = 0.03  # the same, at most, for a fall to one half or less: the price also moves that day
 
 Jump = tuple[int, int]  # the row before the jump, and the asset
 
@@ -87,8 +88,7 @@ def _jumps(values: np.ndarray, moves: np.ndarray, sizes: np.ndarray) -> list[Jum
     """Moves that are large for their asset and that most others do not share, by row."""
     jumps = sizes > LEAST_JUMP
     for j in np.flatnonzero(jumps.any(axis=0)).tolist():
-        # The median is robust to the jumps in question.
-        usual = float(np.median(sizes[:, j][sizes[:, j] > 0])) / 0.6745
+        usual = _usual(sizes[:, j])
         steps = np.abs(np.diff(values[:, j]))
         tick = steps[steps > 0].min()
         jumps[:, j] &= (sizes[:, j] > UNUSUAL * usual) & (steps / (TICKS - 0.5) > tick)
@@ -129,11 +129,20 @@ def _sort_out(
             sound[j] = i + 1 + rows
             continue
         distances = np.abs(ratios - abs(jump))
-        if distances.min() <= np.log1p(EXACT):
-            splits[i, j] = _ratio(SPLITS[distances.argmin()], jump > 0)
+        split = SPLITS[distances.argmin()]
+        # Prices rise by about such a ratio in takeovers, and fall by about a third on bad news.
+        divided = jump < 0 and split >= 2 and split % 1 == 0
+        loose = min(1.5 * _usual(np.abs(moves[:, j])), LOOSE) if divided else 0.0
+        if distances.min() <= max(np.log1p(EXACT), loose):
+            splits[i, j] = _ratio(split, jump > 0)
         else:
             others.append((i, j))
     return ticks, splits, others
+
+
+def _usual(sizes: np.ndarray) -> float:
+    """The deviation of moves of these sizes, by their median, which jumps leave as it is."""
+    return float(np.median(sizes[sizes > 0])) / 0.6745
 
 
 def _ratio(split: float, up: bool) -> str:
