@@ -193,6 +193,10 @@ def test_currency_signs(tmp_path: Path):
     path.write_text("date,A,B\n" + "".join(f"{d},$1,€2\n" for d in days))
     with pytest.raises(QfolioError, match=r"several currencies: \$ and €\. Convert all"):
         load(path)
+    rows = [f"{d},{asset},1,{code}\n" for d in days for asset, code in ("AX", "BY")]
+    path.write_text("date,asset,price,Currency\n" + "".join(rows))
+    (warning,) = [f for f in check(path) if f.severity == "warning" and f.column]
+    assert str(warning) == "column 'Currency': there are several currencies: X and Y"
     path.write_text("date,A\n" + "".join(f"{d},-$1\n" for d in days))
     with pytest.raises(QfolioError, match="is negative"):
         load(path)

@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from qfolio.core.text import amount, quote
+from qfolio.core.text import amount, listed, quote
 from qfolio.portfolio.prices.cells import currencies, label, numbers
 from qfolio.portfolio.prices.columns import Columns
 from qfolio.portfolio.prices.dates import NO_DATE, read_dates, with_times
 from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.layout import Table
+from qfolio.portfolio.prices.vocabulary import plain
+
+ONE_CURRENCY = "Convert all prices to one currency."
 
 MOST_CELLS, SPARSEST = 100_000_000, 0.05  # a long table that would be this large and this empty
 WRITE_DATES = "Write dates as 2020-01-31."
@@ -78,8 +81,16 @@ def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
     if len(signs := sorted(set().union(*(currencies(table.columns[j]) for j in prices)))) > 1:
         findings.error(
             f"prices are in several currencies: {' and '.join(signs)}",
-            advice="Convert all prices to one currency.",
+            advice=ONE_CURRENCY,
         )
+    for j, name in enumerate(table.names):
+        codes = {label(cell) for cell in table.columns[j]} if plain(name) == "currency" else set()
+        if len(codes - {""}) > 1:
+            findings.warn(
+                f"there are several currencies: {listed(sorted(codes - {''})[:LISTED])}",
+                column=name,
+                advice=ONE_CURRENCY,
+            )
     cells = table.columns[columns.date]
     if columns.time is not None:
         cells = with_times(cells, table.columns[columns.time])
