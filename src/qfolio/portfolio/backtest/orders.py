@@ -175,7 +175,9 @@ def _asked(
 
 def holdable(tradable: Bools, mandated: Feasible | None) -> Bools:
     """Those of the tradable assets of which a mandate, if there is one, allows a weight above 0."""
-    return tradable & (mandated.limits.high > 0) if isinstance(mandated, Mandated) else tradable
+    if not isinstance(mandated, Mandated):
+        return tradable
+    return tradable & (np.asarray(mandated.limits.high) > 0)
 
 
 def obeying(

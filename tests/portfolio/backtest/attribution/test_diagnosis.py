@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.attribution.diagnosis import diagnose
+from qfolio.portfolio.backtest.attribution.diagnosis import diagnose, idle
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.simulation import simulate
 
@@ -47,3 +47,11 @@ def test_the_sentence(seeds, expected):
 def test_an_agent_that_ignores_what_it_observes():
     (sentence,) = diagnose("dqn", entry(LIVELY), FOLDS, "ABC", ignored=True)
     assert sentence.startswith("dqn ignored what it observed")
+
+
+def test_a_reference_with_idle_cash():
+    whole, half = entry(always(0, 0.3, 0.3, 0.4)), entry(always(0.5, 0.2, 0.2, 0.1))
+    (sentence,) = idle("dqn", whole, "equal-weight", half)
+    assert sentence.startswith("equal-weight held 50% of its wealth in cash on average, and dqn 0%")
+    assert idle("dqn", half, "equal-weight", whole) == []  # the agent's own choice
+    assert idle("dqn", whole, "equal-weight", whole) == []

@@ -1,4 +1,7 @@
-"""Diagnoses dead agents in plain sentences: they never trade, hold one asset, or see nothing."""
+"""Diagnoses dead agents in plain sentences: they never trade, hold one asset, or see nothing.
+
+It also says where an agent is compared with the idle cash of its reference.
+"""
 
 from collections.abc import Sequence
 
@@ -14,6 +17,10 @@ SAME = 1e-4
 
 ALONE = 0.99
 """Weight above which an asset is held alone, and the share of days on which it has to be."""
+
+
+IDLE = 0.02
+"""Mean weight of cash by which a reference exceeds an agent, from which on this is said."""
 
 
 def diagnose(
@@ -41,6 +48,24 @@ def diagnose(
             "shuffled."
         )
     return sentences
+
+
+def idle(name: str, entry: Entry, reference: str, other: Entry) -> list[str]:
+    """A sentence if the reference holds more cash than the strategy, as a mandate may force it to.
+
+    Args:
+        name: Name of the strategy.
+        entry: Its replay.
+        reference: Name of the reference.
+        other: The reference's replay.
+    """
+    held, theirs = (each.simulation.weights[..., 0].mean() for each in (entry, other))
+    if not theirs - held >= IDLE:
+        return []
+    return [
+        f"{reference} held {theirs:.0%} of its wealth in cash on average, and {name} {held:.0%}: "
+        "part of the difference between them is what the market earned."
+    ]
 
 
 def _dead(entry: Entry, seed: int, folds: Sequence[slice], assets: Sequence[str]) -> str:

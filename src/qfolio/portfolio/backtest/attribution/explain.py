@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from qfolio.portfolio.backtest.attribution.decomposition import decompose
-from qfolio.portfolio.backtest.attribution.diagnosis import diagnose
+from qfolio.portfolio.backtest.attribution.diagnosis import diagnose, idle
 from qfolio.portfolio.backtest.attribution.distillation import Rule, distil
 from qfolio.portfolio.backtest.attribution.factors import exposures, factor_returns
 from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
@@ -74,7 +74,7 @@ def _explained(
         rule=_rule(entry.decisions[0], stretches, names),
         menu=bool(stretches[0].task.menu),
     )
-    return why, {
+    said = {
         each: diagnose(
             each,
             entries[each],
@@ -84,6 +84,8 @@ def _explained(
         )
         for each in dict.fromkeys((name, traded))
     }
+    said[traded] += idle(traded, entry, config.benchmark, entries[config.benchmark])
+    return why, said
 
 
 def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> Rule:
