@@ -2,6 +2,7 @@ import dataclasses
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.registry import BASELINES
+from qfolio.core.registry import BASELINES, find
 from qfolio.experiments.events import read
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset
@@ -404,6 +405,22 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
 def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):
     create(tmp_path / "run", agents={"pathwise:fast": AGENTS["pathwise"]})
     assert list(Backtest.open(tmp_path / "run").agents) == ["pathwise:fast"]
+
+
+def test_a_wrong_baseline_of_ones_own_is_found_before_the_training(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "half.py").write_text(
+        "import numpy as np\n"
+        "from qfolio.portfolio.backtest.baselines import Baseline\n"
+        "class Half(Baseline):\n"
+        "    def decide(self, history, held):\n"
+        "        return np.eye(len(held))[1] / 2\n"
+    )
+    find("baseline", "half:Half")
+    with pytest.raises(QfolioError, match=r"Half at .* gives weights that sum to 0\.5"):
+        create(tmp_path / "run", baselines=("half:Half",))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

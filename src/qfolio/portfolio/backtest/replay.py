@@ -18,7 +18,7 @@ from qfolio.portfolio.backtest.baselines import Baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
 from qfolio.portfolio.backtest.folds import Fold
-from qfolio.portfolio.backtest.orders import orders
+from qfolio.portfolio.backtest.orders import Orders, orders
 from qfolio.portfolio.backtest.own import Placed, kept
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.conditions import Conditions
@@ -268,11 +268,22 @@ class Replay:
 
     def baseline(self, kind: str, name: str, baseline: Baseline) -> tuple[Entry, tuple[str, ...]]:
         """A baseline, and notes on its decisions."""
+        folds = self.folds if self.prices.tradable is None else self._complete
+        given = self._orders(name, baseline, folds)
+        return self.entry(kind, given.decisions[None]), given.notes
+
+    def try_out(self, name: str, baseline: Baseline) -> None:
+        """Asks a baseline for its first decision; raises QfolioError if that is invalid."""
+        fold = self.folds[0] if self.prices.tradable is None else self._complete[0]
+        start = fold.decisions.start
+        self._orders(name, baseline, [fold._replace(decisions=slice(start, start + 1))])
+
+    def _orders(self, name: str, baseline: Baseline, folds: Sequence[Fold]) -> Orders:
         table, text = self.prices, self.task.mandate
-        given = orders(
+        return orders(
             name,
             baseline,
-            self.folds if table.tradable is None else self._complete,
+            folds,
             table.dates,
             table.values,
             universe=table.tradable,
@@ -283,7 +294,6 @@ class Replay:
             month=table.month,
             terms=self._terms,
         )
-        return self.entry(kind, given.decisions[None]), given.notes
 
     def own(self, kind: str, placed: Placed) -> Entry:
         """A strategy of the user's own; with returns only, all else is NaN."""

@@ -23,7 +23,7 @@ from qfolio.core.errors import QfolioError, require_list, require_type
 from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
-from qfolio.core.registry import BASELINES, short
+from qfolio.core.registry import BASELINES, own_modules, short
 from qfolio.core.text import amount, near
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
 from qfolio.experiments.fit import Row
@@ -225,6 +225,9 @@ class Backtest:
         if config.mandate is not None:
             checks.require_safe(backtest.replay.task.mandate, backtest.replay.starts(), config.cap)
         backtest._plan.require_able()
+        for name, each in backtest.baselines.items():
+            if own_modules(each):  # its faults would otherwise show only after all training
+                backtest.replay.try_out(name, each)
         if place is not None:
             with new_folder(place) as folder:
                 BacktestFolder(folder).write(config, prices, field.own)
