@@ -118,7 +118,7 @@ def allocate(
         )
     table = desk.table(followed, prices)
     if prices is not None:
-        console.print_warnings(prices.name, desk.news(prices))
+        console.print_warnings(prices.name, desk.news)
     require_fresh(table, as_of)
     held = read_holdings(holdings, table.assets, capital, debts=desk.debts)
     shares, cash, gone = cashed_out(*held, table)
@@ -221,7 +221,7 @@ def follow(
     desk = Desk.open(folder, returns=returns, **latest.reading)
     following = marked(desk, prices, benchmark)
     if prices is not None:
-        console.print_warnings(prices.name, desk.news(prices))
+        console.print_warnings(prices.name, desk.news)
     path = folder / "follow.csv" if out is None else out
     following.write(path)
     page, live = path.with_suffix(".html"), following.live

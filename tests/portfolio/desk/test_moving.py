@@ -52,7 +52,7 @@ def desk(tmp_path_factory):
         baselines=["inverse-volatility"], mandate=MANDATE,
     ).run()  # fmt: skip
     opened = Desk.open(folder)
-    opened.load = lambda path: table(int(str(path)))
+    opened.inspect = lambda path: (table(int(str(path))), [])
     return opened
 
 
@@ -84,7 +84,7 @@ def test_orders_hold_what_is_there_and_are_reproduced(desk, name):
 
 
 def test_a_table_without_its_members_is_refused(desk):
-    desk = Desk(desk.run, desk.folder, lambda path: _without_members(int(str(path))))
+    desk = Desk(desk.run, desk.folder, lambda path: (_without_members(int(str(path))), []))
     with pytest.raises(QfolioError, match="--members"):
         desk.table(desk.followed("equal-weight"), Path(str(NOW)))
 

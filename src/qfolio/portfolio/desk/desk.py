@@ -22,7 +22,7 @@ from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_d
 from qfolio.portfolio.desk.rule import Kind, Ordered, Rule, Untrained
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.findings import Finding, day
-from qfolio.portfolio.prices.table import Prices, check, load
+from qfolio.portfolio.prices.table import Prices, accepted, inspect
 
 SAME = 1e-6
 """How far reproduced weights may be off: policies decide in float32, which differs by machine."""
@@ -32,13 +32,14 @@ SAME = 1e-6
 class Desk:
     """A run whose agents, baselines and strategies of the user's own are followed.
 
-    load and check: how prices are read and checked, with the options of the command line.
+    inspect: how prices are read, from the options of the command line. findings: what was found on
+    the table that was read last.
     """
 
     run: Backtest
     folder: Path
-    load: Callable[..., Prices] = field(default=load)
-    check: Callable[..., list[Finding]] = field(default=check)
+    inspect: Callable[..., tuple[Prices | None, list[Finding]]] = field(default=inspect)
+    findings: list[Finding] = field(default_factory=list)
 
     @staticmethod
     def open(folder: Path | str, **options: Any) -> "Desk":
@@ -50,7 +51,7 @@ class Desk:
         known["ended"] = options.get("ended") or ends
         # Policies and baselines look at the last rows only; assets may start at any row before.
         known["late"] = "join"
-        return Desk(run, Path(folder), partial(load, **known), partial(check, **known))
+        return Desk(run, Path(folder), partial(inspect, **known))
 
     @property
     def ledger(self) -> Ledger:
@@ -105,7 +106,8 @@ class Desk:
         """The prices to decide on (default: those of the backtest)."""
         if prices is None:
             return self.run.prices
-        table = self.load(prices)
+        read, self.findings = self.inspect(prices)
+        table = accepted(read, self.findings, prices)
         if table.members is None and self.run.prices.members is not None:
             raise QfolioError(
                 "The backtest's universe has members that change over time; give the latest "
@@ -113,10 +115,11 @@ class Desk:
             )
         return followed.table(table)
 
-    def news(self, prices: Path) -> list[Finding]:
-        """The findings on those rows of a table that are later than the backtest's."""
+    @property
+    def news(self) -> list[Finding]:
+        """The findings on those rows of the last table read that are later than the backtest's."""
         last = day(self.run.prices.dates[-1])
-        return [found for found in self.check(prices) if found.date and found.date > last]
+        return [found for found in self.findings if found.date and found.date > last]
 
     def hindsight(self, followed: Policy | Untrained, table: Prices) -> str:
         """Says so if a policy has learned from later rows than a table's last one; else ""."""

@@ -14,10 +14,9 @@ from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.vocabulary import plain
 
-ONE_CURRENCY = "Convert all prices to one currency."
-
 MOST_CELLS, SPARSEST = 100_000_000, 0.05  # a long table that would be this large and this empty
 WRITE_DATES = "Write dates as 2020-01-31."
+ONE_CURRENCY = "Convert all prices to one currency."
 
 
 @dataclass(frozen=True)
@@ -84,13 +83,14 @@ def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:
             advice=ONE_CURRENCY,
         )
     for j, name in enumerate(table.names):
-        codes = {label(cell) for cell in table.columns[j]} if plain(name) == "currency" else set()
-        if len(codes - {""}) > 1:
-            findings.warn(
-                f"there are several currencies: {listed(sorted(codes - {''})[:LISTED])}",
-                column=name,
-                advice=ONE_CURRENCY,
-            )
+        if plain(name) == "currency":
+            codes = sorted({label(cell) for cell in table.columns[j]} - {""})
+            if len(codes) > 1:
+                findings.warn(
+                    f"there are several currencies: {listed(codes[:LISTED])}",
+                    column=name,
+                    advice=ONE_CURRENCY,
+                )
     cells = table.columns[columns.date]
     if columns.time is not None:
         cells = with_times(cells, table.columns[columns.time])

@@ -131,7 +131,7 @@ def _sort_out(
         distances = np.abs(ratios - abs(jump))
         split = SPLITS[distances.argmin()]
         # Prices rise by about such a ratio in takeovers, and fall by about a third on bad news.
-        divided = jump < 0 and split >= 2 and split % 1 == 0
+        divided = jump < 0 and split % 1 == 0
         loose = min(1.5 * _usual(np.abs(moves[:, j])), LOOSE) if divided else 0.0
         if distances.min() <= max(np.log1p(EXACT), loose):
             splits[i, j] = _ratio(split, jump > 0)

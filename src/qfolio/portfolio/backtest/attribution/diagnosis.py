@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from qfolio.core.text import figure
 from qfolio.portfolio.backtest.replay import Entry
 
 STILL = 1e-6
@@ -17,7 +18,6 @@ SAME = 1e-4
 
 ALONE = 0.99
 """Weight above which an asset is held alone, and the share of days on which it has to be."""
-
 
 IDLE = 0.02
 """Mean weight of cash by which a reference exceeds an agent, from which on this is said."""
@@ -63,8 +63,8 @@ def idle(name: str, entry: Entry, reference: str, other: Entry) -> list[str]:
     if not theirs - held >= IDLE:
         return []
     return [
-        f"{reference} held {theirs:.0%} of its wealth in cash on average, and {name} {held:.0%}: "
-        "part of the difference between them is what the market earned."
+        f"{reference} held {figure(theirs, '.0%')} of its wealth in cash on average, and {name} "
+        f"{figure(held, '.0%')}: part of the difference between them is what the market earned."
     ]
 
 
