@@ -8,39 +8,33 @@ from qfolio.portfolio.backtest.verdict import p_value
 from qfolio.portfolio.study.folder import Result
 from qfolio.portfolio.study.pooling import Pooled, Pools
 
+_VERBS = {"better": "{} beats", "worse": "{} falls short of", "none": "No evidence that {} beats"}
+
 
 def verdicts(agents: Mapping[str, Pools]) -> dict[str, list[str]]:
-    """Sentences on each agent: against the reference, its best rebalancing, and by table.
+    """Sentences on each agent: what was found, the same against another speed, and by table."""
+    return {name: [*_findings(name, pools), _tables(pools)] for name, pools in agents.items()}
 
-    Only equal weights are rebalanced at several speeds.
+
+def _findings(name: str, pools: Pools) -> list[str]:
+    """The claim about an agent with its numbers; equal weights have a second sentence.
+
+    Equal weights that are rebalanced at every row pay for trades that earn nothing. To beat them
+    alone is therefore no claim: an agent that merely trades less does so on random walks.
     """
-    return {
-        name: [
-            f"{_claim(name, pools)}: {_numbers(pools.to_reference)}.",
-            *(
-                [f"{_claim_at_best(name, pools)}: {_numbers(pools.to_rebalanced)}."]
-                if _reference(pools) == EQUAL_WEIGHT
-                else []
-            ),
-            _tables(pools),
-        ]
-        for name, pools in agents.items()
-    }
-
-
-def _claim(name: str, pools: Pools) -> str:
-    where = f"{_reference(pools)} in growth after costs over {amount(len(pools.evidence), 'table')}"
-    if pools.to_reference.finding == "better":
-        return f"{name} beats {where}"
-    if pools.to_reference.finding == "worse":
-        return f"{name} falls short of {where}"
-    return f"No evidence that {name} beats {where}"
-
-
-def _claim_at_best(name: str, pools: Pools) -> str:
-    if pools.to_rebalanced.finding == "better":
-        return f"{name} beats {_reference(pools)}, however it is rebalanced, in growth after costs"
-    return f"No evidence that {name} beats the best rebalancing of {_reference(pools)}"
+    reference, alone, best = _reference(pools), pools.to_reference, pools.to_rebalanced
+    at_best = f"the best rebalancing of {reference}"
+    said = f"{_VERBS[alone.finding or 'none'].format(name)} {reference}", alone
+    other = f"Against {at_best}", best
+    if reference == EQUAL_WEIGHT and best.finding == "better":
+        said = f"{name} beats {reference}, however it is rebalanced,", best
+        other = f"Against {reference} itself, which is rebalanced at every row", alone
+    elif reference == EQUAL_WEIGHT and alone.finding == "better":
+        said = f"No evidence that {name} beats {at_best}", best
+        other = f"It beats {reference} itself, as trading less may do without any skill", alone
+    where = f"in growth after costs over {amount(len(pools.evidence), 'table')}"
+    first = f"{said[0]} {where}: {_numbers(said[1])}."
+    return [first, f"{other[0]}: {_numbers(other[1])}."] if reference == EQUAL_WEIGHT else [first]
 
 
 def _reference(pools: Pools) -> str:
@@ -60,7 +54,11 @@ def _tables(pools: Pools) -> str:
     worst = pools.evidence[pools.to_reference.worst].to_reference
     count, total = pools.to_reference.positive, len(pools.evidence)
     grew = f"It grew more than {worst.reference} on {count} of {amount(total, 'table')}"
-    return f"{grew}; its worst is {pools.to_reference.worst}, {percent(worst.growth)} a year."
+    if worst.reference == EQUAL_WEIGHT:
+        grew += f", and more than its best rebalancing on {pools.to_rebalanced.positive}"
+    return (
+        f"{grew}. Its worst table is {pools.to_reference.worst} ({percent(worst.growth)} a year)."
+    )
 
 
 def looks_sentence(result: Result) -> str:
