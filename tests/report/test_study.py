@@ -22,7 +22,7 @@ def test_every_table_has_a_row_and_an_interval(count):
     assert all(0 <= place <= 100 for place in places)
     assert shown.text.count("Pooled") >= 2
     assert "short is left out. 120 rows are too few." in shown.text
-    assert "its worst is" in shown.text
+    assert "Its worst table is" in shown.text
     assert ("worst" in [word.strip() for word in shown.words]) == (count > 1)
 
 
