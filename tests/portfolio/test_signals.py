@@ -137,6 +137,8 @@ def test_what_all_assets_share_has_no_rank():
     [
         ("momentun:5", "there is no signal 'momentun'; did you mean momentum"),
         ("momentum:0", "looks back on 0 rows"),
+        ("momentum:0m", "looks back on 0 rows"),
+        ("momentum:1m-1m", "21 rows and skips 21"),
         ("momentum:5-5", "5 rows and skips 5"),
         ("test_nowhere:Mine", "is code of the module test_nowhere"),
     ],
@@ -155,11 +157,44 @@ def test_a_signal_of_ones_own_is_checked(wrong, says):
     signals.compute([Level()], prices()[:, :4])
 
 
-def table(rows=60):
+@pytest.mark.parametrize(
+    ("a_year", "rows"),
+    [
+        (98_280, [(252, 21), (63, 0), (5, 0), (1, 0), (21, 5)]),  # minutes
+        (365, [(252, 21), (63, 0), (5, 0), (1, 0), (21, 5)]),
+        (252, [(252, 21), (63, 0), (5, 0), (1, 0), (21, 5)]),
+        (52, [(52, 4), (13, 0), (1, 0), (1, 0), (4, 1)]),
+        (12, [(12, 1), (3, 0), (1, 0), (1, 0), (2, 1)]),
+        (1, [(2, 1), (1, 0), (1, 0), (1, 0), (2, 1)]),
+    ],
+)
+def test_a_length_of_time_has_fewer_rows_on_a_slower_table(a_year, rows):
+    text = "momentum:1y-1m,high:3m,high:1w,high:1d,momentum:1m-1w,volatility:21"
+    *found, fixed = signals.parse(text, a_year)
+    assert [(each.rows, each.skip) for each in found] == rows
+    assert fixed.rows == 21
+
+
+def test_signals_that_are_one_on_a_monthly_table_count_once():
+    values = prices()[:, :4]
+    found = signals.compute(signals.parse("drift:1y-1d,drift:1y-1m,high:1y", 12), values)
+    assert found[20:, :, 0].any(1).all()
+    assert not found[..., 1].any()
+    assert found[20:, :, 2].any(1).all()
+
+
+def table(rows=60, every=1):
+    """every: days from a row to the next."""
     values = prices()[:rows, :3]
-    return Prices(
-        np.datetime64("2020-01-01") + np.arange(rows, dtype="m8[D]"), ("a", "b", "c"), values
-    )
+    days = every * np.arange(rows, dtype="m8[D]")
+    return Prices(np.datetime64("2020-01-01") + days, ("a", "b", "c"), values)
+
+
+def test_a_portfolio_counts_the_rows_of_its_own_table():
+    weekly = Portfolio.of(table(every=7), window=2, horizon=10, signals="momentum:3m,high:2m")
+    rows = Portfolio.of(table(every=7), window=2, horizon=10, signals="momentum:13,high:9")
+    np.testing.assert_array_equal(weekly.extra, rows.extra)
+    assert rows.extra[20:].any()
 
 
 def test_a_portfolio_observes_them():

@@ -249,7 +249,8 @@ class Policy:
                 f"needs at least {self.task.window + 1}."
             )
         # A policy that learned from a shorter table has never known its longest signals.
-        looked = min(signals.lookback(signals.parse(self.task.signals)), self.rows - 1)
+        chosen = signals.parse(self.task.signals, table.periods_per_year)
+        looked = min(signals.lookback(chosen), self.rows - 1)
         if len(table) <= looked:
             raise QfolioError(
                 f"The price table has {amount(len(table), 'row')}; the policy's signals "

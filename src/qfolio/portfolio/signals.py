@@ -1,8 +1,9 @@
 """Signals: numbers for each asset and row, from prices up to that row.
 
-A portfolio's setting ``signals="momentum:252-21,volatility:21"`` names signals, each with the
-number of rows that it looks back on and, after the hyphen, of latest rows that it skips. A user's
-own signal is ``module:Name``, with or without rows, and ``feature:NAME`` is a column of the table.
+A portfolio's setting ``signals="momentum:252-21,volatility:1m"`` names signals, each with the
+number of rows that it looks back on and, after the hyphen, of latest rows that it skips; either may
+be a length of time such as ``1y`` (``LENGTHS``). A user's own signal is ``module:Name``, with or
+without rows, and ``feature:NAME`` is a column of the table.
 Agents observe signals after the log return and the table's own features. By default each signal is
 ranked across assets, from −1 to 1, so that nothing has to be fitted; a number that all assets share
 is not scaled. docs/concepts/signals.md lists formulas and sources.
@@ -21,10 +22,15 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.fields import static
 from qfolio.core.registry import SIGNALS, build
 from qfolio.core.text import amount
+from qfolio.portfolio.prices.frequency import TRADING_DAYS
 
 Floats = NDArray[np.float64]
 
 COLUMN = "feature:"
+
+LENGTHS = {"d": 1, "w": 5, "m": 21, "y": 252}
+"""Rows in a day, a week, a month and a year of a daily table. A slower table has fewer, at least
+one; in a faster one, whose prices move on another scale, they are the same numbers of rows."""
 
 SCALES = ("rank", "z-score", "centered", "raw")
 """How signals are scaled across assets, row by row: ranks from −1 to 1; distances from the mean in
@@ -219,14 +225,18 @@ class Column(Signal):
         raise AssertionError("compute reads columns from the table")
 
 
-def parse(text: str) -> list[Signal]:
-    """The signals that a text names; raises QfolioError if there is no such signal."""
-    return [_named(part) for part in labels(text)]
+def parse(text: str, periods_per_year: float = TRADING_DAYS) -> list[Signal]:
+    """The signals that a text names, on a table with some rows a year.
+
+    Raises QfolioError if there is no such signal.
+    """
+    pace = min(1.0, periods_per_year / TRADING_DAYS)
+    return [_named(part, pace) for part in labels(text)]
 
 
 def names(text: str) -> list[str]:
     """The names in such a text, without rows and without columns of the table."""
-    return [_split(part)[0] for part in labels(text) if not part.startswith(COLUMN)]
+    return [_split(part, 1.0)[0] for part in labels(text) if not part.startswith(COLUMN)]
 
 
 def labels(text: str) -> list[str]:
@@ -246,7 +256,7 @@ def compute(
     columns: Mapping[str, Floats] | None = None,
     tradable: NDArray[np.bool_] | None = None,
 ) -> Floats:
-    """Signals of shape (row, asset, signal), 0 where one is unknown.
+    """Signals of shape (row, asset, signal), 0 where one is unknown or repeats an earlier one.
 
     prices, columns: of shape (row, asset), NaN where unknown. tradable: which assets are compared
     at each row, likewise (default: all); the others' signals are 0.
@@ -268,16 +278,30 @@ def compute(
         _scaled(x, same, s.scale or scale)
         for s, x, same in zip(signals, values, shared, strict=True)
     ]
+    # On a monthly table, returns over a day, a week and a month are one signal, not three.
+    for place, signal in enumerate(signals):
+        if signal in signals[:place]:
+            found[place] = np.zeros(prices.shape)
     return np.stack(found, -1) if found else np.zeros((*prices.shape, 0))
 
 
-def _split(text: str) -> tuple[str, dict[str, str]]:
-    """A signal's name, and its rows and skip if it has any."""
-    match = re.fullmatch(r"(.+?)(?::(\d+)(?:-(\d+))?)?", text)
+def _split(text: str, pace: float) -> tuple[str, dict[str, str]]:
+    """A signal's name, and its rows and skip if it has any; pace: rows in a daily table's row."""
+    match = re.fullmatch(r"(.+?)(?::(\d+[dwmy]?)(?:-(\d+[dwmy]?))?)?", text)
     assert match is not None  # anything is a name
     name, *given = match.groups()
-    pairs = zip(("rows", "skip"), given, strict=True)
-    return name, {key: value for key, value in pairs if value is not None}
+    rows = [_rows(length, pace) for length in given if length is not None]
+    if len(rows) == 2 and given[0][-1] in LENGTHS and pace < 1:
+        rows[0] = max(rows[0], rows[1] + 1)  # 1m-1w would be 1-1 on a monthly table
+    return name, dict(zip(("rows", "skip"), map(str, rows), strict=False))
+
+
+def _rows(length: str, pace: float) -> int:
+    """The rows of a length such as 21 or 1m."""
+    if length[-1] not in LENGTHS:
+        return int(length)
+    daily = int(length[:-1]) * LENGTHS[length[-1]]
+    return max(min(1, daily), round(pace * daily))
 
 
 def _is_shared(signal: Signal, values: Floats) -> bool:
@@ -297,10 +321,10 @@ def _column(name: str, columns: Mapping[str, Floats]) -> Floats:
     return columns[name]
 
 
-def _named(text: str) -> Signal:
+def _named(text: str, pace: float) -> Signal:
     if text.startswith(COLUMN):
         return Column(name=text.removeprefix(COLUMN))
-    name, chosen = _split(text)
+    name, chosen = _split(text, pace)
     return build("signal", name, chosen)
 
 

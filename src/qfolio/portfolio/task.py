@@ -124,7 +124,7 @@ class Portfolio(Market):
 
         Signals are 0 where they are not yet known.
         """
-        chosen = signals.parse(self.signals)
+        chosen = signals.parse(self.signals, prices.periods_per_year)
         logs = np.zeros(prices.values.shape)
         logs[1:] = np.nan_to_num(np.diff(np.log(prices.values), axis=0))
         columns = dict(zip(prices.feature_names, np.moveaxis(prices.features, -1, 0), strict=True))
@@ -198,8 +198,8 @@ class Portfolio(Market):
             raise QfolioError(
                 f"{last - first + 1} rows are too few: a window of {self.window}, a lag of "
                 f"{self.lag} and an episode of {self.horizon} need at least "
-                f"{self.window + self.lag + self.horizon + 1}; lower window or horizon "
-                "(--set horizon=…), or give more rows."
+                f"{self.window + self.lag + self.horizon + 1}; give more rows (a longer --train in "
+                "a backtest), or lower window or horizon (--set horizon=…)."
             )
         rows = slice(first + 1, last + 1)
         usable = np.ones(self.limits.shape[0], bool) if tradable is None else tradable

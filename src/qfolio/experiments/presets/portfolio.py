@@ -8,9 +8,9 @@ _TASK = {"window": 60, "horizon": 50, "reward": "crra", "risk_aversion": 5.0}
 
 
 SIGNALS = (
-    "drift:252-1,drift:252-2,drift:252-5,drift:252-10,drift:252-21,drift:252-63,drift:252-126,"
-    "momentum:252-21,volatility:21,volatility:126,volatility-ratio:252-21,high:252,maximum:21,"
-    "beta:252,residual-volatility:252,correlation:252,market-volatility:63"
+    "drift:1y-1d,drift:1y-2d,drift:1y-1w,drift:1y-2w,drift:1y-1m,drift:1y-3m,drift:1y-6m,"
+    "momentum:1y-1m,volatility:1m,volatility:6m,volatility-ratio:1y-1m,high:1y,maximum:1m,"
+    "beta:1y,residual-volatility:1y,correlation:1y,market-volatility:3m"
 )
 
 
