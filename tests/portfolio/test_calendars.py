@@ -9,6 +9,7 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.attribution.explain import explain
+from qfolio.portfolio.backtest.baselines import History
 from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
 from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import AT_EVERY_ROW, orders
@@ -105,6 +106,22 @@ def test_equal_weights_wait_for_drift_as_in_a_ledger_of_shares() -> None:
             assert np.isnan(order[0]) == (row > test.start and abs(held - equal).max() <= band)
             shares = shares if np.isnan(order[0]) else order[1:] / prices.values[row]
         assert 1 < (~np.isnan(found[:, 0])).sum() < len(test) / 2
+
+
+def test_a_fold_without_a_row_of_the_calendar_buys_nothing() -> None:
+    class Asked(EqualWeight):
+        def decide(self, history: History, held: np.ndarray) -> np.ndarray:
+            seen.append(held)
+            return super().decide(history, held)
+
+    seen: list[np.ndarray] = []
+    prices, decides = table(60), np.zeros(60, bool)
+    decides[45] = True
+    folds = [Fold("", slice(0, 21), slice(s, s + 10), slice(0, 21)) for s in (20, 30, 40)]
+    terms = AT_EVERY_ROW._replace(decides=decides)
+    found = orders("x", Asked(), folds, prices.dates, prices.values, terms=terms).decisions
+    assert np.flatnonzero(~np.isnan(found[:, 0])).tolist() == [25]
+    np.testing.assert_array_equal(seen, np.tile(np.eye(5)[0], (3, 1)))
 
 
 @pytest.mark.slow

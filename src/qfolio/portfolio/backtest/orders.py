@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -98,79 +97,102 @@ def orders(
     _check(folds)
     conditions = Conditions(np.empty(0), {}, {}) if conditions is None else conditions
     growth = Growth(filled_in(prices)[0], costs or Proportional(), conditions)
-    limited = lru_cache(1)(feasible) if feasible is not None else lambda *_: None
-    nothing = np.eye(prices.shape[1] + 1)[0]
-    last, row_last, plan = nothing, folds[0].decisions.start, terms.begin(nothing)
-    watched = plan is not None or terms.called < np.inf
-    parts, notes = [], []
+    first, stop = folds[0].decisions.start, folds[-1].decisions.stop
+    account = _Account(growth, terms, universe, first)
+    asks, gives = _calendar(baseline, folds, len(prices), month, terms, universe is not None)
+    decisions, notes = np.full((stop - first, prices.shape[1] + 1), np.nan), []
     for number, fold in enumerate(folds):
-        priced = ~np.isnan(prices[fold.train]).any(axis=0)
-        if universe is None and not priced.any():
-            raise QfolioError(
-                f"Fold {fold.name} has no asset with a price in all of its training rows; begin "
-                "later or drop the assets that start late."
-            )
-        allowed = priced if universe is None else universe & (priced | (not baseline.estimates))
-        rows = range(len(prices))[fold.decisions]
-        decides = terms.decides if len(terms.decides) else None
-        asked = set(_asked(baseline, rows, folds[0].decisions.start, month, decides))
-        trading = np.ones(len(rows), bool) if decides is None else decides[fold.decisions]
-        stands = baseline.calendar == "fold"  # its target holds for every row
-        each = universe is not None and stands
-        asked |= {row for row in rows if each and (decides is None or decides[row])}
-        again = stands and (feasible is not None or terms.band > 0)
-        part = np.full((len(rows), len(last)), np.nan)
+        tradable = _tradable(baseline, fold, prices, universe)
+        wanted = None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            for row in rows if again or watched else sorted(asked):
-                held = growth.held(last, row_last, row)
+            for row in range(fold.decisions.start, fold.decisions.stop):
+                held = account.held(row)
                 called = terms.calls(held)
-                if row in asked or (called and not stands):
+                asked = asks[row] or (called and baseline.calendar != "fold")
+                due = gives[row] or called
+                mandated = feasible(number, row) if feasible and (asked or due) else None
+                if asked:
                     known = slice(0, row + 1)
-                    mandated = limited(number, row)
-                    open_to = holdable(allowed if universe is None else allowed[row], mandated)
+                    open_to = holdable(tradable[row], mandated)
                     history = History(dates[known], prices[known], fold.train, open_to, cap, month)
-                    wanted = baseline.decide(history, held) if open_to.any() else nothing
-                elif not stands:
-                    wanted = None
-                due = trading[row - rows[0]] or called or not (again or watched or each)
-                order, given = held, False
-                if called or (wanted is not None and due):
-                    mandated = limited(number, row)
-                    left = terms.unspent(plan)
-                    if left is not None and isinstance(mandated, Mandated):
-                        mandated = mandated.spending(left)
-                    if wanted is not None:
-                        order = obeying(name, wanted, held, history, mandated)
-                    elif mandated is not None:  # a lender does not wait for the baseline
-                        order = exactly(mandated, held, held)
-                    given = terms.beyond(held, order)
-                target, plan = terms.trade(held, order, given, plan)
-                if given or (target != held).any():
-                    last, row_last = target, row
-                    part[row - rows[0]] = target
-                if plan is not None and row + 1 < len(prices):
-                    coming = growth.held(plan.order, row, row + 1)
-                    coming = coming if universe is None else cashed(coming, universe[row + 1])
-                    plan = terms.next_row(row, plan, coming)
-        if stands and not (again or watched or each or np.isnan(part[0]).any()):
-            part[:] = np.where(trading[:, None], part[0], np.nan)
-            row_last = rows[np.flatnonzero(trading)[-1]] if trading.any() else row_last
+                    wanted = ask(name, baseline, history, held, mandated)
+                # A lender does not wait for the baseline.
+                goal = held if called and wanted is None else wanted
+                order = None
+                if due and goal is not None:
+                    order = obeying(goal, held, account.within_turnover(mandated))
+                decisions[row - first] = account.trade(row, held, order)
         said = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
         notes += [f"{name}, fold {fold.name}: {note}" for note in said]
-        parts.append(part)
-    return Orders(np.concatenate(parts), tuple(notes))
+    return Orders(decisions, tuple(notes))
 
 
-def _asked(
-    baseline: Baseline, rows: range, first: int, month: int, decides: Bools | None
-) -> Sequence[int]:
-    """The rows of a fold at which a baseline decides; months count from the first of the test."""
-    if baseline.calendar == "fold":
-        return rows[:1]
-    if decides is not None:
-        return [row for row in rows if decides[row]]
-    return rows[(first - rows[0]) % month :: month] if baseline.calendar == "month" else rows
+def _tradable(baseline: Baseline, fold: Fold, prices: Floats, universe: Bools | None) -> Bools:
+    """The assets that a baseline may hold in a fold, were there no mandate, of shape (rows, N)."""
+    priced = ~np.isnan(prices[fold.train]).any(axis=0)
+    if universe is not None:
+        return universe & (priced | (not baseline.estimates))
+    if not priced.any():
+        raise QfolioError(
+            f"Fold {fold.name} has no asset with a price in all of its training rows; begin "
+            "later or drop the assets that start late."
+        )
+    return np.tile(priced, (len(prices), 1))
+
+
+def _calendar(
+    baseline: Baseline, folds: Sequence[Fold], rows: int, month: int, terms: Terms, changing: bool
+) -> tuple[Bools, Bools]:
+    """At which rows a baseline is asked, and at which its last answer is an order, both (rows,).
+
+    changing: whether assets come and go.
+    """
+    gives = np.ones(rows, bool)
+    if len(terms.decides):
+        gives = terms.decides
+    elif baseline.calendar == "month":
+        gives = (np.arange(rows) - folds[0].decisions.start) % month == 0
+    if baseline.calendar != "fold":
+        return gives, gives
+    asks = gives & changing
+    asks[[fold.decisions.start for fold in folds]] = True
+    return asks, gives
+
+
+class _Account:
+    """The weights that a baseline holds; it is all in cash at its first row."""
+
+    def __init__(self, growth: Growth, terms: Terms, universe: Bools | None, first: int) -> None:
+        self.growth, self.terms, self.universe = growth, terms, universe
+        self.weights, self.row = np.eye(growth.prices.shape[1] + 1)[0], first  # of the last trade
+        self.plan = terms.begin(self.weights)
+
+    def held(self, row: int) -> Floats:
+        """The weights at a row before it trades."""
+        return self.growth.held(self.weights, self.row, row)
+
+    def within_turnover(self, mandated: Feasible | None) -> Feasible | None:
+        """What a mandate allows with the turnover that is left this year."""
+        left = self.terms.unspent(self.plan)
+        if left is None or not isinstance(mandated, Mandated):
+            return mandated
+        return mandated.spending(left)
+
+    def trade(self, row: int, held: Floats, order: Floats | None) -> Floats:
+        """The weights after a row's trade; NaN if there is none."""
+        given = order is not None and self.terms.beyond(held, order)
+        goal = held if order is None else order
+        target, self.plan = self.terms.trade(held, goal, given, self.plan)
+        traded = given or (target != held).any()
+        if traded:
+            self.weights, self.row = target, row
+        if self.plan is not None and row + 1 < len(self.growth.prices):
+            coming = self.growth.held(self.plan.order, row, row + 1)
+            if self.universe is not None:
+                coming = cashed(coming, self.universe[row + 1])
+            self.plan = self.terms.next_row(row, self.plan, coming)
+        return target if traded else np.full_like(held, np.nan)
 
 
 def holdable(tradable: Bools, mandated: Feasible | None) -> Bools:
@@ -180,16 +202,24 @@ def holdable(tradable: Bools, mandated: Feasible | None) -> Bools:
     return tradable & (np.asarray(mandated.limits.high) > 0)
 
 
-def obeying(
-    name: str, wanted: ArrayLike, held: Floats, history: History, mandated: Feasible | None
-) -> Floats:
-    """A baseline's target weights, projected onto what a mandate allows, if there is one.
+def ask(
+    name: str, baseline: Baseline, history: History, held: Floats, mandated: Feasible | None
+) -> Floats | None:
+    """A baseline's target weights before a mandate, if there is one, is applied; None for no order.
 
-    Raises QfolioError if they are invalid.
+    All cash if it may hold no asset. Raises QfolioError if the weights are invalid.
     """
-    if mandated is None:
-        return checked(name, wanted, history)
-    return exactly(mandated, checked(name, wanted, history._replace(cap=np.inf)), held)
+    if not history.tradable.any():
+        return np.eye(len(held))[0]
+    wanted = baseline.decide(history, held)
+    if wanted is None:
+        return None
+    return checked(name, wanted, history if mandated is None else history._replace(cap=np.inf))
+
+
+def obeying(wanted: Floats, held: Floats, mandated: Feasible | None) -> Floats:
+    """Target weights, projected onto what a mandate allows, if there is one."""
+    return wanted if mandated is None else exactly(mandated, wanted, held)
 
 
 def checked(name: str, wanted: ArrayLike, history: History) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.folds import latest
-from qfolio.portfolio.backtest.orders import TOLERANCE, holdable, obeying
+from qfolio.portfolio.backtest.orders import TOLERANCE, ask, holdable, obeying
 from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.mandate import checks
@@ -115,10 +115,10 @@ class Rule(Untrained):
             mandated = mandated if left is None else mandated.spending(left)
         open_to = holdable(tradable, mandated)
         history = History(table.dates, table.values, fold.train, open_to, cap, table.month)
-        wanted = self.baseline.decide(history, held)
+        wanted = ask(self.name, self.baseline, history, held, mandated)
         target = held
         if wanted is not None:
-            target = obeying(self.name, wanted, held, history, mandated)
+            target = obeying(wanted, held, mandated)
             target = target if terms.beyond(held, target) else held
         return dict(zip(("cash", *self.assets), target.tolist(), strict=True))
 
