@@ -28,7 +28,8 @@ from qfolio.experiments.tuning.search import dimension
 from qfolio.experiments.tuning.sensitivity import ENOUGH, Outcome, sensitivity, short, verdicts
 from qfolio.experiments.tuning.trials import trials_jobs
 from qfolio.report.figures.tuning import draw_progress
-from qfolio.report.tuning import Sweep, render_page, write_tuning_report
+from qfolio.report.sweep import Sweep
+from qfolio.report.tuning import render_page, write_tuning_report
 
 from jobs import Elsewhere
 from shell import TINY, qfolio

@@ -130,7 +130,8 @@ def tune(
 
 def write_again(folder: Path) -> None:
     """Writes the report of a finished search."""
-    from qfolio.report.tuning import sweep, write_tuning_report
+    from qfolio.report.sweep import sweep
+    from qfolio.report.tuning import write_tuning_report
 
     tuning = _tuning()
     if not (folder / "summary.json").is_file():
@@ -201,7 +202,8 @@ def _new(
 
 def _conclude(work: "Tuning", resume: str, executor: "Executor") -> Document:
     from qfolio.commands.console import console, print_search, say
-    from qfolio.report.tuning import sweep, write_tuning_report
+    from qfolio.report.sweep import sweep
+    from qfolio.report.tuning import write_tuning_report
 
     with console.status("Training the best configuration and the preset with fresh seeds"):
         summary = work.conclude(executor=executor)

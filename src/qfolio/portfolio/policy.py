@@ -25,7 +25,7 @@ from qfolio.core.training import episode_steps
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Listener, fit
 from qfolio.experiments.presets import Preset, preset
-from qfolio.portfolio import signals
+from qfolio.portfolio import policy_folder, signals
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.prices.findings import day
@@ -324,16 +324,22 @@ class Policy:
 
     def save(self, folder: Path | str) -> None:
         """Writes the policy into a new or empty folder."""
-        from qfolio.portfolio import policy_folder
-
-        policy_folder.save(self, path_of("folder", folder))
+        content = policy_folder.Content(
+            self.task,
+            self.agent,
+            self.members,
+            self.assets,
+            self.features,
+            self.learner,
+            self.updates,
+            self.learned,
+        )
+        policy_folder.save(content, self.seeds, self.rows, path_of("folder", folder))
 
     @classmethod
     def open(cls, folder: Path | str) -> "Policy":
         """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
-        from qfolio.portfolio import policy_folder
-
-        return policy_folder.read(path_of("folder", folder))
+        return cls(*policy_folder.read(path_of("folder", folder)))
 
     def _moved(self, table: Prices) -> Portfolio:
         """The task on all rows of another table, with the scale of the old one."""

@@ -5,8 +5,9 @@ learning.safetensors the whole learning state, for updates.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,7 +22,6 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import new_folder, read_tree, write_tree
 from qfolio.core.mdp import Agent
 from qfolio.core.registry import build, name_of
-from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.task import Portfolio
 
 
@@ -43,29 +43,42 @@ class PolicyConfig(Config, frozen=True):
     learns: bool
 
 
-def save(policy: Policy, folder: Path) -> None:
-    """Writes a policy into a new or empty folder."""
+class Content(NamedTuple):
+    """What a folder holds: the arguments of ``policy.Policy``."""
+
+    task: Portfolio
+    agent: Agent
+    members: PyTree  # the agents' weights, with a leading seed axis
+    assets: Sequence[str]
+    features: Sequence[str]
+    learner: PyTree  # the agents' whole states, likewise; None if they cannot go on learning
+    updates: int
+    learned: np.datetime64
+
+
+def save(content: Content, seeds: int, rows: int, folder: Path) -> None:
+    """Writes a policy into a new or empty folder; rows: those that it was trained on."""
     config = PolicyConfig(
-        agent=name_of(policy.agent),
-        settings=settings.describe(policy.agent),
-        task=settings.describe(policy.task),
-        assets=list(policy.assets),
-        features=list(policy.features),
-        seeds=policy.seeds,
-        rows=policy.rows,
-        updates=policy.updates,
-        learned=str(policy.learned),
-        learns=policy.learner is not None,
+        agent=name_of(content.agent),
+        settings=settings.describe(content.agent),
+        task=settings.describe(content.task),
+        assets=list(content.assets),
+        features=list(content.features),
+        seeds=seeds,
+        rows=rows,
+        updates=content.updates,
+        learned=str(content.learned),
+        learns=content.learner is not None,
     )
     with new_folder(folder) as place:
         write_config(place / "policy.json", config)
-        kept = jax.tree.map(np.asarray, _kept(policy.task, policy.members))
+        kept = jax.tree.map(np.asarray, _kept(content.task, content.members))
         write_tree(place / "policy.safetensors", kept)
-        if policy.learner is not None:
-            write_tree(place / "learning.safetensors", policy.learner)
+        if content.learner is not None:
+            write_tree(place / "learning.safetensors", content.learner)
 
 
-def read(folder: Path) -> Policy:
+def read(folder: Path) -> Content:
     """Reads what ``save`` wrote. Raises QfolioError if the folder holds no policy."""
     path = folder / "policy.json"
     config = read_config(path, PolicyConfig)
@@ -83,7 +96,7 @@ def read(folder: Path) -> Policy:
     members = kept.pop("members")
     task = dataclasses.replace(task, **jax.tree.map(jnp.asarray, kept))
     learner = read_tree(path.with_name("learning.safetensors"), state) if config.learns else None
-    return Policy(
+    return Content(
         task, agent, members, config.assets, config.features, learner, config.updates, learned
     )
 

@@ -16,12 +16,11 @@ from qfolio.experiments.tuning.sensitivity import Effect, Outcome
 from qfolio.report import palette
 from qfolio.report.figures.style import NARROW, new_figure, svgs
 from qfolio.report.rendering import percent
+from qfolio.report.sweep import Sweep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from qfolio.report.tuning import Sweep
 
 SHADES = 5
 """Shades of trials from the first to the last, or from the worst to the best."""
