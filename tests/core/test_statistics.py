@@ -3,8 +3,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.core.statistics import (
     FEWEST_SEEDS,
     band,
@@ -108,7 +108,7 @@ def test_few_seeds_have_a_range_and_no_interval() -> None:
 
 def test_strata_are_drawn_by_themselves() -> None:
     # Each group is constant, so that its mean cannot change, whoever is drawn.
-    def difference(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def difference(x: Floats, y: Floats) -> Floats:
         return np.asarray(interquartile_mean(x) - interquartile_mean(y))
 
     assert stratified_interval([[5.0] * 3, [2.0] * 7], difference) == pytest.approx((3.0, 3.0))

@@ -16,11 +16,11 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 from PIL import Image
 
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Pathwise
+from qfolio.core.arrays import Floats
 from qfolio.core.market import View
 from qfolio.core.mdp import Box, Position
 from qfolio.experiments.presets import preset
@@ -60,8 +60,6 @@ from qfolio.report.training import (
     write_report,
 )
 from qfolio.tasks.catch import Catch
-
-Floats = NDArray[np.float64]
 
 DISCOUNT = 0.98
 ANGLES = np.linspace(-np.pi, np.pi, 61)

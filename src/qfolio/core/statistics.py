@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from qfolio.core.arrays import Floats
 
 FEWEST_SEEDS = 5
 """With fewer seeds, results show the seeds themselves, or their range, and no interval: Student's

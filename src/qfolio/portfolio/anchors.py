@@ -8,8 +8,8 @@ asset.
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import exists
 from qfolio.portfolio.backtest.baselines import History, baseline
@@ -22,7 +22,7 @@ from qfolio.portfolio.signals import COLUMN
 MONTHS = 60
 """Months of prices up to a decision that a baseline estimates from."""
 
-Weights = NDArray[np.float64]
+Weights = Floats
 
 
 def baselines(anchor: str) -> list[str]:

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 
 PERIODS = ("weekly", "monthly", "quarterly", "yearly")
@@ -12,7 +13,7 @@ DRIFT = "drift:"
 """Prefix of a calendar that trades only when a weight has drifted beyond a band: drift:0.05."""
 
 
-def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bool_]:
+def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> Bools:
     """Whether a decision is due at each row, of shape (row,).
 
     Args:
@@ -43,7 +44,7 @@ def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> NDArray[np.bo
     )
 
 
-def elapsed(dates: NDArray[np.datetime64]) -> NDArray[np.float64]:
+def elapsed(dates: NDArray[np.datetime64]) -> Floats:
     """The share of its calendar year that has passed at each row, of shape (row,)."""
     begin = dates.astype("datetime64[Y]")
     end = begin + np.timedelta64(1, "Y")

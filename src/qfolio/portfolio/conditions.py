@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.costs import Context
 from qfolio.portfolio.prices.table import Prices
@@ -15,8 +15,6 @@ YEAR = np.timedelta64(365, "D") / np.timedelta64(1, "s")
 
 MEMORY = 21
 """Number of log returns that a volatility is estimated from."""
-
-Floats = NDArray[np.float64]
 
 
 class Conditions(NamedTuple):

@@ -16,15 +16,13 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import NDArray
 
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import static
 from qfolio.core.registry import SIGNALS, build
 from qfolio.core.text import amount
 from qfolio.portfolio.prices.frequency import TRADING_DAYS
-
-Floats = NDArray[np.float64]
 
 COLUMN = "feature:"
 
@@ -254,7 +252,7 @@ def compute(
     prices: Floats,
     scale: str = "rank",
     columns: Mapping[str, Floats] | None = None,
-    tradable: NDArray[np.bool_] | None = None,
+    tradable: Bools | None = None,
 ) -> Floats:
     """Signals of shape (row, asset, signal), 0 where one is unknown or repeats an earlier one.
 

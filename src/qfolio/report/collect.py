@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from qfolio.core.arrays import Floats
 from qfolio.core.evaluation import greedy, play, start_keys
 from qfolio.core.mdp import Agent, Box, Policy, Position
 from qfolio.core.text import listed
@@ -30,16 +31,7 @@ from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.contrast import contrast_of
-from qfolio.report.data import (
-    Curve,
-    Episode,
-    Floats,
-    Maps,
-    MarketData,
-    ReportData,
-    Responses,
-    Weights,
-)
+from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
 from qfolio.report.words import agent_name, words_of
 from qfolio.solvers.followed import FollowedOptimum
 from qfolio.tasks.pendulum import Pendulum, PendulumState

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qfolio.core.arrays import AnyFloats
 from qfolio.core.statistics import FEWEST_SEEDS, band, interquartile_mean
 from qfolio.core.text import plural
 from qfolio.experiments.comparison.conclusion import amount, share, span
 from qfolio.experiments.comparison.ranking import HEADLINE, THRESHOLDS, Result, curve
 from qfolio.report import palette, rendering
-from qfolio.report.data import Floats
 from qfolio.report.figures.style import (
     LEAD,
     NARROW,
@@ -282,7 +282,7 @@ def _floor(data: ComparisonData) -> float:
     return float(10 ** math.floor(math.log10(least)))
 
 
-def _middles(data: ComparisonData) -> Floats:
+def _middles(data: ComparisonData) -> AnyFloats:
     """All points of all curves that are drawn as lines."""
     measure = data.ranking["measure"]
     return np.concatenate([interquartile_mean(curve(x, measure)) for x in data.results.values()])

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
-Numbers = NDArray[np.floating[Any]] | NDArray[np.integer[Any]]
+from qfolio.core.arrays import AnyFloats
+
+Numbers = AnyFloats | NDArray[np.integer[Any]]
 
 
 def decimals(size: float, figures: int = 4, least: int = 1) -> int:
@@ -32,8 +33,8 @@ class Curve:
 
     label: str
     done: Numbers
-    returns: Floats
-    overestimation: Floats
+    returns: AnyFloats
+    overestimation: AnyFloats
 
 
 @dataclass(frozen=True)
@@ -51,12 +52,12 @@ class Maps:
         discount: Discount factor per step of both values.
     """
 
-    theta: Floats
-    theta_dot: Floats
-    value: Floats | None
-    policy: Floats
-    exact_value: Floats
-    exact_policy: Floats
+    theta: AnyFloats
+    theta_dot: AnyFloats
+    value: AnyFloats | None
+    policy: AnyFloats
+    exact_value: AnyFloats
+    exact_policy: AnyFloats
     discount: float
 
 
@@ -71,9 +72,9 @@ class Episode:
         rewards: Reward of each step, shape (T,).
     """
 
-    states: Floats
-    torques: Floats
-    rewards: Floats
+    states: AnyFloats
+    torques: AnyFloats
+    rewards: AnyFloats
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,9 @@ class Responses:
     """
 
     scenes: tuple[str, ...]
-    held: Floats
-    exact: Floats
-    learned: Floats
+    held: AnyFloats
+    exact: AnyFloats
+    learned: AnyFloats
     weights: bool
     region: tuple[float, float] | None
 
@@ -108,8 +109,8 @@ class Weights:
     """
 
     names: tuple[str, ...]
-    exact: Floats
-    learned: Floats
+    exact: AnyFloats
+    learned: AnyFloats
 
 
 @dataclass(frozen=True)
@@ -174,7 +175,7 @@ class ReportData:
     curve: Curve
     comparison: Curve | None
     training_done: Numbers
-    training_returns: Floats
+    training_returns: AnyFloats
     optimum: float
     maps: Maps | None
     episode: Episode | None

@@ -8,7 +8,8 @@ from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
-from qfolio.core.statistics import FEWEST_SEEDS, Floats
+from qfolio.core.arrays import Floats
+from qfolio.core.statistics import FEWEST_SEEDS
 from qfolio.core.text import plural
 from qfolio.report import palette
 

@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from qfolio.core.arrays import Floats
 from qfolio.solvers.shared import at_bounds, require, step_length
-from qfolio.solvers.sifting import Floats, sift
+from qfolio.solvers.sifting import sift
 
 
 def maximum_ratio(

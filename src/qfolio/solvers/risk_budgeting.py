@@ -1,12 +1,13 @@
 """The long-only portfolio whose assets contribute equally to its variance."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from qfolio.core.arrays import Floats
 from qfolio.solvers.shared import require, square
 
 
-def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> NDArray[np.float64]:
+def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> Floats:
     """The weights w > 0 with w_i (Σw)_i equal for all i (risk parity).
 
     They minimize ½ w'Σw − Σ ln(w_i)/N up to a factor. The function is strictly convex, so Newton's

@@ -10,8 +10,9 @@ price, the buyer pays the price divided by 1 − c.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 
 
@@ -40,9 +41,7 @@ def step_length(*moves: tuple[np.ndarray, np.ndarray]) -> float:
     return length
 
 
-def at_bounds(
-    weights: NDArray[np.float64], *, empty: NDArray[np.bool_], full: NDArray[np.bool_], cap: float
-) -> NDArray[np.float64]:
+def at_bounds(weights: Floats, *, empty: Bools, full: Bools, cap: float) -> Floats:
     """Weights that are exactly 0 or the cap where they should be; the others fill up to 1."""
     w = np.where(full, cap, np.where(empty, 0, weights))
     inside = ~full & ~empty
@@ -50,7 +49,7 @@ def at_bounds(
     return w
 
 
-def square(covariance: ArrayLike) -> NDArray[np.float64]:
+def square(covariance: ArrayLike) -> Floats:
     """A covariance as an array; raises QfolioError unless it is square and finite."""
     sigma = np.asarray(covariance, dtype=float)
     require(

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from qfolio.core.arrays import Floats
 
 FIRST = 100
 """Number of assets at the start (or more, for a low cap), and the most added at a time."""

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.core.statistics import (
     FEWEST_SEEDS,
-    Floats,
     holm,
     interquartile_mean,
     probability_of_improvement,

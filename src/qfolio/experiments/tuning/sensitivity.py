@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.text import listed
 from qfolio.experiments.tuning.journal import Trial
 from qfolio.experiments.tuning.search import Dimension, positions
-
-Floats = NDArray[np.float64]
 
 TOLERANCE = 0.05
 """Tolerated loss of a robust value, as a share of the optimum (or of the best return)."""
@@ -88,7 +87,7 @@ class Effect:
     share: float  # share of the variation that it explains by itself
     places: Floats  # on its scale: POINTS of them, or one for each choice
     heights: Floats  # predicted there, with all other settings as in the best quarter
-    robust: NDArray[np.bool_]  # whether the expectation is within the tolerance of its best
+    robust: Bools  # whether the expectation is within the tolerance of its best
 
     @property
     def range(self) -> tuple[float, float]:

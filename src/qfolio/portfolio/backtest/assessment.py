@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import finite
 from qfolio.portfolio.backtest.bootstrap import (
@@ -21,7 +22,6 @@ from qfolio.portfolio.backtest.bootstrap import (
 )
 from qfolio.portfolio.backtest.differences import Difference, Rival, compare
 from qfolio.portfolio.backtest.measures import (
-    Floats,
     checked_dates,
     checked_risk_free,
     checked_track,

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.measures import (
     MEASURES,
-    Floats,
     checked_risk_free,
     checked_track,
     deepest_drawdown,

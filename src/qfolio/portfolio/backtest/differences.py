@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.core.statistics import holm
 from qfolio.portfolio.backtest.bootstrap import LEVEL
 from qfolio.portfolio.backtest.estimates import (
@@ -26,7 +27,7 @@ from qfolio.portfolio.backtest.estimates import (
     estimate,
     luckiest,
 )
-from qfolio.portfolio.backtest.measures import Floats, Range
+from qfolio.portfolio.backtest.measures import Range
 
 DRAWS = 10_000
 """Number of draws of the luckiest rival."""

@@ -3,12 +3,11 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel, cashed, delisted
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Rows = NDArray[np.intp] | np.intp | int
 
 

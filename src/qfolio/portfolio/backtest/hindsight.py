@@ -2,8 +2,8 @@
 
 import math
 
+from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.measures import Floats
 from qfolio.solvers.merton import growth_optimal
 
 

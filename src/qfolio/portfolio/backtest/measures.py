@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 
-Floats = NDArray[np.float64]
 Range = tuple[float, float]
 
 MEASURES = (

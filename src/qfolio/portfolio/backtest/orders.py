@@ -8,8 +8,9 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.baselines.base import Baseline, Bools, Floats, History
+from qfolio.portfolio.backtest.baselines.base import Baseline, History
 from qfolio.portfolio.backtest.growth import Growth, filled_in
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel, Proportional, cashed

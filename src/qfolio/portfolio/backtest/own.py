@@ -10,11 +10,11 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.folds import spell
 from qfolio.portfolio.backtest.growth import Growth, filled_in
-from qfolio.portfolio.backtest.measures import Floats
 from qfolio.portfolio.backtest.orders import TOLERANCE
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.mandate.feasible import Mandated

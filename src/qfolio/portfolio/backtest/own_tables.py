@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import hint, quote
-from qfolio.portfolio.backtest.measures import Floats
 from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.desk.holdings import ASSET_NAMES, CASH, SHARES_NAMES
 from qfolio.portfolio.prices.cells import is_missing, label

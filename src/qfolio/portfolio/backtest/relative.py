@@ -3,13 +3,12 @@
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from qfolio.core.arrays import Bools, Floats
 from qfolio.portfolio.backtest.bootstrap import histories
 from qfolio.portfolio.backtest.estimates import clear
-from qfolio.portfolio.backtest.measures import Floats, paired_difference, ratio_or_zero
-
-Bools = NDArray[np.bool_]
+from qfolio.portfolio.backtest.measures import paired_difference, ratio_or_zero
 
 RELATIVE = (
     *("active_return", "tracking_error", "information_ratio", "beta"),

@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.core.statistics import mean_interval
 from qfolio.portfolio.backtest.bootstrap import LEVEL, percentile_interval
-from qfolio.portfolio.backtest.measures import MEASURES, Floats, Range
+from qfolio.portfolio.backtest.measures import MEASURES, Range
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.growth import Growth, Rows, by_sign, filled_in
 from qfolio.portfolio.conditions import Conditions
@@ -40,9 +41,6 @@ MOST = 1 - 1e-6
 
 BLOCK = 60_000
 """Numbers per array in a block: several such arrays fit into a core's cache."""
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

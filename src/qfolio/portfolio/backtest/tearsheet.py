@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.measures import (
     STEADY,
-    Floats,
     checked_dates,
     deviations,
     drawdown,

@@ -13,11 +13,10 @@ does not depend on the past; where it does, they are approximate.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.bootstrap import block_length, stationary_bootstrap_indices
-
-Floats = NDArray[np.float64]
 
 ALPHA = 0.05
 """Probability of a false alarm, over all time."""

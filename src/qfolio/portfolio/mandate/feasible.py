@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
-from numpy.typing import NDArray
 
 from qfolio.core import simplex
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.mandate.order import BARELY, Rules, ordered
 from qfolio.portfolio.mandate.projection import Limits
 from qfolio.portfolio.mandate.risk import Past, Risk
@@ -189,9 +189,7 @@ class Mandated(Feasible):
         return found
 
 
-def exactly(
-    feasible: Feasible, wanted: NDArray[np.float64], held: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def exactly(feasible: Feasible, wanted: Floats, held: Floats) -> Floats:
     """The nearest weights, in float64; all weights have shape (entry,)."""
     with jax.enable_x64(True):
         found = np.array(_projected(jax.tree.map(jnp.asarray, feasible), wanted, held))

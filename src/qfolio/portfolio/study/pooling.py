@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from qfolio.core.arrays import Floats
 from qfolio.core.text import finite
 from qfolio.portfolio.backtest.bootstrap import (
     block_length,
@@ -19,12 +20,7 @@ from qfolio.portfolio.backtest.bootstrap import (
     stationary_bootstrap_indices,
 )
 from qfolio.portfolio.backtest.estimates import Estimate, clear, estimate
-from qfolio.portfolio.backtest.measures import (
-    Floats,
-    log_growth,
-    paired_difference,
-    ratio_or_zero,
-)
+from qfolio.portfolio.backtest.measures import log_growth, paired_difference, ratio_or_zero
 
 RESAMPLES = 2000
 """Number of histories that the hierarchical bootstrap draws."""

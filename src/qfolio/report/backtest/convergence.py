@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qfolio.core.statistics import Floats
+from qfolio.core.arrays import Floats
 from qfolio.report import palette
 from qfolio.report.data import Numbers
 from qfolio.report.figures.style import NARROW, colors, new_figure

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.folder import followed
 from qfolio.report.backtest.convergence import FoldTraining
-from qfolio.report.data import Floats
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.tearsheet import effective_number
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.backtest.paths import compact, texts
-from qfolio.report.data import Floats
 
 BLOCKS = 200
 """Maximum number of points in time; each is a mean over consecutive days."""

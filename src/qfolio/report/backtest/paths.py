@@ -5,14 +5,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.measures import drawdown
 from qfolio.report.backtest.data import StrategySeries
-from qfolio.report.data import Floats
 
 
 def wealth_paths(series: StrategySeries) -> Floats:
     """Wealth after each day, from 1 at the start, of shape (seeds, days)."""
-    return np.cumprod(1 + series.returns, axis=1)
+    return np.asarray(np.cumprod(1 + series.returns, axis=1))
 
 
 def across_seeds(values: Floats) -> tuple[Floats, Floats, Floats]:

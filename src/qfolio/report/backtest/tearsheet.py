@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.core.text import plural
 from qfolio.portfolio.backtest.tearsheet import (
     alpha,
@@ -20,7 +21,6 @@ from qfolio.portfolio.backtest.tearsheet import (
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 from qfolio.report.backtest.facts import unit_of
 from qfolio.report.backtest.why import bars
-from qfolio.report.data import Floats
 from qfolio.report.rendering import number, percent, place
 
 DRAWDOWNS = 5

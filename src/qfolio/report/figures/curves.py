@@ -6,15 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from qfolio.core.arrays import AnyFloats
 from qfolio.core.statistics import band, interquartile_mean, regret
 from qfolio.report import palette
-from qfolio.report.data import (
-    Curve,
-    Floats,
-    Numbers,
-    ReportData,
-    decimals,
-)
+from qfolio.report.data import Curve, Numbers, ReportData, decimals
 from qfolio.report.rendering import number
 
 if TYPE_CHECKING:
@@ -123,7 +118,7 @@ def _line_axes(axes: Axes, title: str, data: ReportData) -> None:
 def _draw_runs(
     axes: Axes,
     done: Numbers,
-    runs: Floats,
+    runs: AnyFloats,
     color: str,
     kind: str | None = None,
     label: str | None = None,

@@ -6,13 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from qfolio.core.arrays import AnyFloats
 from qfolio.report import palette
-from qfolio.report.data import (
-    Episode,
-    Floats,
-    Maps,
-    ReportData,
-)
+from qfolio.report.data import Episode, Maps, ReportData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,7 +53,7 @@ def draw_value(data: ReportData, width: float) -> Figure:
     return figure
 
 
-def _draw_values(axes: Panels, maps: Maps, learned: Floats) -> None:
+def _draw_values(axes: Panels, maps: Maps, learned: AnyFloats) -> None:
     both = np.stack([learned, maps.exact_value])
     low, high = float(both.min()), float(both.max())
     values = colors("value", palette.VALUE_MAP)
@@ -80,7 +76,7 @@ def _draw_values(axes: Panels, maps: Maps, learned: Floats) -> None:
 def _draw_map(
     axes: Axes,
     maps: Maps,
-    table: Floats,
+    table: AnyFloats,
     colors: Colormap,
     low: float,
     high: float,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
+from qfolio.core.arrays import Floats
 from qfolio.experiments.tuning.journal import best_of
 from qfolio.experiments.tuning.search import Dimension
 from qfolio.experiments.tuning.sensitivity import Effect, Outcome
@@ -147,9 +147,7 @@ def _legend(figure: Figure, marks: dict[str, Any], columns: int) -> None:
     )
 
 
-def _draw_effect(
-    axes: Axes, data: Sweep, effect: Effect, heights: NDArray[np.float64]
-) -> dict[str, Any]:
+def _draw_effect(axes: Axes, data: Sweep, effect: Effect, heights: Floats) -> dict[str, Any]:
     """Draw the effect of one setting; return the marks by name."""
     dim = effect.dimension
     axes.grid(axis="y")
@@ -185,9 +183,7 @@ def _draw_effect(
     return marks
 
 
-def _draw_special(
-    axes: Axes, data: Sweep, x: NDArray[np.float64], y: NDArray[np.float64]
-) -> dict[str, Any]:
+def _draw_special(axes: Axes, data: Sweep, x: Floats, y: Floats) -> dict[str, Any]:
     """Mark the preset and the best trial."""
     style: dict[str, Any] = {"clip_on": False, "zorder": 6}
     marks: dict[str, Any] = {}
@@ -207,7 +203,7 @@ def _draw_special(
     return dict(sorted(marks.items(), reverse=True))
 
 
-def _places(data: Sweep, dim: Dimension) -> NDArray[np.float64]:
+def _places(data: Sweep, dim: Dimension) -> Floats:
     """The positions of all trials on the scale of a setting; choices are spread a little."""
     places = np.array([dim.position(trial.values[dim.name]) for trial in data.trials])
     if dim.choices:

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from qfolio.portfolio.backtest.attribution.hac import Floats, mean_t
+from qfolio.core.arrays import Floats
+from qfolio.portfolio.backtest.attribution.hac import mean_t
 
 
 class AssetPart(msgspec.Struct, frozen=True):

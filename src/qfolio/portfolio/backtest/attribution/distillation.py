@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from qfolio.portfolio.backtest.attribution.hac import Floats
+from qfolio.core.arrays import Floats
 
 _LEAST = 1e-6
 """Smaller active weights are rounding errors."""

@@ -9,12 +9,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.attribution.decomposition import decompose
 from qfolio.portfolio.backtest.attribution.diagnosis import diagnose, idle
 from qfolio.portfolio.backtest.attribution.distillation import Rule, distil
 from qfolio.portfolio.backtest.attribution.factors import exposures, factor_returns
 from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
-from qfolio.portfolio.backtest.attribution.hac import Floats
 from qfolio.portfolio.backtest.attribution.importance import importance, of_seeds
 from qfolio.portfolio.backtest.attribution.replays import channel_names, channels
 from qfolio.portfolio.backtest.attribution.slices import slices

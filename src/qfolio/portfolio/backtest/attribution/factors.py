@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio import signals
-from qfolio.portfolio.backtest.attribution.hac import Floats, regress
+from qfolio.portfolio.backtest.attribution.hac import regress
 from qfolio.portfolio.backtest.folds import Fold
 
 COMPONENTS = 2

@@ -12,8 +12,9 @@ import jax
 import msgspec
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.core.mdp import Agent
-from qfolio.portfolio.backtest.attribution.hac import Floats, mean_t
+from qfolio.portfolio.backtest.attribution.hac import mean_t
 from qfolio.portfolio.backtest.attribution.replays import (
     Shuffle,
     Shuffles,

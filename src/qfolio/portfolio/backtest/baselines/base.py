@@ -7,11 +7,9 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import imported
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 class History(NamedTuple):

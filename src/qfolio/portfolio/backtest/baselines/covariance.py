@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from qfolio.portfolio.backtest.baselines.base import Floats
+from qfolio.core.arrays import Floats
 
 
 def ledoit_wolf(returns: Floats) -> Floats:

@@ -4,9 +4,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.baselines.base import (
     Baseline,
-    Floats,
     History,
     equal_weights,
     nearest,

@@ -6,7 +6,8 @@ twelve months, as Ledoit & Wolf (2017, "Markowitz meets Goldilocks") do with dai
 
 import numpy as np
 
-from qfolio.portfolio.backtest.baselines.base import Fitted, Floats
+from qfolio.core.arrays import Floats
+from qfolio.portfolio.backtest.baselines.base import Fitted
 from qfolio.portfolio.backtest.baselines.covariance import exponential, ledoit_wolf, nonlinear
 from qfolio.solvers.minimum_variance import minimum_variance
 

@@ -9,9 +9,9 @@ from abc import abstractmethod
 
 import numpy as np
 
+from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.baselines.base import (
     Baseline,
-    Floats,
     History,
     equal_weights,
     nearest,

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from qfolio.portfolio.backtest.baselines.base import Fitted, Floats
+from qfolio.core.arrays import Floats
+from qfolio.portfolio.backtest.baselines.base import Fitted
 from qfolio.solvers.maximum_ratio import maximum_ratio
 from qfolio.solvers.risk_budgeting import equal_risk
 

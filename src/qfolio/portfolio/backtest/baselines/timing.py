@@ -9,7 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from qfolio.portfolio.backtest.baselines.base import Fitted, Floats
+from qfolio.core.arrays import Floats
+from qfolio.portfolio.backtest.baselines.base import Fitted
 
 
 class InverseVolatility(Fitted):

@@ -4,13 +4,8 @@ import math
 
 import numpy as np
 
-from qfolio.portfolio.backtest.baselines.base import (
-    Baseline,
-    Floats,
-    History,
-    equal_weights,
-    with_cash,
-)
+from qfolio.core.arrays import Floats
+from qfolio.portfolio.backtest.baselines.base import Baseline, History, equal_weights, with_cash
 
 
 class Momentum(Baseline):
