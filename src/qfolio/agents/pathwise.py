@@ -114,7 +114,7 @@ class PathwiseState(eqx.Module):
 
     policy: Band
     optimizer: Optimizer
-    steps: Int[Array, ""]
+    steps: Int[Array, ""]  # rollouts so far; never read, but a part of saved folders
     slopes: Slopes | None  # with bootstrap
     slope_optimizer: Optimizer | None
 

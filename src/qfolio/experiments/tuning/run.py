@@ -55,12 +55,12 @@ RANDOM = 0.5
 own trials gather around the best and do not cover the space."""
 
 
-def tuning_keys(n: int = STARTS) -> Key[Array, " start"]:
+def tuning_keys() -> Key[Array, " start"]:
     """Keys of the start states for tuning, which are never used to grade results.
 
     Choosing by the graded starts would bias every grade upwards.
     """
-    return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(70607), i))(jnp.arange(n))
+    return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(70607), i))(jnp.arange(STARTS))
 
 
 @dataclass(frozen=True)

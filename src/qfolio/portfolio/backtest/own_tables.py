@@ -101,12 +101,10 @@ def _from_table(source: Any, prices: Prices) -> Own:
         rows = dates_of(table, when)
         order = in_order(rows, table)
         return Own("returns", rows[order], numbers_of(table, others[0], rows)[order])
-    return _levels(source, table, others, unknown, prices)
+    return _levels(source, others, unknown, prices)
 
 
-def _levels(
-    source: Any, table: Table, others: list[int], unknown: list[str], prices: Prices
-) -> Own:
+def _levels(source: Any, others: list[int], unknown: list[str], prices: Prices) -> Own:
     """An index, read as a table of prices."""
     try:
         index = load(source)

@@ -51,7 +51,7 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
         )  # fmt: skip
     if (more := len(wild) - LISTED) > 0:
         findings.error(f"and {amount(more, 'more price')} that change by such factors", count=more)
-    ticks, splits, others = _sort_out(values, logs, moves, _jumps(values, moves, sizes))
+    ticks, splits, others = _sort_out(logs, moves, _jumps(values, moves, sizes))
     for (i, j), rows in list(ticks.items())[:LISTED]:
         spell = "in the next row" if rows == 1 else f"{rows} rows later"
         power = round(np.log10(relatives[i, j]))
@@ -107,7 +107,7 @@ def _jumps(values: np.ndarray, moves: np.ndarray, sizes: np.ndarray) -> list[Jum
 
 
 def _sort_out(
-    values: np.ndarray, logs: np.ndarray, moves: np.ndarray, jumps: Iterable[Jump]
+    logs: np.ndarray, moves: np.ndarray, jumps: Iterable[Jump]
 ) -> tuple[dict[Jump, int], dict[Jump, str], list[Jump]]:
     """Bad ticks with the number of rows that they last, splits with their ratios, other jumps."""
     ticks: dict[Jump, int] = {}
