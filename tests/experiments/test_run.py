@@ -107,14 +107,15 @@ SCRIPT = """
 import sys
 from qfolio.core import devices
 devices.configure()
-from qfolio.experiments import run as running
+from qfolio.experiments import seeds
+from qfolio.experiments.run import Run
 from qfolio.experiments.fit import Listener
 from qfolio.agents.dqn import DQN
 from qfolio.tasks.pendulum import Pendulum
-running.CHECKPOINT_SECONDS = 0.0
+seeds.CHECKPOINT_SECONDS = 0.0
 agent = DQN(hidden=(16,), num_envs=2, batch_size=8, replay_capacity=200, learning_starts=20,
             episode_steps=0, learning_rate_steps=200.0)
-run = running.Run.create(Pendulum(horizon=25), agent, episodes={episodes}, seeds=2, out={out!r})
+run = Run.create(Pendulum(horizon=25), agent, episodes={episodes}, seeds=2, out={out!r})
 print("started", flush=True)
 class Wait(Listener):
     def on_chunk(self, training, rows):

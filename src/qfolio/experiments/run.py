@@ -4,40 +4,31 @@ import contextlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import jax
-import msgspec
 import numpy as np
 
 from qfolio.core import devices
 from qfolio.core.errors import require_type
-from qfolio.core.evaluation import start_keys
 from qfolio.core.files import locked, new_folder, path_of, require_new
-from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
-from qfolio.core.population import Population
 from qfolio.core.registry import short
 from qfolio.core.text import amount
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
-from qfolio.experiments.fit import Listener, Row, Training, fit
+from qfolio.experiments.fit import Listener
 from qfolio.experiments.grading import grade
-from qfolio.experiments.log import JobLog, Log, add_result, seed_names
+from qfolio.experiments.log import JobLog, Log, add_result
 from qfolio.experiments.machines.choice import on
-from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder, curve_point
-from qfolio.experiments.seed_groups import SeedGroups, SeedsJob, TrainedSeeds
-
-EVALUATIONS = 20
-"""Approximate number of points on the learning curve."""
-
-CHECKPOINT_SECONDS = 10.0
+from qfolio.experiments.run_folder import RunConfig, RunFolder
+from qfolio.experiments.seed_groups import SeedGroups, SeedsJob
+from qfolio.experiments.seeds import Seeds
 
 
-class Run:
+class Run(Seeds):
     """Seeds of one agent on one task; make it with ``Run.create``, ``Run.open`` or ``train``.
 
     metrics: a row for each finished training episode. evaluations: a row for each seed and point of
@@ -46,16 +37,9 @@ class Run:
     """
 
     def __init__(
-        self, task: Task, agent: Agent, config: RunConfig, folder: RunFolder | None, room: int = 0
+        self, task: Task, agent: Agent, config: RunConfig, folder: RunFolder | None
     ) -> None:
-        """room: seeds of the largest run that shares the programs, if more than this run's."""
-        self.task, self.agent, self.config, self._folder = task, agent, config, folder
-        self.population: Population = population_of(task, agent, config.seed_range, room)
-        self.metrics: list[Row] = []
-        self.evaluations: list[Row] = []
-        self.seconds_train = 0.0
-        self.interrupted = False
-        self._log: JobLog | None = None  # only during training
+        super().__init__(task, agent, config, folder)
         self.groups = SeedGroups(self)
 
     @classmethod
@@ -150,27 +134,6 @@ class Run:
             np.reshape(points, (-1, seeds)).mean(1).tolist(),
         )
 
-    @property
-    def folder(self) -> Path | None:
-        """The folder of the run, if it has one."""
-        return None if self._folder is None else self._folder.path
-
-    @property
-    def episodes(self) -> int:
-        """Number of finished episodes of the seed with the fewest."""
-        return self.population.episodes
-
-    @property
-    def budget(self) -> Budget:
-        """The budget of each seed."""
-        return self.config.budget
-
-    def done(self, unit: str) -> int:
-        """Episodes or environment steps of each seed so far."""
-        if unit == "steps":
-            return self.population.steps * self.agent.num_envs
-        return self.episodes
-
     def train(
         self,
         budget: Budget | None = None,
@@ -198,7 +161,7 @@ class Run:
         budget, executor = budget or self.budget, on(executor)
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
             if isinstance(executor, Here) and not self.groups.begun:
-                self._train(budget, listeners, log)
+                self.train_here(budget, listeners, log)
             else:
                 each = listen or (lambda job, done, share: listeners)
                 self._train_groups(self.groups.jobs(executor, budget), executor, each)
@@ -209,60 +172,6 @@ class Run:
             with Log(self.folder).opened(**self._about) as log:
                 store = partial(self.groups.store, log=log)
                 self.interrupted = carry_out(executor, jobs, listen, store, log)
-
-    def _train(self, budget: Budget, listeners: Sequence[Listener], log: JobLog | None) -> None:
-        self.interrupted = False
-        if not self.evaluations and self.population.steps:
-            self.evaluate()  # the run's table was lost
-        if not budget.left(self.population):
-            return
-        self.aim_at(budget)
-        with contextlib.ExitStack() as stack:
-            if log is None:
-                own = stack.enter_context(Log(self.folder).opened(**self._about))
-                log = own.job(members=seed_names(self.config.seed_range))
-            self._log = log
-            stack.callback(setattr, self, "_log", None)
-            hooks = [log, _Metrics(self), _Curve(self), *listeners, _Checkpoints(self)]
-            config = msgspec.to_builtins(self.config)
-            training = fit(self.population, budget, hooks, config=config)
-            self.interrupted = training.interrupted
-            log.log.settle(training.finished)
-
-    @property
-    def _about(self) -> dict[str, Any]:
-        """The description of the run in the log."""
-        config = self.config
-        return {
-            "kind": "run",
-            "task": config.task,
-            "agents": [config.agent],
-            "preset": config.preset,
-            "seeds": config.seeds,
-            self.budget.unit: self.budget.amount,
-        }
-
-    def aim_at(self, budget: Budget) -> None:
-        """Sets the configured budget, before its training begins."""
-        self.config = msgspec.structs.replace(
-            self.config, episodes=budget.episodes, steps=budget.steps
-        )
-        if not self.population.steps:
-            self.evaluations = []  # left by a process that was killed before its first checkpoint
-        if self._folder is not None:
-            self._folder.write_config(self.config)
-            self._folder.tidy({METRICS: self.metrics, EVALUATION: self.evaluations})
-
-    def adopt(self, trained: TrainedSeeds) -> None:
-        """Takes over the results of training done elsewhere from this run's state."""
-        before = self.done("steps")
-        self.population.restore(trained.state["training"])
-        self.population.seconds_compile += trained.seconds_compile
-        self.seconds_train += float(trained.state["seconds_train"])
-        new = [row for row in trained.evaluations if not before or row["env_steps"] > before]
-        self._record(METRICS, self.metrics, trained.metrics)
-        self._record(EVALUATION, self.evaluations, new)
-        self._write_checkpoint()
 
     def first_weights(self) -> Any:
         """The first seed's learned weights."""
@@ -294,98 +203,6 @@ class Run:
             known["regret"] = None if regrets is None else float(np.mean(regrets))
             add_result(self.folder, {short(config.agent): known})
         return summary
-
-    def evaluate(self) -> None:
-        """Adds a point to the learning curve."""
-        played = self.population.evaluate(start_keys(self.population.curve_starts))
-        members = zip(self.population.seeds, self.population.member_episodes, *played, strict=True)
-        rows = [
-            {
-                "seed": seed,
-                "episode": episode,
-                "env_steps": self.done("steps"),
-                "return": float(returns.mean()),
-                "overestimation": float(overestimation),
-            }
-            for seed, episode, returns, overestimation in members
-        ]
-        self._record(EVALUATION, self.evaluations, rows)
-        if self._log is not None:
-            self._log.record(self.done("steps"), curve_point(rows))
-
-    def _record(self, name: str, table: list[Row], rows: list[Row]) -> None:
-        table += rows
-        if self._folder is not None:
-            self._folder.append(name, rows)
-
-    def _write_checkpoint(self) -> None:
-        if self._folder is not None:
-            state = self.state()
-            self._folder.write_checkpoint(state, self.agent.weights(state["training"].agent))
-
-    def _read_checkpoint(self) -> None:
-        assert self._folder is not None
-        state = self._folder.read_checkpoint(self.state())
-        self.seconds_train = float(state["seconds_train"])
-        self.population.restore(state["training"])
-        members = zip(self.population.seeds, self.population.member_episodes, strict=True)
-        episodes, steps = dict(members), self.done("steps")
-        self.metrics = self._folder.rows(METRICS, episodes, steps)
-        points: dict[float, list[Row]] = {}
-        for row in self._folder.rows(EVALUATION, episodes, steps):
-            points.setdefault(row["env_steps"], []).append(row)
-        whole = [rows for rows in points.values() if len(rows) == self.config.seeds]
-        self.evaluations = [row for rows in whole for row in rows]
-
-    def state(self) -> dict[str, Any]:
-        """The content of a checkpoint: arrays with a leading seed axis."""
-        return {"training": self.population.fetch(), "seconds_train": np.array(self.seconds_train)}
-
-
-class _Metrics(Listener):
-    """Records the row of every finished episode, and the training time."""
-
-    def __init__(self, run: Run) -> None:
-        self.run, self.before = run, run.seconds_train
-
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        self.run.seconds_train = self.before + training.seconds
-        self.run._record(METRICS, self.run.metrics, rows)
-
-
-class _Curve(Listener):
-    """Evaluates the policies at the start, at the end, and about ``EVALUATIONS`` times between."""
-
-    def __init__(self, run: Run) -> None:
-        self.run = run
-
-    def on_start(self, training: Training) -> None:
-        # In steps since the run's start, so that a resumed run has the same curve.
-        self.every = (training.begun + training.left) / EVALUATIONS
-        self.points = training.begun // self.every
-        if not training.begun:
-            self.run.evaluate()
-
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        points = training.population.steps // self.every
-        if points > self.points or training.finished:
-            self.run.evaluate()
-        self.points = points
-
-
-class _Checkpoints(Listener):
-    """Writes a checkpoint every ``CHECKPOINT_SECONDS``, and at the end."""
-
-    def __init__(self, run: Run) -> None:
-        self.run, self.saved = run, perf_counter()
-
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        if perf_counter() - self.saved > CHECKPOINT_SECONDS:
-            self.on_end(training)
-
-    def on_end(self, training: Training) -> None:
-        self.run._write_checkpoint()
-        self.saved = perf_counter()
 
 
 def train(

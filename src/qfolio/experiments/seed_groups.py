@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import msgspec
@@ -22,27 +21,12 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.registry import short
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.executor import Executor, at_once
-from qfolio.experiments.fit import Listener, Row
+from qfolio.experiments.fit import Listener
 from qfolio.experiments.log import Log, seed_names
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder, curve_point
-
-if TYPE_CHECKING:
-    from qfolio.experiments.run import Run
+from qfolio.experiments.seeds import Seeds, TrainedSeeds
 
 FOLDER = "seeds"
-
-
-class TrainedSeeds(NamedTuple):
-    """Seeds that have been trained.
-
-    config: for these seeds alone. state: their checkpoint, with a leading seed axis.
-    """
-
-    config: RunConfig
-    state: PyTree
-    metrics: list[Row]
-    evaluations: list[Row]
-    seconds_compile: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -71,25 +55,23 @@ class SeedsJob:
 
     def run(self, listeners: Sequence[Listener]) -> TrainedSeeds | QfolioError | None:
         """The trained seeds, or why they could not be trained; None if Ctrl-C stopped it."""
-        from qfolio.experiments.run import Run  # imported here, as run.py makes these jobs
-
         try:
-            run = Run(self.task, self.agent, self.config, None, self.most)
+            seeds = Seeds(self.task, self.agent, self.config, None, self.most)
             if self.start is not None:
-                run.population.restore(self.start)
-            run.train(listeners=listeners, log=Log(None).job(members=self.members))
+                seeds.population.restore(self.start)
+            seeds.train_here(seeds.budget, listeners, Log(None).job(members=self.members))
         except QfolioError as error:
             return error
-        if run.interrupted and self.config.budget.left(run.population):
+        if seeds.interrupted and seeds.budget.left(seeds.population):
             return None
-        compiling = run.population.seconds_compile
-        return TrainedSeeds(self.config, run.state(), run.metrics, run.evaluations, compiling)
+        compiling = seeds.population.seconds_compile
+        return TrainedSeeds(self.config, seeds.state(), seeds.metrics, seeds.evaluations, compiling)
 
 
 class SeedGroups:
     """The groups of a run's seeds; ``jobs`` trains those that are missing."""
 
-    def __init__(self, run: "Run") -> None:
+    def __init__(self, run: Seeds) -> None:
         self._run = run
         self._done: dict[int, TrainedSeeds] = {}  # by the first seed
 
@@ -189,7 +171,7 @@ def _groups(seeds: Sequence[int], executor: Executor) -> list[range]:
     return groups
 
 
-def _joined(parts: Sequence[TrainedSeeds], run: "Run") -> TrainedSeeds:
+def _joined(parts: Sequence[TrainedSeeds], run: Seeds) -> TrainedSeeds:
     """Joins the groups of seeds into one; their times are added up.
 
     Rows are ordered as in one population: by time, then by seed.

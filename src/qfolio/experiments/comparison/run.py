@@ -38,7 +38,8 @@ from qfolio.experiments.fit import Listener
 from qfolio.experiments.log import JobLog, Log, add_result, seed_names
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.run import Run
-from qfolio.experiments.seed_groups import SeedsJob, TrainedSeeds
+from qfolio.experiments.seed_groups import SeedsJob
+from qfolio.experiments.seeds import TrainedSeeds
 
 FILE = "comparison.json"
 
