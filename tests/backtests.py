@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from qfolio.portfolio.backtest.assessment import Strategy, assess
 from qfolio.portfolio.backtest.attribution.decomposition import AssetPart, Decomposition, FoldPart
 from qfolio.portfolio.backtest.attribution.distillation import Rule, Term
 from qfolio.portfolio.backtest.attribution.factors import Exposure, Exposures
@@ -15,6 +14,7 @@ from qfolio.portfolio.backtest.attribution.gradients import Gradients, Pull
 from qfolio.portfolio.backtest.attribution.importance import Importance, Worth
 from qfolio.portfolio.backtest.attribution.slices import Slice, Slices
 from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
+from qfolio.portfolio.backtest.statistics.assessment import Strategy, assess
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 
 ATTACK = "</script><script>hacked = 1</script><img src=x onerror='hacked = 1'>"

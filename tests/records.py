@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qfolio.portfolio.backtest.assessment import Strategy
+from qfolio.portfolio.backtest.statistics.assessment import Strategy
 
 
 def days(count: int) -> np.ndarray:

@@ -39,6 +39,14 @@ def test_no_import_points_up(wing):
                 assert allowed, f"{path.relative_to(SOURCE)} imports {name}"
 
 
+def test_the_statistics_of_a_backtest_stand_alone():
+    own = "qfolio.portfolio.backtest.statistics"
+    for path in sorted((SOURCE / "portfolio" / "backtest" / "statistics").glob("*.py")):
+        for name in imported(path):
+            allowed = not name.startswith("qfolio") or name.startswith((own, "qfolio.core"))
+            assert allowed, f"{path.name} imports {name}"
+
+
 def test_every_module_lies_in_a_wing():
     there = {path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or path.is_dir()}
     assert there - {"__pycache__"} == FLOOR.keys()

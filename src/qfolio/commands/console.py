@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
     from qfolio.experiments.run import Run
     from qfolio.experiments.tuning.run import Tuning
-    from qfolio.portfolio.backtest.assessment import Assessment
     from qfolio.portfolio.backtest.run import Backtest
-    from qfolio.portfolio.backtest.sampled import Measure
+    from qfolio.portfolio.backtest.statistics.assessment import Assessment
+    from qfolio.portfolio.backtest.statistics.sampled import Measure
     from qfolio.portfolio.desk.allocation import Allocation
     from qfolio.portfolio.desk.follow import Following
     from qfolio.portfolio.desk.standing import Standing
@@ -233,8 +233,8 @@ def describe_backtest(backtest: "Backtest") -> str:
 
 def print_assessment(assessment: "Assessment") -> None:
     """A row for each strategy, those of interest beside the benchmark, and the verdicts."""
-    from qfolio.portfolio.backtest.assessment import JUDGED
-    from qfolio.portfolio.backtest.verdict import bound_sentence, verdicts
+    from qfolio.portfolio.backtest.statistics.assessment import JUDGED
+    from qfolio.portfolio.backtest.statistics.verdict import bound_sentence, verdicts
 
     heads = ("a year, net", "growth", "vol.", "Sharpe", "drawdown", "turnover", "cost drag")
     shown = {
@@ -265,7 +265,7 @@ def print_assessment(assessment: "Assessment") -> None:
 
 def _print_relative(assessment: "Assessment") -> None:
     """A row for agents, the user's own strategies and the best baseline, beside the benchmark."""
-    from qfolio.portfolio.backtest.assessment import JUDGED
+    from qfolio.portfolio.backtest.statistics.assessment import JUDGED
 
     first = f"to {assessment.reference}, a year"
     shown = {

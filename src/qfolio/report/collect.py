@@ -17,12 +17,12 @@ from qfolio.core.text import listed
 from qfolio.core.training import episode_steps
 from qfolio.experiments.presets import changes, preset
 from qfolio.experiments.run import Run
-from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.capacity import capacity
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import Simulation
+from qfolio.portfolio.backtest.statistics.assessment import Assessment
 from qfolio.portfolio.market import Market
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.synthetic.ar1 import Ar1

@@ -14,7 +14,7 @@ import msgspec
 
 from qfolio.core.files import write_bytes
 from qfolio.core.text import amount
-from qfolio.portfolio.backtest.verdict import p_value
+from qfolio.portfolio.backtest.statistics.verdict import p_value
 from qfolio.portfolio.study.folder import Result, StudyConfig, Variant
 from qfolio.portfolio.study.pooling import Active, Evidence, Pools
 from qfolio.portfolio.study.run import Study

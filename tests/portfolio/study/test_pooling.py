@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.estimates import estimate
+from qfolio.portfolio.backtest.statistics.estimates import estimate
 from qfolio.portfolio.study.pooling import (
     TableReturns,
     correlations,

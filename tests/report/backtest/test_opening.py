@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from qfolio.portfolio.backtest.differences import Finding
+from qfolio.portfolio.backtest.statistics.differences import Finding
 from qfolio.report.backtest.data import BacktestData, followed_names
 from qfolio.report.backtest.opening import (
     best_sentence,

@@ -12,8 +12,8 @@ from PIL import Image
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.capacity import Capacity
-from qfolio.portfolio.backtest.differences import Contrast
-from qfolio.portfolio.backtest.verdict import verdicts
+from qfolio.portfolio.backtest.statistics.differences import Contrast
+from qfolio.portfolio.backtest.statistics.verdict import verdicts
 from qfolio.portfolio.prices.table import load
 from qfolio.report.backtest.data import BacktestData, StrategySeries, shown_order
 from qfolio.report.backtest.page import render_backtest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.tearsheet import contributions
+from qfolio.portfolio.backtest.statistics.tearsheet import contributions
 from qfolio.report.backtest.page import render_backtest
 from qfolio.report.backtest.tearsheet import BINS, LISTED, tear_sheet
 from qfolio.report.rendering import number, percent

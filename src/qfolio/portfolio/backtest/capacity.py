@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qfolio.portfolio.backtest.assessment import JUDGED
 from qfolio.portfolio.backtest.replay import Entry, Replay
+from qfolio.portfolio.backtest.statistics.assessment import JUDGED
 from qfolio.portfolio.itemized import Itemized
 
 SCALES = (0.1, 1.0, 10.0, 100.0)

@@ -13,7 +13,6 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from qfolio.core.mdp import Agent
-from qfolio.portfolio.backtest.assessment import Strategy
 from qfolio.portfolio.backtest.baselines import Baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import SPEEDS, EqualWeightAt
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
@@ -21,6 +20,7 @@ from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.orders import Orders, orders
 from qfolio.portfolio.backtest.own import Placed, kept
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
+from qfolio.portfolio.backtest.statistics.assessment import Strategy
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.execution import Terms

@@ -4,13 +4,13 @@ from collections.abc import Mapping
 
 from qfolio.core.text import finite
 from qfolio.experiments.log import add_result
-from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.folds import spell_all
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.backtest.verdict import verdicts
+from qfolio.portfolio.backtest.statistics.assessment import Assessment
+from qfolio.portfolio.backtest.statistics.verdict import verdicts
 
 
 def write_tables(

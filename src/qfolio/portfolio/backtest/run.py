@@ -30,7 +30,7 @@ from qfolio.experiments.fit import Row
 from qfolio.experiments.log import Log
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio.backtest import assessment, memory
+from qfolio.portfolio.backtest import memory
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.benchmark import field_of, tracked
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
@@ -39,6 +39,7 @@ from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.plan import Plan
 from qfolio.portfolio.backtest.replay import Entry, Replay, Stretch
+from qfolio.portfolio.backtest.statistics import assessment
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold, preparing
 from qfolio.portfolio.mandate import checks

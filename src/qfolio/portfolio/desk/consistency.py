@@ -16,7 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qfolio.core.arrays import Floats
-from qfolio.portfolio.backtest.bootstrap import block_length, stationary_bootstrap_indices
+from qfolio.portfolio.backtest.statistics.bootstrap import (
+    block_length,
+    stationary_bootstrap_indices,
+)
 
 ALPHA = 0.05
 """Probability of a false alarm, over all time."""

@@ -12,7 +12,7 @@ from qfolio.core.files import write_csv
 from qfolio.core.text import amount, figure
 from qfolio.portfolio.backtest.folder import BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
-from qfolio.portfolio.backtest.measures import drawdown
+from qfolio.portfolio.backtest.statistics.measures import drawdown
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.desk import consistency

@@ -14,13 +14,17 @@ from numpy.typing import ArrayLike
 
 from qfolio.core.arrays import Floats
 from qfolio.core.text import finite
-from qfolio.portfolio.backtest.bootstrap import (
+from qfolio.portfolio.backtest.statistics.bootstrap import (
     block_length,
     percentile_interval,
     stationary_bootstrap_indices,
 )
-from qfolio.portfolio.backtest.estimates import Estimate, clear, estimate
-from qfolio.portfolio.backtest.measures import log_growth, paired_difference, ratio_or_zero
+from qfolio.portfolio.backtest.statistics.estimates import Estimate, clear, estimate
+from qfolio.portfolio.backtest.statistics.measures import (
+    log_growth,
+    paired_difference,
+    ratio_or_zero,
+)
 
 RESAMPLES = 2000
 """Number of histories that the hierarchical bootstrap draws."""

@@ -28,15 +28,15 @@ from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.presets import Preset
-from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.attribution.why import Why
-from qfolio.portfolio.backtest.bootstrap import LEVEL
 from qfolio.portfolio.backtest.folds import parse_length, require_fold
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
-from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe
+from qfolio.portfolio.backtest.statistics.assessment import Assessment
+from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
+from qfolio.portfolio.backtest.statistics.sharpe import expected_maximum_sharpe
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
 from qfolio.portfolio.prices.table import Prices, describe, load, trials_on
 from qfolio.portfolio.study.folder import (

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT
-from qfolio.portfolio.backtest.verdict import p_value
+from qfolio.portfolio.backtest.statistics.verdict import p_value
 from qfolio.portfolio.study.folder import Result
 from qfolio.portfolio.study.pooling import Pooled, Pools
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qfolio.portfolio.backtest.tearsheet import rolling_beta, rolling_sharpe
+from qfolio.portfolio.backtest.statistics.tearsheet import rolling_beta, rolling_sharpe
 from qfolio.report import palette
 from qfolio.report.backtest.data import BacktestData, StrategySeries, faint_names
 from qfolio.report.backtest.holdings import holdings

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.folder import followed
+from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment
 from qfolio.report.backtest.convergence import FoldTraining
 
 

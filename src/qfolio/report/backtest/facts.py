@@ -7,7 +7,7 @@ from typing import Any
 
 from qfolio.core.statistics import FEWEST_SEEDS
 from qfolio.core.text import plural
-from qfolio.portfolio.backtest.assessment import Assessment
+from qfolio.portfolio.backtest.statistics.assessment import Assessment
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import THIN_SPACE, number
 

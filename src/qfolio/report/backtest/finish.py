@@ -6,12 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 from qfolio.core.errors import QfolioError, require_type
-from qfolio.portfolio.backtest.assessment import Assessment
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.statistics.assessment import Assessment
 from qfolio.report.backtest.page import write_backtest_report
 from qfolio.report.collect import backtest_data
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.core.arrays import Floats
-from qfolio.portfolio.backtest.tearsheet import effective_number
+from qfolio.portfolio.backtest.statistics.tearsheet import effective_number
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.backtest.paths import compact, texts
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from qfolio.portfolio.backtest.assessment import JUDGED
+from qfolio.portfolio.backtest.statistics.assessment import JUDGED
 from qfolio.report import palette
 from qfolio.report.backtest.data import BacktestData
 

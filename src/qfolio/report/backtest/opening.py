@@ -10,10 +10,10 @@ from functools import partial
 from typing import Any, Literal
 
 from qfolio.core.text import listed
-from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
-from qfolio.portfolio.backtest.differences import Difference
-from qfolio.portfolio.backtest.estimates import Measured
-from qfolio.portfolio.backtest.verdict import claims, comparable, wiped_out
+from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment
+from qfolio.portfolio.backtest.statistics.differences import Difference
+from qfolio.portfolio.backtest.statistics.estimates import Measured
+from qfolio.portfolio.backtest.statistics.verdict import claims, comparable, wiped_out
 from qfolio.report.backtest.data import BacktestData, followed_names, shown_order
 from qfolio.report.backtest.verdicts import ticks_around
 from qfolio.report.rendering import number, percent, place

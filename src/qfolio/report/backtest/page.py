@@ -16,8 +16,8 @@ from pathlib import Path
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
-from qfolio.portfolio.backtest.assessment import JUDGED
-from qfolio.portfolio.backtest.verdict import bound_sentence
+from qfolio.portfolio.backtest.statistics.assessment import JUDGED
+from qfolio.portfolio.backtest.statistics.verdict import bound_sentence
 from qfolio.report import palette
 from qfolio.report.backtest.charts import (
     chart_data,

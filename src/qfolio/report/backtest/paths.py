@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qfolio.core.arrays import Floats
-from qfolio.portfolio.backtest.measures import drawdown
+from qfolio.portfolio.backtest.statistics.measures import drawdown
 from qfolio.report.backtest.data import StrategySeries
 
 

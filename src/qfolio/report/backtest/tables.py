@@ -9,12 +9,12 @@ from typing import Any, Literal
 import numpy as np
 
 from qfolio.core.statistics import FEWEST_SEEDS
-from qfolio.portfolio.backtest.assessment import JUDGED, Assessment
-from qfolio.portfolio.backtest.differences import Difference
-from qfolio.portfolio.backtest.estimates import MEASURED, Measured
-from qfolio.portfolio.backtest.measures import monthly
-from qfolio.portfolio.backtest.sampled import Measure
-from qfolio.portfolio.backtest.verdict import comparable, luck, shown, telling, wiped_out
+from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment
+from qfolio.portfolio.backtest.statistics.differences import Difference
+from qfolio.portfolio.backtest.statistics.estimates import MEASURED, Measured
+from qfolio.portfolio.backtest.statistics.measures import monthly
+from qfolio.portfolio.backtest.statistics.sampled import Measure
+from qfolio.portfolio.backtest.statistics.verdict import comparable, luck, shown, telling, wiped_out
 from qfolio.report.backtest.data import BacktestData, main_names
 from qfolio.report.rendering import number, percent, place
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from qfolio.core.arrays import Floats
 from qfolio.core.text import plural
-from qfolio.portfolio.backtest.tearsheet import (
+from qfolio.portfolio.backtest.statistics.tearsheet import (
     alpha,
     contributions,
     falls,

@@ -6,9 +6,9 @@ import math
 from functools import partial
 from typing import Any
 
-from qfolio.portfolio.backtest.assessment import JUDGED
-from qfolio.portfolio.backtest.differences import Difference
-from qfolio.portfolio.backtest.verdict import claims, evidence
+from qfolio.portfolio.backtest.statistics.assessment import JUDGED
+from qfolio.portfolio.backtest.statistics.differences import Difference
+from qfolio.portfolio.backtest.statistics.verdict import claims, evidence
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import percent, place
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.arrays import Floats
-from qfolio.portfolio.backtest.measures import (
+from qfolio.portfolio.backtest.statistics.measures import (
     MEASURES,
     checked_risk_free,
     checked_track,

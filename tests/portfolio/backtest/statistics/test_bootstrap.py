@@ -6,14 +6,14 @@ import math
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest import bootstrap
-from qfolio.portfolio.backtest.bootstrap import (
+from qfolio.portfolio.backtest.statistics import bootstrap
+from qfolio.portfolio.backtest.statistics.bootstrap import (
     block_length,
     bootstrap_measures,
     percentile_interval,
     stationary_bootstrap_indices,
 )
-from qfolio.portfolio.backtest.measures import MEASURES, measures
+from qfolio.portfolio.backtest.statistics.measures import MEASURES, measures
 
 
 def autoregressive(

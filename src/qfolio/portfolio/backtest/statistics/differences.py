@@ -18,8 +18,8 @@ import numpy as np
 
 from qfolio.core.arrays import Floats
 from qfolio.core.statistics import holm
-from qfolio.portfolio.backtest.bootstrap import LEVEL
-from qfolio.portfolio.backtest.estimates import (
+from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
+from qfolio.portfolio.backtest.statistics.estimates import (
     MEASURED,
     Estimate,
     Measured,
@@ -27,7 +27,7 @@ from qfolio.portfolio.backtest.estimates import (
     estimate,
     luckiest,
 )
-from qfolio.portfolio.backtest.measures import Range
+from qfolio.portfolio.backtest.statistics.measures import Range
 
 DRAWS = 10_000
 """Number of draws of the luckiest rival."""

@@ -8,8 +8,8 @@ import numpy as np
 
 from qfolio.core.arrays import Floats
 from qfolio.core.statistics import mean_interval
-from qfolio.portfolio.backtest.bootstrap import LEVEL, percentile_interval
-from qfolio.portfolio.backtest.measures import MEASURES, Range
+from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL, percentile_interval
+from qfolio.portfolio.backtest.statistics.measures import MEASURES, Range
 
 
 @dataclass(frozen=True)

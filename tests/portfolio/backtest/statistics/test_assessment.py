@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.assessment import Strategy, assess
-from qfolio.portfolio.backtest.bootstrap import block_length
-from qfolio.portfolio.backtest.measures import MEASURES, measures
-from qfolio.portfolio.backtest.sharpe import expected_maximum_sharpe, probabilistic_sharpe
+from qfolio.portfolio.backtest.statistics.assessment import Strategy, assess
+from qfolio.portfolio.backtest.statistics.bootstrap import block_length
+from qfolio.portfolio.backtest.statistics.measures import MEASURES, measures
+from qfolio.portfolio.backtest.statistics.sharpe import (
+    expected_maximum_sharpe,
+    probabilistic_sharpe,
+)
 
 from records import days, record, strategy
 

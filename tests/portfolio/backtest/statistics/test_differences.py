@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from qfolio.core.statistics import holm
-from qfolio.portfolio.backtest.assessment import Assessment, Strategy, assess
-from qfolio.portfolio.backtest.differences import Contrast, Difference, tails_to
-from qfolio.portfolio.backtest.estimates import Estimate, Tails
+from qfolio.portfolio.backtest.statistics.assessment import Assessment, Strategy, assess
+from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference, tails_to
+from qfolio.portfolio.backtest.statistics.estimates import Estimate, Tails
 
 from records import days, strategy
 

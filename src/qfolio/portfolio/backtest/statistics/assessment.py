@@ -15,26 +15,26 @@ from numpy.typing import ArrayLike
 from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import finite
-from qfolio.portfolio.backtest.bootstrap import (
+from qfolio.portfolio.backtest.statistics.bootstrap import (
     LEVEL,
     block_length,
     bootstrap_measures,
 )
-from qfolio.portfolio.backtest.differences import Difference, Rival, compare
-from qfolio.portfolio.backtest.measures import (
+from qfolio.portfolio.backtest.statistics.differences import Difference, Rival, compare
+from qfolio.portfolio.backtest.statistics.measures import (
     checked_dates,
     checked_risk_free,
     checked_track,
     measures,
 )
-from qfolio.portfolio.backtest.relative import (
+from qfolio.portfolio.backtest.statistics.relative import (
     RELATIVE,
     active_share,
     bootstrap_relative,
     relative,
 )
-from qfolio.portfolio.backtest.sampled import Measure, Sampled, mean_over_seeds
-from qfolio.portfolio.backtest.sharpe import (
+from qfolio.portfolio.backtest.statistics.sampled import Measure, Sampled, mean_over_seeds
+from qfolio.portfolio.backtest.statistics.sharpe import (
     deflated_sharpe,
     expected_maximum_sharpe,
     minimum_track_record,

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.assessment import Assessment, assess
-from qfolio.portfolio.backtest.differences import Contrast, Difference
-from qfolio.portfolio.backtest.verdict import bound_sentence, luck, p_value, verdicts
+from qfolio.portfolio.backtest.statistics.assessment import Assessment, assess
+from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference
+from qfolio.portfolio.backtest.statistics.verdict import bound_sentence, luck, p_value, verdicts
 
 from records import days, strategy
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qfolio.core.arrays import Floats
-from qfolio.portfolio.backtest.bootstrap import LEVEL
-from qfolio.portfolio.backtest.measures import (
+from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
+from qfolio.portfolio.backtest.statistics.measures import (
     Range,
     deviations,
     log_growth,

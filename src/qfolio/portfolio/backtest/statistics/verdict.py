@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from qfolio.portfolio.backtest.assessment import JUDGED, Assessment, StrategyAssessment
-from qfolio.portfolio.backtest.bootstrap import LEVEL
-from qfolio.portfolio.backtest.differences import Contrast, Difference, Finding
-from qfolio.portfolio.backtest.estimates import Measured
-from qfolio.portfolio.backtest.measures import STEADY
+from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment, StrategyAssessment
+from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
+from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference, Finding
+from qfolio.portfolio.backtest.statistics.estimates import Measured
+from qfolio.portfolio.backtest.statistics.measures import STEADY
 
 _MEASURES: dict[Measured, str] = {
     "growth": "growth",

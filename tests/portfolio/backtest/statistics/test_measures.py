@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.bootstrap import bootstrap_measures
-from qfolio.portfolio.backtest.measures import MEASURES, drawdown, measures, monthly
+from qfolio.portfolio.backtest.statistics.bootstrap import bootstrap_measures
+from qfolio.portfolio.backtest.statistics.measures import MEASURES, drawdown, measures, monthly
 
 
 def test_measures_by_hand() -> None:

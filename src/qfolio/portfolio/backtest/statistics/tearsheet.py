@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.arrays import Floats
-from qfolio.portfolio.backtest.measures import (
+from qfolio.portfolio.backtest.statistics.measures import (
     STEADY,
     checked_dates,
     deviations,
@@ -20,7 +20,7 @@ from qfolio.portfolio.backtest.measures import (
     monthly,
     ratio_or_zero,
 )
-from qfolio.portfolio.backtest.sharpe import skewness_and_kurtosis
+from qfolio.portfolio.backtest.statistics.sharpe import skewness_and_kurtosis
 
 TAIL = 0.05
 """Share of returns in the tail beyond the value at risk, whose mean loss is CVaR."""

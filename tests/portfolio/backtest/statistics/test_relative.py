@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.assessment import Strategy, assess
-from qfolio.portfolio.backtest.relative import (
+from qfolio.portfolio.backtest.statistics.assessment import Strategy, assess
+from qfolio.portfolio.backtest.statistics.relative import (
     RELATIVE,
     active_share,
     bootstrap_relative,

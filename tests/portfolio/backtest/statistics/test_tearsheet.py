@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.tearsheet import (
+from qfolio.portfolio.backtest.statistics.tearsheet import (
     Fall,
     alpha,
     contributions,

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from qfolio.core.arrays import Floats
-from qfolio.portfolio.backtest.bootstrap import LEVEL
-from qfolio.portfolio.backtest.measures import deviations, ratio_or_zero
+from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
+from qfolio.portfolio.backtest.statistics.measures import deviations, ratio_or_zero
 
 # Every Sharpe ratio in these formulas is per period, not annual: an annual one would count each
 # period as a whole year of evidence.

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qfolio.core.arrays import Bools, Floats
-from qfolio.portfolio.backtest.bootstrap import histories
-from qfolio.portfolio.backtest.estimates import clear
-from qfolio.portfolio.backtest.measures import paired_difference, ratio_or_zero
+from qfolio.portfolio.backtest.statistics.bootstrap import histories
+from qfolio.portfolio.backtest.statistics.estimates import clear
+from qfolio.portfolio.backtest.statistics.measures import paired_difference, ratio_or_zero
 
 RELATIVE = (
     *("active_return", "tracking_error", "information_ratio", "beta"),

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.assessment import Assessment, Strategy, assess
 from qfolio.portfolio.backtest.baselines import Baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import (
     SPEEDS,
@@ -15,6 +14,7 @@ from qfolio.portfolio.backtest.baselines.equal_weight import (
 )
 from qfolio.portfolio.backtest.orders import orders
 from qfolio.portfolio.backtest.simulation import simulate
+from qfolio.portfolio.backtest.statistics.assessment import Assessment, Strategy, assess
 
 from records import days
 

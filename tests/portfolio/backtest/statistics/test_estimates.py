@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.estimates import MEASURED, Estimate, estimate, luckiest
-from qfolio.portfolio.backtest.measures import measures
+from qfolio.portfolio.backtest.statistics.estimates import MEASURED, Estimate, estimate, luckiest
+from qfolio.portfolio.backtest.statistics.measures import measures
 
 
 def pair(rng: np.random.Generator, count: int, *, clustered: bool = False) -> np.ndarray:

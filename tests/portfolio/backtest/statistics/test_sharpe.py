@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from qfolio.portfolio.backtest.sharpe import (
+from qfolio.portfolio.backtest.statistics.sharpe import (
     deflated_sharpe,
     expected_maximum_sharpe,
     minimum_track_record,
