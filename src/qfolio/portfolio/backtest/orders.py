@@ -110,6 +110,7 @@ def orders(
             for row in range(fold.decisions.start, fold.decisions.stop):
                 held = account.held(row)
                 called = terms.calls(held)
+                # A margin call asks for a new target, unless that of the fold stands.
                 asked = asks[row] or (called and baseline.calendar != "fold")
                 due = gives[row] or called
                 mandated = feasible(number, row) if feasible and (asked or due) else None
