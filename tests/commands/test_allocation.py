@@ -69,6 +69,21 @@ def test_a_split_since_the_backtest_is_named(folder, monkeypatch, capsys, tmp_pa
     assert "Warning: newer.csv, row 267 (2020-09-22), column 'B': the price is" in said
 
 
+def test_a_price_carried_forward_is_named_although_the_backtest_saw_it_stand(
+    folder, monkeypatch, capsys, tmp_path
+):
+    newer = write_table(tmp_path / "newer.csv", rows=270, names=("A", "B", "C"))
+    head, *rows = [line.split(",") for line in newer.read_text().split()]
+    for row in rows[245:]:  # the backtest ends with row 260
+        row[2] = rows[244][2]
+    newer.write_text("\n".join(",".join(row) for row in [head, *rows]))
+    options = ["--prices", newer, "--as-of", "2020-09-26", "--capital", 100, "--dry-run"]
+    assert qfolio(monkeypatch, "allocate", folder, *options) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Warning: newer.csv, row 271 (2020-09-26), column 'B': the price has been" in said
+    assert "(25 rows): perhaps the asset was delisted" in said
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

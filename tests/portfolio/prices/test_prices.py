@@ -495,7 +495,7 @@ def test_wild_assets_have_no_splits():
 
 def test_holes_in_the_calendar():
     days = pd.bdate_range("2020-01-01", periods=200).delete(range(100, 110))
-    table = pd.DataFrame({"A": 1.0, "B": 1.0}, index=days)
+    table = pd.DataFrame({"A": range(1, 191), "B": range(191, 1, -1)}, index=days)
     (found,) = warnings(table)
     assert found.row == 100
     assert "15 days earlier" in found.message

@@ -9,6 +9,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import near, quote
 from qfolio.portfolio.prices.columns import find_columns
+from qfolio.portfolio.prices.duplicates import check_duplicates
 from qfolio.portfolio.prices.findings import Finding, Findings, day
 from qfolio.portfolio.prices.gaps import cash_outs, complete
 from qfolio.portfolio.prices.grid import arrange
@@ -16,6 +17,7 @@ from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.moves import check_moves
 from qfolio.portfolio.prices.plausibility import FEWEST_ROWS, check_cells, check_size
 from qfolio.portfolio.prices.returns import UNITS, cumulate
+from qfolio.portfolio.prices.stale import check_stale
 
 MISSING = ("error", "drop-asset", "forward-fill")
 LATE = ("error", "drop-asset", "trim", "join")
@@ -87,6 +89,8 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Findin
     if not len(rest.assets):
         return {}, findings
     check_moves(grid, rest, findings)
+    check_stale(grid, rest, findings)
+    check_duplicates(grid, rest, findings)
     check_size(grid, rest, findings)
     dates = grid.dates[rest.head :]
     market = _shared(rest.features[..., len(features) :], dates, shared, findings)
