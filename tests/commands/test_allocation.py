@@ -69,6 +69,22 @@ def test_a_split_since_the_backtest_is_named(folder, monkeypatch, capsys, tmp_pa
     assert "Warning: newer.csv, row 267 (2020-09-22), column 'B': the price is" in said
 
 
+def test_of_many_splits_since_the_backtest_none_is_hidden(folder, monkeypatch, capsys, tmp_path):
+    """Of those in newer rows, five are named, and the count of the others has a date."""
+    newer = write_table(tmp_path / "newer.csv", rows=340, names=("A", "B", "C"))
+    head, *rows = [line.split(",") for line in newer.read_text().split()]
+    for start in (*range(20, 140, 20), *range(265, 335, 10)):
+        for row in rows[start:]:
+            row[2] = str(float(row[2]) / 2)
+    newer.write_text("\n".join(",".join(row) for row in [head, *rows]))
+    options = ["--prices", newer, "--as-of", "2020-12-05", "--capital", 100, "--dry-run"]
+    assert qfolio(monkeypatch, "allocate", folder, *options) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("perhaps a split that was not adjusted") == 5
+    assert "Warning: newer.csv, row 327" in said
+    assert "2020-10-02: and 7 more moves that may be splits, the latest on this date" in said
+
+
 def test_a_price_carried_forward_is_named_although_the_backtest_saw_it_stand(
     folder, monkeypatch, capsys, tmp_path
 ):

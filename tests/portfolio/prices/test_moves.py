@@ -155,10 +155,18 @@ def test_the_default_table_has_no_bad_ticks_and_one_ratio_of_a_split():
     assert split.startswith("row 69 (1990-04-10), column 'RRC': the price is 0.3332 times")
 
 
-def test_many_are_counted():
+@pytest.mark.parametrize(
+    ("factor", "rows", "said"),
+    [(10, 1, "prices that may be wrong"), (0.5, ROWS, "moves that may be splits")],
+)
+def test_of_many_the_latest_are_named_and_the_others_counted(factor: float, rows: int, said: str):
+    """The count has a date, so that allocate and follow show it if any counted one is new."""
     values = market(12)
     for j in range(12):
-        values[20 * (j + 1), j] *= 10
-    findings = found(values)
-    assert len(findings) == 6
-    assert findings[-1].message == "and 7 more prices that may be wrong"
+        start = 20 * (j + 1)
+        factor_now = factor * values[start - 1, j] / values[start, j]
+        values[start : start + rows, j] *= factor_now
+    *named, more = found(values)
+    assert [finding.column for finding in named] == [f"A{j}" for j in range(7, 12)]
+    assert more.message == f"and 7 more {said}, the latest on this date"
+    assert (more.date, more.count) == (str(DAYS[140])[:10], 7)

@@ -1,6 +1,6 @@
 """Findings: errors, warnings and notes on a price table, with advice."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from qfolio.core.text import amount, quote
 
-LISTED = 5  # findings of one kind that are listed; the others are counted
+LISTED = 5  # findings of one kind that are listed (errors: the first); the others are counted
 
 Severity = Literal["error", "warning", "note"]
 
@@ -62,6 +62,16 @@ class Findings(list[Finding]):
             column = spot(next(iter(said)))["column"]
             more = f"and {amount(rest, 'more row')} of this kind"
             self.error(more, column=column, advice=advice, count=rest)
+
+    def older(self, moments: Sequence[Any], noun: str, kind: str) -> None:
+        """A warning that counts all but the latest of such moments, which are listed.
+
+        It has the date of the latest one that it counts: whoever looks at later rows than a date
+        learns of all findings on them.
+        """
+        if (more := len(moments) - LISTED) > 0:
+            said = f"and {amount(more, f'more {noun}')} {kind}, the latest on this date"
+            self.warn(said, date=day(moments[more - 1]), count=more)
 
     @property
     def bad(self) -> bool:

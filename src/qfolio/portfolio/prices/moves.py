@@ -34,7 +34,7 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
     with np.errstate(over="ignore", divide="ignore", under="ignore"):
         relatives = values[1:] / values[:-1]
         logs = np.log(values)
-    moves = np.diff(logs, axis=0)
+    moves, dates = np.diff(logs, axis=0), grid.dates[rest.head :]
     sizes = np.abs(moves)
 
     def spot(i: int, j: int) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
     if (more := len(wild) - LISTED) > 0:
         findings.error(f"and {amount(more, 'more price')} that change by such factors", count=more)
     ticks, splits, others = _sort_out(logs, moves, _jumps(values, moves, sizes))
-    for (i, j), rows in list(ticks.items())[:LISTED]:
+    for (i, j), rows in list(ticks.items())[-LISTED:]:
         spell = "in the next row" if rows == 1 else f"{rows} rows later"
         power = round(np.log10(relatives[i, j]))
         misplaced = power and abs(moves[i, j] - power * np.log(10)) < LEAST_JUMP
@@ -63,19 +63,17 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
             "(--missing).",
             **spot(i + 1, j),
         )
-    if (more := len(ticks) - LISTED) > 0:
-        findings.warn(f"and {amount(more, 'more price')} that may be wrong", count=more)
-    for (i, j), ratio in list(splits.items())[:LISTED]:
+    findings.older([dates[i + 1] for i, _ in ticks], "price", "that may be wrong")
+    for (i, j), ratio in list(splits.items())[-LISTED:]:
         findings.warn(
             f"{subject(j)} is {relatives[i, j]:.4g} times the one before, close to {ratio}: "
             "perhaps a split that was not adjusted",
             advice="If so, use adjusted prices.", **spot(i + 1, j),
         )  # fmt: skip
-    if (more := len(splits) - LISTED) > 0:
-        findings.warn(f"and {amount(more, 'more move')} that may be splits", count=more)
+    findings.older([dates[i + 1] for i, _ in splits], "move", "that may be splits")
     if others:
         i, j = max(others, key=lambda jump: sizes[jump])
-        when = day(grid.dates[rest.head + i + 1])
+        when = day(dates[i + 1])
         findings.note(
             f"{amount(len(others), 'large move')} that neither other assets nor a split explain; "
             f"the largest: {subject(j)} on {when} is {relatives[i, j]:.4g} times the one before",

@@ -87,7 +87,7 @@ def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:
     steps, usual = spacing(dates)
     closed = 0.0 if every_day(dates) else 7.0  # markets with weekends have holidays, too
     long = np.flatnonzero(steps > 3 * usual + closed)
-    for k in long[:LISTED].tolist():
+    for k in long[-LISTED:].tolist():
         findings.warn(
             f"the previous row is {day(dates[k])}, {steps[k]:.4g} days earlier "
             f"(usual: {usual:.4g})",
@@ -96,5 +96,4 @@ def check_size(grid: Grid, rest: Rest, findings: Findings) -> None:
             else grid.spot(grid.prices, rest.head + int(k) + 1, 0)["row"],
             date=day(dates[k + 1]),
         )
-    if (more := len(long) - LISTED) > 0:
-        findings.warn(f"and {amount(more, 'more gap')} between dates", count=more)
+    findings.older([dates[k + 1] for k in long], "gap", "between dates")

@@ -300,8 +300,8 @@ def check(source: Any = None, **options: Any) -> list[Finding]:
 def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Finding]]:
     """The prices, and all errors, warnings and notes on a table, by row and column.
 
-    The arguments are ``load``'s. Of each kind, at most five cells are named; the others are
-    counted.
+    The arguments are ``load``'s. Of each kind, at most five cells are named, the first
+    ones of errors and the latest ones of warnings; the others are counted.
 
     Returns:
         The prices (None if a finding is an error), and the findings.
