@@ -36,8 +36,9 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
     """What was found about an agent, without numbers, and the difference of each claim.
 
     Claims against the reference come first, and of these, one that says the agent grew less. If the
-    agent does not beat the reference at every speed of rebalancing, a claim says so. After a total
-    loss there is only one claim, which says so.
+    agent beats the reference as it is, but not at every speed of rebalancing, one claim says so of
+    all speeds, and another of which speed it holds. After a total loss there is only one claim,
+    which says so.
     """
     entry, reference, best = (
         assessment.strategies[name],
@@ -56,9 +57,15 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
     claim = _claim(name, main, at_any, at_best)
     if claim and not main.found("better"):
         claim += ", and beats it in nothing"
-    said = [(claim or _nothing(name, main, at_any if _gains(alone) else reference), main)]
+    at_every = f"{reference} at every speed of rebalancing" if _gains(alone) else reference
+    said = [(claim or _nothing(name, main, at_every), main)]
     if rebalanced is not None and not _alike(alone, rebalanced):
-        said.append((_claim(name, alone, reference, reference), alone))
+        here = reference
+        if set(_gains(alone)) > set(_gains(main)):
+            dear = main.reference != reference  # a slower one grew more
+            here += " where it is rebalanced in full with every order"
+            here += ", which pays costs for nothing," if dear else ","
+        said.append((_claim(name, alone, here, reference), alone))
     said.sort(key=lambda each: each[1].growth.finding != "worse")
     if entry.to_best_baseline is not None:
         said.append((_claim(name, entry.to_best_baseline, best, best), entry.to_best_baseline))
