@@ -105,6 +105,18 @@ class Browser:
         self.call("Page.navigate", url=url)
         self.wait(f"document.readyState === 'complete' && ({ready})")
 
+    def cued(self, url: str, width: int, label: str) -> bool:
+        """Whether a page shows, at a width, that a table with this label goes on to the right."""
+        self.show(url, width, phone=width < 600)
+        height, fade = self.evaluate(
+            f"(() => {{ const frame = document.querySelector('.scroll[aria-label=\"{label}\"]'); "
+            "return [getComputedStyle(frame, '::before').height, "
+            "getComputedStyle(frame).getPropertyValue('--fade')]; })()"
+        )
+        shown = {"0px": False, "48px": True}[fade]
+        assert (float(height.removesuffix("px")) > 10) == shown
+        return shown
+
     def click(self, selector: str) -> None:
         """A real click in the middle of an element."""
         x, y = self.evaluate(

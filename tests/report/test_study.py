@@ -3,6 +3,7 @@ import pytest
 from qfolio.report.study import render_study
 
 from backtests import ATTACK, Page
+from browser import Browser
 from studies import study
 
 
@@ -50,3 +51,13 @@ def test_texts_of_others_cannot_run():
     assert not shown.scripts
     assert not [tag for tag, _ in shown.tags if tag in ("img", "script", "link")]
     assert ATTACK in shown.text
+
+
+def test_wide_tables_say_so_on_a_phone(browser: Browser, tmp_path):
+    """By the style that all pages share, without a script."""
+    config, result = study(2, 2, 3)
+    path = tmp_path / "report.html"
+    path.write_text(render_study(config, result, {}, {}), encoding="utf-8")
+    for label in ("tilts, table by table", "tilts, other costs and lags"):
+        assert browser.cued(path.as_uri(), 375, label)
+        assert not browser.cued(path.as_uri(), 1280, label)

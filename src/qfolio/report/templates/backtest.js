@@ -164,15 +164,6 @@
     });
   }
 
-  /** Marks the tables that reach beyond their frame, and those with more to the right. */
-  function cue() {
-    for (const frame of document.querySelectorAll(".scroll")) {
-      frame.classList.toggle("wide", frame.scrollWidth > frame.clientWidth + 1);
-      frame.classList.toggle("more",
-        frame.scrollLeft + frame.clientWidth < frame.scrollWidth - 2);
-    }
-  }
-
   for (const button of document.querySelectorAll("button[data-strategy]")) {
     button.addEventListener("click", () => toggle(Number(button.dataset.strategy)));
   }
@@ -198,14 +189,9 @@
     if (first && byId("rolling").data) {
       follow("rolling", data.dates, (i) => read("rolling", i), () => read("rolling", atEnd()));
     }
-    cue();
   });
   for (const query of [dark, narrow, coarse]) query.addEventListener("change", redraw);
-  addEventListener("resize", () => { cue(); drawWealth(); drawRolling(); });
-  document.addEventListener("scroll", cue, { capture: true, passive: true });
-  document.addEventListener("toggle", cue, { capture: true });
-  document.addEventListener("change", cue);
-  cue();
+  addEventListener("resize", () => { drawWealth(); drawRolling(); });
   let opened = false;
   addEventListener("beforeprint", () => {
     state.printing = true;
