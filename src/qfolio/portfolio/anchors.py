@@ -9,7 +9,7 @@ import warnings
 
 import numpy as np
 
-from qfolio.core.arrays import Floats
+from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import exists
 from qfolio.portfolio.backtest.baselines import History, baseline
@@ -31,8 +31,11 @@ def baselines(anchor: str) -> list[str]:
     return [name for name in named if not name.startswith(COLUMN)]
 
 
-def path(anchor: str, prices: Prices) -> Weights:
+def path(anchor: str, prices: Prices, buyable: Bools | None = None) -> Weights:
     """The weights of an anchor at each row, of shape (row, asset); the rest is cash.
+
+    buyable: the assets among which a baseline may divide the wealth, of shape (asset,), as a
+    mandate allows (default: all). Columns and single assets are taken as they are.
 
     The weights at a row depend on no later row. A baseline decides every month, or at every row if
     that is its calendar; between decisions its holding drifts, unless its target is to be held at
@@ -47,7 +50,7 @@ def path(anchor: str, prices: Prices) -> Weights:
     each = [
         _column(name.removeprefix(COLUMN), prices)
         if name.startswith(COLUMN)
-        else _followed(name, prices)
+        else _followed(name, prices, buyable)
         for name in _names(anchor)
     ]
     return np.asarray(np.mean(each, axis=0))
@@ -73,7 +76,7 @@ def _names(anchor: str) -> list[str]:
     return names
 
 
-def _followed(name: str, prices: Prices) -> Weights:
+def _followed(name: str, prices: Prices, buyable: Bools | None) -> Weights:
     """The weights of a baseline at each row."""
     chosen = baseline(name)
     month, values = prices.month, prices.values
@@ -87,7 +90,7 @@ def _followed(name: str, prices: Prices) -> Weights:
             # Two rows are too few for a baseline, which in a backtest has a whole training window.
             if row % month == 0 or row == 2 or chosen.calendar == "row" or anew:
                 rule = chosen if row >= 2 else EqualWeight()
-                history = _history(prices, row, month, rule.estimates)
+                history = _history(prices, row, month, rule.estimates, buyable)
                 nothing = np.eye(len(held))[0]
                 wanted = rule.decide(history, held) if history.tradable.any() else nothing
                 held = held if wanted is None else checked(name, wanted, history)
@@ -97,7 +100,9 @@ def _followed(name: str, prices: Prices) -> Weights:
     return rows
 
 
-def _history(prices: Prices, row: int, month: int, estimates: bool) -> History:
+def _history(
+    prices: Prices, row: int, month: int, estimates: bool, buyable: Bools | None
+) -> History:
     """What a baseline knows at a row: five years of prices, or one if any asset starts later."""
     known = ~np.isnan(prices.values[: row + 1])
     tradable = known[max(0, row - 12 * month) :].all(0)
@@ -105,6 +110,8 @@ def _history(prices: Prices, row: int, month: int, estimates: bool) -> History:
         tradable = known[row]
     if prices.tradable is not None:
         tradable = prices.tradable[row] & (tradable | (not estimates))
+    if buyable is not None:
+        tradable = tradable & buyable
     first = max(0, row - MONTHS * month)
     if not known[first:, tradable].all():
         first = max(0, row - 12 * month)

@@ -29,7 +29,7 @@ from qfolio.portfolio.costs import cashed
 from qfolio.portfolio.execution import Plan, Terms
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import CappedSimplex, Feasible, Mandated
-from qfolio.portfolio.mandate.limits import feasible, largest_weight, parse, reach, settled
+from qfolio.portfolio.mandate.limits import buyable, feasible, largest_weight, parse, reach, settled
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.mandate.risk import Past, Risk, covariances
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
@@ -132,11 +132,12 @@ class Portfolio(Market):
             chosen, prices.known, self.signal_scale, columns, prices.tradable
         )
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
-        followed = anchors.path(self.anchor, prices) if self.anchor else logs[:0]
+        can = buyable(self.mandate) if self.mandate else None
+        followed = anchors.path(self.anchor, prices, can) if self.anchor else logs[:0]
         then = Conditions.of(prices, self.costs.columns)
         terms, risk = self.written.trading, self.written.risk
         passed = elapsed(prices.dates) if terms.turnover_a_year else np.zeros(0)
-        compared = anchors.path(risk.benchmark, prices) if risk.benchmark else logs[:0]
+        compared = anchors.path(risk.benchmark, prices, can) if risk.benchmark else logs[:0]
         year = np.array(prices.periods_per_year)
         estimated = np.zeros((0, *self.covariances.shape[1:]))
         if self.allowed is not None and self.allowed.limits_risk:

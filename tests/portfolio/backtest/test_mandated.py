@@ -9,10 +9,14 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Box
 from qfolio.experiments.presets import Preset
+from qfolio.portfolio.anchors import path
+from qfolio.portfolio.backtest.attribution.decomposition import decompose
+from qfolio.portfolio.backtest.attribution.explain import open_to
+from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.itemized import Itemized
-from qfolio.portfolio.mandate.limits import feasible
+from qfolio.portfolio.mandate.limits import buyable, feasible
 from qfolio.portfolio.prices.table import Prices
 
 ASSETS = ("A", "B", "C", "D", "E")
@@ -188,6 +192,32 @@ def test_baselines_leave_no_cash_in_place_of_assets_that_may_not_be_held(tmp_pat
     np.testing.assert_allclose(entries["equal-weight"].decisions[0, :, 2:5], 1 / 3)
     target = Desk.open(tmp_path / "run").followed("equal-weight").weights(backtest.prices)
     assert list(target.values()) == pytest.approx([0, 0, 1 / 3, 1 / 3, 1 / 3, 0])
+
+
+def test_equal_weights_are_those_of_what_a_mandate_allows():
+    """As the benchmark of tracking error, as an anchor, and where a return is explained."""
+    limits = {"assets": {"forbidden": ["E"], "cap": {"A": 0}}, "risk": {"tracking_error": 0.1}}
+    backtest = create(limits, agents={"pathwise": AGENTS["pathwise"]})
+    task, third = backtest.tasks["pathwise"], [0, 1 / 3, 1 / 3, 1 / 3, 0]
+    np.testing.assert_allclose(task.benchmarks, np.tile(third, (200, 1)), rtol=1e-6)
+    anchor = path("equal-weight", backtest.prices, buyable(task.mandate))
+    np.testing.assert_allclose(anchor, np.tile(third, (200, 1)))
+    limits["risk"] = {"tracking_error": 9, "benchmark": "E"}  # a single asset is taken as it is
+    asset = create(limits, agents={"pathwise": AGENTS["pathwise"]})
+    assert (np.asarray(asset.tasks["pathwise"].benchmarks)[:, 4] == 1).all()
+
+    part = backtest._plan.part
+    stretches = [Stretch(part("pathwise", fold.name), None, fold) for fold in backtest.folds]
+    entries, _ = backtest.replay.others(backtest.baselines, {}, "equal-weight")
+    entry = entries["equal-weight"].simulation
+    parts = decompose(
+        entry.returns[0], entry.weights[0], backtest.replay.growth - 1, {}, ASSETS, 252,
+        open_to(stretches),
+    )  # fmt: skip
+    # Equal weights tilt nowhere, but for what drifts from a decision to its trade and the first
+    # row, at which nothing is held yet.
+    assert abs(parts.equal) > 0.1
+    assert parts.tilts == pytest.approx(0, abs=0.02 * abs(parts.equal))
 
 
 def test_a_mandate_that_cannot_be_met_is_refused_before_anything_is_written(tmp_path):

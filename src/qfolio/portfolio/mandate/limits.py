@@ -86,6 +86,11 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
     )
 
 
+def buyable(text: str) -> Bool[np.ndarray, " asset"]:
+    """The assets of which a mandate allows a weight above 0."""
+    return np.asarray(feasible(text, np.ones(len(parse(text)[0]), bool)).limits.high > 0)
+
+
 def lots(text: str) -> Float[np.ndarray, " asset"] | None:
     """Shares of each asset that are traded together (default: 1); None if there is no such rule."""
     if not text or (lot := parse(text)[1].trading.lot) is None:

@@ -42,7 +42,7 @@ class Decomposition(msgspec.Struct, frozen=True):
     """The parts of the annual arithmetic mean return: equal + tilts + timing − cost = net."""
 
     net: float
-    equal: float  # return of equal weights of all assets, without costs
+    equal: float  # return of equal weights of all assets that may be held, without costs
     tilts: float  # what the mean weights earned beyond that
     timing: float
     timing_t: float  # HAC t-statistic, given the mean weights
@@ -63,7 +63,7 @@ def decompose(
     folds: dict[str, slice],
     assets: Sequence[str],
     periods_per_year: float,
-    known: np.ndarray | None = None,
+    open_to: np.ndarray | None = None,
 ) -> Decomposition:
     """Decompose a strategy's mean net return.
 
@@ -74,10 +74,10 @@ def decompose(
         folds: The days of each fold, by its name.
         assets: Names of the N assets.
         periods_per_year: For example 252 for trading days.
-        known: Whether an asset had a price on a day, shape (D, N) (default: all had).
+        open_to: Whether an asset could be held on a day, shape (D, N) (default: all could).
     """
     year = periods_per_year
-    mean, there = weights.mean(0), np.ones_like(weights[:, 1:]) if known is None else known
+    mean, there = weights.mean(0), np.ones_like(weights[:, 1:]) if open_to is None else open_to
     equal = (there * returns[:, 1:]).sum(1) / np.maximum(there.sum(1), 1)
     static, timed = returns @ mean, ((weights - mean) * returns).sum(1)
     cost = (weights * returns).sum(1) - net

@@ -56,6 +56,7 @@ def _explained(
     names = channel_names(backtest.tasks[name], prices.feature_names)
     worth, held = importance(agent, stretches, names, prices.values, year)
     few = of_seeds(stretches, worth.seeds)
+    there = ~np.isnan(prices.values) if prices.tradable is None else prices.tradable
     shared = [each.shared for each in worth.signals] or [False] * len(names)
     why = AgentWhy(
         decomposition=decompose(
@@ -65,7 +66,7 @@ def _explained(
             folds,
             prices.assets,
             year,
-            ~np.isnan(prices.values[begin + config.lag :][: len(net)]),
+            open_to(stretches) & there[begin + config.lag :][: len(net)],
         ),
         exposures=exposures(net - reference, factors, year),
         importance=worth,
@@ -88,14 +89,19 @@ def _explained(
     return why, said
 
 
+def open_to(stretches: list[Stretch]) -> np.ndarray:
+    """Which assets a fold, and a mandate if there is one, let be held; of shape (days, assets)."""
+    days = [len(range(fold.decisions.start, fold.decisions.stop)) for *_, fold in stretches]
+    return np.repeat([np.asarray(part.limits) > 0 for part, *_ in stretches], days, axis=0)
+
+
 def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> Rule:
     """The linear rule of an agent's decisions, fitted on every other fold."""
     begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
     task, days = stretches[0].task, end - begin
-    tradable, fitted = np.zeros((days, task.limits.shape[0])), np.zeros(days, bool)
-    for i, (part, _, fold) in enumerate(stretches):
+    tradable, fitted = open_to(stretches), np.zeros(days, bool)
+    for i, (*_, fold) in enumerate(stretches):
         rows = slice(fold.decisions.start - begin, fold.decisions.stop - begin)
-        tradable[rows] = np.asarray(part.limits) > 0
         fitted[rows] = i % 2 == 0
     if len(stretches) == 1:
         fitted[days // 2 :] = False
