@@ -52,6 +52,13 @@ class Budget:
         return population.steps_left(self.episodes, steps=self.steps)
 
 
+def require_budget(value: object) -> Budget:
+    """The value if it is a budget; raises QfolioError if not."""
+    require_type("budget", value, Budget, "a budget, such as Budget(episodes=100)")
+    assert isinstance(value, Budget)
+    return value
+
+
 def seed_range(seeds: int, seed: int) -> range:
     """``seeds`` consecutive seeds from ``seed``; raises QfolioError if one exceeds 32 bits."""
     _require("seeds", seeds, 1, 2**20)

@@ -16,7 +16,7 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
 from qfolio.core.registry import short
 from qfolio.core.text import amount
-from qfolio.experiments.budget import Budget
+from qfolio.experiments.budget import Budget, require_budget
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener
@@ -68,7 +68,9 @@ class Run(Seeds):
         """
         require_type("task", task, Task, "a task, such as qfolio.Pendulum()")
         require_type("agent", agent, Agent, "an agent, such as qfolio.DQN()")
-        budget = budget or Budget(episodes, steps)
+        if preset is not None:
+            require_type("preset", preset, str, "text")
+        budget = Budget(episodes, steps) if budget is None else require_budget(budget)
         config = RunConfig(
             **describe(task, agent),
             preset=preset,
@@ -158,7 +160,8 @@ class Run(Seeds):
                 this one; returns its listeners (default: ``listeners``).
             log: Log of the experiment that the run is a part of (default: the folder's own).
         """
-        budget, executor = budget or self.budget, on(executor)
+        budget = self.budget if budget is None else require_budget(budget)
+        executor = on(executor)
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
             if isinstance(executor, Here) and not self.groups.begun:
                 self.train_here(budget, listeners, log)

@@ -79,7 +79,7 @@ def test_an_overdraft_is_read_although_shorts_are_not_allowed(tmp_path: Path):
         ("asset,shares,shares\nAAA,1,2\n", "'shares' and 'shares' could both be the shares"),
         ("Symbol,Name,Qty\nAAA,Triple,2\n", "'Symbol' and 'Name' could both be the asset"),
         ("AAA,1\n", "needs a first line with the columns asset"),
-        ("", "is empty"),
+        ("", "'holdings.csv' is empty; a table has a header and rows below it."),
     ],
 )
 def test_holdings_that_are_refused(tmp_path: Path, text: str, message: str):

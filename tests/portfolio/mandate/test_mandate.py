@@ -136,6 +136,13 @@ def test_what_is_wrong_in_a_file_is_said(tmp_path, text, message):
         settled(written(tmp_path, text), ASSETS)
 
 
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / "mandate.toml"
+    path.write_bytes(b"PK\x03\x04\xff\xfe")
+    with pytest.raises(QfolioError, match=r"mandate\.toml is not UTF-8 text; write it as TOML"):
+        settled(path, ASSETS)
+
+
 def test_the_example_of_the_guide_is_a_mandate(tmp_path):
     guide = (Path(__file__).parents[3] / "docs/guides/mandate.md").read_text(encoding="utf-8")
     toml, groups = (guide.split(fence)[1].split("\n```")[0] for fence in ("```toml", "```\nasset"))

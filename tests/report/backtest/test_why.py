@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace as replace_in
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.attribution.decomposition import AssetPart
@@ -23,8 +24,8 @@ def explained():
 def test_the_page_says_where_the_return_came_from(explained):
     text = Page(render_backtest(explained)).text
     for sentence in (
-        "Of the 14.2% a year that DQN-together earned, 13.1% come from holding all assets in "
-        "equal parts, +0.4% from weights that were constantly different, +1.1% from their timing "
+        "Of the 14.2% a year that DQN-together earned, 13.1% come from equal weights, "
+        "+0.4% from weights that were constantly different, +1.1% from their timing "
         "(t = 1.7), and costs took 0.4%.",
         "Diagnosis: DQN-together traded once and never again.",
         "+0.2% from fold to fold; t = 1.7",
@@ -84,6 +85,18 @@ def test_small_parts_have_more_digits(explained):
     assert "+0.10% from weights" in headline("x", small)
     assert "costs took 0.06%" in headline("x", small)
     assert "costs took 0.4%" in headline("x", parts)
+
+
+def test_a_weight_that_never_changes_has_a_scale_with_round_ends(explained):
+    """As that of a single asset, which is 100% or nearly so at every value of a signal."""
+    (agent, why), *_ = explained.why.agents.items()
+    flat = [[1.0, 1.0 - 1e-7, 1.0]]
+    signals = [replace_in(each, x=[0.0, 0.5, 1.0], lines=flat, above=[]) for each in
+               why.slices.signals]  # fmt: skip
+    changed = replace_in(why, slices=replace_in(why.slices, signals=signals))
+    data = replace(explained, why=replace_in(explained.why, agents={agent: changed}))
+    panels = why_sections(data)[0]["slices"]["signals"]
+    assert {panel["y"] for panel in panels} == {("99.0%", "100.0%")}
 
 
 def test_attributions_of_another_backtest_are_refused(explained):

@@ -167,7 +167,10 @@ class Backtest:
         """
         _require_types(agents, strategies, lag=lag, seeds=seeds, seed=seed, trials=trials)
         require_type("expanding", expanding, bool, "True or False")
-        require_type("title", title, str, "text")
+        for argument, text in (("command", command), ("title", title)):
+            require_type(argument, text, str, "text")
+        if task is not None:
+            require_type("task", task, Mapping, 'a dictionary of settings, such as {"window": 20}')
         place = None if out is None else path_of("out", out)
         if not agents:
             raise QfolioError("A backtest needs at least one agent; name some with --agents.")

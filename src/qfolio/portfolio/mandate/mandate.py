@@ -157,7 +157,12 @@ class Mandate(Section, frozen=True):
             content = tomllib.loads(path.read_text("utf-8"))
         except OSError as error:
             raise QfolioError(f"The mandate {path} cannot be read: {error.strerror}.") from None
-        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        except UnicodeDecodeError:
+            raise QfolioError(
+                f"The mandate {path} is not UTF-8 text; write it as TOML, see "
+                "docs/guides/mandate.md."
+            ) from None
+        except tomllib.TOMLDecodeError as error:
             raise QfolioError(
                 f"{path} is not valid TOML: {error}; see docs/guides/mandate.md."
             ) from None

@@ -39,9 +39,7 @@ def from_text(content: bytes, name: str, texts: Callable[[tuple[str, ...]], set[
     if "\0" in text:
         raise QfolioError(f"{quote(name)} is not UTF-8 text; save the table as CSV (UTF-8).")
     if not text.strip():
-        raise QfolioError(
-            f"{quote(name)} is empty; a table has a column of dates and one for each asset."
-        )
+        raise QfolioError(f"{quote(name)} is empty; a table has a header and rows below it.")
     separator = ""
     if declared := _DECLARED.match(text):  # by Excel, in a line of its own
         separator, text = declared[1], "\n" + text[declared.end() :]

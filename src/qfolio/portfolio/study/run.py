@@ -115,6 +115,7 @@ class Study:
         require_list("costs", costs, Real, "a list of numbers, such as [0.001, 0.005]")
         require_list("after", after, str | os.PathLike, 'a list of folders, such as ["runs/study"]')
         require_type("trials", trials, Integral, "a whole number")
+        require_type("command", command, str, "text")
         place = path_of("out", out)
         tables = {name: load(table) for name, table in tables.items()}
         for length in (train, test):  # or it would be the reason why tables are left out

@@ -67,8 +67,8 @@ def headline(name: str, parts: Decomposition) -> str:
         )
     }  # fmt: skip
     return (
-        f"Of the {said['net']} a year that {name} earned, {said['equal']} come from holding all "
-        f"assets in equal parts, {said['tilts']} from weights that were constantly different, "
+        f"Of the {said['net']} a year that {name} earned, {said['equal']} come from equal "
+        f"weights, {said['tilts']} from weights that were constantly different, "
         f"{said['timing']} from their timing (t = {number(parts.timing_t)}), and costs took "
         f"{said['cost']}."
     )
@@ -229,9 +229,9 @@ def _panels(slices: Slices) -> dict[str, Any]:
 
 
 def _range(values: Sequence[float]) -> tuple[float, float]:
-    """The ends of an axis, at least a thousandth of a percent apart."""
+    """The ends of an axis: apart by a hundredth of the largest weight, where all are the same."""
     low, high = min(values, default=0.0), max(values, default=1.0)
-    margin = max(0.06 * (high - low), 5e-6)
+    margin = max(0.06 * (high - low), 0.01 * high, 5e-6)
     return max(0.0, low - margin), min(1.0, high + margin)
 
 
