@@ -7,7 +7,7 @@ thousand assets takes no time.
 
 import numpy as np
 
-from qfolio.core.text import amount, listed, quote
+from qfolio.core.text import amount, quote
 from qfolio.portfolio.prices.findings import LISTED, Findings, first_of
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Grid
@@ -28,21 +28,17 @@ def check_duplicates(grid: Grid, rest: Rest, findings: Findings) -> None:
     values = np.where(np.isfinite(rest.values) & (rest.values > 0), rest.values, np.nan)
     names = [quote(grid.assets[j]) for j in rest.assets]
     group = np.arange(len(names))  # the first of the assets with the same returns
-    for i, j in _pairs(values):
+    for i, j in _candidates(values):
         if group[i] != group[j] and _same(values[:, i], values[:, j]):
-            one, other = sorted((group[i], group[j]))
-            group[group == other] = one
+            group[group == max(group[i], group[j])] = min(group[i], group[j])
     found = [j for j in np.unique(group).tolist() if (group == j).sum() > 1]
     for first in found[:LISTED]:
-        members = np.flatnonzero(group == first)
-        ratio = float(np.nanmedian(values[:, members[1]] / values[:, first]))
+        members = np.flatnonzero(group == first).tolist()
         if len(members) > 2:
             said = f"{first_of(names[j] for j in members)} have the same returns"
-        elif abs(ratio - 1) <= NOISE:
-            said = f"{listed([names[j] for j in members])} have the same prices"
         else:
-            times = f"at {ratio:.6g} times its price"
-            said = f"{names[members[1]]} has the returns of {names[first]}, {times}"
+            one, other = members
+            said = _both(names[one], names[other], values[:, other] / values[:, one])
         findings.warn(
             f"{said}: perhaps one asset under {'two' if len(members) == 2 else 'several'} names",
             advice="If so, keep one: equal weights and caps count each name.",
@@ -51,7 +47,15 @@ def check_duplicates(grid: Grid, rest: Rest, findings: Findings) -> None:
         findings.warn(f"and {amount(more, 'more group')} of assets with equal returns", count=more)
 
 
-def _pairs(values: np.ndarray) -> list[tuple[int, int]]:
+def _both(one: str, other: str, ratios: np.ndarray) -> str:
+    """What two assets with the same returns share, in words; ratios: of their prices."""
+    ratio = float(np.nanmedian(ratios))
+    if abs(ratio - 1) <= NOISE:
+        return f"{one} and {other} have the same prices"
+    return f"{other} has the returns of {one}, at {ratio:.6g} times its price"
+
+
+def _candidates(values: np.ndarray) -> list[tuple[int, int]]:
     """Assets that grow by nearly the same in at least half of the periods in which either moves.
 
     Sorted by their growth in a period, such assets are neighbors.
