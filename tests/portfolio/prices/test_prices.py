@@ -385,10 +385,28 @@ def test_forward_fill_never_looks_ahead():
         changed = values.copy()
         changed[cut:-1] = np.where(rng.random((19 - cut, 4)) < 0.5, np.nan, 1.7)
         before, after = (
-            load(pd.DataFrame(v, index=days, columns=list("ABCD")), missing="forward-fill").values
+            load(pd.DataFrame(v, index=days, columns=list("ABCD")), missing="forward-fill")
             for v in (values, changed)
         )
-        np.testing.assert_array_equal(before[:cut], after[:cut])
+        known, still = (table.dates < days[cut].to_datetime64() for table in (before, after))
+        np.testing.assert_array_equal(before.values[known], after.values[still])
+
+
+def test_rows_without_any_number_are_left_out():
+    """Calendars and exports write holidays, and a day that is not over, as empty rows."""
+    table = frame(A=A, B=[20.0, 20.5, 20.25, 20.5, 19.75])
+    table.iloc[[1, 4], :] = np.nan
+    assert str(warnings(table)[0]) == (
+        "left out: 2 rows without any number, from 2020-01-03 to 2020-01-08"
+    )
+    prices = load(table)
+    np.testing.assert_array_equal(prices.dates, table.index[[0, 2, 3]].to_numpy())
+    np.testing.assert_array_equal(prices.values[:, 1], [20.0, 20.25, 20.5])
+    newest_first = load(table[::-1])
+    np.testing.assert_array_equal(newest_first.values, prices.values)
+    table.iloc[1, 1] = 20.5
+    with pytest.raises(QfolioError, match=r"2020-01-03.*column 'A': the price is missing"):
+        load(table)
 
 
 def test_assets_with_gaps_are_dropped_on_demand():

@@ -118,7 +118,8 @@ def _wide(
     table: Table, columns: Columns, moments: np.ndarray, complaints: dict[int, str],
     values: np.ndarray, wrong: np.ndarray, blank: np.ndarray, findings: Findings,
 ) -> Grid:  # fmt: skip
-    lines = np.flatnonzero(~blank)
+    empty = _empty_rows(moments, values, wrong, findings)
+    lines = np.flatnonzero(~blank & ~empty)
     complaints = {line: said for line, said in complaints.items() if not blank[line]}
     findings.rows(complaints, lambda line: table.spot(line, columns.date), WRITE_DATES)
     lines = _in_order(table, columns.date, moments, lines, findings)
@@ -132,6 +133,25 @@ def _wide(
         start = part.stop
     rows = np.broadcast_to(lines[:, None], (len(lines), max(len(columns.assets), 1)))
     return Grid(table, False, moments, columns.assets, rows, blocks[0], tuple(blocks[1:]))
+
+
+def _empty_rows(
+    moments: np.ndarray, values: np.ndarray, wrong: np.ndarray, findings: Findings
+) -> np.ndarray:
+    """Dates without any number after the first with one, such as holidays, of shape (rows,).
+
+    A column alone has gaps instead.
+    """
+    filled = ~np.isnan(values) | wrong
+    dated, some = ~np.isnat(moments), filled.any(axis=1)
+    if filled.any(axis=0).sum() < 2 or not (dated & some).any():
+        return np.zeros_like(some)
+    empty = dated & ~some & (moments > moments[dated & some].min())
+    if count := int(empty.sum()):
+        first, last = day(moments[empty].min()), day(moments[empty].max())
+        when = f"on {first}" if count == 1 else f"from {first} to {last}"
+        findings.warn(f"left out: {amount(count, 'row')} without any number, {when}")
+    return empty
 
 
 def _in_order(
