@@ -137,7 +137,7 @@ class Portfolio(Market):
         then = Conditions.of(prices, self.costs.columns)
         terms, risk = self.written.trading, self.written.risk
         passed = elapsed(prices.dates) if terms.turnover_a_year else np.zeros(0)
-        compared = anchors.path(risk.benchmark, prices, can) if risk.benchmark else logs[:0]
+        compared = anchors.path(risk.benchmark, prices) if risk.benchmark else logs[:0]
         year = np.array(prices.periods_per_year)
         estimated = np.zeros((0, *self.covariances.shape[1:]))
         if self.allowed is not None and self.allowed.limits_risk:
