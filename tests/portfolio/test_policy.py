@@ -240,3 +240,16 @@ def test_progress_and_settings():
     ):
         with pytest.raises(QfolioError, match=said):
             learned("pathwise", **options)
+
+
+def test_prices_of_another_frequency_are_refused(policy, tmp_path):
+    """A signal over a year of months would be another one than that of days."""
+    daily = table()
+    monthly = dataclasses.replace(
+        daily, dates=np.datetime64("2000-01", "M") + np.arange(ROWS, dtype="m8[M]")
+    )
+    policy.save(tmp_path / "policy")
+    for one in (policy, Policy.open(tmp_path / "policy")):
+        assert one.weights(daily).keys() == {"cash", "a", "b", "c"}
+        with pytest.raises(QfolioError, match=r"about 12 rows a year, .* from prices with 365;"):
+            one.weights(monthly)

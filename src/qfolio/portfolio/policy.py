@@ -29,6 +29,7 @@ from qfolio.portfolio import policy_folder, signals
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.frequency import alike
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 
@@ -37,6 +38,9 @@ UPDATE_RATE = 0.1
 
 MOST = 100.0
 """Largest weight that may be held, long or short, where debts are allowed."""
+
+SEVERAL = 10
+"""Rows from which on a table shows its frequency."""
 
 UNKNOWN = np.datetime64("NaT", "s")
 
@@ -242,6 +246,12 @@ class Policy:
             raise QfolioError(
                 f"The price table has {_list(list(table.feature_names)) or 'none'} as further "
                 f"features; the policy was trained with {_list(list(self.features)) or 'none'}."
+            )
+        usual, found = float(self.task.year), table.periods_per_year
+        if usual and len(table) >= SEVERAL and not alike(usual, found):
+            raise QfolioError(
+                f"The price table has about {found:.0f} rows a year, and the policy learned from "
+                f"prices with {usual:.0f}; give prices of the same frequency."
             )
         if len(table) <= self.task.window:
             raise QfolioError(

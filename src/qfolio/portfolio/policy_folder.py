@@ -41,6 +41,7 @@ class PolicyConfig(Config, frozen=True):
     updates: Annotated[int, msgspec.Meta(ge=0)]
     learned: str
     learns: bool
+    periods_per_year: float = 0.0  # rows a year of the prices that it learned from; 0: not known
 
 
 class Content(NamedTuple):
@@ -69,6 +70,7 @@ def save(content: Content, seeds: int, rows: int, folder: Path) -> None:
         updates=content.updates,
         learned=str(content.learned),
         learns=content.learner is not None,
+        periods_per_year=float(content.task.year),
     )
     with new_folder(folder) as place:
         write_config(place / "policy.json", config)
@@ -128,7 +130,8 @@ def _blank(config: PolicyConfig) -> Portfolio:
     return eqx.tree_at(
         lambda t: (
             t.log_relatives, t.extra, t.anchors, t.benchmarks, t.first_decision, t.last_decision,
+            t.year,
         ),
         task,
-        (*shown, jnp.array(task.window, jnp.int32), last),
+        (*shown, jnp.array(task.window, jnp.int32), last, jnp.array(config.periods_per_year)),
     )  # fmt: skip

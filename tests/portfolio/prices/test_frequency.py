@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from qfolio.portfolio.prices.frequency import periods_per_year
+from qfolio.portfolio.prices.frequency import alike, periods_per_year
 
 
 @pytest.mark.parametrize(
@@ -51,3 +51,15 @@ def test_weeks_that_include_a_day_of_the_weekend(week: str, expected: float):
 
 def days(index: pd.DatetimeIndex) -> np.ndarray:
     return index.to_numpy("datetime64[s]")
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        (252, 252, True), (252, 365, True), (283, 252, True), (252, 52, False), (52, 12, False),
+        (12, 4, False), (365, 730, False), (252, 98_280, False),
+        (98_280, 504, True),  # a part of a day has as many bars as it is long
+    ],
+)  # fmt: skip
+def test_frequencies_that_are_alike(one, other, same):
+    assert alike(one, other) is alike(other, one) is same

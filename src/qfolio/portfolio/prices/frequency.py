@@ -3,6 +3,7 @@
 import numpy as np
 
 TRADING_DAYS = 252.0  # a year
+INTRADAY = 366.0  # rows a year beyond which there are several a day
 YEARLY = ((6, 8, 52.0), (27, 32, 12.0), (88, 93, 4.0), (360, 370, 1.0))
 """Days between rows, from and to, and the rows of a year: weeks, months, quarters, years."""
 
@@ -51,6 +52,16 @@ def periods_per_year(dates: np.ndarray) -> float:
         if low <= usual <= high:
             return periods
     return _a_year(dates)
+
+
+def alike(one: float, other: float) -> bool:
+    """Whether two numbers of rows a year are of one frequency.
+
+    All intraday bars are: a table that holds parts of days does not tell how many a day has.
+    """
+    if max(one, other) > INTRADAY:
+        return min(one, other) > INTRADAY
+    return max(one, other) <= 2 * min(one, other)
 
 
 def _a_year(dates: np.ndarray) -> float:
