@@ -60,7 +60,8 @@ def allocate(
         anyway: Allocate even if the backtest is not finished, or found the agent worse than the
             benchmark, or (without a record) if the policy has learned from later prices.
         whole_shares: Trade whole shares only.
-        as_of: Day of the allocation; prices may be up to a week older (default: today).
+        as_of: Day of the allocation; prices may be up to a week older, or up to a week and the
+            days between rows if those are longer (default: today).
         update: Update the policy on the new rows first, and store the new version beside the
             earlier ones.
         orders: Write the trades to this CSV file.

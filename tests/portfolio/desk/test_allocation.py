@@ -193,6 +193,14 @@ def test_costs_by_kind():
     np.testing.assert_allclose(allocation.reached, [0.2, 0.4, 0.4], atol=40 / 10_000)
 
 
+def test_monthly_prices_are_fresh_until_the_next_are_due():
+    months = np.array(["2024-09-30", "2024-10-31", "2024-11-30"], "datetime64[s]")
+    monthly = Prices(months, ("A", "B"), np.ones((3, 2)))
+    require_fresh(monthly, "2025-01-05")
+    with pytest.raises(QfolioError, match="stale"):
+        require_fresh(monthly, "2025-01-10")
+
+
 def test_prices_of_another_day():
     require_fresh(PRICES, "2024-12-31")
     require_fresh(PRICES, "2025-01-07")

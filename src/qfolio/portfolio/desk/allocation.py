@@ -16,10 +16,11 @@ from qfolio.portfolio.desk.whole_shares import whole_shares as rounded
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.limits import lots
 from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.frequency import spacing
 from qfolio.portfolio.prices.table import Prices
 
 MAX_AGE = datetime.timedelta(days=7)
-"""Older prices are stale."""
+"""Older daily prices are stale; slower ones may be older by the days between their rows."""
 
 NOISE = 1e-6
 """Smaller changes of a weight are not ordered, since policies decide in float32."""
@@ -231,7 +232,7 @@ def settled(
 
 
 def require_fresh(prices: Prices, as_of: str | None) -> None:
-    """Raises QfolioError unless prices end in the week up to ``as_of`` (default: today)."""
+    """Raises QfolioError unless prices end shortly before ``as_of`` (default: today)."""
     try:
         today = datetime.date.today() if as_of is None else datetime.date.fromisoformat(as_of)
     except ValueError:
@@ -244,7 +245,8 @@ def require_fresh(prices: Prices, as_of: str | None) -> None:
             f"The prices end on {last}, after {today}; leave out the later rows, or set "
             "a later --as-of."
         )
-    if today - last > MAX_AGE:
+    usual = spacing(prices.dates)[1] if len(prices) > 1 else 1.0
+    if today - last > MAX_AGE + datetime.timedelta(days=max(0, round(usual) - 1)):
         raise QfolioError(
             f"The prices are stale: they end on {last}, {(today - last).days} days before {today}; "
             f"give the latest with --prices, or set --as-of {last}."
