@@ -108,6 +108,8 @@ def orders(
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             for row in range(fold.decisions.start, fold.decisions.stop):
+                if not (asks[row] or gives[row] or account.watched):
+                    continue  # nothing can happen, as on most days of a monthly calendar
                 held = account.held(row)
                 called = terms.calls(held)
                 # A margin call asks for a new target, unless that of the fold stands.
@@ -169,6 +171,11 @@ class _Account:
         self.growth, self.terms, self.universe = growth, terms, universe
         self.weights, self.row = np.eye(growth.prices.shape[1] + 1)[0], first  # of the last trade
         self.plan = terms.begin(self.weights)
+
+    @property
+    def watched(self) -> bool:
+        """Whether it may trade at any row, for a lender or by a plan."""
+        return self.plan is not None or self.terms.called < np.inf
 
     def held(self, row: int) -> Floats:
         """The weights at a row before it trades."""
