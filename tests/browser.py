@@ -108,6 +108,10 @@ class Browser:
     def cued(self, url: str, width: int, label: str) -> bool:
         """Whether a page shows, at a width, that a table with this label goes on to the right."""
         self.show(url, width, phone=width < 600)
+        # A scroll timeline is active only once frames have been drawn.
+        self.evaluate(
+            "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done())))"
+        )
         height, fade = self.evaluate(
             f"(() => {{ const frame = document.querySelector('.scroll[aria-label=\"{label}\"]'); "
             "return [getComputedStyle(frame, '::before').height, "
