@@ -22,8 +22,6 @@ from qfolio.portfolio.signals import COLUMN
 MONTHS = 60
 """Months of prices up to a decision that a baseline estimates from."""
 
-Weights = Floats
-
 
 def baselines(anchor: str) -> list[str]:
     """The baselines that an anchor names; none without an anchor."""
@@ -31,7 +29,7 @@ def baselines(anchor: str) -> list[str]:
     return [name for name in named if not name.startswith(COLUMN)]
 
 
-def path(anchor: str, prices: Prices, buyable: Bools | None = None) -> Weights:
+def path(anchor: str, prices: Prices, buyable: Bools | None = None) -> Floats:
     """The weights of an anchor at each row, of shape (row, asset); the rest is cash.
 
     buyable: the assets among which a baseline may divide the wealth, of shape (asset,), as a
@@ -76,7 +74,7 @@ def _names(anchor: str) -> list[str]:
     return names
 
 
-def _followed(name: str, prices: Prices, buyable: Bools | None) -> Weights:
+def _followed(name: str, prices: Prices, buyable: Bools | None) -> Floats:
     """The weights of a baseline at each row."""
     chosen = baseline(name)
     month, values = prices.month, prices.values
@@ -120,7 +118,7 @@ def _history(
     return History(prices.dates[past], prices.values[past], train, tradable, 1.0, month)
 
 
-def _column(name: str, prices: Prices) -> Weights:
+def _column(name: str, prices: Prices) -> Floats:
     if name not in prices.feature_names:
         raise QfolioError(
             f"anchor is {COLUMN}{name}, but the table has no column {name}; name it with "

@@ -259,7 +259,7 @@ class Policy:
                 f"needs at least {self.task.window + 1}."
             )
         # A policy that learned from a shorter table has never known its longest signals.
-        chosen = signals.parse(self.task.signals, table.periods_per_year)
+        chosen = signals.parse(self.task.signals, found)
         looked = min(signals.lookback(chosen), self.rows - 1)
         if len(table) <= looked:
             raise QfolioError(

@@ -284,7 +284,7 @@ def compute(
 
 
 def _split(text: str, pace: float) -> tuple[str, dict[str, str]]:
-    """A signal's name, and its rows and skip if it has any; pace: rows in a daily table's row."""
+    """A signal's name, and its rows and skip if given; pace: rows for each row of a daily table."""
     match = re.fullmatch(r"(.+?)(?::(\d+[dwmy]?)(?:-(\d+[dwmy]?))?)?", text)
     assert match is not None  # anything is a name
     name, *given = match.groups()

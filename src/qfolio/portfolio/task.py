@@ -124,7 +124,8 @@ class Portfolio(Market):
 
         Signals are 0 where they are not yet known.
         """
-        chosen = signals.parse(self.signals, prices.periods_per_year)
+        year = prices.periods_per_year
+        chosen = signals.parse(self.signals, year)
         logs = np.zeros(prices.values.shape)
         logs[1:] = np.nan_to_num(np.diff(np.log(prices.values), axis=0))
         columns = dict(zip(prices.feature_names, np.moveaxis(prices.features, -1, 0), strict=True))
@@ -132,16 +133,17 @@ class Portfolio(Market):
             chosen, prices.known, self.signal_scale, columns, prices.tradable
         )
         extra = np.concatenate([np.nan_to_num(prices.features), computed], -1)
-        can = buyable(self.mandate) if self.mandate else None
-        followed = anchors.path(self.anchor, prices, can) if self.anchor else logs[:0]
+        followed = logs[:0]
+        if self.anchor:
+            can = buyable(self.mandate) if self.mandate else None
+            followed = anchors.path(self.anchor, prices, can)
         then = Conditions.of(prices, self.costs.columns)
         terms, risk = self.written.trading, self.written.risk
         passed = elapsed(prices.dates) if terms.turnover_a_year else np.zeros(0)
         compared = anchors.path(risk.benchmark, prices) if risk.benchmark else logs[:0]
-        year = np.array(prices.periods_per_year)
         estimated = np.zeros((0, *self.covariances.shape[1:]))
         if self.allowed is not None and self.allowed.limits_risk:
-            estimated = covariances(logs, prices.first_rows, risk.rows, prices.periods_per_year)
+            estimated = covariances(logs, prices.first_rows, risk.rows, year)
         given = (logs, extra, followed, then, passed, compared, estimated, year)
         arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), given)
         decides = decision_rows(self.calendar, prices.dates) if self.calendar else np.zeros(0, bool)

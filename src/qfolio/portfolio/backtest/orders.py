@@ -206,9 +206,7 @@ class _Account:
 
 def holdable(tradable: Bools, mandated: Feasible | None) -> Bools:
     """Those of the tradable assets of which a mandate, if there is one, allows a weight above 0."""
-    if not isinstance(mandated, Mandated):
-        return tradable
-    return tradable & (np.asarray(mandated.limits.high) > 0)
+    return tradable & mandated.buyable if isinstance(mandated, Mandated) else tradable
 
 
 def ask(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from qfolio.core import simplex
-from qfolio.core.arrays import Floats
+from qfolio.core.arrays import Bools, Floats
 from qfolio.portfolio.mandate.order import BARELY, Rules, ordered
 from qfolio.portfolio.mandate.projection import Limits
 from qfolio.portfolio.mandate.risk import Past, Risk
@@ -98,6 +98,11 @@ class Mandated(Feasible):
     volatility: float = eqx.field(static=True, default=float("inf"))  # a year, at most
     tracking_error: float = eqx.field(static=True, default=float("inf"))  # a year, at most
     risk: Risk | Past | None = None  # as known at a row, if there is such a limit
+
+    @property
+    def buyable(self) -> Bools:
+        """The assets of which a weight above 0 is allowed, of shape (asset,)."""
+        return np.asarray(self.limits.high) > 0
 
     @property
     def limits_risk(self) -> bool:

@@ -88,7 +88,7 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
 
 def buyable(text: str) -> Bool[np.ndarray, " asset"]:
     """The assets of which a mandate allows a weight above 0."""
-    return np.asarray(feasible(text, np.ones(len(parse(text)[0]), bool)).limits.high > 0)
+    return feasible(text, np.ones(len(parse(text)[0]), bool)).buyable
 
 
 def lots(text: str) -> Float[np.ndarray, " asset"] | None:

@@ -23,18 +23,20 @@ def _findings(name: str, pools: Pools) -> list[str]:
     alone is therefore no claim: an agent that merely trades less does so on random walks.
     """
     reference, alone, best = _reference(pools), pools.to_reference, pools.to_rebalanced
-    at_best = f"the best rebalancing of {reference}"
-    said = f"{_VERBS[alone.finding or 'none'].format(name)} {reference}", alone
-    other = f"Against {at_best}", best
-    if reference == EQUAL_WEIGHT and best.finding == "better":
-        said = f"{name} beats {reference}, however it is rebalanced,", best
-        other = f"Against {reference} itself, which is rebalanced at every row", alone
-    elif reference == EQUAL_WEIGHT and alone.finding == "better":
-        said = f"No evidence that {name} beats {at_best}", best
-        other = f"It beats {reference} itself, as trading less may do without any skill", alone
     where = f"in growth after costs over {amount(len(pools.evidence), 'table')}"
-    first = f"{said[0]} {where}: {_numbers(said[1])}."
-    return [first, f"{other[0]}: {_numbers(other[1])}."] if reference == EQUAL_WEIGHT else [first]
+    found = f"{_VERBS[alone.finding or 'none'].format(name)} {reference} {where}"
+    if reference != EQUAL_WEIGHT:
+        return [f"{found}: {_numbers(alone)}."]
+    at_best = f"the best rebalancing of {reference}"
+    if best.finding == "better":
+        found = f"{name} beats {reference}, however it is rebalanced, {where}"
+        also = f"Against {reference} itself, which is rebalanced at every row"
+    elif alone.finding == "better":
+        found = f"No evidence that {name} beats {at_best} {where}"
+        also = f"It beats {reference} itself, as trading less may do without any skill"
+    else:
+        return [f"{found}: {_numbers(alone)}.", f"Against {at_best}: {_numbers(best)}."]
+    return [f"{found}: {_numbers(best)}.", f"{also}: {_numbers(alone)}."]
 
 
 def _reference(pools: Pools) -> str:
