@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
+from itertools import chain
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
@@ -207,7 +208,9 @@ def name_of(instance: object) -> str:
     path = f"{type(instance).__module__}:{type(instance).__qualname__}"
     if path == _GYMNASIUM:
         return GYM + instance.id  # type: ignore[attr-defined]
-    tables = (entries.where(kind) for kind, entries in ENTRIES.items())
+    known = (entries.table for entries in ENTRIES.values())
+    installed = (entries.where(kind) for kind, entries in ENTRIES.items())  # slow to find
+    tables = chain(known, installed)
     return next((name for table in tables for name, where in table.items() if where == path), path)
 
 
