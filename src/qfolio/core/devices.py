@@ -34,9 +34,9 @@ step reads a few rows of a large table, that takes as long as the operations. Wi
 with a mandate's projections would take minutes to compile."""
 
 UNROLLED = 16
-"""Most rounds of a loop that LLVM replaces by as many copies of its body. It does so before it looks
-for vector instructions, and finds none in the copies: without this limit an operation on 20 assets
-takes several times as long as on 64, and programs take twice as long to compile."""
+"""Most rounds of a loop that LLVM may replace by as many copies of its body. It does so before it
+looks for vector instructions, and then finds none: without this limit, an operation on a row of 20
+numbers takes longer than on one of 64, and programs take twice as long to compile."""
 
 
 def configure() -> None:
