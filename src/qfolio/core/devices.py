@@ -36,7 +36,7 @@ with a mandate's projections would take minutes to compile."""
 UNROLLED = 16
 """Most rounds of a loop that LLVM may replace by as many copies of its body. It does so before it
 looks for vector instructions, and then finds none: without this limit, an operation on a row of 20
-numbers takes longer than on one of 64, and programs take twice as long to compile."""
+numbers takes longer than on one of 64, and programs take longer to compile."""
 
 
 def configure() -> None:
