@@ -494,9 +494,7 @@ def test_reinforce_wants_whole_episodes():
     [
         ("ppo", 100, 0.05),
         ("a2c", 100, 0.10),
-        # Lost, at a regret of 457%, before means out of reach cost anything.
-        ("a2c", 236, 0.10),
-        ("a2c", 283, 0.10),
+        ("a2c", 236, 0.10),  # lost, at a regret of 457%, before means out of reach cost anything
         ("reinforce", 100, 0.08),
     ],
 )

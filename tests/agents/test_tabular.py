@@ -232,8 +232,6 @@ def process(kind, **changes):
             pytest.param(*case, marks=pytest.mark.slow)
             for case in [
                 (Garnet(), Sarsa, 20e6, 0.1),
-                (FrozenLake(), QLearning, 10e6, 0.1),
-                (FrozenLake(), Sarsa, 12e6, 0.2),
                 (FrozenLake(), DoubleQ, 10e6, 0.1),
             ]
         ),

@@ -419,10 +419,10 @@ def test_wrong_input_gets_one_sentence(tmp_path, monkeypatch, capsys, arguments,
 def test_the_pole_is_balanced(agent):
     preset = presets.preset("fast", "gym:CartPole-v1", agent)
     run = Run.create(
-        GymnasiumTask(**preset.task), preset.build(), seeds=2, seed=100, budget=preset.budget
+        GymnasiumTask(**preset.task), preset.build(), seeds=1, seed=100, budget=preset.budget
     )
     run.train()
-    assert run.grade()["return_per_seed"] == [500.0, 500.0]
+    assert run.grade()["return_per_seed"] == [500.0]
 
 
 @pytest.mark.slow

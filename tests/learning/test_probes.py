@@ -20,6 +20,8 @@ RAINBOW = {
 }  # fmt: skip
 SLOW = pytest.mark.slow
 OPTIONS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "double": {"double": True},
     "dueling": {"dueling": True},
     "n_steps": {"n_steps": 3},
     "prioritized": {"prioritized": True},
@@ -29,6 +31,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "roots categorical": {**CATEGORICAL, "value_rescaling": True},
     "roots quantile": {**QUANTILE, "value_rescaling": True},
     "noisy": {"noisy": True},
+}
+RAINBOWS: dict[str, dict[str, Any]] = {
     "rainbow categorical": {**RAINBOW, **CATEGORICAL},
     "rainbow quantile": {**RAINBOW, **QUANTILE},
 }
@@ -49,32 +53,31 @@ def learned_values(task, observations, steps=1500, **changes):
     return np.asarray(jit(agent.action_values)(weights, jnp.array(observations)))
 
 
+def cases(options, slow):
+    return [
+        pytest.param(changes, id=name, marks=SLOW if name in slow else ())
+        for name, changes in options.items()
+    ]
+
+
 @pytest.mark.parametrize("double", [True, pytest.param(False, marks=SLOW)])
 def test_one_state(double):
     values = learned_values(OneState(), [[1.0]], double=double)
     np.testing.assert_allclose(values, [[0.0, 1.0]], atol=0.02)
 
 
-def variants(*quick):
-    """Plain DQN and all its options, of which only these are tried in the quick tests."""
-    cases = {"plain": {}, "double": {"double": True}, **OPTIONS}
-    return [
-        pytest.param(changes, id=name, marks=() if name in quick else SLOW)
-        for name, changes in cases.items()
-    ]
-
-
 @pytest.mark.parametrize(
-    "changes",
-    variants("plain", "quantile"),
+    "changes", cases({"plain": {}, "quantile": QUANTILE, **RAINBOWS}, slow=RAINBOWS)
 )
 def test_two_states(changes):
+    """Each action has a value of its own; Rainbow has all options together."""
     values = learned_values(TwoStates(), [[1.0], [-1.0]], **changes)
     np.testing.assert_allclose(values, [[-1, 1], [1, -1]], atol=0.02)
 
 
-@pytest.mark.parametrize("changes", variants("n_steps"))
+@pytest.mark.parametrize("changes", cases(OPTIONS, slow=OPTIONS.keys() - {"n_steps"}))
 def test_reward_delay(changes):
+    """Each option by itself."""
     values = learned_values(RewardDelay(), [[1.0, 0.0], [0.0, 1.0]], **changes)
     np.testing.assert_allclose(values, [[DISCOUNT] * 2, [1.0, 1]], rtol=0.02)
 
@@ -91,17 +94,17 @@ def test_a_time_limit_is_not_the_end(changes):
 
 
 @pytest.mark.parametrize(
-    "name",
+    ("name", "horizon"),
     [
-        "n_steps",
-        pytest.param("rainbow categorical", marks=SLOW),
-        pytest.param("rainbow quantile", marks=SLOW),
+        ("n_steps", 2),
+        pytest.param("n_steps", 1, marks=SLOW),
+        pytest.param("rainbow categorical", 2, marks=SLOW),
+        pytest.param("rainbow quantile", 1, marks=SLOW),
     ],
 )
-@pytest.mark.parametrize("horizon", [pytest.param(1, marks=SLOW), 2])
 def test_returns_over_steps_bootstrap_through_a_time_limit(name, horizon):
     """Where the episode is cut before the three steps are over, by the right power of γ."""
-    changes = {**OPTIONS[name], "tau": 0.2, "learning_rate_steps": 3000.0}
+    changes = {**(OPTIONS | RAINBOWS)[name], "tau": 0.2, "learning_rate_steps": 3000.0}
     if "v_max" in changes:
         changes |= {"v_min": 0.0, "v_max": 12.0}
     values = learned_values(Endless(horizon), [[1.0]], steps=3000, **changes)

