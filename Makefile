@@ -15,11 +15,12 @@ demo: .venv/installed
 
 # Two processes, each with whole files: most of a test's time is compiling, which keeps one core busy.
 test: .venv/installed-dev
-	$(BIN)/pytest -n 2 --dist loadfile -m "not slow"
+	$(BIN)/pytest -n 2 --dist loadfile -m "not slow and not optimized"
 
-# All tests: those that learn for long follow, with programs optimized as users have them.
-test-all: test
-	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile -m slow
+# All tests: those that learn for long come last, with programs optimized as users have them.
+test-all: .venv/installed-dev
+	$(BIN)/pytest -n 2 --dist loadfile -m "not optimized"
+	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile -m optimized
 
 check: .venv/installed-dev
 	$(BIN)/ruff format --check

@@ -1,7 +1,8 @@
 """Types are checked in every test: shapes by jaxtyping, the rest by beartype.
 
-Compiling takes most of a test's time, so programs are hardly optimized here; ``make test-all`` runs
-the slow tests with programs as users have them (QFOLIO_TEST_OPTIMIZED=1).
+Compiling takes most of a test's time, so programs are hardly optimized here. The tests marked
+``optimized`` learn for long, or compare what whole programs compute to the bit: ``make test-all``
+runs them with programs as users have them (QFOLIO_TEST_OPTIMIZED=1).
 """
 
 import ctypes

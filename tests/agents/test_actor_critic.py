@@ -668,7 +668,7 @@ def test_a_spread_that_no_policy_has_is_refused():
     SAC(**SMALL, spread=1.0).init(Aim(math.inf), jax.random.key(0))
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
 def test_fast_presets_swing_the_pendulum_up(agent):
     """What docs/algorithms/actor_critic.md says of every seed; an idle agent loses 900%."""

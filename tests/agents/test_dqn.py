@@ -193,7 +193,7 @@ def test_the_target_network_is_copied_every_period(task):
     assert same == [False, False, True, False, False, True]
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 def test_the_report_presets_copies_come_at_the_end_of_each_episode():
     """Every hyperparameter of the report, and the step at which it copies: 200, 400, …"""
     agent, task = preset("report").build(), Pendulum()

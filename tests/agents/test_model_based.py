@@ -237,7 +237,7 @@ def test_learns_values_from_imagined_steps():
     np.testing.assert_allclose(jnp.abs(imagined.observation), 0.5, atol=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 def test_the_fast_preset_swings_the_pendulum_up_from_two_thousand_steps():
     """Values of seed 302 once rose without end, to a regret of 773%, in states never seen.
 

@@ -488,7 +488,7 @@ def test_reinforce_wants_whole_episodes():
         REINFORCE(rollout_length=150).init(Pendulum(), jax.random.key(0))
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.parametrize(
     ("name", "seed", "limit"),
     [

@@ -229,7 +229,7 @@ def process(kind, **changes):
         (Cliff(), ExpectedSarsa, 1.5e6, 0.3),
         (Cliff(), DynaQ, 1e6, 0.3),
         *(
-            pytest.param(*case, marks=pytest.mark.slow)
+            pytest.param(*case, marks=pytest.mark.optimized)
             for case in [
                 (Garnet(), Sarsa, 20e6, 0.1),
                 (FrozenLake(), DoubleQ, 10e6, 0.1),
@@ -244,7 +244,7 @@ def test_values_within_a_hundredth(task, kind, steps, decay):
     assert error(task, values, exact).max() < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 def test_planning_saves_real_steps():
     task = Garnet()
     exact = task.optimum().action_values(DISCOUNT)
@@ -283,7 +283,7 @@ def test_the_command_trains_and_reports(task, chosen, tmp_path, monkeypatch, cap
     assert len((folder / "metrics.csv").read_text().splitlines()) > 2 * 64
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 def test_the_pendulum_in_a_table():
     chosen = preset("fast", "pendulum/grid", "q-learning")
     run = train(GridPendulum(), chosen.build(), episodes=chosen.episodes, seeds=2, seed=100)

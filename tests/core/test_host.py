@@ -414,7 +414,7 @@ def test_wrong_input_gets_one_sentence(tmp_path, monkeypatch, capsys, arguments,
     assert error.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.parametrize("agent", ["dqn", "ppo"])
 def test_the_pole_is_balanced(agent):
     preset = presets.preset("fast", "gym:CartPole-v1", agent)
@@ -425,7 +425,7 @@ def test_the_pole_is_balanced(agent):
     assert run.grade()["return_per_seed"] == [500.0]
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.parametrize(
     ("task", "returns"), [("MountainCarContinuous-v0", 85.0), ("Pendulum-v1", -170.0)]
 )

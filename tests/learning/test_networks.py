@@ -203,7 +203,7 @@ def test_an_agent_recalls_what_it_saw_first(kind):
     np.testing.assert_allclose(values, [[-1, 1], [1, -1]], atol=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 def test_an_agent_learns_to_catch_what_it_sees():
     agent = DQN(
         **{**LEARNER, "network": "cnn", "hidden": (64,), "num_envs": 32, "batch_size": 64,
@@ -214,7 +214,7 @@ def test_an_agent_learns_to_catch_what_it_sees():
     np.testing.assert_array_equal(population.evaluate(start_keys(256), tail=0).returns, 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 def test_the_hidden_pendulum_is_swung_up_and_held():
     preset = presets.preset("fast", "pendulum/hidden", "dqn")
     task = settings.build(HiddenPendulum, preset.task)

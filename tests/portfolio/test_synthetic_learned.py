@@ -16,7 +16,7 @@ TOLERANCE = {
 """Of each number of a learned rule, absolute and relative."""
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.parametrize(("task", "agent"), MARKETS)
 def test_every_seed_is_within_a_percent_of_the_optimum(task, agent):
     preset = PRESETS[task, agent]["fast"]
@@ -33,7 +33,7 @@ def test_every_seed_is_within_a_percent_of_the_optimum(task, agent):
             assert learned == pytest.approx(exact, abs=absolute, rel=relative)
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.parametrize(
     ("fraction", "cost", "steps", "cash_rate"),
     [
@@ -56,7 +56,7 @@ def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps, cash
         assert learned == pytest.approx(result["rule"]["exact"], abs=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 def test_borrowing_is_found():
     """With the preset's risk aversion, the optimum has no cash."""
     preset = PRESETS["market/leverage", "pathwise"]["fast"]
@@ -70,7 +70,7 @@ def test_borrowing_is_found():
         assert learned["weight of cash"] < 0
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.parametrize("agent", ["pathwise", "dqn"])
 @pytest.mark.parametrize(
     ("stay", "mean", "cost"),

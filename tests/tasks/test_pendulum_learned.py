@@ -8,7 +8,7 @@ from qfolio.experiments.run import train
 from qfolio.tasks.pendulum import Pendulum
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.parametrize(("name", "seeds", "worst"), [("fast", 4, 0.05), ("categorical", 1, 0.08)])
 def test_presets_come_near_the_optimum(name, seeds, worst):
     """Of 40 seeds of categorical, one was beyond 5%, by less than 2 points."""
@@ -19,7 +19,7 @@ def test_presets_come_near_the_optimum(name, seeds, worst):
     assert min(regrets) > -0.005, "nothing beats the optimum"
 
 
-@pytest.mark.slow
+@pytest.mark.optimized
 def test_report_preset_learns_in_90_episodes():
     """Where the plain algorithm is at its best (docs/algorithms/dqn.md: until 600)."""
     run = train(Pendulum(), preset("report").build(), episodes=90, seeds=4, seed=100)

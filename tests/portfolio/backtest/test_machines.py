@@ -140,7 +140,7 @@ def test_a_worker_that_is_killed(here, tmp_path):
     assert files(tmp_path / "run") == here
 
 
-@pytest.mark.slow  # and optimized, see OneCore
+@pytest.mark.optimized  # see OneCore
 def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
     """Groups of folds differ with the cores of a worker; what is learned does not."""
     found: list[dict[str, bytes]] = []

@@ -178,7 +178,7 @@ def members(backtest: Backtest) -> list:
     return [stretch.members for stretch in backtest.stretches("pathwise")]
 
 
-@pytest.mark.slow  # programs that are hardly optimized round differently
+@pytest.mark.optimized  # programs that are hardly optimized round differently
 def test_what_is_learned_does_not_depend_on_the_group(finished, tmp_path):
     """A backtest that is resumed has other groups of folds."""
 
