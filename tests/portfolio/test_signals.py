@@ -140,6 +140,7 @@ def test_what_all_assets_share_has_no_rank():
         ("momentum:0m", "looks back on 0 rows"),
         ("momentum:1m-1m", "21 rows and skips 21"),
         ("momentum:5-5", "5 rows and skips 5"),
+        ("momentum:1q", "has no length that can be read; .* such as momentum:21 or momentum:1m"),
         ("test_nowhere:Mine", "is code of the module test_nowhere"),
     ],
 )

@@ -323,6 +323,12 @@ def _named(text: str, pace: float) -> Signal:
     if text.startswith(COLUMN):
         return Column(name=text.removeprefix(COLUMN))
     name, chosen = _split(text, pace)
+    own, _, length = name.partition(":")
+    if own in SIGNALS and length[:1].isdigit():  # no class of a module has such a name
+        raise QfolioError(
+            f"The signal {text} has no length that can be read; write a number of rows or of d, w, "
+            f"m or y, such as {own}:21 or {own}:1m, and rows to skip as in {own}:1y-1m."
+        )
     return build("signal", name, chosen)
 
 

@@ -33,7 +33,7 @@ def pools(reference, alone, best):
             "better",
             "tilts beats equal-weight, however it is rebalanced, in growth after costs over 1 "
             "table: the mean difference in annual growth is +2.00%",
-            "Against equal-weight itself, which is rebalanced at every row: the mean difference "
+            "Against equal-weight itself, rebalanced as often as it may be: the mean difference "
             "in annual growth is +3.00%",
         ),
         # On random walks, an agent that merely trades less grows more than daily equal weights.

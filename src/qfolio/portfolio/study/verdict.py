@@ -30,7 +30,7 @@ def _findings(name: str, pools: Pools) -> list[str]:
     at_best = f"the best rebalancing of {reference}"
     if best.finding == "better":
         found = f"{name} beats {reference}, however it is rebalanced, {where}"
-        also = f"Against {reference} itself, which is rebalanced at every row"
+        also = f"Against {reference} itself, rebalanced as often as it may be"
     elif alone.finding == "better":
         found = f"No evidence that {name} beats {at_best} {where}"
         also = f"It beats {reference} itself, as trading less may do without any skill"
