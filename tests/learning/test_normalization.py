@@ -176,7 +176,7 @@ def test_policies_are_learned_in_any_units(agent):
         learner = agent(**settings, **chosen)
         weights = trained(Foreign(), learner, 8 * 250).weights()
         actions = learner.policy(jax.tree.map(lambda x: jnp.asarray(x[0]), weights), states)
-        assert np.allclose(actions, [[1], [-1]], atol=0.1) == reached
+        assert np.allclose(actions, [[1], [-1]], atol=0.2) == reached
 
 
 @pytest.mark.parametrize(
