@@ -501,7 +501,7 @@ def test_reinforce_wants_whole_episodes():
 def test_presets_learn_the_pendulum(name, seed, limit):
     """All well within public figures: A2C's −163 is a regret of 19%, PPO's −172 one of 26%."""
     fast = preset("fast", "pendulum", name)
-    run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=2, seed=seed)
-    regrets = run.grade()["regret_per_seed"]
-    assert max(regrets) <= limit, regrets
-    assert min(regrets) > -0.005, "nothing beats the optimum"
+    run = train(Pendulum(**fast.task), fast.build(), episodes=fast.episodes, seeds=1, seed=seed)
+    (regret,) = run.grade()["regret_per_seed"]
+    assert regret <= limit
+    assert regret > -0.005, "nothing beats the optimum"

@@ -436,6 +436,6 @@ def test_actions_with_bounds_are_learned(task, returns):
     """
     preset = presets.preset("fast", f"gym:{task}", "sac")
     third = preset.steps // 3
-    run = Run.create(GymnasiumTask(**preset.task), preset.build(), seeds=2, seed=100, steps=third)
+    run = Run.create(GymnasiumTask(**preset.task), preset.build(), seeds=1, seed=100, steps=third)
     run.train()
-    assert min(run.grade()["return_per_seed"]) > returns
+    assert run.grade()["return_per_seed"][0] > returns

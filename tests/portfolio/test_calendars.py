@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.presets import preset
+from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.baselines import History
 from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
@@ -22,6 +22,11 @@ DAYS = np.array(
     ["2023-12-28", "2023-12-29", "2024-01-02", "2024-01-05", "2024-01-08", "2024-02-01",
      "2024-03-28", "2024-04-01", "2024-04-07", "2024-04-08"],
     "datetime64[s]",
+)  # fmt: skip
+
+PATHWISE = Preset(
+    "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (4,)},
+    episodes=8, task={"window": 10, "horizon": 20},
 )  # fmt: skip
 
 
@@ -125,16 +130,15 @@ def test_a_fold_without_a_row_of_the_calendar_buys_nothing() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mandate", [None, {"assets": {"cap": 0.3}}])
-def test_drift_is_that_of_an_independent_ledger(mandate: dict | None) -> None:
+def test_drift_is_that_of_an_independent_ledger() -> None:
     prices, band = table(), 0.02
     backtest = Backtest.create(
         prices,
-        {"tilts": preset("fast", "portfolio", "tilts")},
+        {"pathwise": PATHWISE},
         train="1y",
         test="6m",
         seeds=2,
-        mandate=mandate,
+        mandate={"assets": {"cap": 0.3}},
         calendar=f"drift:{band}",
         cost_model="itemized(fixed=1)",
         baselines=("minimum-variance", "buy-and-hold"),
@@ -166,8 +170,8 @@ def test_drift_is_that_of_an_independent_ledger(mandate: dict | None) -> None:
 def test_every_strategy_of_a_backtest_keeps_to_the_calendar() -> None:
     prices = table()
     agents = {
-        "tilts": preset("fast", "portfolio", "tilts"),
-        "dqn": preset("fast", "portfolio", "dqn"),
+        "pathwise": PATHWISE,
+        "dqn": preset("fast", "portfolio", "dqn")._replace(episodes=64),
     }
     backtest = Backtest.create(
         prices,

@@ -48,7 +48,7 @@ def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps, cash
     market = find("task", "market/no-trade")(
         rate=fraction * 0.2**2, cost=cost, dt=1 / steps, cash_rate=cash_rate
     )
-    run = Run.create(market, preset.build(), episodes=preset.episodes, seeds=2, seed=100)
+    run = Run.create(market, preset.build(), episodes=preset.episodes, seeds=1, seed=100)
     run.train()
     result = run.grade()
     assert max(result["regret_per_seed"]) <= 0.01
@@ -61,7 +61,7 @@ def test_borrowing_is_found():
     """With the preset's risk aversion, the optimum has no cash."""
     preset = PRESETS["market/leverage", "pathwise"]["fast"]
     market = find("task", "market/leverage")(risk_aversion=1.0)
-    run = Run.create(market, preset.build(), budget=preset.budget, seeds=2, seed=100)
+    run = Run.create(market, preset.build(), budget=preset.budget, seeds=1, seed=100)
     run.train()
     result = run.grade()
     assert max(result["regret_per_seed"]) <= 0.01
@@ -83,6 +83,6 @@ def test_other_regimes_are_found(agent, stay, mean, cost):
     preset = PRESETS["market/regime", agent]["fast"]
     task = {**preset.task, "stay": stay, "mean": mean, "cost": cost}
     market = settings.build(find("task", "market/regime"), task)
-    run = Run.create(market, preset.build(), episodes=preset.episodes, seeds=2, seed=100)
+    run = Run.create(market, preset.build(), episodes=preset.episodes, seeds=1, seed=100)
     run.train()
     assert max(run.grade()["regret_per_seed"]) <= 0.01
