@@ -63,7 +63,7 @@ def own(tmp_path, monkeypatch, prices):
         sys.modules.pop(name, None)
 
 
-@pytest.mark.optimized
+@pytest.mark.slow
 def test_the_page_about_own_parts(own, monkeypatch, capsys):
     shown = "".join(code for _, code in blocks("docs/guides/own_parts.md", "sh")).splitlines()
     corridor, table, merton, rate, backtest, own_backtest, evaluate, resume = shown

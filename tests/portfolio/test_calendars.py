@@ -131,7 +131,7 @@ def test_a_fold_without_a_row_of_the_calendar_buys_nothing() -> None:
 
 @pytest.mark.slow
 def test_drift_is_that_of_an_independent_ledger() -> None:
-    prices, band = table(), 0.02
+    prices, band = table(450), 0.02
     backtest = Backtest.create(
         prices,
         {"pathwise": PATHWISE},
