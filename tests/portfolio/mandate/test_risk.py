@@ -104,9 +104,9 @@ def test_no_order_is_nearer(risk):
                 ratios.append(np.linalg.norm(found - wanted[1:]) / least)
     assert len(ratios) > 200
     assert min(ratios) > 1 - 1e-4
-    for order in (ratios[::2], ratios[1::2]):
-        assert np.mean(order) < 1.0001
-        assert max(order) < 1.005
+    for of_one_kind in (ratios[::2], ratios[1::2]):
+        assert np.mean(of_one_kind) < 1.0001
+        assert max(of_one_kind) < 1.005
 
 
 @pytest.mark.parametrize("room", [2**24, 0])
