@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.presets import Preset, preset
+from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.baselines import History
 from qfolio.portfolio.backtest.baselines.equal_weight import EqualWeight
@@ -18,15 +18,12 @@ from qfolio.portfolio.calendars import decision_rows
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
+from tiny import PATHWISE
+
 DAYS = np.array(
     ["2023-12-28", "2023-12-29", "2024-01-02", "2024-01-05", "2024-01-08", "2024-02-01",
      "2024-03-28", "2024-04-01", "2024-04-07", "2024-04-08"],
     "datetime64[s]",
-)  # fmt: skip
-
-PATHWISE = Preset(
-    "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (4,)},
-    episodes=8, task={"window": 10, "horizon": 20},
 )  # fmt: skip
 
 
@@ -130,7 +127,8 @@ def test_a_fold_without_a_row_of_the_calendar_buys_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_drift_is_that_of_an_independent_ledger() -> None:
+@pytest.mark.parametrize("mandate", [None, {"assets": {"cap": 0.3}}])
+def test_drift_is_that_of_an_independent_ledger(mandate: dict | None) -> None:
     prices, band = table(450), 0.02
     backtest = Backtest.create(
         prices,
@@ -138,7 +136,7 @@ def test_drift_is_that_of_an_independent_ledger() -> None:
         train="1y",
         test="6m",
         seeds=2,
-        mandate={"assets": {"cap": 0.3}},
+        mandate=mandate,
         calendar=f"drift:{band}",
         cost_model="itemized(fixed=1)",
         baselines=("minimum-variance", "buy-and-hold"),

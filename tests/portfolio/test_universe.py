@@ -31,11 +31,9 @@ from qfolio.portfolio.prices.table import Prices, check, load
 from qfolio.portfolio.task import Portfolio
 from qfolio.portfolio.universe import Patterns, spread
 
+from tiny import PATHWISE
+
 NAMES = tuple("ABCDEFGH")
-TINY = Preset(
-    "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (4,)}, episodes=8,
-    task={"window": 10, "horizon": 20},
-)  # fmt: skip
 MENU = Preset(
     "dqn",
     {"network": "mlp", "hidden": (4,), "num_envs": 4, "batch_size": 8, "learning_starts": 40,
@@ -391,7 +389,7 @@ def test_limits_of_every_set_of_assets_can_be_met() -> None:
 def test_a_mandate_in_motion_is_said_and_checked_over_a_whole_backtest(tmp_path: Path) -> None:
     prices, _ = moving(4, 160, 4, haircut=0.2)
     backtest = Backtest.create(
-        prices, {"pathwise": TINY, "dqn": MENU}, train="100d", test="30d", seeds=1,
+        prices, {"pathwise": PATHWISE, "dqn": MENU}, train="100d", test="30d", seeds=1,
         out=tmp_path / "run", baselines=["momentum"], mandate=LIMITS,
         strategies={"mine": frame_of_weights(prices)},
     )  # fmt: skip

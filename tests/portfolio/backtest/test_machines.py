@@ -22,13 +22,9 @@ from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.study.run import Study
 
 from listeners import Interrupt
+from tiny import PATHWISE
 
-AGENTS = {
-    "pathwise": Preset(
-        "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (4,)},
-        episodes=8, seeds=2, task={"window": 10, "horizon": 20},
-    ),
-}  # fmt: skip
+AGENTS = {"pathwise": PATHWISE}
 DQN = {
     "dqn": Preset(
         "dqn",
