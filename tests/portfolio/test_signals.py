@@ -149,6 +149,15 @@ def test_what_is_no_signal(text, says):
         signals.parse(text)
 
 
+def test_the_names_alone_need_lengths_that_can_be_read():
+    """The commands look them up before there is a table."""
+    assert signals.names("momentum:1y-1m, feature:pe, test_nowhere:Mine:5") == [
+        "momentum", "test_nowhere:Mine"
+    ]  # fmt: skip
+    with pytest.raises(QfolioError, match="momentum:1q has no length that can be read"):
+        signals.names("momentum:1q")
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"), [(Tomorrow(), "Tomorrow looks ahead: its value at row"), (Short(), "shape")]
 )

@@ -288,6 +288,12 @@ def _split(text: str, pace: float) -> tuple[str, dict[str, str]]:
     match = re.fullmatch(r"(.+?)(?::(\d+[dwmy]?)(?:-(\d+[dwmy]?))?)?", text)
     assert match is not None  # anything is a name
     name, *given = match.groups()
+    own, _, length = name.partition(":")
+    if own in SIGNALS and length[:1].isdigit():  # no class of a module has such a name
+        raise QfolioError(
+            f"The signal {text} has no length that can be read; write a number of rows or of d, w, "
+            f"m or y, such as {own}:21 or {own}:1m, and rows to skip as in {own}:1y-1m."
+        )
     rows = [_rows(length, pace) for length in given if length is not None]
     if len(rows) == 2 and given[0][-1] in LENGTHS and pace < 1:
         rows[0] = max(rows[0], rows[1] + 1)  # 1m-1w would be 1-1 on a monthly table
@@ -323,12 +329,6 @@ def _named(text: str, pace: float) -> Signal:
     if text.startswith(COLUMN):
         return Column(name=text.removeprefix(COLUMN))
     name, chosen = _split(text, pace)
-    own, _, length = name.partition(":")
-    if own in SIGNALS and length[:1].isdigit():  # no class of a module has such a name
-        raise QfolioError(
-            f"The signal {text} has no length that can be read; write a number of rows or of d, w, "
-            f"m or y, such as {own}:21 or {own}:1m, and rows to skip as in {own}:1y-1m."
-        )
     return build("signal", name, chosen)
 
 
