@@ -201,6 +201,13 @@ def test_lockstep_members_learn_the_same(task, agent, monkeypatch):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), expected, actual)
 
 
+def test_a_version_of_xla_that_lacks_the_option_compiles_without_it(task, agent, monkeypatch):
+    monkeypatch.setattr("qfolio.core.devices.PRODUCTS_ONLY", {"xla_no_such_option": True})
+    programs_of.cache_clear()
+    population, _ = trained(task, agent, [0], [30])
+    assert population.steps == 30
+
+
 def test_small_loops_are_compiled_whole():
     loop = jax.jit(lambda x: jax.lax.fori_loop(0, 50, lambda i, x: jnp.sin(x) * 2, x))
     program = loop.lower(jnp.ones(1000)).compile().as_text()

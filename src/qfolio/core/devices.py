@@ -39,6 +39,13 @@ looks for vector instructions, and then finds none: without this limit, an opera
 numbers takes longer than on one of 64, and programs take longer to compile."""
 
 
+PRODUCTS_ONLY: dict[str, str | bool] = {
+    "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"
+}
+"""Makes XLA leave only matrix products to YNNPACK, a library for CPUs. By default it also leaves it
+sums and what is summed; where arrays are small, that takes longer than the sums."""
+
+
 def configure() -> None:
     """Makes each CPU core a device, compiles loops for speed and keeps programs on disk.
 
@@ -170,7 +177,11 @@ class Members:
             )(taken, *args)
 
         program = jax.jit(on_all, donate_argnums=1 if donate else ())
-        return program.lower(self.taken, *example).compile()
+        lowered = program.lower(self.taken, *example)
+        try:
+            return lowered.compile(compiler_options=PRODUCTS_ONLY)
+        except jax.errors.JaxRuntimeError:  # this version of XLA has no such option
+            return lowered.compile()
 
 
 def _map(function: Callable[[Any], Any], members: Any, count: Array) -> Any:
