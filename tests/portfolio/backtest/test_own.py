@@ -3,7 +3,6 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.own import Own, place
 from qfolio.portfolio.backtest.own_tables import read_own
 from qfolio.portfolio.backtest.results import write_tables
@@ -11,12 +10,9 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 
-AGENTS = {
-    "pathwise": Preset(
-        "pathwise", {"rollout_length": 10, "num_envs": 2, "hidden": (4,)},
-        episodes=4, seeds=1, task={"window": 5, "horizon": 20},
-    )
-}  # fmt: skip
+from tiny import PATHWISE
+
+AGENTS = {"pathwise": PATHWISE}
 ROWS, FIRST, LAST = 160, 98, 157  # rows of the table, and of the first and the last decision
 
 

@@ -5,18 +5,14 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.desk.reference import reference
 from qfolio.portfolio.prices.table import Prices
 
-AGENTS = {
-    "pathwise": Preset(
-        "pathwise", {"rollout_length": 10, "num_envs": 2, "hidden": (4,)},
-        episodes=4, seeds=1, task={"window": 5, "horizon": 20},
-    )
-}  # fmt: skip
+from tiny import PATHWISE
+
+AGENTS = {"pathwise": PATHWISE}
 
 
 def table(rows=160):

@@ -5,7 +5,6 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.folds import spell_all
 from qfolio.portfolio.backtest.run import Backtest
@@ -15,12 +14,9 @@ from qfolio.portfolio.desk.follow import follow
 from qfolio.portfolio.desk.standing import Standing
 from qfolio.portfolio.prices.table import Prices
 
-AGENTS = {
-    "pathwise": Preset(
-        "pathwise", {"rollout_length": 10, "num_envs": 2, "hidden": (4,)},
-        episodes=4, seeds=1, task={"window": 5, "horizon": 20},
-    )
-}  # fmt: skip
+from tiny import PATHWISE
+
+AGENTS = {"pathwise": PATHWISE}
 NAMES = ("cash", "A", "B", "C")
 
 

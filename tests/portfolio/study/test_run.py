@@ -7,7 +7,6 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.core.statistics import holm
 from qfolio.experiments.executor import Here
-from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.folds import require_fold
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.study.folder import Variant
@@ -15,13 +14,9 @@ from qfolio.portfolio.study.run import Study, corrected
 
 from listeners import Interrupt
 from studies import study
+from tiny import PATHWISE
 
-AGENTS = {
-    "pathwise": Preset(
-        "pathwise", {"rollout_length": 10, "num_envs": 4, "hidden": (4,)},
-        episodes=8, seeds=2, task={"window": 10, "horizon": 20},
-    ),
-}  # fmt: skip
+AGENTS = {"pathwise": PATHWISE}
 
 
 def table(seed, rows=160):
