@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
+from qfolio.core.devices import Members
 from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin
@@ -199,6 +200,12 @@ def test_lockstep_members_learn_the_same(task, agent, monkeypatch):
     assert lockstep._programs is not one_by_one._programs  # or this would compare like with like
     expected, actual = (p.fetch().agent.online.mlp.weights for p in (one_by_one, lockstep))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), expected, actual)
+
+
+def test_sums_are_left_to_compiled_loops():
+    rows = jnp.ones((2, 64, 64))
+    program = Members(1).compile(lambda x: (x**2).sum(-1), rows).as_text()
+    assert "ynn_fusion" not in program
 
 
 def test_a_version_of_xla_that_lacks_the_option_compiles_without_it(task, agent, monkeypatch):

@@ -42,8 +42,9 @@ numbers takes longer than on one of 64, and programs take longer to compile."""
 PRODUCTS_ONLY: dict[str, str | bool] = {
     "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"
 }
-"""Makes XLA leave only matrix products to YNNPACK, a library for CPUs. By default it also leaves it
-sums and what is summed; where arrays are small, that takes longer than the sums."""
+"""Leaves only matrix products to YNNPACK, a library that XLA calls on a CPU. By default sums, and
+what is summed, go to it as well; for small arrays its call takes longer than the sum. An option of
+the compiler instead of a flag, because a version that does not know a flag ends the process."""
 
 
 def configure() -> None:
