@@ -1,9 +1,15 @@
-"""The report's run for 1,024 agents in one program on a GPU: `make bench-gpu`.
+"""What a GPU gains: `make bench-gpu`.
 
-Prints how long it took beside the limits from arithmetic and from memory, which default to those of
-an H200 (float32 without tensor cores). docs/results/benchmarks.md says how they are counted.
+First the report's run for 1,024 agents in one program. Prints how long it took beside the limits
+from arithmetic and from memory; docs/results/benchmarks.md says how they are counted. Then the
+default backtest, on the GPU and on two cores of the same machine, and how much the results differ.
 """
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 
 from qfolio.core import devices
@@ -12,6 +18,7 @@ devices.configure()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
+import pandas as pd  # noqa: E402
 import tyro  # noqa: E402
 
 from qfolio.core.evaluation import start_keys  # noqa: E402
@@ -24,26 +31,40 @@ TARGET = 180.0
 STARTS = 128
 """Start states that the policies are graded on."""
 
+TERABYTES = {"H100": 3.35, "H200": 4.8}
+"""Bandwidth of a card's memory, in 10¹² bytes a second, from its maker's data sheet."""
+
 
 def main(
     agents: int = 1024,
     episodes: int = EPISODES,
     tflops: float = 67.0,
-    terabytes: float = 4.8,
+    terabytes: float | None = None,
+    backtest: bool = True,
     allow_cpu: bool = False,
 ) -> None:
-    """Train many agents with the report's settings in one program on a GPU.
+    """Train many agents with the report's settings in one program on a GPU, then backtest on it.
 
     Args:
         agents: How many.
         episodes: Of each agent.
-        tflops: The GPU's peak arithmetic, in 10¹² operations a second.
-        terabytes: Its memory's bandwidth, in 10¹² bytes a second.
+        tflops: The GPU's peak arithmetic in 10¹² operations a second (default: that of an H100 or
+            H200 in float32, without tensor cores).
+        terabytes: Its memory's bandwidth in 10¹² bytes a second (default: the card's).
+        backtest: Whether to run the backtests, too.
         allow_cpu: Go on without a GPU, to try the script out.
     """
     if jax.devices()[0].platform != "gpu" and not allow_cpu:
         print("jax finds no GPU here, so that there is nothing to measure.")
         return
+    if backtest:  # first: later the GPU's memory is taken
+        compare_backtests()
+    kind = jax.devices()[0].device_kind
+    known = [value for name, value in TERABYTES.items() if name in kind]
+    train(agents, episodes, tflops, terabytes or next(iter(known), TERABYTES["H100"]))
+
+
+def train(agents: int, episodes: int, tflops: float, terabytes: float) -> None:
     task, agent = report()
     population = Population(task, agent, range(agents))
     start, compiled = perf_counter(), population.seconds_compile
@@ -59,6 +80,8 @@ def main(
     optimum = float(task.optimum().returns(keys).mean())
     regrets = (optimum - population.evaluate(keys).returns.mean(1)) / abs(optimum)
     print(f"{agents:,} agents × {episodes} episodes on {devices.describe()}")
+    precision = jax.config.jax_default_matmul_precision  # type: ignore[attr-defined]
+    print(f"products    {precision} precision")
     print(f"training    {seconds:,.1f} s, and {compiled:,.1f} s of compiling")
     if (agents, episodes) == (1024, EPISODES):
         reached = "reached" if seconds <= TARGET else "not reached"
@@ -72,8 +95,45 @@ def main(
     )
     print(
         f"regret      mean {regrets.mean():.2%}, median {np.median(regrets):.2%}, "
-        f"worst {regrets.max():.2%}"
+        f"worst {regrets.max():.2%}",
+        flush=True,
     )
+
+
+def compare_backtests() -> None:
+    with TemporaryDirectory() as folder:
+        seconds, growth = zip(
+            _backtest(Path(folder, "gpu"), list(range(2, os.cpu_count() or 3)), {}),
+            _backtest(Path(folder, "cpu"), [0, 1], {"JAX_PLATFORMS": "cpu"}, "--on", "processes:2"),
+            strict=True,
+        )
+    print(f"backtest    {seconds[0]:,.0f} s on the GPU, {seconds[1]:,.0f} s on two cores")
+    for agent in ("tilts", "dqn"):
+        here, there = ([g[k] for k in g.index if k.startswith(f"{agent}/")] for g in growth)
+        apart = np.abs(np.subtract(here, there)).max()
+        print(
+            f"{agent:<11} grew by {np.mean(here):.3%} and {np.mean(there):.3%} a year; "
+            f"a seed by at most {apart:.3%} more or less",
+            flush=True,
+        )
+
+
+def _backtest(
+    out: Path, cores: list[int], environment: dict[str, str], *options: str
+) -> tuple[float, "pd.Series[float]"]:
+    """Seconds of the default backtest and annual growth of its strategies."""
+    begun = perf_counter()
+    subprocess.run(
+        [sys.executable, "-m", "qfolio", "backtest", "--out", out, *options],
+        env={**os.environ, "QFOLIO_CACHE": f"{out}-cache", **environment},
+        preexec_fn=lambda: os.sched_setaffinity(0, cores),
+        stdout=subprocess.DEVNULL,
+        check=True,
+    )
+    seconds = perf_counter() - begun
+    returns = pd.read_csv(out / "returns.csv", index_col=0, parse_dates=True)
+    years = (returns.index[-1] - returns.index[0]).days / 365.25
+    return seconds, (1 + returns).prod() ** (1 / years) - 1
 
 
 if __name__ == "__main__":

@@ -19,10 +19,11 @@ from qfolio.tasks.pendulum import Pendulum
 EPISODES = preset("report").episodes
 
 PASSES = 12
-"""Over arrays of the network's size, in an update.
+"""Over arrays of the network's size, in a step with its update.
 
 Both networks are read forward and the Q-network once more backward (3); the gradient is written and
-read again (2); Adam reads and writes the weights and both moments (6); the target is written (1).
+read again (2); Adam reads and writes the weights and both moments (6); acting reads the Q-network
+(1). The target network is written at few of the steps.
 """
 
 

@@ -22,7 +22,7 @@ if "QFOLIO_TEST_OPTIMIZED" not in os.environ:
         "--xla_backend_optimization_level=0",
         "--xla_llvm_disable_expensive_passes=true",
     ]
-    if importlib.metadata.version("jax") < "0.12":  # later versions end the process over this flag
+    if importlib.metadata.version("jax") < "0.11":  # later versions end the process over this flag
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
 

@@ -38,7 +38,7 @@ from qfolio.learning.networks import Network, NetworkConfig
 from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.priorities import ImportanceSchedule, Priorities
 from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
-from qfolio.learning.targets import bootstrap, chosen, follow, huber_loss, td_target
+from qfolio.learning.targets import bootstrap, chosen, follow_when, huber_loss, td_target
 
 Weights = Network | Heads
 """One network of action values, or bootstrapped heads."""
@@ -310,8 +310,7 @@ class DQN(Agent):
         learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         online, adam, priorities = learned
         due = state.steps % self.target_update_interval < self.train_freq
-        rate = self.tau if self.target_update_interval == 1 else jnp.where(due, self.tau, 0)
-        target = follow(state.target, online, rate)
+        target = follow_when(due, state.target, online, self.tau)
         replay = dataclasses.replace(state.replay, priorities=priorities)
         return DQNState(online, target, adam, replay, state.episodes, state.steps), metrics
 

@@ -48,7 +48,8 @@ the compiler instead of a flag, because a version that does not know a flag ends
 
 
 def configure() -> None:
-    """Makes each CPU core a device, compiles loops for speed and keeps programs on disk.
+    """Makes each CPU core a device, compiles loops for speed and keeps programs on disk; makes
+    matrix products on a GPU as precise as on a CPU.
 
     Has an effect only before jax first computes; settings that the user has made are kept.
     """
@@ -63,6 +64,9 @@ def configure() -> None:
     }
     new = [f"{flag}={value}" for flag, value in wanted.items() if flag not in flags]
     os.environ["XLA_FLAGS"] = " ".join([flags, *new]).strip()
+    if not jax.config.jax_default_matmul_precision:  # type: ignore[attr-defined]
+        # GPUs would round the factors to three digits. CPUs compute as before.
+        jax.config.update("jax_default_matmul_precision", "highest")
     if not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "programs"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

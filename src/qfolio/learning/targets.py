@@ -6,6 +6,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 Weights = TypeVar("Weights", bound=PyTree)
@@ -141,3 +142,27 @@ def advantages(
 def follow(target: Weights, online: Weights, rate: Scalar) -> Weights:
     """The target network after a step of ``rate`` towards the online one; exact for 0 and 1."""
     return jax.tree.map(lambda t, w: (1 - rate) * t + rate * w, target, online)
+
+
+def follow_when(due: Bool[Array, ""], target: Weights, online: Weights, rate: Scalar) -> Weights:
+    """``follow`` if it is due, and otherwise the target as it is, without a pass over its memory.
+
+    Members in lockstep pass over all of their targets if it is due for one of them.
+    """
+
+    def step() -> Weights:
+        return follow(target, online, jnp.where(due, rate, 0))
+
+    return lax.cond(_for_any(due), step, lambda: target)
+
+
+@custom_vmap
+def _for_any(flag: Bool[Array, ""]) -> Bool[Array, ""]:
+    """The flag; one for all where flags are batched, because ``lax.cond`` then does not choose
+    between two results that it has both computed."""
+    return flag
+
+
+@_for_any.def_vmap
+def _(size: int, batched: list[bool], flags: Bool[Array, " member"]) -> tuple[Array, bool]:
+    return _for_any(flags.any()), False
