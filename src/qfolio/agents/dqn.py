@@ -38,7 +38,7 @@ from qfolio.learning.networks import Network, NetworkConfig
 from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
 from qfolio.learning.priorities import ImportanceSchedule, Priorities
 from qfolio.learning.replay import Discount, Experience, Replay, ReplayConfig, join
-from qfolio.learning.targets import bootstrap, chosen, follow_when, huber_loss, td_target
+from qfolio.learning.targets import bootstrap, chosen, follow, follow_when, huber_loss, td_target
 
 Weights = Network | Heads
 """One network of action values, or bootstrapped heads."""
@@ -309,8 +309,11 @@ class DQN(Agent):
         learned = (state.online, state.optimizer, state.replay.priorities)
         learned, metrics = optimizer.repeat(update, learned, self.gradient_steps, key)
         online, adam, priorities = learned
-        due = state.steps % self.target_update_interval < self.train_freq
-        target = follow_when(due, state.target, online, self.tau)
+        if self.target_update_interval == 1:
+            target = follow(state.target, online, self.tau)
+        else:
+            due = state.steps % self.target_update_interval < self.train_freq
+            target = follow_when(due, state.target, online, self.tau)
         replay = dataclasses.replace(state.replay, priorities=priorities)
         return DQNState(online, target, adam, replay, state.episodes, state.steps), metrics
 
