@@ -1,4 +1,7 @@
-"""Types are checked in every test: shapes by jaxtyping, the rest by beartype.
+"""The quick tests check types: shapes by jaxtyping, the rest by beartype.
+
+The slow ones do without (QFOLIO_TEST_UNTYPED=1): checks take from a tenth of their time to more than
+half, if they loop in Python.
 
 Compiling takes most of a test's time, so programs are hardly optimized here. The tests marked
 ``optimized`` learn for long, or compare what whole programs compute to the bit: ``make test-all``
@@ -28,7 +31,8 @@ if "QFOLIO_TEST_OPTIMIZED" not in os.environ:
 
 # Not the adapters: scikit-learn's habit is to take any setting and to check it when fitting.
 WINGS = "core solvers learning agents tasks experiments portfolio report commands"
-install_import_hook([f"qfolio.{wing}" for wing in WINGS.split()], "typechecker.check")
+if "QFOLIO_TEST_UNTYPED" not in os.environ:
+    install_import_hook([f"qfolio.{wing}" for wing in WINGS.split()], "typechecker.check")
 
 import jax  # noqa: E402
 
