@@ -1,7 +1,7 @@
 """The quick tests check types: shapes by jaxtyping, the rest by beartype.
 
-The slow ones do without (QFOLIO_TEST_UNTYPED=1): checks take from a tenth of their time to more than
-half, if they loop in Python.
+The slow ones do without (QFOLIO_TEST_UNTYPED=1): checks take a tenth of their time or, where they
+loop in Python, up to five sixths.
 
 Compiling takes most of a test's time, so programs are hardly optimized here. The tests marked
 ``optimized`` learn for long, or compare what whole programs compute to the bit: ``make test-all``

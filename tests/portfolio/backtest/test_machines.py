@@ -152,7 +152,7 @@ def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason='needs pip install "ray"')
 def test_ray_equals_this_process(here, tmp_path):
     ray = importlib.import_module("ray")
-    ray.init(num_cpus=2, log_to_driver=False)
+    ray.init("local", num_cpus=2, log_to_driver=False)  # not the cluster of another test
     try:
         backtest = create(tmp_path / "run")
         backtest.run(executor=on("ray"))
