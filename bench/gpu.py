@@ -14,6 +14,7 @@ from time import perf_counter
 
 from qfolio.core import devices
 
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # the backtest's process shares it
 devices.configure()
 
 import jax  # noqa: E402
@@ -57,7 +58,7 @@ def main(
     if jax.devices()[0].platform != "gpu" and not allow_cpu:
         print("jax finds no GPU here, so that there is nothing to measure.")
         return
-    if backtest:  # first: later the GPU's memory is taken
+    if backtest:  # first, because training then keeps the GPU's memory
         compare_backtests()
     kind = jax.devices()[0].device_kind
     known = [value for name, value in TERABYTES.items() if name in kind]
@@ -101,10 +102,12 @@ def train(agents: int, episodes: int, tflops: float, terabytes: float) -> None:
 
 
 def compare_backtests() -> None:
+    cores = devices.cores()
+    on_cpu = {"JAX_PLATFORMS": "cpu"}, "--on", "processes:2"
     with TemporaryDirectory() as folder:
         seconds, growth = zip(
-            _backtest(Path(folder, "gpu"), list(range(2, os.cpu_count() or 3)), {}),
-            _backtest(Path(folder, "cpu"), [0, 1], {"JAX_PLATFORMS": "cpu"}, "--on", "processes:2"),
+            _backtest(Path(folder, "gpu"), cores[:-2] or cores, {}),
+            _backtest(Path(folder, "cpu"), cores[-2:], *on_cpu),
             strict=True,
         )
     print(f"backtest    {seconds[0]:,.0f} s on the GPU, {seconds[1]:,.0f} s on two cores")
