@@ -17,10 +17,10 @@ demo: .venv/installed
 test: .venv/installed-dev
 	$(BIN)/pytest -n 2 --dist loadfile -m "not slow and not optimized"
 
-# The slow tests do not check types, and those that learn for long have programs as users have them.
-test-all: test
-	QFOLIO_TEST_UNTYPED=1 $(BIN)/pytest -n 2 --dist loadfile -m "slow and not optimized"
-	QFOLIO_TEST_UNTYPED=1 QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile -m optimized
+# All tests: those that learn for long come last, with programs optimized as users have them.
+test-all: .venv/installed-dev
+	$(BIN)/pytest -n 2 --dist loadfile -m "not optimized"
+	QFOLIO_TEST_OPTIMIZED=1 $(BIN)/pytest -n 2 --dist loadfile -m optimized
 
 check: .venv/installed-dev
 	$(BIN)/ruff format --check

@@ -1,7 +1,4 @@
-"""The quick tests check types: shapes by jaxtyping, the rest by beartype.
-
-The slow ones do without (QFOLIO_TEST_UNTYPED=1): checks take a tenth of their time or, where they
-loop in Python, up to five sixths.
+"""Types are checked in every test.
 
 Compiling takes most of a test's time, so programs are hardly optimized here. The tests marked
 ``optimized`` learn for long, or compare what whole programs compute to the bit: ``make test-all``
@@ -16,7 +13,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from jaxtyping import install_import_hook
+
+import typechecker
 
 os.environ.setdefault("QFOLIO_CACHE", str(Path(__file__).parents[1] / ".cache"))
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # no window on anybody's screen
@@ -31,8 +29,7 @@ if "QFOLIO_TEST_OPTIMIZED" not in os.environ:
 
 # Not the adapters: scikit-learn's habit is to take any setting and to check it when fitting.
 WINGS = "core solvers learning agents tasks experiments portfolio report commands"
-if "QFOLIO_TEST_UNTYPED" not in os.environ:
-    install_import_hook([f"qfolio.{wing}" for wing in WINGS.split()], "typechecker.check")
+typechecker.install([f"qfolio.{wing}" for wing in WINGS.split()])
 
 import jax  # noqa: E402
 
@@ -49,6 +46,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs():
     """Compiled programs of one file do not stay in memory while the next ones run."""
+    typechecker.check_again()
     yield
     programs_of.cache_clear()
     jax.clear_caches()

@@ -1,13 +1,18 @@
-"""What checks the types of arguments in tests.
+"""What checks the types of arguments in tests: shapes by jaxtyping, the rest by beartype.
 
 As for mypy, an int is a float where one is asked for. Some types are wider than they say at run
 time: a comparison of numpy's is a bool, a sum over all axes is an array, a tuple is an
 ``ArrayLike``, days are ``datetime64``, and a buffer is an ``IO``.
 """
 
+import functools
+import inspect
 import io
-from typing import IO
+from collections import Counter
+from collections.abc import Callable
+from typing import IO, Any
 
+import jaxtyping
 import numpy as np
 from beartype import BeartypeConf, FrozenDict, beartype
 from numpy.typing import ArrayLike, NDArray
@@ -27,3 +32,37 @@ check = beartype(
         ),
     )
 )
+
+CALLS = 50
+"""Calls of a function that are checked in a file of tests. Later ones hardly bring other types, and
+a check takes longer than many a function: a test that loops in Python took six times as long."""
+
+_calls: Counter[Callable] = Counter()
+_jaxtyped = jaxtyping.jaxtyped
+
+
+def install(packages: list[str]) -> None:
+    """Has the functions of packages checked that are imported from now on."""
+    # What the hook applies to each function:
+    jaxtyping.jaxtyped = _first_calls  # type: ignore[assignment]
+    jaxtyping.install_import_hook(packages, "typechecker.check")
+
+
+def check_again() -> None:
+    """Counts calls anew."""
+    _calls.clear()
+
+
+def _first_calls(function: Any = None, *, typechecker: Any) -> Any:
+    if function is None:
+        return functools.partial(_first_calls, typechecker=typechecker)
+    checked = _jaxtyped(function, typechecker=typechecker)
+    if not inspect.isfunction(function):
+        return checked
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        _calls[function] += 1
+        return (checked if _calls[function] <= CALLS else function)(*args, **kwargs)
+
+    return call
