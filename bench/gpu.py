@@ -1,10 +1,12 @@
 """What a GPU gains: `make bench-gpu`.
 
-First the report's run for 1,024 agents in one program. Prints how long it took beside the limits
-from arithmetic and from memory; docs/results/benchmarks.md says how they are counted. Then the
-default backtest, on the GPU and on two cores of the same machine, and how much the results differ.
+First the default backtest, on the GPU and on two cores of the same machine, and how much the
+results differ. Then the report's run for 1,024 agents in one program, beside the limits from
+arithmetic and from memory; docs/results/benchmarks.md says how they are counted.
 """
 
+import json
+import math
 import os
 import subprocess
 import sys
@@ -19,7 +21,6 @@ devices.configure()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
-import pandas as pd  # noqa: E402
 import tyro  # noqa: E402
 
 from qfolio.core.evaluation import start_keys  # noqa: E402
@@ -44,14 +45,15 @@ def main(
     backtest: bool = True,
     allow_cpu: bool = False,
 ) -> None:
-    """Train many agents with the report's settings in one program on a GPU, then backtest on it.
+    """Backtest on a GPU, then train many agents with the report's settings in one program.
 
     Args:
         agents: How many.
         episodes: Of each agent.
         tflops: The GPU's peak arithmetic in 10¹² operations a second (default: that of an H100 or
             H200 in float32, without tensor cores).
-        terabytes: Its memory's bandwidth in 10¹² bytes a second (default: the card's).
+        terabytes: Its memory's bandwidth in 10¹² bytes a second (default: that of an H100 or
+            H200, unknown for others).
         backtest: Whether to run the backtests, too.
         allow_cpu: Go on without a GPU, to try the script out.
     """
@@ -60,9 +62,9 @@ def main(
         return
     if backtest:  # first, because training then keeps the GPU's memory
         compare_backtests()
-    kind = jax.devices()[0].device_kind
-    known = [value for name, value in TERABYTES.items() if name in kind]
-    train(agents, episodes, tflops, terabytes or next(iter(known), TERABYTES["H100"]))
+    card = jax.devices()[0].device_kind
+    known = (bandwidth for name, bandwidth in TERABYTES.items() if name in card)
+    train(agents, episodes, tflops, terabytes or next(known, math.nan))
 
 
 def train(agents: int, episodes: int, tflops: float, terabytes: float) -> None:
@@ -103,28 +105,22 @@ def train(agents: int, episodes: int, tflops: float, terabytes: float) -> None:
 
 def compare_backtests() -> None:
     cores = devices.cores()
-    on_cpu = {"JAX_PLATFORMS": "cpu"}, "--on", "processes:2"
     with TemporaryDirectory() as folder:
-        seconds, growth = zip(
-            _backtest(Path(folder, "gpu"), cores[:-2] or cores, {}),
-            _backtest(Path(folder, "cpu"), cores[-2:], *on_cpu),
-            strict=True,
-        )
-    print(f"backtest    {seconds[0]:,.0f} s on the GPU, {seconds[1]:,.0f} s on two cores")
-    for agent in ("tilts", "dqn"):
-        here, there = ([g[k] for k in g.index if k.startswith(f"{agent}/")] for g in growth)
-        apart = np.abs(np.subtract(here, there)).max()
-        print(
-            f"{agent:<11} grew by {np.mean(here):.3%} and {np.mean(there):.3%} a year; "
-            f"a seed by at most {apart:.3%} more or less",
-            flush=True,
-        )
+        here, there = Path(folder, "gpu"), Path(folder, "cpu")
+        on_gpu = _backtest(here, cores[:-2] or cores, {})
+        on_cpu = _backtest(there, cores[-2:], {"JAX_PLATFORMS": "cpu"}, "--on", "processes:2")
+        print(f"backtest    {on_gpu:,.0f} s on the GPU, {on_cpu:,.0f} s on two cores")
+        for agent in ("tilts", "dqn"):
+            growth = np.array([_growth(out, agent) for out in (here, there)])
+            print(
+                "{:<11} grew by {:.3%} and {:.3%} a year; ".format(agent, *growth.mean(1))
+                + f"a seed by at most {np.ptp(growth, axis=0).max():.3%} more or less",
+                flush=True,
+            )
 
 
-def _backtest(
-    out: Path, cores: list[int], environment: dict[str, str], *options: str
-) -> tuple[float, "pd.Series[float]"]:
-    """Seconds of the default backtest and annual growth of its strategies."""
+def _backtest(out: Path, cores: list[int], environment: dict[str, str], *options: str) -> float:
+    """Seconds of the default backtest."""
     begun = perf_counter()
     subprocess.run(
         [sys.executable, "-m", "qfolio", "backtest", "--out", out, *options],
@@ -133,10 +129,13 @@ def _backtest(
         stdout=subprocess.DEVNULL,
         check=True,
     )
-    seconds = perf_counter() - begun
-    returns = pd.read_csv(out / "returns.csv", index_col=0, parse_dates=True)
-    years = (returns.index[-1] - returns.index[0]).days / 365.25
-    return seconds, (1 + returns).prod() ** (1 / years) - 1
+    return perf_counter() - begun
+
+
+def _growth(out: Path, agent: str) -> list[float]:
+    """Annual growth of an agent's seeds."""
+    summary = json.loads((out / "summary.json").read_text())
+    return list(summary["strategies"][agent]["measures"]["growth"]["per_seed"])
 
 
 if __name__ == "__main__":

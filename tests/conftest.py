@@ -44,9 +44,13 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 @pytest.fixture(autouse=True, scope="module")
+def check_types_again():
+    typechecker.check_again()
+
+
+@pytest.fixture(autouse=True, scope="module")
 def forget_programs():
     """Compiled programs of one file do not stay in memory while the next ones run."""
-    typechecker.check_again()
     yield
     programs_of.cache_clear()
     jax.clear_caches()

@@ -9,7 +9,6 @@ import functools
 import inspect
 import io
 from collections import Counter
-from collections.abc import Callable
 from typing import IO, Any
 
 import jaxtyping
@@ -37,7 +36,7 @@ CALLS = 50
 """Calls of a function that are checked in a file of tests. Later ones hardly bring other types, and
 a check takes longer than many a function: a test that loops in Python took six times as long."""
 
-_calls: Counter[Callable] = Counter()
+_calls: Counter[int] = Counter()  # by the address of a function's code, which its closures share
 _jaxtyped = jaxtyping.jaxtyped
 
 
@@ -56,13 +55,16 @@ def check_again() -> None:
 def _first_calls(function: Any = None, *, typechecker: Any) -> Any:
     if function is None:
         return functools.partial(_first_calls, typechecker=typechecker)
-    checked = _jaxtyped(function, typechecker=typechecker)
     if not inspect.isfunction(function):
-        return checked
+        return _jaxtyped(function, typechecker=typechecker)
+    code = id(function.__code__)
+    if _calls[code] >= CALLS:  # a closure that is made again and again
+        return function
+    checked = _jaxtyped(function, typechecker=typechecker)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        _calls[function] += 1
-        return (checked if _calls[function] <= CALLS else function)(*args, **kwargs)
+        _calls[code] += 1
+        return (checked if _calls[code] <= CALLS else function)(*args, **kwargs)
 
     return call

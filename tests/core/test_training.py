@@ -208,6 +208,11 @@ def test_sums_are_left_to_compiled_loops():
     assert "ynn_fusion" not in program
 
 
+def test_products_are_as_precise_on_any_device():
+    program = jax.jit(lambda x: x @ x).lower(jnp.ones((4, 4))).as_text()
+    assert "precision = [HIGHEST, HIGHEST]" in program
+
+
 def test_a_version_of_xla_that_lacks_the_option_compiles_without_it(task, agent, monkeypatch):
     monkeypatch.setattr("qfolio.core.devices.PRODUCTS_ONLY", {"xla_no_such_option": True})
     programs_of.cache_clear()

@@ -48,8 +48,7 @@ the compiler instead of a flag, because a version that does not know a flag ends
 
 
 def configure() -> None:
-    """Makes each CPU core a device, compiles loops for speed and keeps programs on disk; makes
-    matrix products on a GPU as precise as on a CPU.
+    """Makes each core a device, compiles for speed, multiplies precisely, keeps programs on disk.
 
     Has an effect only before jax first computes; settings that the user has made are kept.
     """

@@ -158,8 +158,10 @@ def follow_when(due: Bool[Array, ""], target: Weights, online: Weights, rate: Sc
 
 @custom_vmap
 def _for_any(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """The flag; one for all where flags are batched, because ``lax.cond`` then does not choose
-    between two results that it has both computed."""
+    """The flag, or in a batch whether any is set.
+
+    By one flag for all, ``lax.cond`` runs one branch; by a batch of them it would run both.
+    """
     return flag
 
 
