@@ -60,7 +60,7 @@ class Nodes:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
-        head = {"num_cpus": 0, "ray_client_server_port": self.port}
+        head = {"num_cpus": 0, "ray_client_server_port": self.port, "include_dashboard": False}
         self.cluster = Cluster(initialize_head=True, head_node_args=head)
         self.nodes = [self.cluster.add_node(num_cpus=1) for _ in range(count)]
         ray.init(address=self.cluster.address, log_to_driver=False)

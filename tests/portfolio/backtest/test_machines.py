@@ -140,11 +140,11 @@ def test_a_worker_that_is_killed(here, tmp_path):
 def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
     """Groups of folds differ with the cores of a worker; what is learned does not."""
     found: list[dict[str, bytes]] = []
-    for executor in (Here(), Processes(1), Processes(2, cores=1)):
+    for executor in (Here(), Processes(2, cores=1)):
         backtest = create(tmp_path / f"{len(found)}", AGENTS | DQN)
         backtest.run(executor=executor)
         found.append(files(backtest.folder))
-    assert found[0] == found[1] == found[2]
+    assert found[0] == found[1]
 
 
 @pytest.mark.slow
@@ -152,7 +152,8 @@ def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason='needs pip install "ray"')
 def test_ray_equals_this_process(here, tmp_path):
     ray = importlib.import_module("ray")
-    ray.init("local", num_cpus=2, log_to_driver=False)  # not the cluster of another test
+    # Not the cluster of another test.
+    ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
     try:
         backtest = create(tmp_path / "run")
         backtest.run(executor=on("ray"))
