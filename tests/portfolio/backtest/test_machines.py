@@ -140,11 +140,11 @@ def test_a_worker_that_is_killed(here, tmp_path):
 def test_whole_programs_round_alike_whatever_the_workers(tmp_path):
     """Groups of folds differ with the cores of a worker; what is learned does not."""
     found: list[dict[str, bytes]] = []
-    for executor in (Here(), Processes(2, cores=1)):
+    for executor in (Here(), Processes(1), Processes(2, cores=1)):
         backtest = create(tmp_path / f"{len(found)}", AGENTS | DQN)
         backtest.run(executor=executor)
         found.append(files(backtest.folder))
-    assert found[0] == found[1]
+    assert found[0] == found[1] == found[2]
 
 
 @pytest.mark.slow
