@@ -14,6 +14,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.machines.parcels import Packer, Unpacker
+from qfolio.experiments.records import Records
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class Tell:
         for listener in listeners:
             listener.on_start(training)
             training.left = 0
-            listener.on_chunk(training, [{"seed": 0, "episode": 1, "return": 2.5}])
+            listener.on_chunk(training, Records.of([{"seed": 0, "episode": 1, "return": 2.5}]))
             listener.on_end(training)
         return "told"
 

@@ -13,6 +13,7 @@ from qfolio.experiments.events import EVENTS, read
 from qfolio.experiments.log import Log, Tracker, means, tracked
 from qfolio.experiments.machines.messages import Report
 from qfolio.experiments.machines.remote import RemoteTraining, hear
+from qfolio.experiments.records import Records
 from qfolio.experiments.run import Run
 
 from listeners import Interrupt
@@ -120,7 +121,7 @@ def test_damaged_lines_are_skipped(tmp_path, line):
 def test_a_member_without_an_episode_has_no_mean():
     rows = [{"seed": 7, "episode": 4, "return": 2.0, "loss": np.nan},
             {"seed": 7, "episode": 5, "return": 4.0, "loss": 1.0}]  # fmt: skip
-    assert means(rows, [1, 1], 3) == {
+    assert means(Records.of(rows), [1, 1], 3) == {
         "episode": [None, 5.0, None],
         "return": [None, 3.0, None],
         "loss": [None, 1.0, None],
@@ -130,8 +131,8 @@ def test_a_member_without_an_episode_has_no_mean():
 def report(hook, seconds=1.0, left=0, rows=(), members=()):
     """What a worker says of a training."""
     share, where = 1.0 if not left else 0.5, "process 7 on far"
-    return Report(hook, where, Budget(4), {}, 0, left, 100, seconds, share, 7.0, 3.0, [*rows],
-                  [*members])  # fmt: skip
+    return Report(hook, where, Budget(4), {}, 0, left, 100, seconds, share, 7.0, 3.0,
+                  Records.of(rows), [*members])  # fmt: skip
 
 
 def test_jobs_on_workers_are_logged_by_the_driver(tmp_path):
@@ -190,7 +191,8 @@ def test_logging_takes_little_of_a_training(tmp_path, monkeypatch):
     monkeypatch.setattr(logs, "perf_counter", lambda: now[0])
     members = [i % 8 for i in range(10)]
     training = RemoteTraining(report("on_chunk", left=2, members=members))
-    rows = [dict.fromkeys(("seed", "episode", "return", "loss", "q"), 1.0) for _ in range(10)]
+    row = dict.fromkeys(("seed", "episode", "return", "loss", "q"), 1.0)
+    rows = Records.of([row] * 10)
     begun, chunks = process_time(), 20_000
     with Log(tmp_path).opened(kind="run") as log:
         job = log.job("", [f"seed {i}" for i in range(8)])

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, NoReturn
 
 from qfolio.commands.console import bar, console, number, say
 from qfolio.core.training import episode_steps
-from qfolio.experiments.fit import Listener, Row, Training
+from qfolio.experiments.fit import Listener, Training
 from qfolio.experiments.interrupts import EXIT_CODE
+from qfolio.experiments.records import Records
 
 if TYPE_CHECKING:
     from qfolio.experiments.executor import Job
@@ -39,11 +40,10 @@ class RunProgress(Listener):
         self.bar = bar("compiling", budget.amount, run.done(budget.unit))
         self.update = self.bar.__enter__()
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+    def on_chunk(self, training: Training, rows: Records) -> None:
         run, budget = self.run, training.budget
         done = run.done(budget.unit)
-        returns = [row["return"] for row in rows]
-        value = number(sum(returns) / len(returns) if returns else math.nan)
+        value = number(float(rows.column("return").mean()) if rows else math.nan)
         rate = f"{training.steps_per_second:,.0f}"
         epsilon = rows[-1].get("epsilon", math.nan) if rows else math.nan
         explored = "–" if math.isnan(epsilon) else f"{epsilon:.2f}"
@@ -74,7 +74,7 @@ class BarProgress(Listener):
     def on_start(self, training: Training) -> None:
         self.update(completed=training.share, description=f"{self.name}  compiling")
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+    def on_chunk(self, training: Training, rows: Records) -> None:
         speed = f"{training.steps_per_second:,.0f} steps/s"
         status = f"{self.name}  {speed}  {time_left(training.seconds_left)} left"
         self.update(completed=training.share, description=status)
@@ -119,7 +119,7 @@ class _JobProgress(Listener):
     def on_start(self, training: Training) -> None:
         self.whole.note(self.job, 0.0, learning=False)
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+    def on_chunk(self, training: Training, rows: Records) -> None:
         learning = not math.isnan(training.seconds_left)
         self.whole.note(self.job, self.share * training.share, learning)
 

@@ -10,7 +10,6 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.text import csv_cell
 
 _JSON = msgspec.json.Encoder()
+_NUMBERS, _LARGE = (float, int), 2.0**63
 _SPECIAL = re.compile('[,"\r\n]')
 
 UNFINISHED = ".part"
@@ -147,12 +147,12 @@ def csv_lines(rows: Iterable[Iterable[Any]]) -> bytes:
         quoted = '"' + text.replace('"', '""') + '"'
         return msgspec.Raw((quoted if _SPECIAL.search(text) else text).encode())
 
-    # JSON spells finite numbers as CSV does, in a third of the csv module's time.
-    lines = [
-        _JSON.encode([x if type(x) is float and isfinite(x) else cell(x) for x in row])[1:-1]
-        for row in rows
-    ]
-    return b"\n".join([*lines, b""])
+    def line(row: Iterable[Any]) -> bytes:
+        # JSON spells finite numbers as CSV does, in a third of the csv module's time.
+        cells = [x if type(x) in _NUMBERS and -_LARGE < x < _LARGE else cell(x) for x in row]
+        return _JSON.encode(cells)[1:-1]
+
+    return b"".join([line(row) + b"\n" for row in rows])
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -34,8 +34,9 @@ from qfolio.core.training import TrainingState
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.comparison.ranking import middle_steps, steps_within
 from qfolio.experiments.described import agent_of, describe, task_of
-from qfolio.experiments.fit import Listener, Row, Training, fit
+from qfolio.experiments.fit import Listener, Training, fit
 from qfolio.experiments.log import JobLog, Log, seed_names
+from qfolio.experiments.records import Records
 from qfolio.learning.optimizer import Optimizer
 
 FILE, LEARNED = "continual.json", "learned.safetensors"
@@ -363,7 +364,7 @@ class _Curve(Listener):
         done = population.steps * population.agent.num_envs
         self.job.record(done, {"greedy regret": self.regrets[-1]})
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+    def on_chunk(self, training: Training, rows: Records) -> None:
         self.add(training.population, training.population.steps - training.begun)
 
 

@@ -16,9 +16,7 @@ from qfolio.core.population import Population
 from qfolio.core.training import Episodes
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.interrupts import interruptible
-
-Row = dict[str, float]
-"""A finished episode: seed, episode (counted from 1), return and the agent's metrics."""
+from qfolio.experiments.records import Records
 
 
 @dataclass
@@ -82,7 +80,7 @@ class Training:
             return self._learned / max(self._learning_seconds, 1e-9)
         return (self.population.steps - self.begun) / max(self.seconds, 1e-9)
 
-    def advance(self, most: int, strict: bool) -> list[Row]:
+    def advance(self, most: int, strict: bool) -> Records:
         """Trains one chunk of at most ``most`` steps; returns the episodes that it finished."""
         population = self.population
         episodes, steps, compiled = (
@@ -100,7 +98,7 @@ class Training:
         self.left = self.budget.left(population)
         if not strict and not any(population.healthy):
             self.left = 0
-        rows, self.members = _rows(population.seeds, episodes, records)
+        rows, self.members = _records(population.seeds, episodes, records)
         return rows
 
 
@@ -110,8 +108,8 @@ class Listener:
     def on_start(self, training: Training) -> None:
         """Before the first chunk."""
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        """After each chunk, with its finished episodes in order of time."""
+    def on_chunk(self, training: Training, rows: Records) -> None:
+        """After each chunk, with a row for each episode that it finished, in order of time."""
 
     def on_end(self, training: Training) -> None:
         """After the last chunk, also if Ctrl-C stopped the training; not after an error."""
@@ -157,18 +155,21 @@ def fit(
     return training
 
 
-def _rows(
+def _records(
     seeds: Sequence[int], before: Sequence[int], episodes: Episodes
-) -> tuple[list[Row], list[int]]:
-    """A row for each finished episode and its member, in order of time."""
+) -> tuple[Records, list[int]]:
+    """A row for each finished episode and its member, in order of time.
+
+    before: finished episodes of each member until now.
+    """
     # By time first, so that the order does not depend on the chunks.
-    places = np.argwhere(episodes.finished.swapaxes(0, 1))
-    time, member, environment = places.T
-    columns = {"return": episodes.returns, **episodes.metrics}
-    values = [column[member, time, environment].tolist() for column in columns.values()]
-    count = list(before)
-    rows = []
-    for i, *row in zip(member.tolist(), *values, strict=True):
-        count[i] += 1
-        rows.append({"seed": seeds[i], "episode": count[i], **dict(zip(columns, row, strict=True))})
-    return rows, member.tolist()
+    time, member, environment = np.argwhere(episodes.finished.swapaxes(0, 1)).T
+    by_member = np.argsort(member, kind="stable")
+    counts = np.bincount(member, minlength=len(seeds))
+    earlier = np.cumsum(counts) - counts - before  # rows of other members, less episodes until now
+    number = np.empty_like(by_member)
+    number[by_member] = 1 + np.arange(len(member)) - np.repeat(earlier, counts)
+    columns = {"seed": np.array(seeds)[member], "episode": number}
+    for name, values in {"return": episodes.returns, **episodes.metrics}.items():
+        columns[name] = np.asarray(values[member, time, environment], float)
+    return Records(columns), member.tolist()

@@ -18,7 +18,8 @@ import numpy as np
 
 from qfolio.core.errors import QfolioError, one_line
 from qfolio.experiments.events import BEAT, EVENTS
-from qfolio.experiments.fit import Listener, Row, Training
+from qfolio.experiments.fit import Listener, Training
+from qfolio.experiments.records import Records
 
 SHARE, SHORTEST, LONGEST = 0.05, 0.05, 1.0
 """Time between two records: a share of the training time so far, within limits in seconds."""
@@ -151,7 +152,7 @@ class JobLog(Listener):
 
     def __init__(self, log: Log, name: str, members: Sequence[str]) -> None:
         self.log, self.name, self.members = log, name, list(members)
-        self._rows: list[Row] = []
+        self._rows: list[Records] = []  # of each chunk
         self._of: list[int] = []  # the member of each row
         self._due = 0.0
         self._step, self._share = 0, 0.0  # of the previous record
@@ -167,8 +168,8 @@ class JobLog(Listener):
             share=training.share,
         )
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        self._rows += rows
+    def on_chunk(self, training: Training, rows: Records) -> None:
+        self._rows.append(rows)
         self._of += training.members
         if perf_counter() >= self._due:
             self._flush(training)
@@ -176,7 +177,7 @@ class JobLog(Listener):
             self._due = perf_counter() + apart
 
     def on_end(self, training: Training) -> None:
-        if self._rows:
+        if any(self._rows):
             self._flush(training)
         state = "done" if training.finished else "stopped"
         self.log.write(state, job=self.name, step=training.steps)
@@ -187,7 +188,8 @@ class JobLog(Listener):
         self.log.track(self.name, step, values)
 
     def _flush(self, training: Training) -> None:
-        rows, members, most = self._rows, self._of, max(RECENT, 4 * len(self.members))
+        rows, members = Records.joined(self._rows), self._of
+        most = max(RECENT, 4 * len(self.members))
         step, share = training.steps, training.share
         parts = max(1, min(math.ceil(PARTS * (share - self._share)), len(rows)))
         for part in range(parts):  # in order of time, as the rows are
@@ -203,14 +205,11 @@ class JobLog(Listener):
         self._rows, self._of, self._step, self._share = [], [], step, share
 
 
-def means(rows: Sequence[Row], members: Sequence[int], count: int) -> dict[str, list[float | None]]:
+def means(rows: Records, members: Sequence[int], count: int) -> dict[str, list[float | None]]:
     """The mean of each number over each member's rows; None if a member has no row."""
-    if not rows:
-        return {}
-    of, result = np.asarray(members), {}
-    for name in rows[-1]:
+    of, result = np.asarray(members, int), {}
+    for name, column in rows.columns.items():
         if name != "seed":
-            column = np.array([row.get(name, np.nan) for row in rows], float)
             known = np.isfinite(column)  # metrics of learning are NaN before it begins
             weights = np.bincount(of[known], minlength=count)
             if name == "episode":  # counted from 1, in order

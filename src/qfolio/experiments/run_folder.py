@@ -6,18 +6,18 @@ summary.json. The checkpoint is authoritative: rows ahead of it are dropped when
 and then recomputed bit for bit.
 """
 
-import contextlib
 import csv
 from collections.abc import Sequence
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
 from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import UNFINISHED, csv_lines, read_tree, write_bytes, write_json, write_tree
+from qfolio.core.files import UNFINISHED, read_tree, write_bytes, write_json, write_tree
 from qfolio.experiments.budget import Budget, seed_range
-from qfolio.experiments.fit import Row
+from qfolio.experiments.records import Records, Row
 
 CONFIG, METRICS, EVALUATION = "config.json", "metrics.csv", "evaluation.csv"
 CHECKPOINT, POLICY, SUMMARY = "checkpoint.safetensors", "policy.safetensors", "summary.json"
@@ -81,39 +81,37 @@ class RunFolder:
         """The state that ``write_checkpoint`` wrote, in the shape of ``template``."""
         return read_tree(self.path / CHECKPOINT, template)
 
-    def append(self, name: str, rows: Sequence[Row]) -> None:
+    def append(self, name: str, rows: Records) -> None:
         """Appends rows to a table, with a header if it is new."""
         if rows:
             with (self.path / name).open("ab") as file:
-                file.write(_csv(rows, header=file.tell() == 0))
+                file.write(rows.csv(header=file.tell() == 0))
 
-    def rows(self, name: str, episodes: dict[int, int], steps: int) -> list[Row]:
+    def rows(self, name: str, episodes: dict[int, int], steps: int) -> Records:
         """The rows of a table up to a checkpoint; skips a last row that a crash cut short.
 
         episodes: number of episodes at the checkpoint, by seed. steps: of each seed's environments.
         """
         path = self.path / name
         if not path.exists():
-            return []
+            return Records()
         try:
-            table = list(csv.DictReader(path.read_text(errors="replace").splitlines()))
-        except csv.Error as error:
+            records = Records.read(path.read_text(errors="replace").splitlines(), cut=True)
+        except (csv.Error, ValueError) as error:
             raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
-        rows = []
-        for row in table:
-            # A row that was cut short has too few numbers.
-            with contextlib.suppress(TypeError, ValueError, KeyError, OverflowError):
-                values = {key: _number(text) for key, text in row.items()}
-                done = values["episode"] <= episodes[int(values["seed"])]
-                if done and values.get("env_steps", 0) <= steps:
-                    rows.append(values)
-        return rows
+        if not {"seed", "episode"} <= records.columns.keys():
+            return Records()
+        most = np.array([episodes.get(seed, -1) for seed in records.column("seed").tolist()])
+        done = records.column("episode") <= most
+        if "env_steps" in records.columns:
+            done &= records.column("env_steps") <= steps
+        return records[done]
 
-    def tidy(self, tables: dict[str, list[Row]]) -> None:
+    def tidy(self, tables: dict[str, Records]) -> None:
         """Resets the tables to these rows, and removes temporary files of a killed process."""
         for name, rows in tables.items():
             if rows:
-                write_bytes(self.path / name, _csv(rows, header=True))
+                write_bytes(self.path / name, rows.csv(header=True))
             else:
                 (self.path / name).unlink(missing_ok=True)
         for path in self.path.glob(f".*{UNFINISHED}"):
@@ -124,12 +122,3 @@ def curve_point(rows: Sequence[Row]) -> dict[str, list[float]]:
     """The log's values for a point of the learning curve; rows: of evaluation.csv, one per seed."""
     names = {"greedy return": "return", "overestimation": "overestimation"}
     return {name: [row[key] for row in rows] for name, key in names.items()}
-
-
-def _csv(rows: Sequence[Row], header: bool) -> bytes:
-    values = itemgetter(*rows[0])
-    return (csv_lines([rows[0]]) if header else b"") + csv_lines(map(values, rows))
-
-
-def _number(text: str) -> float:
-    return int(text) if str.isdigit(text) else float(text)

@@ -23,6 +23,7 @@ from qfolio.experiments.budget import Budget
 from qfolio.experiments.executor import Executor, at_once
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.log import Log, seed_names
+from qfolio.experiments.records import Records
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder, curve_point
 from qfolio.experiments.seeds import Seeds, TrainedSeeds
 
@@ -178,22 +179,19 @@ def _joined(parts: Sequence[TrainedSeeds], run: Seeds) -> TrainedSeeds:
     """
     parts = sorted(parts, key=lambda part: part.config.seed)
     states = [part.state["training"] for part in parts]
-    count = run.agent.num_envs
+    episodes = Records.joined(part.metrics for part in parts)
+    points = Records.joined(part.evaluations for part in parts)
+    # Environments finish their episodes at the same time, unless some end early.
+    lap = (episodes.column("episode") - 1) // run.agent.num_envs
+    by_time = np.lexsort([episodes.column("episode"), episodes.column("seed"), lap])
     return TrainedSeeds(
         run.config,
         {
             "training": jax.tree.map(lambda *x: np.concatenate(x), *states),
             "seconds_train": sum(part.state["seconds_train"] for part in parts),
         },
-        sorted(
-            (row for part in parts for row in part.metrics),
-            # Environments finish their episodes at the same time, unless some end early.
-            key=lambda row: ((row["episode"] - 1) // count, row["seed"], row["episode"]),
-        ),
-        sorted(
-            (row for part in parts for row in part.evaluations),
-            key=lambda row: (row["env_steps"], row["seed"]),
-        ),
+        episodes[by_time],
+        points[np.lexsort([points.column("seed"), points.column("env_steps")])],
         sum(part.seconds_compile for part in parts),
     )
 

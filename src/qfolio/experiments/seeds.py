@@ -1,6 +1,7 @@
 """Seeds of one agent on one task, side by side in this process: training, records, checkpoints."""
 
 import contextlib
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -15,8 +16,9 @@ from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.population import Population
 from qfolio.experiments.budget import Budget
-from qfolio.experiments.fit import Listener, Row, Training, fit
+from qfolio.experiments.fit import Listener, Training, fit
 from qfolio.experiments.log import JobLog, Log, seed_names
+from qfolio.experiments.records import Records
 from qfolio.experiments.run_folder import EVALUATION, METRICS, RunConfig, RunFolder, curve_point
 
 EVALUATIONS = 20
@@ -33,16 +35,16 @@ class TrainedSeeds(NamedTuple):
 
     config: RunConfig
     state: PyTree
-    metrics: list[Row]
-    evaluations: list[Row]
+    metrics: Records
+    evaluations: Records
     seconds_compile: float = 0.0
 
 
 class Seeds:
     """The seeds of a run, with its folder if it has one.
 
-    metrics: a row for each finished training episode. evaluations: a row for each seed and point of
-    the learning curve. interrupted: whether Ctrl-C stopped the last training.
+    evaluations: a row for each seed and point of the learning curve. interrupted: whether Ctrl-C
+    stopped the last training.
     """
 
     def __init__(
@@ -51,8 +53,8 @@ class Seeds:
         """room: seeds of the largest run that shares the programs, if more than this run's."""
         self.task, self.agent, self.config, self._folder = task, agent, config, folder
         self.population: Population = population_of(task, agent, config.seed_range, room)
-        self.metrics: list[Row] = []
-        self.evaluations: list[Row] = []
+        self._metrics: list[Records] = []  # of each chunk
+        self.evaluations = Records()
         self.seconds_train = 0.0
         self.interrupted = False
         self._log: JobLog | None = None  # only during training
@@ -61,6 +63,12 @@ class Seeds:
     def folder(self) -> Path | None:
         """The folder of the run, if it has one."""
         return None if self._folder is None else self._folder.path
+
+    @property
+    def metrics(self) -> Records:
+        """A row for each finished training episode."""
+        self._metrics = [Records.joined(self._metrics)]
+        return self._metrics[0]
 
     @property
     def episodes(self) -> int:
@@ -122,7 +130,8 @@ class Seeds:
             self.config, episodes=budget.episodes, steps=budget.steps
         )
         if not self.population.steps:
-            self.evaluations = []  # left by a process that was killed before its first checkpoint
+            # A process that was killed before its first checkpoint may have left some.
+            self.evaluations = Records()
         if self._folder is not None:
             self._folder.write_config(self.config)
             self._folder.tidy({METRICS: self.metrics, EVALUATION: self.evaluations})
@@ -133,16 +142,16 @@ class Seeds:
         self.population.restore(trained.state["training"])
         self.population.seconds_compile += trained.seconds_compile
         self.seconds_train += float(trained.state["seconds_train"])
-        new = [row for row in trained.evaluations if not before or row["env_steps"] > before]
-        self._record(METRICS, self.metrics, trained.metrics)
-        self._record(EVALUATION, self.evaluations, new)
+        new = (row for row in trained.evaluations if not before or row["env_steps"] > before)
+        self._record_episodes(trained.metrics)
+        self._record_point(Records.of(new))
         self._write_checkpoint()
 
     def evaluate(self) -> None:
         """Adds a point to the learning curve."""
         played = self.population.evaluate(start_keys(self.population.curve_starts))
         members = zip(self.population.seeds, self.population.member_episodes, *played, strict=True)
-        rows = [
+        rows = Records.of(
             {
                 "seed": seed,
                 "episode": episode,
@@ -151,8 +160,8 @@ class Seeds:
                 "overestimation": float(overestimation),
             }
             for seed, episode, returns, overestimation in members
-        ]
-        self._record(EVALUATION, self.evaluations, rows)
+        )
+        self._record_point(rows)
         if self._log is not None:
             self._log.record(self.done("steps"), curve_point(rows))
 
@@ -160,10 +169,15 @@ class Seeds:
         """The content of a checkpoint: arrays with a leading seed axis."""
         return {"training": self.population.fetch(), "seconds_train": np.array(self.seconds_train)}
 
-    def _record(self, name: str, table: list[Row], rows: list[Row]) -> None:
-        table += rows
+    def _record_episodes(self, rows: Records) -> None:
+        self._metrics.append(rows)
         if self._folder is not None:
-            self._folder.append(name, rows)
+            self._folder.append(METRICS, rows)
+
+    def _record_point(self, rows: Records) -> None:
+        self.evaluations = Records.joined([self.evaluations, rows])
+        if self._folder is not None:
+            self._folder.append(EVALUATION, rows)
 
     def _write_checkpoint(self) -> None:
         if self._folder is not None:
@@ -177,12 +191,11 @@ class Seeds:
         self.population.restore(state["training"])
         members = zip(self.population.seeds, self.population.member_episodes, strict=True)
         episodes, steps = dict(members), self.done("steps")
-        self.metrics = self._folder.rows(METRICS, episodes, steps)
-        points: dict[float, list[Row]] = {}
-        for row in self._folder.rows(EVALUATION, episodes, steps):
-            points.setdefault(row["env_steps"], []).append(row)
-        whole = [rows for rows in points.values() if len(rows) == self.config.seeds]
-        self.evaluations = [row for rows in whole for row in rows]
+        self._metrics = [self._folder.rows(METRICS, episodes, steps)]
+        points = self._folder.rows(EVALUATION, episodes, steps)
+        rows_at = Counter(row["env_steps"] for row in points)
+        whole = (row for row in points if rows_at[row["env_steps"]] == self.config.seeds)
+        self.evaluations = Records.of(whole)
 
 
 class _Metrics(Listener):
@@ -191,9 +204,9 @@ class _Metrics(Listener):
     def __init__(self, seeds: Seeds) -> None:
         self.seeds, self.before = seeds, seeds.seconds_train
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+    def on_chunk(self, training: Training, rows: Records) -> None:
         self.seeds.seconds_train = self.before + training.seconds
-        self.seeds._record(METRICS, self.seeds.metrics, rows)
+        self.seeds._record_episodes(rows)
 
 
 class _Curve(Listener):
@@ -209,7 +222,7 @@ class _Curve(Listener):
         if not training.begun:
             self.seeds.evaluate()
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+    def on_chunk(self, training: Training, rows: Records) -> None:
         points = training.population.steps // self.every
         if points > self.points or training.finished:
             self.seeds.evaluate()
@@ -222,7 +235,7 @@ class _Checkpoints(Listener):
     def __init__(self, seeds: Seeds) -> None:
         self.seeds, self.saved = seeds, perf_counter()
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+    def on_chunk(self, training: Training, rows: Records) -> None:
         if perf_counter() - self.saved > CHECKPOINT_SECONDS:
             self.on_end(training)
 

@@ -16,6 +16,7 @@ from qfolio.core.mdp import Agent, Box, Policy, Position
 from qfolio.core.text import listed
 from qfolio.core.training import episode_steps
 from qfolio.experiments.presets import changes, preset
+from qfolio.experiments.records import Records
 from qfolio.experiments.run import Run
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.capacity import capacity
@@ -55,7 +56,7 @@ def report_data(
     known = solution if isinstance(solution, FollowedOptimum) else None
     # In a market, training episodes have other random paths, so their returns are not comparable.
     whole = known is None and episode_steps(run.task, run.agent) == run.task.horizon
-    rows = run.metrics if whole else []
+    episodes = run.metrics if whole else Records()
     variant = contrast_of(run.agent)
     names = ("greedy return", "") if variant is None else (variant.name, variant.variant_name)
     agent, task, unit = summary["agent"], summary["task"], run.budget.unit
@@ -67,8 +68,8 @@ def report_data(
         config=msgspec.to_builtins(run.config),
         curve=_curve(run, names[0], unit),
         comparison=_curve(contrast, names[1], unit) if contrast and contrast.evaluations else None,
-        training_done=_done(run, unit, np.array([row["episode"] for row in rows], float)),
-        training_returns=np.array([row["return"] for row in rows]),
+        training_done=_done(run, unit, episodes.column("episode").astype(float)),
+        training_returns=episodes.column("return"),
         optimum=optimum,
         maps=_maps(run, pendulum) if pendulum else None,
         episode=greedy_episode(run, pendulum) if pendulum else None,
@@ -174,7 +175,7 @@ def _moves(backtest: Backtest) -> Floats:
 def _training(backtest: Backtest, agent: str) -> list[FoldTraining]:
     """An agent's training in each fold; empty if a fold's records are missing."""
     records = (backtest.records(agent, fold.name) for fold in backtest.folds)
-    folds = [FoldTraining.of(np.array([row["return"] for row in rows])) for rows in records]
+    folds = [FoldTraining.of(rows.column("return")) for rows in records]
     known = [fold for fold in folds if fold is not None]
     return known if len(known) == len(folds) else []
 

@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from qfolio.core.version import __version__
 from qfolio.experiments.budget import Budget
+from qfolio.experiments.records import Records
 
 
 class Ready(NamedTuple):
@@ -31,7 +32,7 @@ class Report(NamedTuple):
     share: float
     steps_per_second: float
     seconds_left: float
-    rows: list[dict[str, float]]
+    rows: Records
     members: Sequence[int]
 
 

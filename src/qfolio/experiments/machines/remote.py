@@ -5,8 +5,9 @@ from time import perf_counter
 from typing import Any, Literal
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.fit import Listener, Row, Training
+from qfolio.experiments.fit import Listener, Training
 from qfolio.experiments.machines.messages import Report, place
+from qfolio.experiments.records import Records
 
 EVERY = 0.5
 """Minimum number of seconds between two reports, since many workers may have short chunks."""
@@ -17,14 +18,14 @@ class Reporter(Listener):
 
     def __init__(self, send: Callable[[Report], None]) -> None:
         self.send, self.sent = send, 0.0
-        self.rows: list[Row] = []
+        self.rows: list[Records] = []  # of each chunk
         self.members: list[int] = []
 
     def on_start(self, training: Training) -> None:
         self._report("on_start", training)
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        self.rows += rows
+    def on_chunk(self, training: Training, rows: Records) -> None:
+        self.rows.append(rows)
         self.members += training.members
         if training.finished or perf_counter() - self.sent > EVERY:
             self._report("on_chunk", training)
@@ -47,7 +48,7 @@ class Reporter(Listener):
                 training.share,
                 training.steps_per_second,
                 training.seconds_left,
-                self.rows,
+                Records.joined(self.rows),
                 self.members,
             )
         )

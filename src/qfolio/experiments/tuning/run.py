@@ -31,9 +31,10 @@ from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Job, carry_out, persistent
-from qfolio.experiments.fit import Listener, Row, Training
+from qfolio.experiments.fit import Listener, Training
 from qfolio.experiments.log import Log
 from qfolio.experiments.machines.choice import on
+from qfolio.experiments.records import Records
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
 from qfolio.experiments.tuning.search import Value
@@ -88,7 +89,7 @@ class _Share(Listener):
     ) -> None:
         self.tell, self.shares, self.job, self.share = tell, shares, job, share
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
+    def on_chunk(self, training: Training, rows: Records) -> None:
         self.shares[self.job] = training.share * self.share
         self.tell(sum(self.shares.values()))
 

@@ -33,6 +33,7 @@ from qfolio.core.files import (
     read_json,
     read_tree,
     write_arrays,
+    write_bytes,
     write_csv,
     write_json,
     write_tree,
@@ -41,8 +42,8 @@ from qfolio.core.mdp import Agent
 from qfolio.core.registry import BASELINES, name_of
 from qfolio.core.text import quote
 from qfolio.experiments.budget import Budget, seed_range
-from qfolio.experiments.fit import Row
 from qfolio.experiments.presets import Preset
+from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest.own import KINDS, Own
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.prices.table import Prices
@@ -259,19 +260,17 @@ class BacktestFolder:
     def read_policy(self, agent: str, fold: str, template: Any) -> Any:
         return read_tree(self.policy_file(agent, fold), template)
 
-    def write_records(self, agent: str, fold: str, rows: Sequence[Row]) -> None:
-        header = list(rows[0]) if rows else []
-        write_csv(self._records(agent, fold), header, (row.values() for row in rows))
+    def write_records(self, agent: str, fold: str, rows: Records) -> None:
+        write_bytes(self._records(agent, fold), rows.csv(header=True))
 
-    def read_records(self, agent: str, fold: str) -> list[Row]:
+    def read_records(self, agent: str, fold: str) -> Records:
         """The training episodes of a fold; none if their table is missing."""
         path = self._records(agent, fold)
         if not path.exists():
-            return []
+            return Records()
         try:
-            table = list(csv.DictReader(path.read_text(errors="replace").splitlines()))
-            return [{name: float(text) for name, text in row.items()} for row in table]
-        except (csv.Error, TypeError, ValueError) as error:
+            return Records.read(path.read_text(errors="replace").splitlines())
+        except (csv.Error, ValueError) as error:
             raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
 
     def write_returns(self, days: Sequence[str], columns: dict[str, np.ndarray]) -> None:

@@ -1,13 +1,12 @@
 """What a backtest has trained: in its folder or, without one, in memory."""
 
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.experiments.fit import Row
+from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest.folder import BacktestFolder
 
 LATEST = "latest"
@@ -25,7 +24,7 @@ class Kept:
     def __init__(self, folder: BacktestFolder | None) -> None:
         self.folder = folder
         self._policies: dict[tuple[str, str], Any] = {}
-        self._records: dict[tuple[str, str], list[Row]] = {}
+        self._records: dict[tuple[str, str], Records] = {}
 
     def has(self, agent: str, fold: str) -> bool:
         """Whether an agent is trained on a fold."""
@@ -56,16 +55,16 @@ class Kept:
             return self._policies[agent, fold]
         return self.folder.read_policy(agent, fold, template)
 
-    def records(self, agent: str, fold: str) -> list[Row]:
+    def records(self, agent: str, fold: str) -> Records:
         """Every training episode of all seeds, in order of time; empty if there are none."""
         if self.folder is None:
-            return self._records.get((agent, fold), [])
+            return self._records.get((agent, fold), Records())
         return self.folder.read_records(agent, fold)
 
-    def write(self, agent: str, fold: str, rows: Sequence[Row], policy: Any) -> None:
+    def write(self, agent: str, fold: str, rows: Records, policy: Any) -> None:
         """Keeps a fold; its records come first, because the policy marks it as trained."""
         if self.folder is None:
-            self._records[agent, fold] = list(rows)
+            self._records[agent, fold] = rows
         else:
             self.folder.write_records(agent, fold, rows)
         self.write_policy(agent, fold, policy)

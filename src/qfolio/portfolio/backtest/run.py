@@ -26,10 +26,10 @@ from qfolio.core.notebook import card
 from qfolio.core.registry import BASELINES, own_modules, short
 from qfolio.core.text import amount, near
 from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
-from qfolio.experiments.fit import Row
 from qfolio.experiments.log import Log
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.presets import Preset
+from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest import memory
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.benchmark import field_of, tracked
@@ -398,7 +398,7 @@ class Backtest:
             for f in self.folds
         ]
 
-    def records(self, agent: str, fold: str) -> list[Row]:
+    def records(self, agent: str, fold: str) -> Records:
         """Every training episode of an agent in a fold, all seeds, in order of time."""
         return self._kept.records(agent, fold)
 

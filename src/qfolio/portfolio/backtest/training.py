@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
+import numpy as np
 from jaxtyping import PyTree
 
 from qfolio.core.mdp import Agent
 from qfolio.core.population import Population, Rehearsal
 from qfolio.experiments.budget import Budget
-from qfolio.experiments.fit import Listener, Row, Training, fit
+from qfolio.experiments.fit import Listener, Training, fit
+from qfolio.experiments.records import Records
 from qfolio.portfolio.task import Portfolio
 
 
@@ -24,7 +26,7 @@ class TrainedFold(NamedTuple):
     """
 
     kept: PyTree
-    rows: list[Row]
+    rows: Records
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class FoldsJob:
         if training.interrupted and not training.finished:
             return None
         return {
-            fold: TrainedFold(self._of_fold(population, i), records.rows[i])
+            fold: TrainedFold(self._of_fold(population, i), Records.joined(records.rows[i]))
             for i, fold in enumerate(self.folds)
         }
 
@@ -102,8 +104,9 @@ class _RowsByFold(Listener):
 
     def __init__(self, job: FoldsJob) -> None:
         self.seeds = len(job.seeds)
-        self.rows: list[list[Row]] = [[] for _ in job.folds]
+        self.rows: list[list[Records]] = [[] for _ in job.folds]  # of each chunk
 
-    def on_chunk(self, training: Training, rows: list[Row]) -> None:
-        for member, row in zip(training.members, rows, strict=True):
-            self.rows[member // self.seeds].append(row)
+    def on_chunk(self, training: Training, rows: Records) -> None:
+        fold = np.asarray(training.members, int) // self.seeds
+        for i, mine in enumerate(self.rows):
+            mine.append(rows[fold == i])
