@@ -78,6 +78,8 @@ def test_an_overdraft_is_read_although_shorts_are_not_allowed(tmp_path: Path):
         ("asset,shares\n,1\n", "line 2: the asset has no name"),
         ("asset,shares,shares\nAAA,1,2\n", "'shares' and 'shares' could both be the shares"),
         ("Symbol,Name,Qty\nAAA,Triple,2\n", "'Symbol' and 'Name' could both be the asset"),
+        ("asset,shares\n", "holdings.csv lists no holdings; leave it out if all is cash."),
+        ("asset,shares\n,\n", "holdings.csv lists no holdings"),
         ("AAA,1\n", "needs a first line with the columns asset"),
         ("", "'holdings.csv' is empty; a table has a header and rows below it."),
     ],

@@ -33,8 +33,9 @@ def read_holdings(
             overdraft.
 
     Raises:
-        QfolioError: The file is not such a table, names an unknown asset or one asset twice, a
-            number cannot be read or is negative without debts, or cash is given twice.
+        QfolioError: The file is not such a table or has no rows, names an unknown asset or one
+            asset twice, a number cannot be read or is negative without debts, or cash is given
+            twice.
     """
     if capital is not None and not 0 <= capital < math.inf:
         raise QfolioError(f"--capital is {capital}; it must be a sum of money, at least 0.")
@@ -70,6 +71,8 @@ def read_holdings(
             wanted = "a number" if debts or name == CASH else "0 or more: the backtest is long-only"
             raise QfolioError(f"{where}: {quote(name)} has {amount:g} shares; give {wanted}.")
         held[name] = amount
+    if not held:  # an export may have been cut short
+        raise QfolioError(f"{path} lists no holdings; leave it out if all is cash.")
     cash = held.pop(CASH, capital or 0.0)
     for name, amount in held.items():
         shares[places[name]] = amount
