@@ -1,3 +1,5 @@
+import os
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -5,7 +7,7 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
-from qfolio.core.devices import Members
+from qfolio.core.devices import Members, configure
 from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population, Rehearsal, programs_of
 from qfolio.core.training import advance, begin
@@ -208,9 +210,22 @@ def test_sums_are_left_to_compiled_loops():
     assert "ynn_fusion" not in program
 
 
+def lowered_product() -> str:
+    return jax.jit(lambda x: x @ x).lower(jnp.ones((4, 4))).as_text()
+
+
 def test_products_are_as_precise_on_any_device():
-    program = jax.jit(lambda x: x @ x).lower(jnp.ones((4, 4))).as_text()
-    assert "precision = [HIGHEST, HIGHEST]" in program
+    assert "precision = [HIGHEST, HIGHEST]" in lowered_product()
+
+
+def test_a_precision_that_the_user_chose_is_kept(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"])
+    jax.config.update("jax_default_matmul_precision", "tensorfloat32")
+    try:
+        configure()
+        assert "precision = [HIGH, HIGH]" in lowered_product()
+    finally:
+        jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def test_a_version_of_xla_that_lacks_the_option_compiles_without_it(task, agent, monkeypatch):

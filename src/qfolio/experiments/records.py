@@ -57,9 +57,11 @@ class Records(Sequence[Row]):
     @staticmethod
     def joined(parts: Iterable["Records"]) -> "Records":
         """The rows of all parts, one after another."""
-        columns = [part.columns for part in parts if part]
-        names = columns[0] if columns else ()
-        return Records({name: np.concatenate([each[name] for each in columns]) for name in names})
+        parts = [part for part in parts if part]
+        if len(parts) < 2:
+            return parts[0] if parts else Records()
+        columns = [part.columns for part in parts]
+        return Records({n: np.concatenate([each[n] for each in columns]) for n in columns[0]})
 
     def csv(self, header: bool) -> bytes:
         """The rows as CSV, with a header if asked for."""

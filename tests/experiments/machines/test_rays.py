@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -47,6 +48,29 @@ def test_without_ray(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(QfolioError, match=r'^Ray is not installed; .*pip install "qfolio\[ray\]"'):
         on("ray")
+
+
+SLOW = [ConnectionAbortedError("late"), RuntimeError("Starting Ray client server failed. See x")]
+
+
+@pytest.mark.parametrize(
+    ("errors", "calls", "why"),
+    [
+        (SLOW, 3, None),
+        ([*SLOW, SLOW[0]], 3, "late"),
+        ([RuntimeError("Python versions differ")], 1, "Python versions differ"),
+    ],
+)
+def test_a_head_that_is_slow_is_asked_again(errors, calls, why, monkeypatch):
+    init = Mock(side_effect=[*errors, None])
+    fake = Mock(init=init, is_initialized=lambda: False)
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    if why is None:
+        assert rays._connected("ray://x:1") is fake
+    else:
+        with pytest.raises(QfolioError, match=rf"ray://x:1 cannot be reached \({why}\)"):
+            rays._connected("ray://x:1")
+    assert init.call_count == calls
 
 
 class Nodes:

@@ -170,12 +170,7 @@ def _connected(address: str | None) -> Any:
         ) from None
     if not ray.is_initialized():
         try:
-            try:
-                _connect(ray, address)
-            except ConnectionAbortedError:
-                # The head starts a process for each client, and gives up after 30 seconds, which
-                # a busy machine may need. By then most of it has been loaded.
-                _connect(ray, address)
+            _connect(ray, address)
         except (ConnectionError, ValueError, RuntimeError) as error:
             lines = str(error).strip().splitlines() or [type(error).__name__]
             why = lines[-1] if isinstance(error, ConnectionAbortedError) else lines[0]
@@ -186,10 +181,20 @@ def _connected(address: str | None) -> Any:
     return ray
 
 
-def _connect(ray: Any, address: str | None) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # real problems raise an exception
-        ray.init(address, logging_level=logging.ERROR, log_to_driver=False)
+def _connect(ray: Any, address: str | None, more: int = 2) -> None:
+    """more: how often to try again if the head is too slow to start a process for this client.
+
+    It gives up after 30 seconds, which a busy machine may need, and may then fail to start another.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # real problems raise an exception
+            ray.init(address, logging_level=logging.ERROR, log_to_driver=False)
+    except (ConnectionAbortedError, RuntimeError) as error:
+        failed = isinstance(error, ConnectionAbortedError) or "client server failed" in str(error)
+        if not more or not failed:
+            raise
+        _connect(ray, address, more - 1)
 
 
 def _cores(count: int) -> str:
