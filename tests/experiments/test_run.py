@@ -271,7 +271,7 @@ def test_a_learning_curve_that_was_damaged(task, agent, tmp_path, damage):
 def test_damaged_tables_are_refused_or_skipped(task, agent, tmp_path, text):
     create(task, agent, tmp_path / "run")
     (tmp_path / "run" / "metrics.csv").write_text(text)
-    damaged = "9\n" in text or "_" in text
+    damaged = "9" * 1000 in text or "_" in text
     with pytest.raises(QfolioError, match="metrics") if damaged else contextlib.nullcontext():
         assert Run.open(tmp_path / "run").metrics == []
 

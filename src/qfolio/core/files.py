@@ -24,7 +24,7 @@ from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.text import csv_cell
 
 _JSON = msgspec.json.Encoder()
-_NUMBERS, _LARGE = (float, int), 2.0**63
+_NUMBERS, _LARGE = (float, int), 2.0**63  # msgspec takes no larger integers
 _SPECIAL = re.compile('[,"\r\n]')
 
 UNFINISHED = ".part"

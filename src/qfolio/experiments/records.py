@@ -2,11 +2,13 @@
 
 import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from qfolio.core.errors import QfolioError
 from qfolio.core.files import csv_lines
 
 Row = dict[str, float]
@@ -31,17 +33,22 @@ class Records(Sequence[Row]):
         return Records({name: np.array([row[name] for row in rows]) for name in names})
 
     @staticmethod
-    def read(lines: Sequence[str], *, cut: bool = False) -> "Records":
-        """The records of a table that ``csv`` wrote.
+    def read(path: Path, *, cut: bool = False) -> "Records":
+        """The records in a file that holds what ``csv`` wrote; none if there is no file.
 
-        Args:
-            lines: The header, then the rows.
-            cut: Whether rows may be damaged, as the last one is after a crash; they are skipped.
-
-        Raises:
-            ValueError, csv.Error: The table is damaged.
+        cut: whether rows may be damaged, as the last one is after a crash; they are skipped. Raises
+        QfolioError if the file is damaged otherwise.
         """
-        names = next(csv.reader(lines[:1]), [])
+        if not path.exists():
+            return Records()
+        try:
+            return Records._parsed(path.read_text(errors="replace").splitlines(), cut)
+        except (csv.Error, ValueError) as error:
+            raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
+
+    @staticmethod
+    def _parsed(lines: Sequence[str], cut: bool) -> "Records":
+        names, *_ = [*csv.reader(lines[:2]), []]
         rows = [row for row in lines[1:] if not cut or _is_whole(row, len(names))]
         if not rows:
             return Records()

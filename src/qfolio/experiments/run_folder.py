@@ -6,7 +6,6 @@ summary.json. The checkpoint is authoritative: rows ahead of it are dropped when
 and then recomputed bit for bit.
 """
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,7 +13,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from qfolio.core.config import Config, read_config, write_config
-from qfolio.core.errors import QfolioError
 from qfolio.core.files import UNFINISHED, read_tree, write_bytes, write_json, write_tree
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.records import Records, Row
@@ -92,13 +90,7 @@ class RunFolder:
 
         episodes: number of episodes at the checkpoint, by seed. steps: of each seed's environments.
         """
-        path = self.path / name
-        if not path.exists():
-            return Records()
-        try:
-            records = Records.read(path.read_text(errors="replace").splitlines(), cut=True)
-        except (csv.Error, ValueError) as error:
-            raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
+        records = Records.read(self.path / name, cut=True)
         if not {"seed", "episode"} <= records.columns.keys():
             return Records()
         most = np.array([episodes.get(seed, -1) for seed in records.column("seed").tolist()])

@@ -1,7 +1,6 @@
 """Seeds of one agent on one task, side by side in this process: training, records, checkpoints."""
 
 import contextlib
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -142,9 +141,9 @@ class Seeds:
         self.population.restore(trained.state["training"])
         self.population.seconds_compile += trained.seconds_compile
         self.seconds_train += float(trained.state["seconds_train"])
-        new = (row for row in trained.evaluations if not before or row["env_steps"] > before)
+        points = trained.evaluations
         self._record_episodes(trained.metrics)
-        self._record_point(Records.of(new))
+        self._record_point(points[points.column("env_steps") > before] if before else points)
         self._write_checkpoint()
 
     def evaluate(self) -> None:
@@ -193,9 +192,10 @@ class Seeds:
         episodes, steps = dict(members), self.done("steps")
         self._metrics = [self._folder.rows(METRICS, episodes, steps)]
         points = self._folder.rows(EVALUATION, episodes, steps)
-        rows_at = Counter(row["env_steps"] for row in points)
-        whole = (row for row in points if rows_at[row["env_steps"]] == self.config.seeds)
-        self.evaluations = Records.of(whole)
+        _, at, counts = np.unique(
+            points.column("env_steps"), return_inverse=True, return_counts=True
+        )
+        self.evaluations = points[counts[at] == self.config.seeds]  # whole points
 
 
 class _Metrics(Listener):

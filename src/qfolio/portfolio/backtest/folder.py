@@ -265,13 +265,7 @@ class BacktestFolder:
 
     def read_records(self, agent: str, fold: str) -> Records:
         """The training episodes of a fold; none if their table is missing."""
-        path = self._records(agent, fold)
-        if not path.exists():
-            return Records()
-        try:
-            return Records.read(path.read_text(errors="replace").splitlines())
-        except (csv.Error, ValueError) as error:
-            raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
+        return Records.read(self._records(agent, fold))
 
     def write_returns(self, days: Sequence[str], columns: dict[str, np.ndarray]) -> None:
         """Writes returns.csv, with a column per strategy and seed."""
