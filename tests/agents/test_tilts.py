@@ -8,18 +8,14 @@ import numpy as np
 import pytest
 
 from qfolio.agents import paths, tilts
-from qfolio.agents.tilts import (
-    Tilt,
-    TiltPolicy,
-    Tilts,
-    tilted,
-)
+from qfolio.agents.tilts import Deep, Tilt, TiltPolicy, Tilts, tilted
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import View
 from qfolio.core.mdp import Simplex
 from qfolio.core.population import Population, programs_of
 from qfolio.learning.evidence import Evidence, left_out
+from qfolio.learning.scores import Hidden
 from qfolio.learning.trading import Trading
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -44,13 +40,13 @@ def prices(values):
     return Prices(dates, tuple(f"a{i}" for i in range(values.shape[1])), values)
 
 
-def tilt(linear, interaction=None, rate=0.0, band=-20.0, cap=1.0, network=None):
+def tilt(linear, interaction=None, rate=0.0, band=-20.0, cap=1.0):
     count = len(linear)
     square = np.zeros((count, count)) if interaction is None else interaction
     trading = Trading(jnp.asarray(rate, float), jnp.asarray(band, float))
-    trading, network = jax.tree.map(lambda x: x[None], (trading, network))
-    one = Tilt(jnp.asarray([linear], float), jnp.asarray([square], float), network, trading)
-    return TiltPolicy(one, jnp.array(1.0), Simplex(3, cap))
+    trading = jax.tree.map(lambda x: x[None], trading)
+    one = Tilt(jnp.asarray([linear], float), jnp.asarray([square], float), None, trading)
+    return TiltPolicy(one, jnp.array(1.0), None, Simplex(3, cap))
 
 
 def view(held, features=((0.0,), (0.0,), (0.0,)), anchor=(0.25, 0.25, 0.5)):
@@ -140,8 +136,8 @@ def test_no_evidence_of_nothing():
     assert Evidence.none(8).t == 0
 
 
-def trained(*tables, rounds=40, **settings):
-    tasks = [Portfolio.of(prices(values), **TASK) for values in tables]
+def trained(*tables, rounds=40, signals=TASK["signals"], **settings):
+    tasks = [Portfolio.of(prices(values), **{**TASK, "signals": signals}) for values in tables]
     population = Population(tasks, Tilts(**SMALL, **settings), list(range(len(tables))))
     while population.steps < rounds * SMALL["rollout_length"]:
         population.advance(SMALL["rollout_length"] * rounds - population.steps)
@@ -152,21 +148,27 @@ def walk(rows, assets, seed, drift=0.0):
     return np.exp(np.cumsum(np.random.default_rng(seed).normal(0, 0.01, (rows, assets)) + drift, 0))
 
 
-def test_stays_at_the_anchor_where_prices_hold_nothing():
-    states = trained(*(walk(1500, 8, seed) for seed in range(3)))
+@pytest.mark.parametrize("network", ["linear", "hidden"])
+def test_stays_at_the_anchor_where_prices_hold_nothing(network):
+    states = trained(*(walk(1500, 8, seed) for seed in range(3)), network=network)
     assert states.evidence.steps.min() > 0
-    assert (states.policy.share == 0).sum() >= 2
+    at_anchor = states.policy.share == 0
+    if states.policy.depth is not None:
+        assert states.evidence_of_depth.steps.min() > 0
+        at_anchor &= states.policy.depth == 0
+    assert at_anchor.sum() >= 2
 
 
-def test_many_assets_learn_as_few_do(monkeypatch):
+@pytest.mark.parametrize("network", ["linear", "hidden"])
+def test_many_assets_learn_as_few_do(monkeypatch, network):
     """A step at a time and a path at a time, as with many assets, or all of them at once."""
     table = walk(300, 3, seed=3)
-    found = [trained(table, rounds=2).policy]
+    found = [trained(table, rounds=2, network=network).policy]
     for module in (paths, tilts):
         monkeypatch.setattr(module, "AT_ONCE", 0)
     monkeypatch.setattr(paths, "BLOCK", 1)
     programs_of.cache_clear()
-    found.append(trained(table, rounds=2).policy)
+    found.append(trained(table, rounds=2, network=network).policy)
     programs_of.cache_clear()
     for one, other in zip(*map(jax.tree.leaves, found), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
@@ -179,6 +181,50 @@ def test_finds_momentum():
     state = jax.tree.map(lambda x: x[0], trained(walk(1500, 8, 2, drift)))
     assert state.evidence.t > 4
     assert state.policy.members.linear[:, 0].min() > 0.1
+
+
+def hump(seed, size):
+    """Prices whose assets of middling volatility rise, and the others fall; volatilities change."""
+    rng, assets, rows = np.random.default_rng(seed), 8, 75
+    ranks = np.stack([np.linspace(-1, 1, assets)[rng.permutation(assets)] for _ in range(20)])
+    noise = 0.01 * np.exp(0.7 * ranks).repeat(rows, 0) * rng.normal(size=(20 * rows, assets))
+    return np.exp(np.cumsum(size * (1 - 2 * np.abs(ranks)).repeat(rows, 0) + noise, 0))
+
+
+@pytest.mark.parametrize("network", ["hidden", "attention"])
+def test_a_network_finds_what_linear_scores_cannot(network):
+    tables = [hump(seed, 0.004) for seed in range(3)]
+    states = trained(*tables, signals="volatility:21", network=network)
+    assert states.policy.depth.min() > 0.5
+    ranks = jnp.array([-1.5, -0.2, 0.2, 1.5])  # in standard deviations
+    seen = jnp.zeros((4, 1, 2)).at[:, 0, 1].set(ranks)
+    for seed in range(3):
+        members = jax.tree.map(lambda x, seed=seed: x[seed], states.policy.members)
+        scores = members.deep.scores(seen).mean(0)
+        assert scores[1:3].min() > scores[jnp.array([0, 3])].max()
+
+
+def test_a_network_changes_nothing_in_what_is_learned_without_it():
+    tables = [walk(1500, 8, seed) for seed in range(3)]
+    deep, linear = (trained(*tables, network=name) for name in ("hidden", "linear"))
+    np.testing.assert_allclose(deep.evidence.total, linear.evidence.total, rtol=1e-2, atol=1e-5)
+    for name in ("linear", "interaction"):
+        one, other = (getattr(state.policy.members, name) for state in (deep, linear))
+        np.testing.assert_allclose(one, other, rtol=1e-2, atol=1e-3)
+
+
+def test_a_network_without_evidence_is_not_followed():
+    linear = tilt([1.0], rate=0.5)
+    network = jax.tree.map(lambda x: x[None] + 1.0, Hidden(1, 4, jax.random.key(0)))
+    fast = jax.tree.map(lambda x: x[None], Trading.start(0.9))
+    one = Tilt(linear.members.linear, linear.members.interaction, Deep(network, fast),
+               linear.members.trading)  # fmt: skip
+    seen = view([0.2, 0.3, 0.5], [[0.3], [0.0], [-0.3]])
+    without = TiltPolicy(one, linear.share, jnp.array(0.0), linear.actions)
+    np.testing.assert_array_equal(without(seen), linear(seen))
+    whole = TiltPolicy(one, linear.share, jnp.array(1.0), linear.actions)
+    np.testing.assert_allclose(whole.trading.described["rate"], 0.9, rtol=1e-5)
+    assert np.abs(whole.target(seen) - linear.target(seen)).max() > 1e-2
 
 
 def test_needs_an_anchor():

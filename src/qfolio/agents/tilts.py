@@ -7,11 +7,10 @@ net utility through whole paths, as in ``pathwise.py``.
 
 Several members learn side by side, each without some blocks of the data. What a member earns over
 the anchor in the blocks that it has not seen is the evidence: the policy, the mean of the members,
-is shrunk to the anchor by it, after James & Stein (1961), and stays there without it.
+is shrunk to the anchor by it, after James & Stein (1961), and stays there without it. A network
+learns on top of this policy and is followed as far as there is evidence that it earns more.
 docs/algorithms/tilts.md lists formulas and their sources.
 """
-
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from qfolio.agents.paths import AT_ONCE, Onlooker
+from qfolio.agents.paths import AT_ONCE, Onlooker, Rewards
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, require_counts, static
@@ -34,36 +33,58 @@ LARGEST = 3.0
 """Inputs are clipped to ± this many standard deviations of the training data."""
 
 
-class Tilt(eqx.Module):
-    """What the members learn: scores of assets, and how to trade.
+FEW_ASSETS = 64
+"""Most assets with which a network learns from every second path instead of every fourth, to save
+time: a path says more with more assets."""
 
-    Every array has a leading member axis.
 
-    The scores are s = x·(θ + Θc) with an asset's inputs x, the latest of its features but the first
-    (its return), and their mean over the assets c, the state of the market: features that rank
-    assets have mean 0 and do not enter it.
-    """
+def inputs_of(
+    features: Float[Array, "*batch asset time channel"],
+) -> Float[Array, "*batch asset input"]:
+    """An asset's inputs: the latest of its features but the first, its return."""
+    return jnp.clip(features[..., -1, 1:], -LARGEST, LARGEST)
 
-    linear: Float[Array, "member channel"]  # θ
-    interaction: Float[Array, "member channel channel"]  # Θ
-    network: Hidden | Attention | None  # added to the linear scores
+
+class Deep(eqx.Module):
+    """What the members learn on top of their linear scores; arrays have a leading member axis."""
+
+    network: Hidden | Attention
     trading: Trading
 
     def scores(
         self, features: Float[Array, "*batch asset time channel"]
     ) -> Float[Array, "member *batch asset"]:
-        inputs = jnp.clip(features[..., -1, 1:], -LARGEST, LARGEST)
+        return jax.vmap(lambda network: network(inputs_of(features)))(self.network)
+
+
+class Tilt(eqx.Module):
+    """What the members learn: scores of assets, and how to trade.
+
+    Every array has a leading member axis.
+
+    The linear scores are s = x·(θ + Θc) with an asset's inputs x and their mean over the assets c,
+    the state of the market: features that rank assets have mean 0 and do not enter it.
+    """
+
+    linear: Float[Array, "member channel"]  # θ
+    interaction: Float[Array, "member channel channel"]  # Θ
+    deep: Deep | None
+    trading: Trading
+
+    def scores(
+        self, features: Float[Array, "*batch asset time channel"]
+    ) -> Float[Array, "member *batch asset"]:
+        """The linear scores."""
+        inputs = inputs_of(features)
         # Products for all members at once take half the time of a vmap, which transposes weights.
         context = jnp.einsum("...d,mcd->...mc", inputs.mean(-2), self.interaction)
-        found = jnp.einsum("...ac,...mc->m...a", inputs, self.linear + context)
-        if self.network is None:
-            return found
-        return found + jax.vmap(lambda network: network(inputs))(self.network)
+        return jnp.einsum("...ac,...mc->m...a", inputs, self.linear + context)
 
     @property
     def squares(self) -> Float[Array, ""]:
         """The sum of squared coefficients."""
-        leaves = jax.tree.leaves((self.linear, self.interaction, self.network))
+        output = None if self.deep is None else self.deep.network.output
+        leaves = jax.tree.leaves((self.linear, self.interaction, output))
         return sum((jnp.sum(leaf**2) for leaf in leaves), jnp.array(0.0))
 
 
@@ -71,7 +92,8 @@ class TiltPolicy(eqx.Module):
     """Maps a view of the market to an order, by the mean scores of the members."""
 
     members: Tilt
-    share: Float[Array, ""]  # of the scores that the evidence leaves
+    share: Float[Array, ""]  # of the linear scores that the evidence leaves
+    depth: Float[Array, ""] | None  # share of what the network adds that its evidence leaves
     actions: Simplex | Box
 
     def __call__(self, view: View) -> Float[Array, "*batch entry"]:
@@ -81,12 +103,19 @@ class TiltPolicy(eqx.Module):
 
     def target(self, view: View) -> Float[Array, "*batch entry"]:
         assert view.anchor is not None
-        scores = self.members.scores(view.features).mean(0)
-        return tilted(view.anchor, self.share * scores, self.actions)
+        scores = self.share * self.members.scores(view.features).mean(0)
+        if self.members.deep is not None and self.depth is not None:
+            scores += self.depth * self.members.deep.scores(view.features).mean(0)
+        return tilted(view.anchor, scores, self.actions)
 
     @property
     def trading(self) -> Trading:
-        return jax.tree.map(lambda x: x.mean(0), self.members.trading)
+        """That of the linear policy, or as far as the network is followed, that of the network."""
+        linear = jax.tree.map(lambda x: x.mean(0), self.members.trading)
+        if self.members.deep is None:
+            return linear
+        deep = jax.tree.map(lambda x: x.mean(0), self.members.deep.trading)
+        return jax.tree.map(lambda one, other: one + self.depth * (other - one), linear, deep)
 
 
 def tilted(
@@ -143,12 +172,15 @@ class TiltsState(eqx.Module):
     policy: TiltPolicy
     optimizer: optimizer.Optimizer
     evidence: Evidence
+    evidence_of_depth: Evidence | None  # that a network earns more than the linear policy
 
 
 class Tilts(Onlooker):
     """Gradient ascent on net utility, with a penalty on tracking error and on tilts."""
 
-    network: str = static("linear")  # linear scores, or hidden or attention beside them
+    network: str = static(
+        "hidden"
+    )  # on top of linear scores: hidden, attention, or linear for none
     units: int = static(8)  # units of such a network
     members: int = static(4)  # members; each leaves out some blocks of the data
     blocks: int = static(32)  # equal blocks that the data are cut into
@@ -191,19 +223,23 @@ class Tilts(Onlooker):
         self._require_whole(task)
         channels = view.features.shape[-1] - 1
 
-        kind, network = NETWORKS.get(self.network), None
-        if kind is not None:
-            make = lambda key: kind(channels, self.units, key)  # noqa: E731
-            network = jax.vmap(make)(jax.random.split(key, self.members))
         linear = jnp.zeros((self.members, channels))
         square = jnp.zeros((self.members, channels, channels))
         trading = jax.tree.map(lambda x: jnp.full(self.members, x), Trading.start(0.3))
-        members = Tilt(linear, square, network, trading)
-        policy = TiltPolicy(members, jnp.array(0.0), actions)
-        return TiltsState(policy, optimizer.begin(members), Evidence.none(self.blocks))
+        deep, depth, evidence = None, None, Evidence.none(self.blocks)
+        if self.network in NETWORKS:
+            make = lambda key: NETWORKS[self.network](channels, self.units, key)  # noqa: E731
+            networks = jax.vmap(make)(jax.random.split(key, self.members))
+            deep, depth = Deep(networks, trading), jnp.array(0.0)
+        members = Tilt(linear, square, deep, trading)
+        policy = TiltPolicy(members, jnp.array(0.0), depth, actions)
+        of_depth = None if deep is None else evidence
+        return TiltsState(policy, optimizer.begin(members), evidence, of_depth)
 
     def monitor(self, state: TiltsState) -> Metrics:
         found = {"evidence": state.evidence.t, "share": state.policy.share}
+        if state.evidence_of_depth is not None and state.policy.depth is not None:
+            found |= {"evidence_of_depth": state.evidence_of_depth.t, "depth": state.policy.depth}
         return found | state.policy.trading.described
 
     def weights(self, state: TiltsState) -> TiltPolicy:
@@ -219,28 +255,47 @@ class Tilts(Onlooker):
         block = blocks_of(task, rollout, self.blocks)
         counted = jnp.arange(self.rollout_length)[:, None] >= self.head
         left = left_out(block, self.members)
+        seen, unseen = counted & ~left, counted & left
+        stride = 2 if rollout.observation.holding.shape[-1] <= FEW_ASSETS else 4
+        some = lambda x: x[:, ::stride]  # noqa: E731
 
-        def loss(members: Tilt) -> tuple[Array, tuple[Array, Array]]:
-            follow = jax.vmap(partial(self._paths, task, rollout))
-            rewards, anchored = follow(members.trading, self._scores(members, task, rollout))
-            active = rewards - anchored
-            seen = counted & ~left
+        def utility(rewards: Array, active: Array, seen: Array) -> Float[Array, " member"]:
             steps = jnp.maximum(seen.sum((1, 2)), 1)
             mean = lambda x: (seen * x).sum((1, 2)) / steps  # noqa: E731
             variance = mean(active**2) - mean(active) ** 2
-            utility = mean(rewards) - self.tracking_aversion / 2 * variance
-            penalty = self.ridge / task.moves * members.squares
-            return penalty - utility.sum(), (utility.mean(), active)
+            return mean(rewards) - self.tracking_aversion / 2 * variance
 
-        gradient, (utility, active) = jax.grad(loss, has_aux=True)(state.policy.members)
+        def loss(members: Tilt) -> tuple[Array, tuple[Array, list[Array]]]:
+            scores = self._scores(members, task, rollout)
+            trades = members.trading, lax.stop_gradient(members.trading)
+            rewards, anchored = self._paths(task, rollout, trades, (scores, None))
+            active = [rewards - anchored]
+            total = utility(rewards, active[0], seen)
+            if members.deep is not None:
+                # On top of the policy as far as it is followed, and from some of the paths.
+                fewer, anchored = jax.tree.map(some, rollout), jax.vmap(some)(anchored)
+                base = lax.stop_gradient(state.policy.share * jax.vmap(some)(scores))
+                higher = base + self._scores(members.deep, task, fewer)
+                trades = members.deep.trading, trades[1]
+                rewards, without = self._paths(task, fewer, trades, (higher, base))
+                active.append(rewards - without)
+                total += utility(rewards, rewards - anchored, jax.vmap(some)(seen))
+            penalty = self.ridge / task.moves * members.squares
+            return penalty - total.sum(), (total.mean(), active)
+
+        gradient, (gained, active) = jax.grad(loss, has_aux=True)(state.policy.members)
         rate = self._schedule(state.optimizer.count + 1)
         members, adam = optimizer.descend(state.policy.members, gradient, state.optimizer, rate)
-        evidence = state.evidence.add(block, active, counted & left, self.memory)
-        policy = TiltPolicy(members, evidence.share(self.threshold), state.policy.actions)
-        return TiltsState(policy, adam, evidence), {"loss": -utility}
+        evidence = state.evidence.add(block, active[0], unseen, self.memory)
+        share, depth, of_depth = evidence.share(self.threshold), None, state.evidence_of_depth
+        if of_depth is not None:
+            of_depth = of_depth.add(some(block), active[1], jax.vmap(some)(unseen), self.memory)
+            depth = of_depth.share(self.threshold)
+        policy = TiltPolicy(members, share, depth, state.policy.actions)
+        return TiltsState(policy, adam, evidence, of_depth), {"loss": -gained}
 
     def _scores(
-        self, members: Tilt, task: ExogenousTask, rollout: Transition
+        self, members: Tilt | Deep, task: ExogenousTask, rollout: Transition
     ) -> Float[Array, "member time path asset"]:
         """Scores at each step of a rollout."""
         features = rollout.observation.features
@@ -256,20 +311,23 @@ class Tilts(Onlooker):
         self,
         task: ExogenousTask,
         rollout: Transition,
-        trading: Trading,
-        scores: Float[Array, "time path asset"],
-    ) -> tuple[Float[Array, "time path"], Float[Array, "time path"]]:
-        """Rewards of a member along the rollout's market, and of the anchor.
+        trades: tuple[Trading, ...],
+        scores: tuple[Float[Array, "member time path asset"] | None, ...],
+    ) -> tuple[Float[Array, "member time path"], ...]:
+        """Rewards of the members along the rollout's market, by scores; None follows the anchor.
 
-        Both begin at their own targets. The anchor is followed at the member's rate and band.
+        Each begins at its own targets.
         """
         actions = task.actions
         assert not isinstance(actions, Discrete)
 
-        def targets(view: View, scores: Array) -> tuple[Array, Array]:
-            assert view.anchor is not None
-            return tilted(view.anchor, scores, actions), simplex.with_rest(view.anchor)
+        def targets(view: View, scores: tuple[Array | None, ...]) -> tuple[Array, ...]:
+            anchor = view.anchor
+            assert anchor is not None
+            whole = simplex.with_rest(anchor)
+            return tuple(whole if x is None else tilted(anchor, x, actions) for x in scores)
 
-        trades = trading, lax.stop_gradient(trading)
-        (rewards, anchored), _ = self._followed(task, rollout, trades, targets, scores)
-        return rewards, anchored
+        def follow(trades: tuple[Trading, ...], scores: tuple[Array | None, ...]) -> Rewards:
+            return self._followed(task, rollout, trades, targets, scores)[0]
+
+        return jax.vmap(follow)(trades, scores)

@@ -31,6 +31,9 @@ _ON_LOW_RISK = {
 }
 
 
+_LOW_RISK = {"network": "linear", "tracking_aversion": 0.0}
+
+
 _ON_MENU = {
     "window": 1,
     "horizon": 64,
@@ -163,7 +166,7 @@ PRESETS: Presets = {
     ("portfolio", "pathwise"): _fast("pathwise", _PATHWISE, 800, _TASK),
     ("portfolio", "tilts"): {
         **_fast("tilts", {}, 1920, _ON_ANCHOR),
-        "low-risk": Preset("tilts", {"tracking_aversion": 0.0}, 1920, seeds=5, task=_ON_LOW_RISK),
+        "low-risk": Preset("tilts", _LOW_RISK, 1920, seeds=5, task=_ON_LOW_RISK),
     },
     ("portfolio", "mean-variance-learned"): _fast("mean-variance-learned", {}, 640, _ON_COVARIANCE),
     ("portfolio", "minimum-variance-learned"): _fast(
