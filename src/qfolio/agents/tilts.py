@@ -111,11 +111,12 @@ class TiltPolicy(eqx.Module):
     @property
     def trading(self) -> Trading:
         """That of the linear policy, or as far as the network is followed, that of the network."""
-        linear = jax.tree.map(lambda x: x.mean(0), self.members.trading)
+        mean = lambda trading: jax.tree.map(lambda x: x.mean(0), trading)  # noqa: E731
+        linear = mean(self.members.trading)
         if self.members.deep is None:
             return linear
-        deep = jax.tree.map(lambda x: x.mean(0), self.members.deep.trading)
-        return jax.tree.map(lambda one, other: one + self.depth * (other - one), linear, deep)
+        between = lambda one, other: one + self.depth * (other - one)  # noqa: E731
+        return jax.tree.map(between, linear, mean(self.members.deep.trading))
 
 
 def tilted(
@@ -172,15 +173,13 @@ class TiltsState(eqx.Module):
     policy: TiltPolicy
     optimizer: optimizer.Optimizer
     evidence: Evidence
-    evidence_of_depth: Evidence | None  # that a network earns more than the linear policy
+    evidence_of_depth: Evidence | None  # that the network earns more than the linear policy
 
 
 class Tilts(Onlooker):
     """Gradient ascent on net utility, with a penalty on tracking error and on tilts."""
 
-    network: str = static(
-        "hidden"
-    )  # on top of linear scores: hidden, attention, or linear for none
+    network: str = static("hidden")  # on top of linear scores: hidden or attention; linear: none
     units: int = static(8)  # units of such a network
     members: int = static(4)  # members; each leaves out some blocks of the data
     blocks: int = static(32)  # equal blocks that the data are cut into
@@ -257,7 +256,7 @@ class Tilts(Onlooker):
         left = left_out(block, self.members)
         seen, unseen = counted & ~left, counted & left
         stride = 2 if rollout.observation.holding.shape[-1] <= FEW_ASSETS else 4
-        some = lambda x: x[:, ::stride]  # noqa: E731
+        some = lambda x: x[:, ::stride]  # noqa: E731 (of the paths)
 
         def utility(rewards: Array, active: Array, seen: Array) -> Float[Array, " member"]:
             steps = jnp.maximum(seen.sum((1, 2)), 1)
