@@ -46,7 +46,7 @@ def tilt(linear, interaction=None, rate=0.0, band=-20.0, cap=1.0):
     trading = Trading(jnp.asarray(rate, float), jnp.asarray(band, float))
     trading = jax.tree.map(lambda x: x[None], trading)
     one = Tilt(jnp.asarray([linear], float), jnp.asarray([square], float), None, trading)
-    return TiltPolicy(one, jnp.array(1.0), None, Simplex(3, cap))
+    return TiltPolicy(one, jnp.array(1.0), jnp.array(0.0), Simplex(3, cap))
 
 
 def view(held, features=((0.0,), (0.0,), (0.0,)), anchor=(0.25, 0.25, 0.5)):
@@ -153,7 +153,7 @@ def test_stays_at_the_anchor_where_prices_hold_nothing(network):
     states = trained(*(walk(1500, 8, seed) for seed in range(3)), network=network)
     assert states.evidence.steps.min() > 0
     at_anchor = states.policy.share == 0
-    if states.policy.depth is not None:
+    if states.policy.members.deep is not None:
         assert states.evidence_of_depth.steps.min() > 0
         at_anchor &= states.policy.depth == 0
     assert at_anchor.sum() >= 2

@@ -93,7 +93,7 @@ class TiltPolicy(eqx.Module):
 
     members: Tilt
     share: Float[Array, ""]  # of the linear scores that the evidence leaves
-    depth: Float[Array, ""] | None  # share of what the network adds that its evidence leaves
+    depth: Float[Array, ""]  # share of what a network adds that its evidence leaves
     actions: Simplex | Box
 
     def __call__(self, view: View) -> Float[Array, "*batch entry"]:
@@ -104,7 +104,7 @@ class TiltPolicy(eqx.Module):
     def target(self, view: View) -> Float[Array, "*batch entry"]:
         assert view.anchor is not None
         scores = self.share * self.members.scores(view.features).mean(0)
-        if self.members.deep is not None and self.depth is not None:
+        if self.members.deep is not None:
             scores += self.depth * self.members.deep.scores(view.features).mean(0)
         return tilted(view.anchor, scores, self.actions)
 
@@ -173,7 +173,7 @@ class TiltsState(eqx.Module):
     policy: TiltPolicy
     optimizer: optimizer.Optimizer
     evidence: Evidence
-    evidence_of_depth: Evidence | None  # that the network earns more than the linear policy
+    evidence_of_depth: Evidence  # that a network earns more than the linear policy
 
 
 class Tilts(Onlooker):
@@ -225,19 +225,18 @@ class Tilts(Onlooker):
         linear = jnp.zeros((self.members, channels))
         square = jnp.zeros((self.members, channels, channels))
         trading = jax.tree.map(lambda x: jnp.full(self.members, x), Trading.start(0.3))
-        deep, depth, evidence = None, None, Evidence.none(self.blocks)
+        nothing, deep, evidence = jnp.array(0.0), None, Evidence.none(self.blocks)
         if self.network in NETWORKS:
             make = lambda key: NETWORKS[self.network](channels, self.units, key)  # noqa: E731
             networks = jax.vmap(make)(jax.random.split(key, self.members))
-            deep, depth = Deep(networks, trading), jnp.array(0.0)
+            deep = Deep(networks, trading)
         members = Tilt(linear, square, deep, trading)
-        policy = TiltPolicy(members, jnp.array(0.0), depth, actions)
-        of_depth = None if deep is None else evidence
-        return TiltsState(policy, optimizer.begin(members), evidence, of_depth)
+        policy = TiltPolicy(members, nothing, nothing, actions)
+        return TiltsState(policy, optimizer.begin(members), evidence, evidence)
 
     def monitor(self, state: TiltsState) -> Metrics:
         found = {"evidence": state.evidence.t, "share": state.policy.share}
-        if state.evidence_of_depth is not None and state.policy.depth is not None:
+        if state.policy.members.deep is not None:
             found |= {"evidence_of_depth": state.evidence_of_depth.t, "depth": state.policy.depth}
         return found | state.policy.trading.described
 
@@ -286,11 +285,11 @@ class Tilts(Onlooker):
         rate = self._schedule(state.optimizer.count + 1)
         members, adam = optimizer.descend(state.policy.members, gradient, state.optimizer, rate)
         evidence = state.evidence.add(block, active[0], unseen, self.memory)
-        share, depth, of_depth = evidence.share(self.threshold), None, state.evidence_of_depth
-        if of_depth is not None:
+        of_depth = state.evidence_of_depth
+        if members.deep is not None:
             of_depth = of_depth.add(some(block), active[1], jax.vmap(some)(unseen), self.memory)
-            depth = of_depth.share(self.threshold)
-        policy = TiltPolicy(members, share, depth, state.policy.actions)
+        shares = evidence.share(self.threshold), of_depth.share(self.threshold)
+        policy = TiltPolicy(members, *shares, state.policy.actions)
         return TiltsState(policy, adam, evidence, of_depth), {"loss": -gained}
 
     def _scores(

@@ -127,6 +127,38 @@ def test_runs_are_compared(board: Board, browser: Browser, tmp_path: Path) -> No
     assert "second" in names
 
 
+def test_agents_of_a_backtest_have_charts_of_their_own(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    folder = tmp_path / "runs" / "us20"
+    folder.mkdir(parents=True)
+    records = [("tilts/2001", 100_000, 0.001), ("tilts/2002", 90_000, 0.002), ("dqn/2001", 900, 9)]
+    events = [
+        {"event": "start", "time": 1, "kind": "backtest", "agents": ["tilts", "dqn"]},
+        *(
+            {"event": "record", "time": 1, "job": job, "step": step, "values": {"loss": [loss]}}
+            for job, last, loss in records
+            for step in (last / 2, last)
+        ),
+    ]
+    (folder / EVENTS).write_text("".join(json.dumps(event) + "\n" for event in events))
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length === 3")
+    charts = "[...document.querySelectorAll('#charts .chart')]"
+    titles = browser.evaluate(
+        f"{charts}.map((chart) => chart.querySelector('h3').innerText.trim())"
+    )
+    assert [title.split("\n")[0] for title in titles] == ["Loss · tilts", "Loss · dqn"]
+    lines = browser.evaluate(f"{charts}.map((chart) => chart.querySelectorAll('.line').length)")
+    assert lines == [2, 1]
+    # The last step of each agent is at the right edge of its own chart.
+    right = "getBoundingClientRect().right"
+    ends = browser.evaluate(
+        f"{charts}.map((chart) => chart.querySelector('svg').{right} - "
+        f"Math.max(...[...chart.querySelectorAll('.line')].map((line) => line.{right})))"
+    )
+    assert all(0 <= end < 10 for end in ends)
+
+
 EVIL = """<!doctype html><script>
 const target = "%s";
 const tries = {

@@ -157,11 +157,9 @@ function choose(keys) {
 
 // What is chosen ------------------------------------------------------------------------------
 
-function groupOf(run, job) {
+function agentOf(run, job) { // of runs in which an agent has many jobs
   const parts = job.name.split("/");
-  if (run.kind === "backtest") return parts[0];
-  if (run.kind === "study") return parts[parts.length - 2];
-  return job.name;
+  return run.kind === "backtest" ? parts[0] : run.kind === "study" ? parts.at(-2) : null;
 }
 
 function groups() {
@@ -171,13 +169,13 @@ function groups() {
     if (!run || !detail) continue;
     const byName = new Map();
     for (const job of detail.jobs.values()) {
-      const name = groupOf(run, job);
+      const name = agentOf(run, job) ?? job.name;
       if (!byName.has(name)) byName.set(name, []);
       byName.get(name).push(job);
     }
     for (const [name, jobs] of byName) {
       const labels = [chosen.length > 1 ? run.name : "", name || (chosen.length > 1 ? "" : run.agents.map(tail).join(", "))];
-      found.push({ run, name, jobs, label: labels.filter(Boolean).join(" · ") });
+      found.push({ run, name, jobs, agent: agentOf(run, jobs[0]) ?? "", label: labels.filter(Boolean).join(" · ") });
     }
   }
   found.forEach((group, i) => {
@@ -328,31 +326,38 @@ function table(body, rows, kind) {
 
 const LEFT = 46, RIGHT = 6, TOP = 12, BOTTOM = 22, HEIGHT = 208;
 
-function charts(found) {
-  const metrics = new Set(found.flatMap((group) => group.jobs.flatMap((job) => Object.keys(job.curves))));
+function charts(found) { // agents of a backtest differ in losses and steps: each has its own charts
+  const agents = [...new Set(found.map((group) => group.agent))], wanted = new Map();
   const order = Object.keys(NAMES), place = find("charts");
   const rank = (name) => (order.includes(name) ? order.indexOf(name) : order.length);
-  const names = [...metrics].sort((a, b) => rank(a) - rank(b) || (a < b ? -1 : 1));
-  find("curves").hidden = !names.length;
-  for (const old of [...place.children]) if (!metrics.has(old.dataset.name)) old.remove();
-  names.forEach((name, i) => {
-    let chart = [...place.children].find((old) => old.dataset.name === name);
+  for (const agent of agents) {
+    const groups = found.filter((group) => group.agent === agent);
+    const metrics = new Set(groups.flatMap((group) => group.jobs.flatMap((job) => Object.keys(job.curves))));
+    for (const name of [...metrics].sort((a, b) => rank(a) - rank(b) || (a < b ? -1 : 1))) {
+      wanted.set(`${agent}\n${name}`, { name, groups, of: agents.length > 1 ? agent : "" });
+    }
+  }
+  find("curves").hidden = !wanted.size;
+  for (const old of [...place.children]) if (!wanted.has(old.dataset.id)) old.remove();
+  [...wanted].forEach(([id, { name, groups, of }], i) => {
+    let chart = [...place.children].find((old) => old.dataset.id === id);
     if (!chart) {
       chart = element("div", { className: "chart" }, element("h3", {}, element("span"), element("output")));
-      chart.dataset.name = name;
+      chart.dataset.id = id;
       chart.append(drawn("svg", { role: "img" }), element("div", { className: "tip", hidden: true }));
       const svg = chart.querySelector("svg");
-      svg.addEventListener("pointermove", (event) => { hovered = { name, x: event.offsetX }; draw(); });
+      svg.addEventListener("pointermove", (event) => { hovered = { id, x: event.offsetX }; draw(); });
       svg.addEventListener("pointerleave", () => { hovered = null; draw(); });
     }
     if (place.children[i] !== chart) place.insertBefore(chart, place.children[i] || null);
-    plot(chart, name, found);
+    plot(chart, name, groups, of);
   });
 }
 
-function plot(chart, name, found) {
+function plot(chart, name, found, of) {
   const svg = chart.querySelector("svg"), width = svg.clientWidth || 340;
-  const title = NAMES[name] || name.replaceAll("_", " ").replace(/^./, (c) => c.toUpperCase());
+  const shown = NAMES[name] || name.replaceAll("_", " ").replace(/^./, (c) => c.toUpperCase());
+  const title = [shown, of].filter(Boolean).join(" · ");
   say(chart.querySelector("h3 span"), title);
   svg.setAttribute("viewBox", `0 0 ${width} ${HEIGHT}`);
   svg.setAttribute("aria-label", title);
@@ -391,13 +396,13 @@ function plot(chart, name, found) {
   }
   const last = lines.filter((one) => one.alone);
   say(chart.querySelector("output"), last.length === 1 ? number(last[0].points.at(-1)[1]) : "");
-  tip(chart, name, lines, steps, width, parts, x);
+  tip(chart, lines, steps, width, parts, x);
   svg.replaceChildren(...parts);
 }
 
-function tip(chart, name, lines, steps, width, parts, x) {
+function tip(chart, lines, steps, width, parts, x) {
   const place = chart.querySelector(".tip");
-  place.hidden = hovered?.name !== name || !lines.length;
+  place.hidden = hovered?.id !== chart.dataset.id || !lines.length;
   if (place.hidden) return;
   const step = steps[0] + (steps[1] - steps[0]) * Math.max(0, Math.min(1, (hovered.x - LEFT) / (width - LEFT - RIGHT)));
   parts.push(drawn("line", { class: "cursor", x1: x(step), x2: x(step), y1: TOP, y2: HEIGHT - BOTTOM }));
