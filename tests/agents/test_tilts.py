@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from qfolio.agents import paths, tilts
 from qfolio.agents.tilts import Deep, Tilt, TiltPolicy, Tilts, tilted
@@ -43,9 +44,9 @@ def prices(values):
 def tilt(linear, interaction=None, rate=0.0, band=-20.0, cap=1.0):
     count = len(linear)
     square = np.zeros((count, count)) if interaction is None else interaction
-    trading = Trading(jnp.asarray(rate, float), jnp.asarray(band, float))
-    trading = jax.tree.map(lambda x: x[None], trading)
-    one = Tilt(jnp.asarray([linear], float), jnp.asarray([square], float), None, trading)
+    resting = Trading(jnp.asarray(rate, float), jnp.asarray(band, float))
+    trading = jax.tree.map(lambda x: x[None], resting)
+    one = Tilt(jnp.asarray([linear], float), jnp.asarray([square], float), None, trading, resting)
     return TiltPolicy(one, jnp.array(1.0), jnp.array(0.0), Simplex(3, cap))
 
 
@@ -227,14 +228,34 @@ def test_a_network_without_evidence_is_not_followed():
     linear = tilt([1.0], rate=0.5)
     network = jax.tree.map(lambda x: x[None] + 1.0, Hidden(1, 4, jax.random.key(0)))
     fast = jax.tree.map(lambda x: x[None], Trading.start(0.9))
-    one = Tilt(linear.members.linear, linear.members.interaction, Deep(network, fast),
-               linear.members.trading)  # fmt: skip
+    members = linear.members
+    one = Tilt(members.linear, members.interaction, Deep(network, fast), members.trading,
+               members.resting)  # fmt: skip
     seen = view([0.2, 0.3, 0.5], [[0.3], [0.0], [-0.3]])
     without = TiltPolicy(one, linear.share, jnp.array(0.0), linear.actions)
     np.testing.assert_array_equal(without(seen), linear(seen))
     whole = TiltPolicy(one, linear.share, jnp.array(1.0), linear.actions)
     np.testing.assert_allclose(whole.trading.described["rate"], 0.9, rtol=1e-5)
     assert np.abs(whole.target(seen) - linear.target(seen)).max() > 1e-2
+
+
+@pytest.mark.parametrize(("share", "rate"), [(0.0, 0.1), (1.0, 0.5)])
+def test_without_evidence_it_trades_as_the_anchor_alone(share, rate):
+    members = tilt([1.0], rate=0.0).members  # a rate of one half
+    members = Tilt(members.linear, members.interaction, None, members.trading, Trading.start(0.1))
+    policy = TiltPolicy(members, jnp.array(share), jnp.array(0.0), Simplex(3))
+    np.testing.assert_allclose(policy.trading.described["rate"], rate, rtol=1e-5)
+
+
+@pytest.mark.parametrize("network", ["linear", "hidden"])
+def test_the_anchor_is_rebalanced_faster_where_losers_recover(network):
+    noise = np.random.default_rng(0).normal(0, 0.01, (1500, 8))
+    fading = lfilter([1], [1, -0.8], noise, axis=0)  # forgets a fifth a day
+    go_on, revert = np.exp(np.cumsum(fading / 2, 0)), np.exp(fading)
+    states = trained(go_on, revert, network=network)
+    slow, fast = states.policy.members.resting.described["rate"]
+    assert slow < 0.15
+    assert fast > 0.6
 
 
 def test_needs_an_anchor():

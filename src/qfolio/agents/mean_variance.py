@@ -71,10 +71,7 @@ class Efficient(eqx.Module):
     def trading(self) -> Trading:
         """How to trade: as for minimum variance, moved by the share towards the members' mean."""
         least, members = self.learned.trading, self.learned.members
-        if members is None:
-            return least
-        between = lambda x, each: x + self.share * (each.mean(0) - x)  # noqa: E731
-        return jax.tree.map(between, least, members.trading)
+        return least if members is None else least.towards(members.trading.mean, self.share)
 
 
 def expected(view: View, means: Means) -> Float[Array, "*batch asset"]:

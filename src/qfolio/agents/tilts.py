@@ -60,7 +60,7 @@ class Deep(eqx.Module):
 class Tilt(eqx.Module):
     """What the members learn: scores of assets, and how to trade.
 
-    Every array has a leading member axis.
+    Every array has a leading member axis, except in ``resting``, which they share.
 
     The linear scores are s = x·(θ + Θc) with an asset's inputs x and their mean over the assets c,
     the state of the market: features that rank assets have mean 0 and do not enter it.
@@ -70,6 +70,7 @@ class Tilt(eqx.Module):
     interaction: Float[Array, "member channel channel"]  # Θ
     deep: Deep | None
     trading: Trading
+    resting: Trading  # of the anchor itself
 
     def scores(
         self, features: Float[Array, "*batch asset time channel"]
@@ -110,13 +111,11 @@ class TiltPolicy(eqx.Module):
 
     @property
     def trading(self) -> Trading:
-        """That of the linear policy, or as far as the network is followed, that of the network."""
-        mean = lambda trading: jax.tree.map(lambda x: x.mean(0), trading)  # noqa: E731
-        linear = mean(self.members.trading)
-        if self.members.deep is None:
-            return linear
-        between = lambda one, other: one + self.depth * (other - one)  # noqa: E731
-        return jax.tree.map(between, linear, mean(self.members.deep.trading))
+        """That of the anchor, as far as the scores are followed that of the linear policy, and as
+        far as the network is followed that of the network."""
+        found = self.members.resting.towards(self.members.trading.mean, self.share)
+        deep = self.members.deep
+        return found if deep is None else found.towards(deep.trading.mean, self.depth)
 
 
 def tilted(
@@ -224,13 +223,14 @@ class Tilts(Onlooker):
 
         linear = jnp.zeros((self.members, channels))
         square = jnp.zeros((self.members, channels, channels))
-        trading = jax.tree.map(lambda x: jnp.full(self.members, x), Trading.start(0.3))
+        resting = Trading.start(0.3)
+        trading = jax.tree.map(lambda x: jnp.full(self.members, x), resting)
         nothing, deep, evidence = jnp.array(0.0), None, Evidence.none(self.blocks)
         if self.network in NETWORKS:
             make = lambda key: NETWORKS[self.network](channels, self.units, key)  # noqa: E731
             networks = jax.vmap(make)(jax.random.split(key, self.members))
             deep = Deep(networks, trading)
-        members = Tilt(linear, square, deep, trading)
+        members = Tilt(linear, square, deep, trading, resting)
         policy = TiltPolicy(members, nothing, nothing, actions)
         return TiltsState(policy, optimizer.begin(members), evidence, evidence)
 
@@ -264,22 +264,26 @@ class Tilts(Onlooker):
             return mean(rewards) - self.tracking_aversion / 2 * variance
 
         def loss(members: Tilt) -> tuple[Array, tuple[Array, list[Array]]]:
-            scores = self._scores(members, task, rollout)
-            trades = members.trading, lax.stop_gradient(members.trading)
-            rewards, anchored = self._paths(task, rollout, trades, (scores, None))
+            scores, share = self._scores(members, task, rollout), state.policy.share
+            resting = jax.tree.map(lambda x: x[None], members.resting)
+            (rested,) = self._paths(task, rollout, (resting,), (None,))
+            (rewards,) = self._paths(task, rollout, (members.trading,), (scores,))
+            anchored = lax.stop_gradient(rested)
             active = [rewards - anchored]
             total = utility(rewards, active[0], seen)
             if members.deep is not None:
                 # On top of the policy as far as it is followed, and from some of the paths.
                 fewer, anchored = jax.tree.map(some, rollout), jax.vmap(some)(anchored)
-                base = lax.stop_gradient(state.policy.share * jax.vmap(some)(scores))
+                base = lax.stop_gradient(share * jax.vmap(some)(scores))
                 higher = base + self._scores(members.deep, task, fewer)
-                trades = members.deep.trading, trades[1]
+                followed = lax.stop_gradient(members.resting.towards(members.trading, share))
+                trades = members.deep.trading, followed
                 rewards, without = self._paths(task, fewer, trades, (higher, base))
                 active.append(rewards - without)
                 total += utility(rewards, rewards - anchored, jax.vmap(some)(seen))
             penalty = self.ridge / task.moves * members.squares
-            return penalty - total.sum(), (total.mean(), active)
+            gained = total.sum() + (counted * rested).sum() / counted.sum()
+            return penalty - gained, (total.mean(), active)
 
         gradient, (gained, active) = jax.grad(loss, has_aux=True)(state.policy.members)
         rate = self._schedule(state.optimizer.count + 1)

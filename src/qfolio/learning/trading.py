@@ -26,6 +26,15 @@ class Trading(eqx.Module):
         """The share of the way, and the band in units of the equal weight, as named scalars."""
         return {"rate": jax.nn.sigmoid(self.rate), "band": jnp.exp(self.band)}
 
+    @property
+    def mean(self) -> "Trading":
+        """The mean over a leading axis."""
+        return jax.tree.map(lambda x: x.mean(0), self)
+
+    def towards(self, other: "Trading", share: Array) -> "Trading":
+        """A share of the way from this to another."""
+        return jax.tree.map(lambda one, there: one + share * (there - one), self, other)
+
     def __call__(
         self,
         held: Float[Array, "*batch asset"],
