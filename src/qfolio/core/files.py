@@ -229,8 +229,8 @@ def read_tree(path: Path, template: Any) -> Any:
     )
     if not fits:
         raise QfolioError(
-            f"{path} does not belong to the settings beside it; "
-            "restore the two together, or train again."
+            f"{path} does not belong to the settings beside it, or is of another version of "
+            "qfolio; restore the two together, or train again."
         )
     return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])
 
