@@ -282,6 +282,7 @@ class Tilts(Onlooker):
                 active.append(rewards - without)
                 total += utility(rewards, rewards - anchored, jax.vmap(some)(seen))
             penalty = self.ridge / task.moves * members.squares
+            # No other weight depends on what the resting anchor earns: its scale does not matter.
             gained = total.sum() + (counted * rested).sum() / counted.sum()
             return penalty - gained, (total.mean(), active)
 
