@@ -214,14 +214,10 @@ def test_a_network_changes_nothing_in_what_is_learned_without_it():
         np.testing.assert_allclose(one, other, rtol=1e-2, atol=1e-3)
 
 
-@pytest.mark.parametrize(("few", "share"), [(3, 1 / 2), (2, 1 / 4)])
-def test_a_network_learns_from_some_of_the_paths(monkeypatch, few, share):
-    monkeypatch.setattr(tilts, "FEW_ASSETS", few)
-    programs_of.cache_clear()
+def test_a_network_learns_from_every_fourth_path():
     state = trained(walk(300, 3, seed=3), rounds=2)
-    programs_of.cache_clear()
     counted = state.evidence_of_depth.steps.sum() / state.evidence.steps.sum()
-    np.testing.assert_allclose(counted, share, rtol=1e-5)
+    np.testing.assert_allclose(counted, 1 / 4, rtol=1e-5)
 
 
 def test_a_network_without_evidence_is_not_followed():

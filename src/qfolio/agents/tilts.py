@@ -32,10 +32,8 @@ from qfolio.learning.trading import Trading, ratio
 LARGEST = 3.0
 """Inputs are clipped to ± this many standard deviations of the training data."""
 
-
-FEW_ASSETS = 64
-"""Most assets with which a network learns from every second path instead of every fourth, to save
-time: a path says more with more assets."""
+EVERY = 4
+"""A network learns from every so many of the paths, to save time."""
 
 
 def inputs_of(
@@ -254,8 +252,7 @@ class Tilts(Onlooker):
         counted = jnp.arange(self.rollout_length)[:, None] >= self.head
         left = left_out(block, self.members)
         seen, unseen = counted & ~left, counted & left
-        stride = 2 if rollout.observation.holding.shape[-1] <= FEW_ASSETS else 4
-        some = lambda x: x[:, ::stride]  # noqa: E731 (of the paths)
+        some = lambda x: x[:, ::EVERY]  # noqa: E731 (of the paths)
 
         def utility(rewards: Array, active: Array, seen: Array) -> Float[Array, " member"]:
             steps = jnp.maximum(seen.sum((1, 2)), 1)
