@@ -236,7 +236,7 @@ def test_a_network_without_evidence_is_not_followed():
 
 
 @pytest.mark.parametrize(("share", "rate"), [(0.0, 0.1), (1.0, 0.5)])
-def test_without_evidence_it_trades_as_the_anchor_alone(share, rate):
+def test_trades_at_the_speed_of_the_anchor_without_evidence_and_of_the_scores_with_it(share, rate):
     members = tilt([1.0], rate=0.0).members  # a rate of one half
     members = Tilt(members.linear, members.interaction, None, members.trading, Trading.start(0.1))
     policy = TiltPolicy(members, jnp.array(share), jnp.array(0.0), Simplex(3))

@@ -7,9 +7,9 @@ net utility through whole paths, as in ``pathwise.py``.
 
 Several members learn side by side, each without some blocks of the data. What a member earns over
 the anchor in the blocks that it has not seen is the evidence: the policy, the mean of the members,
-is shrunk to the anchor by it, after James & Stein (1961), and stays there without it. A network
-learns on top of this policy and is followed as far as there is evidence that it earns more.
-docs/algorithms/tilts.md lists formulas and their sources.
+is shrunk to the anchor by it, after James & Stein (1961), and stays there without it, rebalanced at
+a speed of the anchor's own. A network learns on top of this policy and is followed as far as there
+is evidence that it earns more. docs/algorithms/tilts.md lists formulas and their sources.
 """
 
 import equinox as eqx
@@ -109,8 +109,8 @@ class TiltPolicy(eqx.Module):
 
     @property
     def trading(self) -> Trading:
-        """That of the anchor, as far as the scores are followed that of the linear policy, and as
-        far as the network is followed that of the network."""
+        """The anchor's, moved by the share towards the linear policy's, then by the depth towards
+        the network's."""
         found = self.members.resting.towards(self.members.trading.mean, self.share)
         deep = self.members.deep
         return found if deep is None else found.towards(deep.trading.mean, self.depth)
