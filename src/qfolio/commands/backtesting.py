@@ -72,8 +72,9 @@ class Options(Reading):
         seeds: Agents of each kind (default: the preset's number).
         seed: First seed; the others follow it.
         episodes: Training episodes of each agent in a fold (default: the preset's number).
-        trials: Earlier trials on these prices, for the deflated Sharpe ratio; known trials on the
-            default table are added to them.
+        trials: Earlier trials on these prices, such as settings tried before, which make luck
+            likelier in verdicts and deflated Sharpe ratios; known trials on the default table are
+            added to them.
         assignments: Hyperparameters of all agents that have them (learning_rate=1e-3) or of one
             (dqn.discount=0.9), or of the task (window=20 reward=crra).
         out: New folder (default: one in runs/).

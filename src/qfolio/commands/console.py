@@ -319,8 +319,9 @@ def print_study(result: "Result") -> None:
             ratios = (active.information_ratio, active.t, known.to_rebalanced.t, known.sharpe)
             rows.append((name, *_growth(active), *map(decimal, ratios)))
         for entry in result.variants:
-            pooled, rest = entry.agents[agent].to_reference, entry.agents[agent].to_rebalanced
-            cells = (*_growth(pooled), "", decimal(pooled.z), decimal(rest.z), "")
+            found = entry.agents[agent]
+            numbers = (found.to_reference.z, found.to_rebalanced.z, found.sharpe.difference)
+            cells = (*_growth(found.to_reference), "", *map(decimal, numbers))
             rows.append((_pooled(entry.variant), *cells))
         heads = (agent, "a year", "95% interval", "IR", "t", "rebal.", "Sharpe")
         print_table(heads, rows, bold=[_pooled(main.variant)])

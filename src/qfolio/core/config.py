@@ -55,11 +55,13 @@ def read_config(path: Path, kind: type[C]) -> C:
     another format, or holds invalid values.
     """
     if not path.is_file():
-        raise QfolioError(f"{path.parent} is no {kind.kind}: it has no {path.name}.")
+        raise QfolioError(
+            f"{path.parent} is no {kind.kind}: it has no {path.name}; give the folder of one."
+        )
     content = read_json(path)
     found = content.pop("kind", None)
     if isinstance(found, str) and found != kind.kind:
-        raise QfolioError(f"{path.parent} is a {found}, not a {kind.kind}.")
+        raise QfolioError(f"{path.parent} is a {found}, not a {kind.kind}; give the folder of one.")
     if found != kind.kind or content.pop("format", None) != kind.format:
         raise QfolioError(
             f"{path.parent} was written by qfolio {content.get('version', '(unknown version)')} in "

@@ -20,7 +20,7 @@ from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.files import path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.population import Population
-from qfolio.core.text import amount
+from qfolio.core.text import amount, near
 from qfolio.core.training import episode_steps
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.fit import Listener, fit
@@ -293,7 +293,10 @@ class Policy:
             ) from None
         for name, weight in given.items():
             if name != "cash" and name not in self.assets:
-                raise QfolioError(f"The holdings name {name!r}, which the policy does not know.")
+                raise QfolioError(
+                    f"The holdings name {name!r}, which the policy does not know; "
+                    f"{near(name, self.assets)}"
+                )
             low, high = (0.0, 1 + 1e-9) if long_only else (-MOST, MOST)
             if not isinstance(weight, Real) or not low <= float(weight) <= high:
                 raise QfolioError(

@@ -207,7 +207,9 @@ class Portfolio(Market):
         rows = slice(first + 1, last + 1)
         usable = np.ones(self.limits.shape[0], bool) if tradable is None else tradable
         if not usable.any():
-            raise QfolioError("No asset can be traded over these rows.")
+            raise QfolioError(
+                "No asset can be traded over these rows; give rows in which some have prices."
+            )
         channels = np.concatenate(
             [np.asarray(self.log_relatives)[rows, :, None], np.asarray(self.extra)[rows]], axis=2
         )[:, usable]

@@ -178,7 +178,7 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
                 ("",),
                 (f"z {decimal(pooled.z)}", _chance(pooled.p_holm)),
                 (percent(rest.growth), f"z {decimal(rest.z)}", _chance(rest.p_holm)),
-                ("",),
+                (decimal(pools.sharpe.difference), f"z {decimal(pools.sharpe.z)}"),
             ],
             "label": _label(pooled.growth, pooled.low, pooled.high),
         },

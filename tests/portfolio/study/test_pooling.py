@@ -83,6 +83,41 @@ def test_to_beat_the_best_rebalancing_is_to_beat_them_all():
     assert found.to_rebalanced.reference == max(growth, key=lambda name: growth[name])
 
 
+def number(found: float | None) -> float:
+    assert found is not None
+    return found
+
+
+def risky(count=2000, free=0.0):
+    """An agent without cash, and a calm baseline that is mostly cash, of the same market."""
+    noise, own = np.random.default_rng(0).standard_normal((2000, 2))[:count].T
+    market = 0.0006 + 0.01 * noise
+    ours, calm = market, 0.1 * market + 0.9 * 0.0002 + 0.0002 * own
+    rates = np.full(count, free) if free else None
+    columns = {"ew": market, "calm": calm}
+    return TableReturns(days(0, count), 252.0, {"a": ours}, {"ew": market}, columns, rates)
+
+
+def test_sharpe_ratios_are_in_excess_of_cash():
+    without, with_rates = evidence(risky(), "a"), evidence(risky(free=0.0002), "a")
+    assert without.baseline == "calm"  # as cash counts as a return for its little risk
+    assert number(without.sharpe) < -2
+    assert with_rates.sharpe == pytest.approx(0, abs=0.1)
+    assert with_rates.to_reference == without.to_reference
+
+
+def test_sharpe_ratios_are_pooled():
+    tables = {"one": risky(), "two": risky(count=800)}
+    found = pool(tables, ["a"])["a"]
+    each = [found.evidence[name] for name in tables]
+    assert found.sharpe.difference == pytest.approx(np.mean([one.sharpe for one in each]))
+    # The days of the second table are among those of the first, so they count once.
+    weights = np.sqrt([one.years for one in each])
+    apart = weights @ [number(one.sharpe_z) for one in each] / math.sqrt(weights @ weights)
+    assert apart < number(found.sharpe.z) < -2
+    assert found.sharpe.positive == 0
+
+
 def test_correlations_come_from_common_days():
     rng = np.random.default_rng(2)
     x = rng.standard_normal(100)

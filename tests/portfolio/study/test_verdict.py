@@ -1,6 +1,6 @@
 import pytest
 
-from qfolio.portfolio.study.pooling import Active, Evidence, Pooled, Pools
+from qfolio.portfolio.study.pooling import Active, Evidence, Pooled, PooledSharpe, Pools
 from qfolio.portfolio.study.verdict import verdicts
 
 ACTIVE = {"growth": 0.01, "low": 0.0, "high": 0.02, "tracking_error": 0.02, "t": 1.0, "z": 1.0}
@@ -11,7 +11,8 @@ def pools(reference, alone, best):
     active = Active(reference=reference, information_ratio=0.5, **ACTIVE)
     known = Evidence(
         first="2001-01-02", last="2002-12-31", days=500, years=2.0, to_reference=active,
-        to_rebalanced=active, baseline="momentum", sharpe=0.0, sharpe_t=0.0,
+        to_rebalanced=active, baseline="momentum", sharpe=-0.1, sharpe_t=-0.5,
+        sharpe_z=-0.5,
     )  # fmt: skip
 
     def pooled(growth, finding):
@@ -21,7 +22,10 @@ def pools(reference, alone, best):
         )  # fmt: skip
 
     return Pools(
-        evidence={"us": known}, to_reference=pooled(0.03, alone), to_rebalanced=pooled(0.02, best)
+        evidence={"us": known},
+        to_reference=pooled(0.03, alone),
+        to_rebalanced=pooled(0.02, best),
+        sharpe=PooledSharpe(difference=-0.1, z=-0.5, positive=0),
     )
 
 
@@ -67,10 +71,14 @@ def test_equal_weights_count_as_beaten_only_at_every_speed(alone, best, first, s
     said = verdicts({"tilts": pools("equal-weight", alone, best)})["tilts"]
     assert said[0].startswith(first)
     assert said[1].startswith(second)
-    assert len(said) == 3
+    assert len(said) == 4
+    assert said[3] == (
+        "Its Sharpe ratio less that of the best baseline is −0.10 (Stouffer’s z −0.50); it is "
+        "higher on 0 of 1 table."
+    )
 
 
 def test_another_reference_has_one_speed():
     said = verdicts({"tilts": pools("fund", "better", "better")})["tilts"]
     assert said[0].startswith("tilts beats fund in growth after costs over 1 table: ")
-    assert len(said) == 2
+    assert len(said) == 3

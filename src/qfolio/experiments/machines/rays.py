@@ -48,15 +48,18 @@ class Ray:
         cpus: int = 1,
         gpus: bool | None = None,
     ) -> None:
+        for name, value in (("workers", workers), ("cores of a worker", cpus)):
+            if value is not None and value < 1:
+                raise QfolioError(f"The number of {name} is {value}; it must be 1 or more.")
         ray = _connected(address)
         there = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self.lockstep = any("GPU" in node for node in there) if gpus is None else gpus
-        kind, asked = ("GPU", 1) if self.lockstep else ("CPU", max(cpus, 1))
+        kind, asked = ("GPU", 1) if self.lockstep else ("CPU", cpus)
         room = sum(int(node.get(kind, 0)) // asked for node in there)
         self.workers, self.cpus = room if workers is None else workers, cpus
         self.waits = workers is not None  # for machines that join later
-        if self.workers < 1 or cpus < 1:
-            what = "GPU" if self.lockstep else f"node with {_cores(max(cpus, 1))}"
+        if self.workers < 1:
+            what = "GPU" if self.lockstep else f"node with {_cores(cpus)}"
             raise QfolioError(
                 f"The Ray cluster has no {what}, so no worker can start; add one, or give workers, "
                 "which then wait for it."

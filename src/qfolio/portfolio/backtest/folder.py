@@ -54,6 +54,9 @@ EQUAL_WEIGHT = "equal-weight"
 TOGETHER = "-together"
 """Suffix of an agent's ensemble: the mean of all its seeds, which is the policy for tomorrow."""
 
+RISK_FREE = "risk_free"
+"""The column of returns.csv with the returns of cash, if it earns any."""
+
 STRATEGIES = "strategies.safetensors"
 
 MOST_WEIGHTS = 10_000_000
@@ -268,7 +271,7 @@ class BacktestFolder:
         return Records.read(self._records(agent, fold))
 
     def write_returns(self, days: Sequence[str], columns: dict[str, np.ndarray]) -> None:
-        """Writes returns.csv, with a column per strategy and seed."""
+        """Writes returns.csv, with a column per strategy and seed, and one of cash if given."""
         rows = zip(days, *(column.tolist() for column in columns.values()), strict=True)
         write_csv(self.path / "returns.csv", ["date", *columns], rows)
 

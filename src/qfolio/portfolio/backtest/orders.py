@@ -121,7 +121,7 @@ def orders(
                     open_to = holdable(tradable[row], mandated)
                     history = History(dates[known], prices[known], fold.train, open_to, cap, month)
                     wanted = ask(name, baseline, history, held, mandated)
-                # A lender does not wait for the baseline.
+                # A margin call must be met even if the baseline has no target.
                 goal = held if called and wanted is None else wanted
                 order = None
                 if due and goal is not None:
@@ -244,10 +244,14 @@ def checked(name: str, wanted: ArrayLike, history: History) -> Floats:
             f"{target.min():.3g}; they must sum to 1 and not be negative."
         )
     if (target[1:][~history.tradable] > 0).any():
-        raise QfolioError(f"{where} gives weight to an asset that this fold may not hold.")
+        raise QfolioError(
+            f"{where} gives weight to an asset that this fold may not hold; its decide must heed "
+            "history.tradable."
+        )
     if target[1:].max() > history.cap + TOLERANCE:
         raise QfolioError(
-            f"{where} gives an asset {target[1:].max():.4g}, more than the cap of {history.cap:g}."
+            f"{where} gives an asset {target[1:].max():.4g}, more than the cap of {history.cap:g}; "
+            "its decide must heed history.cap."
         )
     return target
 

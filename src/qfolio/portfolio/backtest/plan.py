@@ -84,7 +84,9 @@ class Plan:
         except ValueError:
             raise QfolioError(f"{date!r} is no date; write one such as 2020-01-01.") from None
         if first == len(self.dates):
-            raise QfolioError(f"The test ends on {day(self.dates[-1])}, before {date}.")
+            raise QfolioError(
+                f"The test ends on {day(self.dates[-1])}, before {date}; give an earlier date."
+            )
         return first
 
     def part(self, agent: str, policy: str) -> Portfolio:
@@ -121,7 +123,7 @@ class Plan:
     def require_able(self) -> None:
         """Raises QfolioError if an agent cannot begin, such as one with a wrong menu or rollout.
 
-        Agents judge some settings only as they meet a task; here nothing of it is computed.
+        Some settings can be checked only with a task. Only shapes are traced.
         """
         for name, agent in self.agents.items():
             task = self.part(name, self.folds[0].name)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from qfolio.core.text import finite
 from qfolio.experiments.log import add_result
 from qfolio.portfolio.backtest.attribution.why import Why
-from qfolio.portfolio.backtest.folder import BacktestFolder
+from qfolio.portfolio.backtest.folder import RISK_FREE, BacktestFolder
 from qfolio.portfolio.backtest.folds import spell_all
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.run import Backtest
@@ -21,7 +21,8 @@ def write_tables(
 ) -> None:
     """Writes returns.csv (a column per strategy and seed), weights.csv (means) and summary.json.
 
-    With attributions, it also writes why.json, and the diagnosis into summary.json.
+    If cash earns interest, returns.csv has a column of its returns. With attributions, it also
+    writes why.json, and the diagnosis into summary.json.
     """
     assert backtest.folder is not None
     folder, dates, first = BacktestFolder(backtest.folder), backtest.dates, backtest.config.seed
@@ -31,6 +32,8 @@ def write_tables(
         for name, entry in entries.items()
         for i, series in enumerate(entry.simulation.returns)
     }
+    if (cash := backtest.replay.growth[:, 0] - 1).any():
+        columns.setdefault(RISK_FREE, cash)
     folder.write_returns(days, columns)
     weights = {
         name: entry.mean_weights

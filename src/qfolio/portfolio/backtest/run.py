@@ -155,7 +155,7 @@ class Backtest:
             seeds: Number of agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
             episodes: Training episodes in a fold of each agent without a preset.
             task: Settings of the portfolio task for agents without a preset.
-            trials: Earlier trials on these prices, for the deflated Sharpe ratio; those of the
+            trials: Number of earlier trials on these prices, see ``differences.py``; those of the
                 default table (``prices.table.DEFAULT_TRIALS``) are added to them.
             command: The command that started it, for the report.
             title: The report's title (default: agents, table and years).

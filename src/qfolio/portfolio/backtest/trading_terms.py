@@ -11,7 +11,7 @@ PROPORTIONAL = "proportional"
 
 
 class TradingTerms(NamedTuple):
-    """The arguments of ``Backtest.create`` of these names, where a mandate has had its say."""
+    """The arguments of ``Backtest.create`` of these names, after a mandate's own are applied."""
 
     mandate: Mandate | None
     cost: float

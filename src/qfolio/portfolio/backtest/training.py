@@ -96,7 +96,8 @@ def preparing(jobs: Iterable[FoldsJob]) -> Iterator[None]:
         try:
             yield
         finally:
-            thread.shutdown(wait=False, cancel_futures=True)  # at the end, waits for the one begun
+            # Cancels what has not begun; leaving the block waits for the rest.
+            thread.shutdown(wait=False, cancel_futures=True)
 
 
 class _RowsByFold(Listener):

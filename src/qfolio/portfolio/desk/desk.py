@@ -260,8 +260,8 @@ class Desk:
         off = float(abs(again.weights - np.array(record.target)).max())
         if off > SAME:
             raise QfolioError(
-                f"{name} gives other weights from the same inputs: one is off by {off:.2g}. It was "
-                f"made by qfolio {record.version}, and this is {__version__}."
+                f"{name} gives other weights from the same inputs: one is off by {off:.2g}; use "
+                f"qfolio {record.version}, which made it (this is {__version__})."
             )
         return record, again
 

@@ -69,7 +69,10 @@ def mark(
                 f"{record.date}, on which record {record.number} was made; give a table with it."
             )
         if tuple(record.assets) != prices.assets:
-            raise QfolioError(f"Record {record.number} has other assets than the price table.")
+            raise QfolioError(
+                f"Record {record.number} has other assets than the price table; give a table with "
+                "the record's."
+            )
         at[row] = record
     first = int(rows[0])
     units, cash = np.zeros(values.shape[1]), 0.0
@@ -94,7 +97,7 @@ def mark(
                 due = {then: np.where(gone, 0.0, part) for then, part in due.items()}
             total = cash + float(units @ values[row])
             if row > first + lag:
-                # As in the backtest, no more than all can be lost, and nothing is earned then.
+                # As in the backtest, an account loses at most everything, and then earns nothing.
                 earned = max(total / base - 1, -1.0) if base > 0 else 0.0
                 held = float(abs(units * values[row]).sum())
                 gross = held / total if total > 0 else np.inf

@@ -110,7 +110,7 @@ class Mandated(Feasible):
         return min(self.volatility, self.tracking_error) < float("inf")
 
     def knowing(self, risk: Risk | Past) -> "Mandated":
-        """The set at a row where so much is known of risk."""
+        """The set at one row, with that row's estimate of risk."""
         return dataclasses.replace(self, risk=risk)
 
     @property

@@ -33,14 +33,17 @@ def parse(text: str) -> tuple[list[str], Mandate]:
     try:
         return msgspec.json.decode(text, type=tuple[list[str], Mandate])
     except msgspec.MsgspecError as error:
-        raise QfolioError(f"mandate is no mandate: {error}.") from None
+        raise QfolioError(
+            f"The setting mandate is not the text of a mandate ({error}); give a file or a "
+            "dictionary to Portfolio.of."
+        ) from None
 
 
 def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> Mandated:
     """The set of weights that a mandate allows, in float64.
 
     usable: assets that can be traded; the others have weight 0, and no floor. most: the largest
-    weight of each asset, beside its cap; 1 limits none that the mandate lets be above it.
+    weight of each asset, beside its cap; 1 adds no cap if the mandate allows debts.
     """
     assets, mandate = parse(text)
     can = usable & ~np.isin(assets, mandate.assets.forbidden)

@@ -91,8 +91,8 @@ class Cash(Section, frozen=True):
 class Trading(Section, frozen=True):
     """Limits of a decision. turnover: the sum of all changes of weights, bought and sold.
 
-    calendar: as ``calendars.decision_rows`` takes it. turnover_a_year: likewise, in a calendar
-    year. fill: rows over which an order is filled, in equal parts. lot: shares that are traded
+    turnover_a_year: the same sum over a calendar year. calendar: as ``calendars.decision_rows``
+    takes it. fill: rows over which an order is filled, in equal parts. lot: shares that are traded
     together, a number for all assets or for some; allocation alone knows shares, and rounds to
     them.
     """

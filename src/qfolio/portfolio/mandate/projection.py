@@ -143,7 +143,7 @@ def _search(
 
     def advance(search: tuple[Array, Array, _Found]) -> tuple[Array, Array, _Found]:
         step, _, found = search
-        # One more step than are needed rounds better.
+        # One extra step reduces rounding errors.
         return step + 1, (found.error <= accuracy).all(), improve(found)
 
     begin = jnp.array(0, jnp.int32), jnp.array(False), _Found(start, *value(start))

@@ -15,7 +15,7 @@ import numpy as np
 from qfolio.core.config import AgentName, Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json, write_csv
-from qfolio.portfolio.backtest.folder import BacktestFolder, followed
+from qfolio.portfolio.backtest.folder import RISK_FREE, BacktestFolder, followed
 from qfolio.portfolio.study.pooling import Pools, TableReturns
 
 FILE = "study.json"
@@ -153,6 +153,7 @@ class StudyFolder:
                 {agent: _traded(agent, columns) for agent in agents},
                 {reference: columns[reference], **_of_kind("rebalancing", kinds, columns)},
                 baselines,
+                None if RISK_FREE in kinds else columns.get(RISK_FREE),
             )
         except (AttributeError, KeyError, StopIteration, TypeError, ValueError):
             raise QfolioError(

@@ -19,6 +19,7 @@ from qfolio.portfolio.backtest.statistics.bootstrap import (
     percentile_interval,
     stationary_bootstrap_indices,
 )
+from qfolio.portfolio.backtest.statistics.differences import estimates
 from qfolio.portfolio.backtest.statistics.estimates import Estimate, clear, estimate
 from qfolio.portfolio.backtest.statistics.measures import (
     log_growth,
@@ -42,7 +43,8 @@ class TableReturns(NamedTuple):
     """Simple daily returns on one table over the days of its test, each of shape (days,).
 
     agents: by name, each traded as ``allocate`` trades it. rebalancings: the reference first, then
-    the reference at other speeds. baselines: all of them, the reference included.
+    the reference at other speeds. baselines: all of them, the reference included. risk_free: of
+    cash, which Sharpe ratios subtract; None if it earns nothing.
     """
 
     days: Sequence[str]
@@ -50,6 +52,7 @@ class TableReturns(NamedTuple):
     agents: Mapping[str, Floats]
     rebalancings: Mapping[str, Floats]
     baselines: Mapping[str, Floats]
+    risk_free: Floats | None = None
 
 
 class Active(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,6 +80,7 @@ class Evidence(msgspec.Struct, frozen=True, kw_only=True):
     baseline: str  # the one with the highest Sharpe ratio over the same days
     sharpe: float | None  # annual Sharpe ratio minus that of this baseline
     sharpe_t: float | None
+    sharpe_z: float | None
 
 
 class Pooled(msgspec.Struct, frozen=True, kw_only=True):
@@ -93,12 +97,25 @@ class Pooled(msgspec.Struct, frozen=True, kw_only=True):
     worst: str  # the table with the least active growth
 
 
+class PooledSharpe(msgspec.Struct, frozen=True, kw_only=True):
+    """What all tables say about the Sharpe ratio of one agent, less that of their best baselines.
+
+    The best baseline of each table is known in hindsight only, so this is no fair test of an agent:
+    one as good as all baselines falls short of the luckiest of them.
+    """
+
+    difference: float | None  # mean over tables
+    z: float | None  # Stouffer's
+    positive: int  # tables on which the agent's is higher
+
+
 class Pools(msgspec.Struct, frozen=True, kw_only=True):
     """What all tables say about one agent; evidence: that of each table, by its name."""
 
     evidence: dict[str, Evidence]
     to_reference: Pooled
     to_rebalanced: Pooled
+    sharpe: PooledSharpe
 
 
 def evidence(tested: TableReturns, agent: str) -> Evidence:
@@ -114,9 +131,9 @@ def evidence(tested: TableReturns, agent: str) -> Evidence:
         for name, theirs in tested.rebalancings.items()
     }
     reference, best = next(iter(to)), _best_rebalancing(tested)
-    sharpes = {name: _sharpe(returns) for name, returns in tested.baselines.items()}
-    baseline = max(sharpes, key=lambda name: sharpes[name])
-    sharpe = estimate(ours[None], tested.baselines[baseline][None], year)["sharpe"]
+    baseline = _best_baseline(tested)
+    theirs = tested.baselines[baseline]
+    sharpe = estimates(ours[None], theirs[None], year, tested.risk_free)["sharpe"]
     return Evidence(
         first=tested.days[0],
         last=tested.days[-1],
@@ -127,6 +144,7 @@ def evidence(tested: TableReturns, agent: str) -> Evidence:
         baseline=baseline,
         sharpe=finite(sharpe.value),
         sharpe_t=finite(_t(sharpe)),
+        sharpe_z=finite(z_of(sharpe)),
     )
 
 
@@ -174,9 +192,30 @@ def pool(
             evidence=known[agent],
             to_reference=pooled[agent, "to_reference"],
             to_rebalanced=pooled[agent, "to_rebalanced"],
+            sharpe=_pooled_sharpe(tables, agent, known[agent]),
         )
         for agent in agents
     }
+
+
+def _pooled_sharpe(
+    tables: Mapping[str, TableReturns], agent: str, known: Mapping[str, Evidence]
+) -> PooledSharpe:
+    """From the evidence of each table on an agent."""
+    found = [_known(each.sharpe) for each in known.values()]
+    # To first order, a day contributes the difference of both standardized returns.
+    daily = [
+        _standardized(table.agents[agent]) - _standardized(table.baselines[known[name].baseline])
+        for name, table in tables.items()
+    ]
+    shared = correlations([table.days for table in tables.values()], daily)
+    weights = [math.sqrt(each.years) for each in known.values()]
+    z = stouffer([_known(each.sharpe_z) for each in known.values()], weights, shared)
+    return PooledSharpe(
+        difference=finite(float(np.mean(found))),
+        z=finite(z),
+        positive=sum(value > 0 for value in found),
+    )
 
 
 def _pooled(
@@ -325,8 +364,19 @@ def _best_rebalancing(tested: TableReturns) -> str:
     return max(growth, key=lambda name: growth[name])
 
 
-def _sharpe(returns: Floats) -> float:
-    return float(ratio_or_zero(returns.mean(), returns.std(ddof=1)))
+def _best_baseline(tested: TableReturns) -> str:
+    """The baseline with the highest Sharpe ratio."""
+    free = 0.0 if tested.risk_free is None else tested.risk_free
+
+    def sharpe(name: str) -> float:
+        excess = tested.baselines[name] - free
+        return float(ratio_or_zero(excess.mean(), excess.std(ddof=1)))
+
+    return max(tested.baselines, key=sharpe)
+
+
+def _standardized(returns: Floats) -> Floats:
+    return ratio_or_zero(returns - returns.mean(), returns.std())
 
 
 def _t(difference: Estimate) -> float:

@@ -12,8 +12,11 @@ _VERBS = {"better": "{} beats", "worse": "{} falls short of", "none": "No eviden
 
 
 def verdicts(agents: Mapping[str, Pools]) -> dict[str, list[str]]:
-    """Sentences on each agent: what was found, the same against another speed, and by table."""
-    return {name: [*_findings(name, pools), _tables(pools)] for name, pools in agents.items()}
+    """Sentences on each agent: growth, the same against another speed, by table, Sharpe ratio."""
+    return {
+        name: [*_findings(name, pools), _tables(pools), _sharpe(pools)]
+        for name, pools in agents.items()
+    }
 
 
 def _findings(name: str, pools: Pools) -> list[str]:
@@ -60,6 +63,16 @@ def _tables(pools: Pools) -> str:
         grew += f", and more than its best rebalancing on {pools.to_rebalanced.positive}"
     return (
         f"{grew}. Its worst table is {pools.to_reference.worst} ({percent(worst.growth)} a year)."
+    )
+
+
+def _sharpe(pools: Pools) -> str:
+    sharpe, total = pools.sharpe, len(pools.evidence)
+    best = "the best baseline" if total == 1 else "each table’s best baseline, seen in hindsight,"
+    return (
+        f"Its Sharpe ratio less that of {best} is {decimal(sharpe.difference)}"
+        f"{'' if total == 1 else ' on average'} (Stouffer’s z {decimal(sharpe.z)}); it is higher "
+        f"on {sharpe.positive} of {amount(total, 'table')}."
     )
 
 

@@ -122,7 +122,10 @@ def _others(names: list[str], test: Assessment, better: bool = False) -> str:
 
 
 def best_sentence(data: BacktestData) -> str:
-    """Which strategy was best over the days of the test, by growth and by Sharpe ratio."""
+    """Which strategy was best over the days of the test, by growth and by Sharpe ratio.
+
+    With the difference in Sharpe ratio of the agent at the top of the page to the best baseline.
+    """
     measured = {name: data.assessment.strategies[name].measures for name in shown_order(data)}
 
     def best(key: str) -> str:
@@ -131,15 +134,34 @@ def best_sentence(data: BacktestData) -> str:
     by_growth, by_sharpe = best("growth"), best("sharpe")
     growth = percent(measured[by_growth]["growth"].mean)
     sharpe = number(measured[by_sharpe]["sharpe"].mean, 2)
+    subject = f"Best of all {len(measured)} strategies, seen in hindsight:"
     if by_growth == by_sharpe:
-        return (
-            f"Best of all {len(measured)} strategies, seen in hindsight: {by_growth}, in growth "
-            f"({growth} a year) and Sharpe ratio ({sharpe})."
+        said = f"{subject} {by_growth}, in growth ({growth} a year) and Sharpe ratio ({sharpe})."
+    else:
+        said = (
+            f"{subject} {by_growth} in growth ({growth} a year), {by_sharpe} in Sharpe ratio "
+            f"({sharpe})."
         )
+    test, lead = data.assessment, lead_name(data)
+    if lead is None or (rival := to_best_sharpe(lead, test)) is None:
+        return said
+    low, high = (number(end, 2, sign=True) for end in rival.sharpe.interval)
     return (
-        f"Best of all {len(measured)} strategies, seen in hindsight: {by_growth} in growth "
-        f"({growth} a year), {by_sharpe} in Sharpe ratio ({sharpe})."
+        f"{said} The Sharpe ratio of {lead} less that of {rival.reference} is "
+        f"{number(rival.sharpe.value, 2, sign=True)} (95% interval {low} to {high})."
     )
+
+
+def to_best_sharpe(name: str, test: Assessment) -> Difference | None:
+    """The difference to the baseline with the highest Sharpe ratio; None if that is the reference.
+
+    None, too, if the ratios have no difference, as after a total loss.
+    """
+    entry = test.strategies[name]
+    for each in (entry.to_best_sharpe, entry.to_best_baseline):
+        if each is not None and each.reference == test.best_sharpe:
+            return each if comparable("sharpe", each.sharpe) else None
+    return None
 
 
 def tiles(data: BacktestData) -> list[dict[str, str]]:

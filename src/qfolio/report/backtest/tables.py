@@ -124,7 +124,7 @@ def difference_headings(data: BacktestData) -> list[str]:
 
 
 def difference_rows(name: str, data: BacktestData) -> list[dict[str, str] | None]:
-    """Differences to the reference, to its best rebalancing, and to the best baseline.
+    """Differences to the reference, to its best rebalancing, and to the best baselines.
 
     None where there is nothing to compare, or nothing that says something; see ``comparable``.
     """
@@ -163,8 +163,14 @@ def _comparisons(test: Assessment) -> list[tuple[str, str, str, tuple[Measured, 
     found = [("to_reference", test.reference, "", MEASURED)]
     if any(entry.to_rebalanced is not None for entry in test.strategies.values()):
         found.append(("to_rebalanced", test.rebalanced, " (best rebalancing)", MEASURED))
+    of_best: tuple[Measured, ...] = ("growth",)
+    if test.best_sharpe == test.best_baseline:
+        of_best = ("growth", "sharpe")
     if test.best_baseline != test.reference:
-        found.append(("to_best_baseline", test.best_baseline, " (best baseline)", ("growth",)))
+        found.append(("to_best_baseline", test.best_baseline, " (best baseline)", of_best))
+    if test.best_sharpe not in (test.reference, test.best_baseline):
+        remark = " (highest Sharpe ratio)"
+        found.append(("to_best_sharpe", test.best_sharpe, remark, ("sharpe",)))
     return found
 
 
@@ -220,21 +226,24 @@ def luck_rows(names: list[str], data: BacktestData) -> list[dict[str, Any]]:
     for name in names:
         entry = data.assessment.strategies[name]
         test = entry.sharpe_test
+        active = entry.active_test
         # Probabilities are rounded down: 94.96 must not read as 95.0.
-        certain, deflated = (
+        certain, deflated, skilled = (
             f"{percent(math.floor(1000 * p) / 1000)}" if math.isfinite(p) else "–"
-            for p in (test.probabilistic, test.deflated)
+            for p in (test.probabilistic, test.deflated, active.deflated if active else math.nan)
         )
         rows.append(
             {
                 "name": name,
-                "sentence": luck(name, entry)
+                "sentence": luck(name, data.assessment)
                 if entry.kind in JUDGED and not wiped_out(entry)
                 else None,
                 "sharpe": number(entry.measures["sharpe"].mean, 2),
                 "certain": certain,
                 "threshold": number(test.threshold, 2),
                 "deflated": deflated,
+                "information": number(active.ratio, 2) if active else "–",
+                "skilled": skilled,
                 "years": number(test.minimum_years),
                 "shape": f"{number(test.skewness)} / {number(test.kurtosis)}",
             }

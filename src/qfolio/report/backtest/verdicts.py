@@ -21,6 +21,7 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
         end
         for _, claimed in agents
         for _, each in claimed
+        if _tested(each)
         for end in (each.growth.value, *each.growth.interval)
         if math.isfinite(end)
     ]
@@ -33,7 +34,7 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
     def row(claim: str, each: Difference) -> dict[str, Any]:
         growth, interval = each.growth.value, each.growth.interval
         left, right = map(at, interval)
-        known = all(map(math.isfinite, (growth, *interval)))
+        known = _tested(each) and all(map(math.isfinite, (growth, *interval)))
         return {
             "finding": claim,
             "numbers": f"{numbers}." if (numbers := evidence(each, test)) else "",
@@ -49,6 +50,11 @@ def verdict_rows(names: list[str], data: BacktestData) -> dict[str, Any]:
         "ticks": [(percent(tick, digits, sign=True), at(tick)) for tick in ticks],
         "zero": at(0),
     }
+
+
+def _tested(difference: Difference) -> bool:
+    """Whether a verdict is on growth, of which the axis is."""
+    return difference.growth.p is not None
 
 
 def ticks_around(low: float, high: float) -> tuple[list[float], int]:

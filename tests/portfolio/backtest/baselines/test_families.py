@@ -151,6 +151,18 @@ def test_moving_average_reversion_by_hand() -> None:
     np.testing.assert_allclose(decide("olmar", prices, held, cap=0.7), [0.3, 0.7], atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["olmar", "pamr", "minimum-variance-ledoit-wolf"])
+def test_months_of_few_rows_do_not_starve_a_rule(name: str) -> None:
+    """On monthly prices a rule sees the rows that it needs, not the one row of a month."""
+    rng = np.random.default_rng(1)
+    prices = np.cumprod(1 + rng.normal(0, 0.03, (300, 3)), axis=0)
+    held = np.array([0, 0.5, 0.3, 0.2])
+    found = decide(name, prices, held, month=1)
+    months = decide(name, prices, held, month=5)  # with 60 rows a year
+    np.testing.assert_allclose(found, months, rtol=1e-12)
+    assert not np.allclose(decide(name, prices[-4:], held, month=1), found) or name == "pamr"
+
+
 @pytest.mark.parametrize("name", ["pamr", "olmar"])
 def test_online_rules_stay_where_all_assets_move_alike(name: str) -> None:
     prices = np.cumprod(np.full((6, 3), 1.1), axis=0)

@@ -75,6 +75,30 @@ def test_assess_by_hand_on_one_block() -> None:
     assert alone.deflated == alone.probabilistic  # nobody picked it from anything
 
 
+def test_a_market_that_rose_is_no_skill() -> None:
+    """An agent that holds the reference, give or take noise, has its Sharpe ratio, and adds 0."""
+    rng = np.random.default_rng(2)
+    base = strategy(rng, "baseline", 1)
+    returns = np.asarray(base.returns)
+    returns = 0.002 + 0.01 * (returns - returns.mean()) / returns.std()
+    noise = rng.standard_normal((3, 300))
+    noise -= noise.mean(axis=1, keepdims=True)
+    entries = {
+        "equal weight": base._replace(returns=returns),
+        "dqn": strategy(rng)._replace(returns=returns + 0.001 * noise),
+    }
+    result = assess(entries, days(300), periods_per_year=252, resamples=10, earlier_trials=10)
+    test, active = result.strategies["dqn"].sharpe_test, result.strategies["dqn"].active_test
+    assert active is not None
+    assert result.strategies["equal weight"].active_test is None
+    assert test.ratio == pytest.approx(result.strategies["dqn"].measures["sharpe"].mean)
+    assert test.deflated > 0.9
+    assert active.ratio == pytest.approx(0, abs=1e-9)
+    assert active.probabilistic == pytest.approx(0.5)
+    assert active.deflated < 0.1
+    assert active.trials == test.trials == 13
+
+
 def test_skewness_and_kurtosis_by_hand() -> None:
     # One day of +3 among three of −1: variance 3, third moment 6, fourth 21.
     returns = np.tile([[0.03, -0.01, -0.01, -0.01]], 5)

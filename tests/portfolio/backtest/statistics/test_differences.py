@@ -45,6 +45,13 @@ def test_beating_the_best_is_beating_every_one() -> None:
     assert to_best(calm, wild).better == wild.tails().better > 0.05
 
 
+def test_a_wild_rival_does_not_hide_who_falls_short() -> None:
+    """Its errors are large, but so is the lead that would be evidence for it."""
+    behind, wild = estimate(-0.05, 0.01, 1), estimate(0.3, 0.08, 2)
+    assert to_best(behind).worse < 1e-5
+    assert to_best(behind, wild).worse < 0.001
+
+
 def test_less_volatility_is_better() -> None:
     calmer = estimate(-0.03, 0.01)
     assert to_best(calmer, more=False) == to_best(calmer.negated())
@@ -64,7 +71,7 @@ def both(result: Assessment, name: str) -> list[Difference]:
 
 
 def in_tests(result: Assessment, *names: str) -> list[Contrast]:
-    fields = ("to_reference", "to_rebalanced", "to_best_baseline")
+    fields = ("to_reference", "to_rebalanced", "to_best_baseline", "to_best_sharpe")
     found = [getattr(result.strategies[name], field) for name in names for field in fields]
     contrasts = [c for each in found if each is not None for c in each.contrasts().values()]
     return [each for each in contrasts if each.p is not None]
@@ -104,8 +111,34 @@ def test_holm_takes_away_what_many_comparisons_found_by_luck() -> None:
     np.testing.assert_allclose(corrected, holm(alone_p))
 
 
-def test_the_best_baseline_is_the_one_that_grew_most() -> None:
-    """Not the one with the best Sharpe ratio: what is compared with it is growth."""
+def test_earlier_trials_weaken_claims_to_be_better() -> None:
+    """Whoever tried 20 settings before has 21 chances to look better, and none to look worse."""
+    rng = np.random.default_rng(6)
+    base = strategy(rng, "baseline", 1)
+    excess = rng.standard_normal(300)
+    excess = 0.002 * ((excess - excess.mean()) / excess.std() + 3.5 / math.sqrt(300))
+    up, down = (np.asarray(base.returns) + sign * excess for sign in (1, -1))
+    entries = {
+        "equal weight": base,
+        "up": Strategy("agent", up, base.turnover, base.cost),
+        "down": Strategy("agent", down, base.turnover, base.cost),
+    }
+
+    def growth(trials: int) -> list[Contrast]:
+        result = assess(
+            entries, days(300), periods_per_year=252, resamples=100, earlier_trials=trials
+        )
+        return [both(result, name)[0].growth for name in ("up", "down")]
+
+    (up_alone, down_alone), (up_among, down_among) = growth(0), growth(20)
+    assert up_alone.p is not None
+    assert up_among.p == pytest.approx(21 * up_alone.p)
+    assert down_among.p == down_alone.p
+    assert [each.finding for each in (up_alone, up_among)] == ["better", "none"]
+    assert [each.finding for each in (down_alone, down_among)] == ["worse", "worse"]
+
+
+def test_the_best_are_those_with_the_most_growth_and_the_highest_sharpe_ratio() -> None:
     rng = np.random.default_rng(3)
     wave = rng.standard_normal((1, 300))
     wave -= wave.mean()
@@ -117,14 +150,22 @@ def test_the_best_baseline_is_the_one_that_grew_most() -> None:
     result = assess(entries, days(300), periods_per_year=252, resamples=100)
     sharpes = {name: entry.measures["sharpe"].mean for name, entry in result.strategies.items()}
     assert sharpes["calm"] > sharpes["bold"]
-    assert result.best_baseline == "bold"
-    assert result.comparisons == 3 + 1  # with the best baseline in growth alone
-    best = result.strategies["dqn"].to_best_baseline
-    assert best is not None
-    assert best.reference == "bold"
-    assert best.sharpe.finding is None
-    assert best.growth.finding is not None
+    assert (result.best_baseline, result.best_sharpe) == ("bold", "calm")
+    assert result.comparisons == 3 + 1 + 1  # with the best, each in one measure
+    best, calmest = (
+        getattr(result.strategies["dqn"], field) for field in ("to_best_baseline", "to_best_sharpe")
+    )
+    assert (best.reference, calmest.reference) == ("bold", "calm")
+    assert best.sharpe.finding is None is calmest.growth.finding
+    assert best.growth.finding is not None is not calmest.sharpe.finding
+    assert calmest.sharpe.value == pytest.approx(sharpes["dqn"] - sharpes["calm"])
     assert in_tests(result, "calm", "bold") == []
+    # One baseline that is the best in both is compared in both.
+    del entries["bold"]
+    result = assess(entries, days(300), periods_per_year=252, resamples=100)
+    assert result.best_baseline == result.best_sharpe == "calm"
+    assert result.comparisons == 3 + 2
+    assert result.strategies["dqn"].to_best_sharpe is None
 
 
 def test_the_reference_as_the_best_is_one_comparison() -> None:

@@ -42,15 +42,17 @@ def said(
     rebalanced: Difference | None,
     reference: Difference,
     best: Difference | None = None,
+    calmest: Difference | None = None,
 ) -> list[str]:
     entry = dataclasses.replace(
         assessment.strategies["dqn"],
         to_reference=reference,
         to_rebalanced=rebalanced,
         to_best_baseline=best,
+        to_best_sharpe=calmest,
     )
     strategies = {**assessment.strategies, "dqn": entry}
-    changed = dataclasses.replace(assessment, strategies=strategies, best_baseline="other")
+    changed = dataclasses.replace(assessment, strategies=strategies)
     return [text(sentence) for sentence in verdicts(changed)["dqn"]]
 
 
@@ -110,11 +112,18 @@ def test_claims_are_plain(assessment: Assessment) -> None:
         "best rebalancing of equal weight in growth after costs, and fluctuates less"
     ]
     untested = Contrast(0.1, (0.0, 0.2))
-    best = about(growth=better, sharpe=untested, volatility=untested)
+    best = about("other", growth=better, sharpe=untested, volatility=untested)
     *_, last = said(assessment, none, none, best)
     assert last == (
-        "dqn beats other in growth after costs: the difference in annual growth to it is +1.0% "
+        "dqn beats other in growth after costs: the difference in annual growth to other is +1.0% "
         "(95% interval +0.5% to +1.5%; corrected p = 0.020)."
+    )
+    less = Contrast(-0.1, (-0.18, -0.02), 0.01, 0.02, "worse")
+    calmest = about("calm", growth=untested, sharpe=less, volatility=untested)
+    *_, last = said(assessment, none, none, None, calmest)
+    assert last == (
+        "dqn falls short of calm in Sharpe ratio after costs: the difference in Sharpe ratio to "
+        "calm is -0.10 (95% interval -0.18 to -0.02; corrected p = 0.020)."
     )
 
 
@@ -215,18 +224,21 @@ def test_p_values_are_rounded_up(p: float, said: str) -> None:
 
 def test_verdicts_are_on_agents_alone(assessment: Assessment) -> None:
     assert list(verdicts(assessment)) == ["dqn"]
-    assert assessment.comparisons == 3 + (assessment.best_baseline == "other")
+    best = assessment.best_baseline, assessment.best_sharpe
+    assert assessment.comparisons == 3 + best.count("other")
 
 
 def test_luck_in_words(assessment: Assessment) -> None:
     entry = assessment.strategies["dqn"]
+    active = None
 
     def said(sharpe: float, threshold: float, deflated: float, trials: int) -> str:
-        measures = {"sharpe": dataclasses.replace(entry.measures["sharpe"], mean=sharpe)}
         test = dataclasses.replace(
-            entry.sharpe_test, threshold=threshold, deflated=deflated, trials=trials
+            entry.sharpe_test, ratio=sharpe, threshold=threshold, deflated=deflated, trials=trials
         )
-        return text(luck("dqn", dataclasses.replace(entry, measures=measures, sharpe_test=test)))
+        changed = dataclasses.replace(entry, sharpe_test=test, active_test=active)
+        strategies = {**assessment.strategies, "dqn": changed}
+        return text(luck("dqn", dataclasses.replace(assessment, strategies=strategies)))
 
     assert said(0.9, 0.31, 0.8349, 10) == (
         "The annual Sharpe ratio of dqn, 0.90, may be luck: the probability that the true one "
@@ -239,3 +251,11 @@ def test_luck_in_words(assessment: Assessment) -> None:
     )
     assert "is more than luck is likely to explain" in said(0.9, 0.31, 0.95, 10)
     assert said(math.nan, 0.31, math.nan, 10).count("undefined") == 2
+    active = dataclasses.replace(
+        entry.sharpe_test, ratio=0.25, threshold=0.53, deflated=0.0664, trials=10
+    )
+    assert said(0.9, 0.31, 0.97, 10).endswith(
+        "Its information ratio to equal weight, 0.25, may be luck: the probability that the true "
+        "one exceeds 0.53, the expected best of 10 trials without skill, is 6.6%, less than the "
+        "usual 95%."
+    )

@@ -112,7 +112,7 @@ def importance(
                 conditions=task.conditions,
                 long_only=task.feasible.long_only,
             )
-            # Ruin, which has no finite growth, is as bad as while agents learn.
+            # Growth after ruin is not finite; use the floor of training.
             logs.append(np.maximum(replayed.growth, np.log(RUIN)))
     lost = (logs[0] - np.array(logs[1:])).reshape(count + 1, draws, -1)
     each = periods_per_year * lost.mean(2)

@@ -22,23 +22,24 @@ class History(NamedTuple):
     cap: float  # largest weight of one asset when it is ordered
     month: int = 21  # rows in a month
 
-    def window(self, months: int | None = None) -> Floats:
+    def window(self, months: int | None = None, least: int = 0) -> Floats:
         """Prices of the tradable assets from the start of the training window to the decision.
 
         Args:
             months: Only the returns of this many latest months, if there are so many.
+            least: Number of returns below which these months are too few, if rows are rare.
 
         Returns:
             Prices of shape (rows, assets), without gaps; one row more than there are returns.
         """
         start = self.train.start or 0
         if months is not None:
-            start = max(start, len(self.prices) - 1 - months * self.month)
+            start = max(start, len(self.prices) - 1 - max(months * self.month, least))
         return np.asarray(self.prices[start:][:, self.tradable])
 
-    def returns(self, months: int | None = None) -> Floats:
+    def returns(self, months: int | None = None, least: int = 0) -> Floats:
         """Simple returns over ``window``, of shape (rows, assets)."""
-        prices = self.window(months)
+        prices = self.window(months, least)
         return np.asarray(prices[1:] / prices[:-1] - 1)
 
 
@@ -82,10 +83,12 @@ class Fitted(Baseline):
 
     Attributes:
         months: The window of the estimate (default: the training window and all rows since).
+        least: Number of returns that the window has at least, if there are so many.
     """
 
     calendar = "month"
     months: ClassVar[int | None] = None
+    least: ClassVar[int] = 0
 
     @abstractmethod
     def fit(self, returns: Floats, cap: float) -> Floats:
@@ -100,7 +103,7 @@ class Fitted(Baseline):
         equal = equal_weights(history)
         if history.cap * equal.size <= 1 + 1e-9:
             return with_cash(equal, history)
-        returns = history.returns(self.months)
+        returns = history.returns(self.months, self.least)
         try:
             if len(returns) < 3 or not np.ptp(returns, axis=0).all():
                 raise ValueError("the returns of an asset are too few or have no variance")

@@ -1,7 +1,8 @@
 """The long-only portfolio of least variance, on four estimates of the covariance.
 
 The first is the sample covariance over the training window and since. The others use the latest
-twelve months, as Ledoit & Wolf (2017, "Markowitz meets Goldilocks") do with daily returns.
+twelve months, as Ledoit & Wolf (2017, "Markowitz meets Goldilocks") do with daily returns; where
+rows are rare, the latest 60 rows, as many as DeMiguel, Garlappi & Uppal (2009) use of months.
 """
 
 import numpy as np
@@ -22,28 +23,28 @@ class MinimumVariance(Fitted):
         return minimum_variance(self.covariance(returns), cap)
 
 
-class MinimumVarianceLedoitWolf(MinimumVariance):
-    """Least variance on linear shrinkage."""
+class RecentMinimumVariance(MinimumVariance):
+    """Least variance on the sample covariance of the latest year."""
 
-    months = 12
+    months, least = 12, 60
+
+
+class MinimumVarianceLedoitWolf(RecentMinimumVariance):
+    """Least variance on linear shrinkage."""
 
     def covariance(self, returns: Floats) -> Floats:
         return ledoit_wolf(returns)
 
 
-class MinimumVarianceNonlinear(MinimumVariance):
+class MinimumVarianceNonlinear(RecentMinimumVariance):
     """Least variance on nonlinear shrinkage."""
-
-    months = 12
 
     def covariance(self, returns: Floats) -> Floats:
         return nonlinear(returns)
 
 
-class MinimumVarianceEwma(MinimumVariance):
+class MinimumVarianceEwma(RecentMinimumVariance):
     """Least variance on an exponentially weighted covariance."""
-
-    months = 12
 
     def covariance(self, returns: Floats) -> Floats:
         return exponential(returns)

@@ -18,6 +18,9 @@ from qfolio.portfolio.backtest.baselines.base import (
     with_cash,
 )
 
+FEWEST = 5
+"""Rows that a step may use, of any length of row; a training window has more."""
+
 
 class Online(Baseline):
     """A rule that starts with equal weights and takes a step at every row."""
@@ -30,11 +33,11 @@ class Online(Baseline):
 
         Args:
             target: The weights of the last order, of shape (assets,).
-            prices: The latest month's prices of shape (rows, assets), at least two rows.
+            prices: The latest prices of shape (rows, assets), those of ``FEWEST`` rows or more.
         """
 
     def decide(self, history: History, held: Floats) -> Floats:
-        prices = history.prices[max(0, len(history.prices) - 1 - history.month) :]
+        prices = history.prices[-max(history.month + 1, FEWEST) :]
         prices = prices[:, history.tradable]
         weights = held[1:][history.tradable]
         if not weights.any():
@@ -66,7 +69,7 @@ class Olmar(Online):
     """
 
     def step(self, target: Floats, prices: Floats) -> Floats:
-        predicted = prices[-5:].mean(axis=0) / prices[-1]
+        predicted = prices[-FEWEST:].mean(axis=0) / prices[-1]
         return _reach(predicted, 10 - target @ predicted)
 
 

@@ -5,8 +5,8 @@
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,13 +34,7 @@ from qfolio.portfolio.backtest.statistics.relative import (
     relative,
 )
 from qfolio.portfolio.backtest.statistics.sampled import Measure, Sampled, mean_over_seeds
-from qfolio.portfolio.backtest.statistics.sharpe import (
-    deflated_sharpe,
-    expected_maximum_sharpe,
-    minimum_track_record,
-    probabilistic_sharpe,
-    skewness_and_kurtosis,
-)
+from qfolio.portfolio.backtest.statistics.sharpe import SharpeTest, sharpe_tests
 
 KINDS = ("agent", "ensemble", "strategy", "baseline", "rebalancing")
 """An ensemble is all seeds of an agent, traded as one. A strategy is of the user's own; as the
@@ -64,19 +58,6 @@ class Strategy(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class SharpeTest:
-    """Tests of whether a Sharpe ratio is more than luck; moments are means over the seeds."""
-
-    skewness: float
-    kurtosis: float  # 3 for a normal distribution
-    probabilistic: float  # probability that the true Sharpe ratio exceeds zero
-    minimum_years: float  # track record needed until that probability reaches 95%; may be inf
-    threshold: float  # annual Sharpe ratio expected of the best trial if none has any skill
-    deflated: float  # probability that the true Sharpe ratio exceeds the threshold
-    trials: int  # number that the threshold counts; 1 for a baseline
-
-
-@dataclasses.dataclass(frozen=True)
 class StrategyAssessment:
     """The statistics of one strategy."""
 
@@ -86,7 +67,9 @@ class StrategyAssessment:
     to_reference: Difference | None  # None for the reference itself
     to_rebalanced: Difference | None  # None for itself, or if only one speed was replayed
     to_best_baseline: Difference | None  # None for itself, or if the reference is the best
+    to_best_sharpe: Difference | None  # None for itself, or if it is one of the others
     sharpe_test: SharpeTest
+    active_test: SharpeTest | None  # of the returns less those of ``rebalanced``; None for itself
     relative: dict[str, Measure]  # to the reference, by the names in RELATIVE; empty for itself
 
 
@@ -107,6 +90,7 @@ class Assessment:
     reference: str
     rebalanced: str  # the reference or its rebalancing, whichever grew most over the same days
     best_baseline: str  # or a user's own strategy, whichever grew most over the same days
+    best_sharpe: str  # likewise, whichever had the highest Sharpe ratio
     strategies: dict[str, StrategyAssessment]
     bound: float | None = None  # annual growth that no constant weights exceed, even without costs
 
@@ -131,8 +115,9 @@ def assess(
     """Compute every statistic of a backtest.
 
     Agents, ensembles and strategies of the user's own are compared with a reference, with the
-    rebalancing of the reference that grew most over the days of the test, and with the baseline or
-    other strategy that grew most; see ``differences.py``.
+    rebalancing of the reference that grew most over the days of the test, with the baseline or
+    other strategy that grew most, and with the one that had the highest Sharpe ratio; see
+    ``differences.py``.
 
     All strategies share the resampled days and so one block length: the longest that their returns
     (mean over seeds) or squared returns require. Squared returns are autocorrelated for months, and
@@ -189,24 +174,44 @@ def assess(
             {key: values[:, start:end] for key, values in drawn.items()},
         )
 
-    def growth(name: str) -> float:
-        return mean_over_seeds(sampled[name].observed["growth"])
+    def observed(key: str, name: str) -> float:
+        return mean_over_seeds(sampled[name].observed[key])
 
+    growth, sharpe = partial(observed, "growth"), partial(observed, "sharpe")
     family = [reference, *(name for name, each in known.items() if each.kind == "rebalancing")]
     classical = [name for name, each in known.items() if each.kind in ("baseline", "strategy")]
     rebalanced, best = max(family, key=growth), max(classical, key=growth)
+    best_sharpe = max(classical, key=sharpe)
     judged = [name for name, each in known.items() if each.kind in JUDGED]
     trials = earlier_trials + sum(tracks[name].shape[1] for name in judged)
-    sharpes = [sharpe for name in judged for sharpe in sampled[name].observed["sharpe"]]
-    variance = _trial_variance(sharpes, periods, periods_per_year)
     rivals = {"reference": Rival(reference, (reference,))}
     if len(family) > 1:
         rivals["rebalanced"] = Rival(rebalanced, tuple(family))
     if best != reference:
-        rivals["best"] = Rival(best, tuple(classical), tested=("growth",))
+        one = best == best_sharpe
+        rivals["best"] = Rival(best, tuple(classical), ("growth", "sharpe") if one else ("growth",))
+    if best_sharpe not in (reference, best):
+        rivals["best sharpe"] = Rival(best_sharpe, tuple(classical), ("sharpe",))
     returns = {name: _canonical(track)[0] for name, track in tracks.items()}
+    theirs = returns[rebalanced].mean(axis=0)
+    tests, active_tests = (
+        sharpe_tests(less, ratios, judged, trials, periods_per_year)
+        for less, ratios in (
+            (
+                {name: each - (0.0 if free is None else free) for name, each in returns.items()},
+                {name: each.observed["sharpe"] for name, each in sampled.items()},
+            ),
+            (
+                {name: each - theirs for name, each in returns.items()},
+                {
+                    name: relative(each, theirs, periods_per_year)["information_ratio"]
+                    for name, each in returns.items()
+                },
+            ),
+        )
+    )
     compared = _relative(known, tracks, reference, periods_per_year, block, resamples, seed)
-    differences = compare(returns, rivals, judged, periods_per_year, seed, free)
+    differences = compare(returns, rivals, judged, periods_per_year, seed, free, earlier_trials)
 
     return Assessment(
         first_date=str(days[0].astype("datetime64[D]")),
@@ -227,6 +232,7 @@ def assess(
         reference=reference,
         rebalanced=rebalanced,
         best_baseline=best,
+        best_sharpe=best_sharpe,
         strategies={
             name: StrategyAssessment(
                 kind=known[name].kind,
@@ -235,13 +241,9 @@ def assess(
                 to_reference=differences["reference"].get(name),
                 to_rebalanced=differences.get("rebalanced", {}).get(name),
                 to_best_baseline=differences.get("best", {}).get(name),
-                sharpe_test=_sharpe_test(
-                    returns[name] if free is None else returns[name] - free,
-                    mean_over_seeds(sampled[name].observed["sharpe"]),
-                    trials if name in judged else 1,  # baselines were not selected among trials
-                    variance,
-                    periods_per_year,
-                ),
+                to_best_sharpe=differences.get("best sharpe", {}).get(name),
+                sharpe_test=tests[name],
+                active_test=None if name == rebalanced else active_tests[name],
                 relative=compared.get(name, {}),
             )
             for name, track in tracks.items()
@@ -299,36 +301,6 @@ def _relative(
         )
         result[name] = {key: sampled.measure(key) for key in RELATIVE}
     return result
-
-
-def _sharpe_test(
-    returns: Floats, sharpe: float, trials: int, variance: float, periods_per_year: float
-) -> SharpeTest:
-    """The tests of an annual Sharpe ratio, the mean over seeds; returns: (seeds, periods)."""
-    year = math.sqrt(periods_per_year)
-    periods = returns.shape[1]
-    moments = skewness_and_kurtosis(returns)
-    return SharpeTest(
-        *moments,
-        probabilistic=probabilistic_sharpe(sharpe / year, periods, *moments),
-        minimum_years=minimum_track_record(sharpe / year, *moments) / periods_per_year,
-        threshold=year * expected_maximum_sharpe(trials, variance),
-        deflated=deflated_sharpe(sharpe / year, periods, *moments, trials, variance),
-        trials=trials,
-    )
-
-
-def _trial_variance(annual: list[float], periods: int, periods_per_year: float) -> float:
-    """The variance of the trials' Sharpe ratios per period.
-
-    At least that of an estimate from normal returns without skill: seeds of one agent are similar,
-    and their spread understates what other trials could have found by luck.
-    """
-    known = np.sort(annual)  # so that the order of the seeds cannot move the last digit
-    luck = 1 / (periods - 1)
-    if len(known) < 2 or not np.isfinite(known).all():
-        return luck
-    return max(luck, float(np.var(known, ddof=1) / periods_per_year))
 
 
 def _common_block(series: list[Floats]) -> float:

@@ -2,12 +2,14 @@
 
 Agents, ensembles and the user's own strategies are tested in growth, Sharpe ratio and volatility
 against the reference, which was chosen in advance, and against the reference at its best speed of
-rebalancing, which is known only in hindsight; and in growth against the best baseline (or strategy
-of the user's own), likewise. The tests account for such a choice: beating the best means beating
-all that it was chosen from, so the largest of their p-values applies (an intersection–union test,
-Berger 1982); falling short of the best has the p-value of White's reality check (2000), which asks
-how far ahead the luckiest of them would be if none were better. P-values with Holm's correction for
-all of these comparisons decide on findings.
+rebalancing, which is known only in hindsight; and in growth and in Sharpe ratio against the best
+baseline (or strategy of the user's own), likewise. The tests account for such a choice: beating the
+best means beating all that it was chosen from, so the largest of their p-values applies (an
+intersection–union test, Berger 1982); falling short of the best has the p-value of a reality check
+(White 2000) on t-statistics (Hansen 2005), which asks how far ahead the luckiest of them would be
+if none were better. Earlier trials on the same prices make it likelier that something looks better
+by luck: p-values of that claim are multiplied by their number plus one (Bonferroni). P-values with
+Holm's correction for all of these comparisons decide on findings.
 """
 
 import dataclasses
@@ -44,7 +46,7 @@ class Contrast:
 
     value: float
     interval: Range
-    p: float | None = None  # two-sided; accounts for a choice in hindsight
+    p: float | None = None  # two-sided; accounts for a choice in hindsight and earlier trials
     p_holm: float | None = None  # corrected for all comparisons of the backtest; sets finding
     finding: Finding | None = None
 
@@ -90,6 +92,7 @@ def compare(
     periods_per_year: float,
     seed: int = 0,
     risk_free: Floats | None = None,
+    earlier_trials: int = 0,
 ) -> dict[str, dict[str, Difference]]:
     """Every strategy minus each of the rivals.
 
@@ -100,6 +103,7 @@ def compare(
         periods_per_year: For example 252 for trading days.
         seed: Seed of the draws.
         risk_free: Returns of cash, shape (periods,), which Sharpe ratios subtract (default: 0).
+        earlier_trials: Number of earlier trials on these days.
 
     Returns:
         Differences by role and strategy, without those of a rival to itself.
@@ -123,7 +127,9 @@ def compare(
                 for key in rival.tested:
                     rng = np.random.default_rng(seed)
                     among = [others[other][key] for other in rival.without(name)]
-                    tails[role, name, key] = tails_to(shown[key], among, key != "volatility", rng)
+                    better, worse = tails_to(shown[key], among, key != "volatility", rng)
+                    better = min(1.0, better * (1 + earlier_trials))
+                    tails[role, name, key] = Tails(better, worse)
     p_values = [min(1.0, 2 * min(each)) for each in tails.values()]
     for ((role, name, key), (better, worse)), p, p_holm in zip(
         tails.items(), p_values, holm(p_values).tolist(), strict=True
@@ -166,10 +172,9 @@ def tails_to(
     if not more:
         shown, among = shown.negated(), [one.negated() for one in among]
     better, worse = max(one.tails().better for one in among), shown.tails().worse
-    if len(among) > 1 and worse < better:
-        known = [one for one in among if one.known]
-        lead = -min(one.value for one in known)
-        lucky = luckiest(known, DRAWS, rng) >= lead
+    if len(among) > 1 and worse < better and shown.error > 0:
+        lead = -shown.value / shown.error
+        lucky = luckiest([one for one in among if one.known and one.error > 0], DRAWS, rng) >= lead
         # No claim that contradicts the interval; the observed history counts as one draw.
         worse = max(worse, float((1 + lucky.sum()) / (1 + DRAWS)))
     return Tails(better, worse)

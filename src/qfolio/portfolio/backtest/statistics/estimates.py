@@ -133,22 +133,26 @@ def estimate(ours: Floats, theirs: Floats, periods_per_year: float) -> dict[Meas
 
 
 def luckiest(family: list[Estimate], draws: int, rng: np.random.Generator) -> Floats:
-    """Draw the largest error of several estimates of one strategy, all true differences being zero.
+    """Draw the largest t-statistic of several estimates, all true differences being zero.
 
-    Errors are jointly normal, with the covariance of their loads, over a common estimated scale.
+    Each error is in units of its own standard error. In a common unit, the wildest strategy would
+    set how lucky the luckiest is expected to be, whatever it is compared with (Hansen 2005). Errors
+    are jointly normal, with the correlations of their loads, over a common estimated scale.
 
     Args:
-        family: Estimates on the same days and with the same seeds.
+        family: Estimates on the same days and with the same seeds, with errors above zero.
         draws: Number of draws.
         rng: Source of randomness.
 
     Returns:
         Numbers of shape (draws,).
     """
-    loads = np.stack([each.loads for each in family], axis=1)  # (ν, estimates)
+    errors = np.array([each.error for each in family])
+    loads = np.stack([each.loads for each in family], axis=1) / errors  # (ν, estimates)
     count = len(loads)
     days = rng.standard_normal((draws, count)) @ loads / math.sqrt(count)
-    seeds = rng.standard_normal((draws, 1)) * math.sqrt(max(e.seed_variance for e in family))
+    spread = np.sqrt([each.seed_variance for each in family]) / errors
+    seeds = rng.standard_normal((draws, 1)) * spread
     freedom = min(each.freedom for each in family)
     scale = np.sqrt(rng.chisquare(freedom, (draws, 1)) / freedom)
     return np.asarray(((days + seeds) / scale).max(axis=1))

@@ -1,12 +1,72 @@
 """Significance of Sharpe ratios: probabilistic, deflated, and the minimum track record."""
 
+import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from qfolio.core.arrays import Floats
 from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
 from qfolio.portfolio.backtest.statistics.measures import deviations, ratio_or_zero
+from qfolio.portfolio.backtest.statistics.sampled import mean_over_seeds
+
+
+@dataclasses.dataclass(frozen=True)
+class SharpeTest:
+    """Tests of whether a Sharpe ratio is more than luck; moments are means over the seeds.
+
+    That of active returns is an information ratio.
+    """
+
+    ratio: float  # annual, mean over the seeds
+    skewness: float
+    kurtosis: float  # 3 for a normal distribution
+    probabilistic: float  # probability that the true Sharpe ratio exceeds zero
+    minimum_years: float  # track record needed until that probability reaches 95%; may be inf
+    threshold: float  # annual Sharpe ratio expected of the best trial if none has any skill
+    deflated: float  # probability that the true Sharpe ratio exceeds the threshold
+    trials: int  # number that the threshold counts; 1 for a baseline
+
+
+def sharpe_tests(
+    returns: Mapping[str, Floats],
+    ratios: Mapping[str, Floats],
+    judged: Sequence[str],
+    trials: int,
+    periods_per_year: float,
+) -> dict[str, SharpeTest]:
+    """The tests of annual Sharpe ratios, means over the seeds.
+
+    Baselines were not selected among trials.
+
+    Args:
+        returns: Of shape (seeds, periods), by strategy.
+        ratios: Their annual Sharpe ratios of shape (seeds,).
+        judged: Which strategies are trials.
+        trials: Number of trials.
+        periods_per_year: For example 252 for trading days.
+    """
+    year = math.sqrt(periods_per_year)
+    periods = next(iter(returns.values())).shape[1]
+    found = [float(ratio) for name in judged for ratio in ratios[name]]
+    variance = _trial_variance(found, periods, periods_per_year)
+
+    def test(name: str) -> SharpeTest:
+        annual, moments = mean_over_seeds(ratios[name]), skewness_and_kurtosis(returns[name])
+        sharpe, count = annual / year, trials if name in judged else 1
+        return SharpeTest(
+            annual,
+            *moments,
+            probabilistic=probabilistic_sharpe(sharpe, periods, *moments),
+            minimum_years=minimum_track_record(sharpe, *moments) / periods_per_year,
+            threshold=year * expected_maximum_sharpe(count, variance),
+            deflated=deflated_sharpe(sharpe, periods, *moments, count, variance),
+            trials=count,
+        )
+
+    return {name: test(name) for name in returns}
+
 
 # Every Sharpe ratio in these formulas is per period, not annual: an annual one would count each
 # period as a whole year of evidence.
@@ -82,6 +142,19 @@ def deflated_sharpe(
     """
     benchmark = expected_maximum_sharpe(trials, variance)
     return probabilistic_sharpe(sharpe, periods, skewness, kurtosis, benchmark)
+
+
+def _trial_variance(annual: list[float], periods: int, periods_per_year: float) -> float:
+    """The variance of the trials' Sharpe ratios per period.
+
+    At least that of an estimate from normal returns without skill: seeds of one agent are similar,
+    and their spread understates what other trials could have found by luck.
+    """
+    known = np.sort(annual)  # so that the order of the seeds cannot move the last digit
+    luck = 1 / (periods - 1)
+    if len(known) < 2 or not np.isfinite(known).all():
+        return luck
+    return max(luck, float(np.var(known, ddof=1) / periods_per_year))
 
 
 def _sharpe_variance(sharpe: float, skewness: float, kurtosis: float) -> float:

@@ -9,6 +9,7 @@ from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
 from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference, Finding
 from qfolio.portfolio.backtest.statistics.estimates import Measured
 from qfolio.portfolio.backtest.statistics.measures import STEADY
+from qfolio.portfolio.backtest.statistics.sharpe import SharpeTest
 
 _MEASURES: dict[Measured, str] = {
     "growth": "growth",
@@ -40,11 +41,7 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
     all speeds, and another of which speed it holds. After a total loss there is only one claim,
     which says so.
     """
-    entry, reference, best = (
-        assessment.strategies[name],
-        assessment.reference,
-        assessment.best_baseline,
-    )
+    entry, reference = assessment.strategies[name], assessment.reference
     alone, rebalanced = entry.to_reference, entry.to_rebalanced
     assert alone is not None  # only the reference itself has none
     if rebalanced is None:
@@ -67,8 +64,9 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
             here += ", which pays costs for nothing," if dear else ","
         said.append((_claim(name, alone, here, reference), alone))
     said.sort(key=lambda each: each[1].growth.finding != "worse")
-    if entry.to_best_baseline is not None:
-        said.append((_claim(name, entry.to_best_baseline, best, best), entry.to_best_baseline))
+    for each in (entry.to_best_baseline, entry.to_best_sharpe):
+        if each is not None:
+            said.append((_claim(name, each, each.reference, each.reference), each))
     return [(claim, difference) for claim, difference in said if claim]
 
 
@@ -136,14 +134,16 @@ def evidence(difference: Difference, assessment: Assessment) -> str:
     """
     if not comparable("growth", difference.growth):
         return ""
-    lead = f"the difference in annual growth to {difference.reference} is"
     tested = {key: each for key, each in difference.contrasts().items() if each.p is not None}
     p = "corrected p" if assessment.comparisons > 1 else "p"
-    texts = [
-        f"{lead if key == 'growth' else 'in ' + _MEASURES[key]} {_numbers(key, each, p)}"
-        for key, each in (tested or {"growth": difference.growth}).items()
-        if comparable(key, each)
-    ]
+    texts: list[str] = []
+    for key, each in (tested or {"growth": difference.growth}).items():
+        if comparable(key, each):
+            lead = f"in {_MEASURES[key]}"
+            if not texts:
+                what = "annual growth" if key == "growth" else _MEASURES[key]
+                lead = f"the difference in {what} to {difference.reference} is"
+            texts.append(f"{lead} {_numbers(key, each, p)}")
     steady = "volatility" in tested and difference.volatility.value > math.log(STEADY)
     return _joined(texts, "and") + (f"; {difference.reference} hardly fluctuates" if steady else "")
 
@@ -196,13 +196,21 @@ def p_value(p: float) -> str:
     return f"= {math.ceil(10**digits * p - 1e-9) / 10**digits:.{digits}f}"
 
 
-def luck(name: str, strategy: StrategyAssessment) -> str:
-    """The verdict of a deflated Sharpe ratio.
+def luck(name: str, assessment: Assessment) -> str:
+    """The verdicts of the deflated Sharpe ratio and information ratio.
 
-    It tests whether there is a return for the risk at all, given the selection among trials.
-    ``verdicts`` tests whether an agent is better than a baseline.
+    The first tests whether there is a return for the risk at all, given the selection among trials;
+    stocks usually have one. The second tests what an agent adds to the reference.
     """
-    test, sharpe = strategy.sharpe_test, strategy.measures["sharpe"].mean
+    entry = assessment.strategies[name]
+    said = [_luck(f"The annual Sharpe ratio of {name}", entry.sharpe_test)]
+    if entry.active_test is not None:
+        subject = f"Its information ratio to {assessment.rebalanced}"
+        said.append(_luck(subject, entry.active_test))
+    return " ".join(said)
+
+
+def _luck(subject: str, test: SharpeTest) -> str:
     bar = "zero"
     if test.trials > 1:
         bar = f"{test.threshold:.2f}, the expected best of {test.trials} trials without skill,"
@@ -212,8 +220,8 @@ def luck(name: str, strategy: StrategyAssessment) -> str:
     if not test.deflated >= LEVEL:
         claim, shortfall = "may be luck", ", less than the usual 95%"
     return (
-        f"The annual Sharpe ratio of {name}, {_number(sharpe, 2)}, {claim}: the probability that "
-        f"the true one exceeds {bar} is {_number(chance, 1)}%{shortfall}."
+        f"{subject}, {_number(test.ratio, 2)}, {claim}: the probability that the true one exceeds "
+        f"{bar} is {_number(chance, 1)}%{shortfall}."
     )
 
 
