@@ -3,8 +3,17 @@
 import csv
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from qfolio.portfolio.prices.findings import Finding
+from qfolio.portfolio.prices.table import inspect
+
+
+def all_findings(source: Any = None, **options: Any) -> list[Finding]:
+    """All findings on a table."""
+    return inspect(source, **options)[1]
 
 
 def write_table(

@@ -113,6 +113,10 @@ def test_the_page_about_own_parts(own, monkeypatch, capsys):
         assert qfolio(monkeypatch, *command) == 2
         assert "add --trust constant" in capsys.readouterr().err
         assert qfolio(monkeypatch, *command, "--trust", "constant") == 0
+    rows = Path("prices.csv").read_text()
+    Path("newer.csv").write_text(f"{rows}2021-02-04,50,50,50\n")
+    updated = [*policy, "--prices", "newer.csv", "--update", "--trust", "constant", "--anyway"]
+    assert qfolio(monkeypatch, *updated) == 0
     own()
     assert qfolio(monkeypatch, "backtest", "--resume", "runs/own") == 2
     assert "--trust" in capsys.readouterr().err

@@ -413,6 +413,12 @@ def test_a_holding_within_the_band_is_said_to_stay(copy, monkeypatch, capsys, tm
     assert qfolio(monkeypatch, "allocate", copy, *options) == 0
     said = "Nothing is ordered: no weight is more than 0.6 from what is wanted."
     assert said in " ".join(capsys.readouterr().out.split())
+    # Here the capital is too small for a share, whatever the band.
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"calendar": "drift:0.01"}))
+    options = [*AS_OF, "--agent", "equal-weight", "--capital", 1, "--whole-shares", "--dry-run"]
+    assert qfolio(monkeypatch, "allocate", copy, *options) == 0
+    said = "Nothing is ordered: the trades come to no whole share or lot."
+    assert said in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import math
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from qfolio.commands.backtesting import Options
@@ -185,6 +186,29 @@ def test_backtest_obeys_a_mandate(monkeypatch, capsys, tmp_path):
     assert qfolio(monkeypatch, "allocate", *asked) == 0
     weights = {row["asset"]: row["weight"] for row in json.loads(capsys.readouterr().out)["assets"]}
     assert weights["A"] + weights["B"] <= 0.3 + 1e-5
+
+
+def test_returns_give_no_share_prices(monkeypatch, capsys, tmp_path):
+    """Their levels start at 100, and no number of shares can be bought at them."""
+    monkeypatch.chdir(tmp_path)
+    write_table(tmp_path / "prices.csv")
+    prices = pd.read_csv("prices.csv", index_col=0)
+    prices.pct_change().iloc[1:].to_csv("returns.csv")
+    options = ["returns.csv", "--returns", "fraction", "--agents", "pathwise", "--train", "100d",
+               "--test", "80d", "--seeds", 1, "--episodes", 4, "--baselines", "buy-and-hold",
+               "--set", "window=10", "horizon=20", "hidden=4", "num_envs=2",
+               "rollout_length=10"]  # fmt: skip
+    assert qfolio(monkeypatch, "backtest", *options, "--out", "run") == 0
+    asked = ["run", "--capital", 1000, "--as-of", "2020-09-16", "--anyway"]
+    for more in (["--whole-shares"], ["--orders", "orders.csv"]):
+        assert qfolio(monkeypatch, "allocate", *asked, *more) == 2
+        assert "Returns give no share prices" in " ".join(capsys.readouterr().err.split())
+    assert qfolio(monkeypatch, "allocate", *asked) == 0
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if x.strip().startswith("A ")]
+    assert line.split()[1] == line.split()[-1] == "–"
+    # Prices of the same assets may be given for it.
+    given = ["--prices", "prices.csv", "--whole-shares"]
+    assert qfolio(monkeypatch, "allocate", *asked, *given) == 0
 
 
 def test_backtest_explains_its_agents(folder):

@@ -73,9 +73,3 @@ def test_costs_read_a_column_of_the_market(table):
     prices = Options(returns="percent", columns=("rate",)).load(table)
     known = Conditions.of(prices, ["rate"]).values["rate"]
     np.testing.assert_array_equal(known, prices.market)
-
-
-def test_shares_need_prices(monkeypatch, capsys, tmp_path):
-    given = ["--returns", "fraction", "--whole-shares"]
-    assert qfolio(monkeypatch, "allocate", tmp_path, *given) == 2
-    assert "--returns gives no share prices" in " ".join(capsys.readouterr().err.split())

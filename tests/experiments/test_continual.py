@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
+from qfolio.agents.tabular import QLearning
 from qfolio.commands.progress import BarProgress
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
@@ -155,6 +156,12 @@ def test_an_interrupted_comparison_goes_on_as_if_it_never_was(content, way, tmp_
 def test_refuses_changes_that_make_no_sense(changed, message):
     with pytest.raises(QfolioError, match=message):
         Plan(OLD, changed, AGENT, EPISODES)
+
+
+def test_an_agent_without_a_schedule_cannot_go_on():
+    """It is refused before anything is trained, and before a folder is written."""
+    with pytest.raises(QfolioError, match="QLearning has no learning-rate schedule"):
+        Plan(OLD, NEW, QLearning(), EPISODES)
 
 
 def test_a_task_without_numbers_cannot_change():

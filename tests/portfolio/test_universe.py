@@ -24,13 +24,14 @@ from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.feasible import exactly
-from qfolio.portfolio.mandate.limits import feasible, settled
+from qfolio.portfolio.mandate.limits import feasible, mandate_text
 from qfolio.portfolio.market import Holding
 from qfolio.portfolio.prices.gaps import cash_outs
-from qfolio.portfolio.prices.table import Prices, check, load
+from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 from qfolio.portfolio.universe import Patterns, spread
 
+from tables import all_findings
 from tiny import PATHWISE
 
 NAMES = tuple("ABCDEFGH")
@@ -40,6 +41,7 @@ MENU = Preset(
      "all_actions": True, "replay_capacity": 400, "episode_steps": 0},
     episodes=8, task={"menu": "tilts:0.2", "window": 10, "horizon": 20},
 )  # fmt: skip
+
 SIGNALS = {"signals": "momentum:5,volatility:5", "anchor": "equal-weight"}
 
 
@@ -370,7 +372,7 @@ def test_limits_of_every_set_of_assets_can_be_met() -> None:
     short = {"assets": {"cap": 0.6, "floor": {"A": -0.2}}, "cash": {"min": 0.0, "max": 1.0},
              "groups": {"kind": {"x": {"assets": ["C"], "floor": 0.3}}}}  # fmt: skip
     for mandate in (few, short):
-        text = settled(mandate, NAMES[:4])
+        text = mandate_text(mandate, NAMES[:4])
         patterns, _ = Patterns.of(text, there, 1.0)
         every = feasible(text, np.ones(4, bool))
         for row, present in enumerate(there):
@@ -378,7 +380,7 @@ def test_limits_of_every_set_of_assets_can_be_met() -> None:
             weights = exactly(made, np.array([0, 0.25, 0.25, 0.25, 0.25]), np.eye(5)[0])
             assert max(made.violations(weights).values()) < 1e-6, (mandate, present)
             assert (weights[1:][~present] == 0).all()
-    patterns, said = Patterns.of(settled(few, NAMES[:4]), there, 1.0)
+    patterns, said = Patterns.of(mandate_text(few, NAMES[:4]), there, 1.0)
     cash = 1 + patterns.most[patterns.of_row, 1]
     assert cash[there.all(1)] == pytest.approx(0.2)
     np.testing.assert_allclose(cash[there.sum(1) == 3], [0.3, 0.3, 0.3, 0.2], atol=1e-6)
@@ -507,7 +509,7 @@ def test_a_table_with_leavers_is_read(tmp_path: Path) -> None:
     frame.loc[frame.index[20:], "C"] = np.nan
     file = tmp_path / "prices.csv"
     frame.to_csv(file)
-    said = " ".join(f"{finding} {finding.advice}" for finding in check(file, late="join"))
+    said = " ".join(f"{finding} {finding.advice}" for finding in all_findings(file, late="join"))
     assert "no prices after 2024-01-26" in said
     assert "--ended" in said
     prices = load(file, late="join", ended="cash-out", delisting_haircut=0.25)

@@ -45,7 +45,6 @@ from qfolio.report.figures.curves import (
     LEAST_REGRET,
     draw_learning_curve,
     draw_overestimation,
-    overestimation,
 )
 from qfolio.report.figures.pendulum import value
 from qfolio.report.figures.policies import draw_policy, policy
@@ -292,12 +291,6 @@ def test_one_seed_one_evaluation_and_no_extras(tmp_path: Path) -> None:
     assert "95" not in page.split("<h2>Learning curve")[1].split("Terms")[0].split("<svg")[0]
     assert "The learned policy" not in page
     assert "without double DQN" not in page
-
-
-def test_overestimation_into_a_buffer() -> None:
-    buffer = io.BytesIO()
-    overestimation(buffer, make_data(seeds=2, points=3, steps=1))
-    assert buffer.getvalue().startswith(b"\x89PNG")
 
 
 def test_value_needs_maps() -> None:

@@ -18,6 +18,7 @@ from qfolio.core.registry import TASKS, find
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.market import RUIN
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import load
 
 try:
@@ -81,7 +82,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         render_mode: str | None = None,
         **task: Any,
     ) -> None:
-        from qfolio.portfolio.mandate.limits import settled
+        from qfolio.portfolio.mandate.limits import mandate_text
         from qfolio.portfolio.task import Portfolio
 
         if render_mode not in (None, "ansi"):
@@ -89,7 +90,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         self.render_mode = render_mode
         self.prices = load(prices)
         if "mandate" in task:
-            task["mandate"] = settled(task["mandate"], self.prices.assets)
+            task["mandate"] = mandate_text(task["mandate"], self.prices.assets)
         chosen = settings.convert(Portfolio, task)
         self.task = Portfolio.of(self.prices, **chosen)
         self._conditions = Conditions.of(self.prices, self.task.costs.columns)
@@ -221,7 +222,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         }
 
     def _day(self, row: int) -> str:
-        return str(self.prices.dates[row])[:10]
+        return day(self.prices.dates[row])
 
 
 class _Programs:

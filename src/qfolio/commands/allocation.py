@@ -95,11 +95,6 @@ def allocate(
     from qfolio.portfolio.policy import Policy
     from qfolio.portfolio.prices.findings import day
 
-    if returns and (holdings or whole_shares or orders):
-        raise QfolioError(
-            "--returns gives no share prices; leave out --holdings, --whole-shares and --orders, "
-            "or give a table of prices."
-        )
     desk = Desk.open(folder, returns=returns, **latest.reading)
     if reproduce is not None:
         if agent is not None or update or orders is not None:
@@ -113,11 +108,17 @@ def allocate(
     if not anyway:
         standing.require_sound(folder, named=agent is not None)
     followed = desk.followed(name)
-    if returns and lots(followed.mandate) is not None:
-        raise QfolioError(
-            "The mandate has lots, but --returns gives no share prices; give a table of prices."
-        )
     table = desk.table(followed, prices)
+    if table.levels and (holdings or whole_shares or orders):
+        raise QfolioError(
+            "Returns give no share prices; leave out --holdings, --whole-shares and --orders, or "
+            "give a table of prices (--prices, without --returns)."
+        )
+    if table.levels and lots(followed.mandate) is not None:
+        raise QfolioError(
+            "The mandate has lots, but returns give no share prices; give a table of prices "
+            "(--prices, without --returns)."
+        )
     if prices is not None:
         console.print_warnings(prices.name, desk.news)
     require_fresh(table, as_of)
@@ -160,7 +161,7 @@ def allocate(
         trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
     else:
         notes = followed.notes(table)
-    console.print_allocation(allocation, standing, trained)
+    console.print_allocation(allocation, standing, trained, shares=not table.levels)
     for reason in why:
         console.tell(f"Why {sentence(reason)}")
     for line in (*gone, *notes, *desk.terms(followed, table, allocation, spent), said):

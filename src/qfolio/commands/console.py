@@ -219,12 +219,14 @@ def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
 def describe_backtest(backtest: "Backtest") -> str:
     """What a backtest trains and tests, in a line; its memory, if that is large."""
     from qfolio.portfolio.backtest import memory
+    from qfolio.portfolio.prices.findings import day
 
     config, size = backtest.config, memory.needed(backtest.prices, backtest.config)
     large = f" It needs about {size / 2**30:.1f} GiB of memory, beside what training takes."
     folds, seeds = amount(len(backtest.folds), "fold"), amount(config.seeds, "seed")
+    first = backtest.prices.dates[backtest.folds[0].decisions.start]
     return (
-        f"{folds} ({backtest.folds[0].name} to {str(backtest.dates[-1])[:10]}) · "
+        f"{folds} ({day(first)} to {day(backtest.dates[-1])}) · "
         f"{amount(len(backtest.prices.assets), 'asset')} · {' and '.join(backtest.agents)} · "
         f"{seeds} · {config.cost * 1e4:g} bp · lag {config.lag} · {config.device}"
         + (f".{large}" if size > memory.MENTIONED else "")
@@ -345,10 +347,13 @@ def _growth(entry: "Active | Pooled") -> tuple[str, str]:
     return growth, f"{low.removesuffix('%')} … {high}"
 
 
-def print_allocation(allocation: "Allocation", standing: "Standing", trained: str | None) -> None:
+def print_allocation(
+    allocation: "Allocation", standing: "Standing", trained: str | None, *, shares: bool
+) -> None:
     """What is followed and what its backtest found, the trades, and their cost.
 
-    trained: the date of the last row that the policy has learned from, if it has.
+    trained: the date of the last row that the policy has learned from, if it has. shares: whether
+    the prices are those of shares.
     """
     kind = standing.kind.capitalize()
     say(f"{kind}: {standing.agent}" + (f", trained on prices up to {trained}." if trained else "."))
@@ -365,7 +370,8 @@ def print_allocation(allocation: "Allocation", standing: "Standing", trained: st
         if held[1 + i] or targets[1 + i] or trade:
             weights = (figure(float(x[1 + i]), ".2%") for x in (held, targets, after))
             money = figure(trade * price, "+,.2f")
-            rows.append((asset, figure(price, ",.2f"), *weights, money, figure(trade, "+,.4g")))
+            cost, count = (figure(price, ",.2f" if price >= 1 else ".4g"), figure(trade, "+,.4g"))
+            rows.append((asset, cost if shares else "–", *weights, money, count if shares else "–"))
     cash = (figure(float(x[0]), ".2%") for x in (held, targets, after))
     print_table(heads, [*rows, ("cash", "", *cash, "", "")])
     kinds = ", ".join(f"{kind} {figure(money, ',.2f')}" for kind, money in allocation.costs.items())

@@ -83,6 +83,8 @@ class Plan:
             raise QfolioError(
                 "nothing changes; give one of the task's numbers a new value, as in mass=2."
             )
+        for name in ("final", "steps"):
+            _setting(self.agent, name)
         if any(task.optimum() is None for task in (self.task, self.changed)):
             raise QfolioError(
                 f"recovery is measured against an exact optimum, but {type(self.task).__name__} "

@@ -115,7 +115,7 @@ class Seeds:
         """The description of the run in the log."""
         config = self.config
         return {
-            "kind": "run",
+            "kind": config.kind,
             "task": config.task,
             "agents": [config.agent],
             "preset": config.preset,

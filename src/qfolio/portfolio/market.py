@@ -152,7 +152,7 @@ class Menu(eqx.Module):
         # The other order would give all choices' weights by asset, to be transposed.
         weights = signalled.anchor * jnp.exp(tilt @ signalled.signals.T)
         weights = weights * signalled.anchor.sum() / jnp.maximum(weights.sum(), 1e-9)
-        return jnp.append(1 - weights.sum(), weights)
+        return simplex.with_rest(weights)
 
 
 class Market(ExogenousTask):
@@ -311,7 +311,7 @@ class Market(ExogenousTask):
         anchor = self.anchor_weights(market)
         if anchor is None:
             return None
-        weights = jnp.append(1 - anchor.sum(), anchor)
+        weights = simplex.with_rest(anchor)
         return self._earn(market, next_market, self.hold(weights), weights)[0]
 
     def hold(self, weights: Float[Array, " entry"]) -> Holding:

@@ -28,7 +28,7 @@ from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio import policy_folder, signals
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.following import begin, follow, on_table
-from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.findings import day, listing
 from qfolio.portfolio.prices.frequency import alike
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
@@ -180,11 +180,13 @@ class Policy:
         table = table.between(max(0, len(table) - self.rows), None)
         task = self._moved(table)
         of_now: Any = self.agent
-        agent: Agent = dataclasses.replace(
-            of_now,
-            learning_rate=of_now.learning_rate * UPDATE_RATE,
-            learning_rate_final=1.0,  # the schedule may have ended
-        )
+        rates = {
+            "learning_rate": getattr(of_now, "learning_rate", 0.0) * UPDATE_RATE,
+            "learning_rate_final": 1.0,  # the schedule may have ended
+        }
+        known = {field.name for field in dataclasses.fields(of_now)}  # a user's may have no rate
+        changed = {name: rate for name, rate in rates.items() if name in known}
+        agent: Agent = dataclasses.replace(of_now, **changed)
         draws = [np.random.SeedSequence((i, self.updates + 1)) for i in range(self.seeds)]
         seeds = [int(draw.generate_state(1)[0]) for draw in draws]
         unlearned = -(-agent.warm_up() // episode_steps(task, agent)) * agent.num_envs
@@ -236,16 +238,16 @@ class Policy:
         missing = [name for name in self.assets if name not in table.assets]
         unknown = [name for name in table.assets if name not in self.assets]
         if missing or unknown:
-            said = [f"lacks {_list(missing)}"] * bool(missing)
-            said += [f"has {_list(unknown)}, which the policy does not know"] * bool(unknown)
+            said = [f"lacks {listing(missing)}"] * bool(missing)
+            said += [f"has {listing(unknown)}, which the policy does not know"] * bool(unknown)
             raise QfolioError(
                 f"The price table {' and '.join(said)}; it must have the {len(self.assets)} "
                 "assets that the policy was trained on, and no others."
             )
         if table.feature_names != self.features:
             raise QfolioError(
-                f"The price table has {_list(list(table.feature_names)) or 'none'} as further "
-                f"features; the policy was trained with {_list(list(self.features)) or 'none'}."
+                f"The price table has {listing(table.feature_names) or 'none'} as further "
+                f"features; the policy was trained with {listing(self.features) or 'none'}."
             )
         usual, found = float(self.task.year), table.periods_per_year
         if usual and len(table) >= SEVERAL and not alike(usual, found):
@@ -274,9 +276,10 @@ class Policy:
         begin = last - self.task.window
         late = table.first_rows > np.where(tradable, begin, last)
         if late.any():
+            names = [name for name, is_late in zip(self.assets, late, strict=True) if is_late]
             raise QfolioError(
                 f"The policy's window begins on {day(table.dates[begin])}, when there was no price "
-                f"of {_list([n for n, is_late in zip(self.assets, late, strict=True) if is_late])} "
+                f"of {listing(names)} "
                 "yet; give earlier prices, or wait until there are enough."
             )
         return table
@@ -367,8 +370,3 @@ def _learn(population: Population, episodes: int, listeners: Sequence[Listener])
     """Trains; raises KeyboardInterrupt if Ctrl-C stopped it before the end."""
     if not fit(population, Budget(episodes), listeners).finished:
         raise KeyboardInterrupt
-
-
-def _list(names: list[str]) -> str:
-    shown = ", ".join(map(repr, names[:3]))
-    return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")

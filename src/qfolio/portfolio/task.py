@@ -29,7 +29,14 @@ from qfolio.portfolio.costs import cashed
 from qfolio.portfolio.execution import Plan, Terms
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import CappedSimplex, Feasible, Mandated
-from qfolio.portfolio.mandate.limits import buyable, feasible, largest_weight, parse, reach, settled
+from qfolio.portfolio.mandate.limits import (
+    buyable,
+    feasible,
+    largest_weight,
+    mandate_text,
+    parse,
+    reach,
+)
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.mandate.risk import Past, Risk, covariances
 from qfolio.portfolio.market import Contexts, Holding, Market, Relatives, Signalled
@@ -86,10 +93,10 @@ class Portfolio(Market):
 
     @staticmethod
     def of(prices: Prices, **settings: Any) -> "Portfolio":
-        """A task on all rows of a table; mandate: anything that ``limits.settled`` takes."""
+        """A task on all rows of a table; mandate: anything that ``limits.mandate_text`` takes."""
         require_type("prices", prices, Prices, "a table that qfolio.load_prices has read")
         if "mandate" in settings:
-            settings["mandate"] = settled(settings["mandate"], prices.assets)
+            settings["mandate"] = mandate_text(settings["mandate"], prices.assets)
         task = Portfolio.blank(len(prices.assets), len(prices.feature_names), **settings)
         first = ~np.isnan(prices.values[0]) if prices.tradable is None else None
         return task.on(prices).part(0, len(prices) - 1, first)

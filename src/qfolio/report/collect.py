@@ -25,6 +25,7 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import Simulation
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
 from qfolio.portfolio.market import Market
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.base import OneAsset, Synthetic
@@ -90,7 +91,7 @@ def backtest_data(
     """Collects everything ``write_backtest_report`` needs."""
     config, dates = backtest.config, backtest.prices.dates
     shift = config.lag + 1
-    day = lambda row: str(dates[row])[:10]  # noqa: E731
+    date = lambda row: day(dates[row])  # noqa: E731
     first, last = (str(backtest.dates[i])[:4] for i in (0, -1))
     table = str(config.prices["source"]).rpartition(": ")[2]  # without its vendor
     named = f"{listed(list(backtest.agents))} on {table}, {first} to {last}"
@@ -120,10 +121,10 @@ def backtest_data(
         folds=[
             {
                 "name": fold.name,
-                "train_first": day(fold.train.start),
-                "train_last": day(fold.train.stop - 1),
-                "test_first": day(fold.decisions.start + shift),
-                "test_last": day(fold.decisions.stop - 1 + shift),
+                "train_first": date(fold.train.start),
+                "train_last": date(fold.train.stop - 1),
+                "test_first": date(fold.decisions.start + shift),
+                "test_last": date(fold.decisions.stop - 1 + shift),
             }
             for fold in backtest.folds
         ],

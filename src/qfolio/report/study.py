@@ -14,7 +14,7 @@ import msgspec
 
 from qfolio.core.files import write_bytes
 from qfolio.core.text import amount
-from qfolio.portfolio.backtest.statistics.verdict import p_value
+from qfolio.portfolio.backtest.statistics.verdict import p_text
 from qfolio.portfolio.study.folder import Result, StudyConfig, Variant
 from qfolio.portfolio.study.pooling import Active, Evidence, Pools
 from qfolio.portfolio.study.run import Study
@@ -248,7 +248,7 @@ def _label(growth: float | None, low: float | None, high: float | None) -> str:
 
 
 def _chance(p: float | None) -> str:
-    return "" if p is None else f"p {p_value(p)}"
+    return "" if p is None else f"p {p_text(p)}"
 
 
 def _spread(active: Active) -> str:

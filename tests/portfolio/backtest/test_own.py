@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -252,6 +254,16 @@ HOURS = Prices(np.datetime64("2020-01-01T09:30", "s") + np.arange(ROWS) * np.tim
 def test_strategies_that_are_refused(source, prices, message):
     with pytest.raises(QfolioError, match=message):
         create(prices, strategies={"mine": source})
+
+
+def test_an_order_of_a_delisted_asset_is_refused():
+    """It would be carried out as cash."""
+    prices, listed = table(), np.ones((ROWS, 3), bool)
+    listed[150:, 1] = False
+    prices = dataclasses.replace(prices, listed=listed)
+    create(prices, strategies={"mine": weights([100, 149, 150], B=[0.5, 0.3, 0.0])})
+    with pytest.raises(QfolioError, match="mine orders B on 2020-05-30, after its last price"):
+        create(prices, strategies={"mine": weights([100, 150], B=[0.5, 0.5])})
 
 
 def test_a_return_on_a_day_between_rows_is_refused():

@@ -7,7 +7,7 @@ import pytest
 
 from qfolio.portfolio.costs import Proportional
 from qfolio.portfolio.desk.allocation import Allocation
-from qfolio.portfolio.mandate.limits import settled
+from qfolio.portfolio.mandate.limits import mandate_text
 from qfolio.portfolio.prices.table import Prices
 
 
@@ -78,13 +78,13 @@ def test_lots_of_a_mandate_are_traded_whole_and_single_shares_of_a_split_are_the
             np.arange(2).astype("datetime64[D]"), names, np.tile(whole.prices / lot, (2, 1))
         )
         policy = Fixed(whole.weights, cost)
-        policy.mandate = settled(
+        policy.mandate = mandate_text(
             {"trading": {"lot": dict(zip(names, lot.tolist(), strict=True))}}, names
         )
         found = Allocation.of(policy, finer, whole.shares * lot, whole.cash)
         np.testing.assert_allclose(found.trades, whole.trades * lot, rtol=1e-9)
         assert found.cash_after == pytest.approx(whole.cash_after, abs=1e-8 * whole.wealth)
-        policy.mandate = settled({"trading": {"lot": 10}}, names)
+        policy.mandate = mandate_text({"trading": {"lot": 10}}, names)
         tens = Allocation.of(policy, finer, whole.shares * lot, whole.cash).trades
         np.testing.assert_array_equal(tens % 10, 0)
         differ += int((tens != found.trades).any())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qfolio.portfolio.mandate.feasible import CappedSimplex
-from qfolio.portfolio.mandate.limits import feasible, settled
+from qfolio.portfolio.mandate.limits import feasible, mandate_text
 from qfolio.portfolio.mandate.projection import excess, nearest
 
 LIMITS = [0.4, 0.0, 0.7]
@@ -51,7 +51,7 @@ MANDATE = {
 
 def mandated(**trading):
     assets = [f"A{i}" for i in range(8)]
-    made = feasible(settled({**MANDATE, "trading": trading}, assets), np.ones(8, bool))
+    made = feasible(mandate_text({**MANDATE, "trading": trading}, assets), np.ones(8, bool))
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), made)
 
 
@@ -84,14 +84,14 @@ def test_where_turnover_gives_way_no_other_limit_does_for_the_sake_of_small_trad
 
 def test_what_a_mandate_with_loans_draws_is_allowed():
     limits = {"cash": {"min": -1.0, "max": -0.2}, "exposure": {"gross": 2.0}}
-    made = feasible(settled(limits, "ABCDE"), np.ones(5, bool))
+    made = feasible(mandate_text(limits, "ABCDE"), np.ones(5, bool))
     drawn = jax.vmap(made.draw)(jax.random.split(jax.random.key(0), 100))
     assert largest(made.violations(drawn)) <= 2e-6
     assert float(drawn[:, 0].max()) <= -0.2 + 2e-6
 
 
 def test_no_rounding_makes_a_loan():
-    fully = feasible(settled({"cash": {"max": 0.0}}, "ABCDE"), np.ones(5, bool))
+    fully = feasible(mandate_text({"cash": {"max": 0.0}}, "ABCDE"), np.ones(5, bool))
     random = np.random.default_rng(1)
     wanted = random.dirichlet(np.full(6, 0.5), 5000).astype(np.float32)
     held = jax.vmap(fully.draw)(jax.random.split(jax.random.key(0), 5000))
@@ -130,7 +130,7 @@ def test_how_far_the_largest_weights_are_from_the_best_choice(
     """Against all 70 choices of 4 of 8 assets, in 300 cases: the distance to what is wanted."""
     trading = {"holdings": 4} | ({} if turnover is None else {"turnover": turnover})
     assets = [f"A{i}" for i in range(8)]
-    made = feasible(settled({**limits, "trading": trading}, assets), np.ones(8, bool))
+    made = feasible(mandate_text({**limits, "trading": trading}, assets), np.ones(8, bool))
     chosen = itertools.combinations(range(8), 4)
     others = np.array([[i not in some for i in range(8)] for some in chosen])
     with jax.enable_x64(True):

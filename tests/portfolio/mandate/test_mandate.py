@@ -5,7 +5,14 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate import checks
-from qfolio.portfolio.mandate.limits import feasible, largest_weight, lots, parse, reach, settled
+from qfolio.portfolio.mandate.limits import (
+    feasible,
+    largest_weight,
+    lots,
+    mandate_text,
+    parse,
+    reach,
+)
 from qfolio.portfolio.mandate.mandate import Mandate
 
 ASSETS = ["SPY", "TLT", "XLE", "XOM"]
@@ -39,17 +46,23 @@ def written(folder: Path, text: str = FILE, groups: str = GROUPS) -> Path:
     return folder / "mandate.toml"
 
 
+def notes_on(text: str, usable: np.ndarray) -> list[str]:
+    """What is unusual about a mandate that can be met."""
+    checks.require(text, usable)
+    return checks.unusual(text, usable)
+
+
 def test_lots_are_for_all_assets_or_for_some():
     assert lots("") is None
-    assert lots(settled({"assets": {"cap": 0.5}}, ASSETS)) is None
+    assert lots(mandate_text({"assets": {"cap": 0.5}}, ASSETS)) is None
     for lot, each in ((100, [100] * 4), ({"TLT": 10}, [1, 10, 1, 1])):
-        found = lots(settled({"trading": {"lot": lot}}, ASSETS))
+        found = lots(mandate_text({"trading": {"lot": lot}}, ASSETS))
         assert found is not None
         assert found.tolist() == each
     with pytest.raises(QfolioError, match=r"trading\.lot of the mandate names 'TTL'.*TLT"):
-        settled({"trading": {"lot": {"TTL": 10}}}, ASSETS)
+        mandate_text({"trading": {"lot": {"TTL": 10}}}, ASSETS)
     with pytest.raises(QfolioError, match=r"trading\.lot"):
-        settled({"trading": {"lot": 0}}, ASSETS)
+        mandate_text({"trading": {"lot": 0}}, ASSETS)
 
 
 def test_keys_that_are_no_text_are_refused():
@@ -79,7 +92,7 @@ def test_single_keys_take_precedence_over_a_file():
 
 
 def test_a_file_says_the_limits(tmp_path):
-    made = feasible(settled(written(tmp_path), ASSETS), ALL)
+    made = feasible(mandate_text(written(tmp_path), ASSETS), ALL)
     limits = made.limits
     np.testing.assert_allclose(limits.high, [0.5, 0, 0.5, 0.5])
     np.testing.assert_allclose(limits.low, [0.1, 0, 0, 0])
@@ -101,14 +114,14 @@ def test_a_file_says_the_limits(tmp_path):
 
 def test_its_text_is_whole_and_is_for_any_order_of_assets(tmp_path):
     mandate = Mandate.read(written(tmp_path))
-    text = settled(mandate, ASSETS)
+    text = mandate_text(mandate, ASSETS)
     assert parse(text) == (ASSETS, mandate)
     assert mandate.groups["sector"]["Energy"].assets == ("XLE", "XOM", "other")
-    turned = feasible(settled(text, ASSETS[::-1]), ALL)
+    turned = feasible(mandate_text(text, ASSETS[::-1]), ALL)
     np.testing.assert_allclose(turned.limits.low, [0, 0, 0, 0.1])
-    assert settled(None, ASSETS) == settled("", ASSETS) == ""
+    assert mandate_text(None, ASSETS) == mandate_text("", ASSETS) == ""
     inline = {"assets": {"cap": 0.5}, "groups": {"kind": {"x": {"assets": ["XLE"], "cap": 0.1}}}}
-    np.testing.assert_allclose(feasible(settled(inline, ASSETS), ALL, 0.4).limits.high, 0.4)
+    np.testing.assert_allclose(feasible(mandate_text(inline, ASSETS), ALL, 0.4).limits.high, 0.4)
 
 
 @pytest.mark.parametrize(
@@ -133,14 +146,14 @@ def test_its_text_is_whole_and_is_for_any_order_of_assets(tmp_path):
 )  # fmt: skip
 def test_what_is_wrong_in_a_file_is_said(tmp_path, text, message):
     with pytest.raises(QfolioError, match=message):
-        settled(written(tmp_path, text), ASSETS)
+        mandate_text(written(tmp_path, text), ASSETS)
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "mandate.toml"
     path.write_bytes(b"PK\x03\x04\xff\xfe")
     with pytest.raises(QfolioError, match=r"mandate\.toml is not UTF-8 text; write it as TOML"):
-        settled(path, ASSETS)
+        mandate_text(path, ASSETS)
 
 
 def test_the_example_of_the_guide_is_a_mandate(tmp_path):
@@ -148,7 +161,7 @@ def test_the_example_of_the_guide_is_a_mandate(tmp_path):
     toml, groups = (guide.split(fence)[1].split("\n```")[0] for fence in ("```toml", "```\nasset"))
     assets = ["SPY", "TLT", "USO", "GLD", "XLE", "XOM", "EWG"]
     path = written(tmp_path, toml, "asset" + groups)
-    _, mandate = parse(settled(path, assets))
+    _, mandate = parse(mandate_text(path, assets))
     members = {name: group.assets for _, name, group in mandate.every_group}
     assert members == {"Energy": ("XLE", "XOM"), "US": ("XLE", "XOM"), "metals": ("GLD", "SLV")}
 
@@ -193,18 +206,18 @@ GROUP = {"assets": ["XLE", "XOM"]}
 )  # fmt: skip
 def test_limits_that_clash_are_refused_with_their_names(mandate, message):
     with pytest.raises(QfolioError, match=message):
-        checks.require(settled(mandate, ASSETS), ALL)
+        checks.require(mandate_text(mandate, ASSETS), ALL)
 
 
 def test_what_is_unusual_is_said():
     many = [f"A{i}" for i in range(15)]
-    [note] = checks.require(settled({"assets": {"cap": 0.05}}, many), np.ones(15, bool))
+    [note] = notes_on(mandate_text({"assets": {"cap": 0.05}}, many), np.ones(15, bool))
     assert note == "The mandate forces at least 25% cash: caps allow no more."
     bound = {"assets": {"cap": 0.1}, "groups": {"s": {"E": {**GROUP, "floor": 0.2}}}}
-    notes = checks.require(settled(bound, ASSETS), ALL)
+    notes = notes_on(mandate_text(bound, ASSETS), ALL)
     assert "no choice for s E: its floor, 20%" in notes[1]
-    assert checks.require(settled({"cash": {"max": 0.1}}, ASSETS), ALL) == []
-    [note] = checks.require(settled({"trading": {"smallest_trade": 0.3}}, ASSETS), ALL)
+    assert notes_on(mandate_text({"cash": {"max": 0.1}}, ASSETS), ALL) == []
+    [note] = notes_on(mandate_text({"trading": {"smallest_trade": 0.3}}, ASSETS), ALL)
     assert note.startswith("The smallest trade, 30%, is more than an equal weight, 25%")
     [note] = checks.unusual("", np.ones(15, bool), 0.05)
     assert note == "The cap of 5% for each of 15 assets forces at least 25% cash."
@@ -212,8 +225,8 @@ def test_what_is_unusual_is_said():
 
 
 def test_a_floor_for_all_assets_is_for_those_that_may_be_held():
-    text = settled({"assets": {"floor": 0.1, "forbidden": ["TLT"]}}, ASSETS)
-    assert checks.require(text, ALL) == []
+    text = mandate_text({"assets": {"floor": 0.1, "forbidden": ["TLT"]}}, ASSETS)
+    assert notes_on(text, ALL) == []
     np.testing.assert_allclose(feasible(text, ALL).limits.low, [0.1, 0, 0.1, 0.1])
 
 
@@ -239,7 +252,7 @@ def test_every_way_to_give_a_mandate_may_name_a_file_of_groups(tmp_path, monkeyp
 def test_a_file_of_groups_may_name_assets_of_other_tables(tmp_path):
     mandate = Mandate.read(written(tmp_path)).changed(["cash.max=1.0"])
     assert "other" in mandate.groups["sector"]["Energy"].assets
-    notes = checks.require(settled(mandate, ASSETS), ALL)
+    notes = notes_on(mandate_text(mandate, ASSETS), ALL)
     assert notes == ["The mandate forces at least 20% cash: caps allow no more."]
 
 
@@ -255,7 +268,7 @@ def test_a_file_of_groups_may_name_assets_of_other_tables(tmp_path):
     ],
 )
 def test_a_cap_above_1_holds_where_there_are_loans_or_shorts(mandate, most, high, size):
-    text = settled(mandate, ASSETS)
+    text = mandate_text(mandate, ASSETS)
     np.testing.assert_allclose(feasible(text, ALL, most).limits.high, high)
     assert reach(text, most) == size
     assert largest_weight(text) <= 1  # of baselines, which have neither
@@ -264,7 +277,7 @@ def test_a_cap_above_1_holds_where_there_are_loans_or_shorts(mandate, most, high
 def test_floors_yield_where_assets_cannot_be_traded():
     mandate = {"assets": {"cap": 0.3, "floor": {"XOM": 0.1}}, "cash": {"max": 0.2},
                "groups": {"sector": {"E": {**GROUP, "floor": 0.25}}}}  # fmt: skip
-    text = settled(mandate, ASSETS)
+    text = mandate_text(mandate, ASSETS)
     assert checks.relaxed(feasible(text, ALL))[1] == []
     made, lowered = checks.relaxed(feasible(text, np.array([True, True, False, False])))
     assert sorted(x.partition(" by ")[0] for x in lowered) == ["cash", "sector E"]

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated, exactly
-from qfolio.portfolio.mandate.limits import feasible, settled
+from qfolio.portfolio.mandate.limits import feasible, mandate_text
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.mandate.risk import Risk
 from qfolio.portfolio.prices.table import Prices
@@ -118,7 +118,9 @@ def test_the_risk_of_an_asset_that_joins_comes_from_its_own_days(monkeypatch, ro
     members = np.ones_like(values, bool)
     members[:50, 0] = False
     late = Prices(prices.dates, ASSETS, values, members=members)
-    task = Portfolio.blank(5, 0, mandate=settled({"risk": {"volatility": 0.2}}, ASSETS)).on(late)
+    task = Portfolio.blank(5, 0, mandate=mandate_text({"risk": {"volatility": 0.2}}, ASSETS)).on(
+        late
+    )
     for row in (first + 10, ROWS - 1):
         found = np.asarray(task.risk_at(jnp.array(row)).covariance)
         for i in range(5):
@@ -282,7 +284,7 @@ def test_what_forces_risk_is_named_if_no_row_allows_as_little():
     with pytest.raises(QfolioError, match=said):
         checks.require_safe(task.mandate, [risky, risky])
     checks.require_safe(task.mandate, [risky, calmer(risky, 0.1)])
-    checks.require_safe(settled({"cash": {"max": 0.05}}, ASSETS), iter([]))
+    checks.require_safe(mandate_text({"cash": {"max": 0.05}}, ASSETS), iter([]))
 
 
 @pytest.mark.parametrize(

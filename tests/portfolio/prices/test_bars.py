@@ -8,7 +8,9 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.prices.table import check, load
+from qfolio.portfolio.prices.table import load
+
+from tables import all_findings
 
 DAYS = pd.date_range("2024-01-02", periods=5, name="Date")
 KINDS = ["Close", "High", "Low", "Open", "Volume"]
@@ -35,7 +37,7 @@ def as_parquet(folder: Path, frame: pd.DataFrame) -> Path:
 
 
 def findings(source: object, severity: str) -> list[str]:
-    return [str(f) for f in check(source) if f.severity == severity]
+    return [str(f) for f in all_findings(source) if f.severity == severity]
 
 
 def test_yfinance_in_every_shape(tmp_path: Path):
@@ -195,7 +197,7 @@ def test_currency_signs(tmp_path: Path):
         load(path)
     rows = [f"{d},{asset},1,{code}\n" for d in days for asset, code in ("AX", "BY")]
     path.write_text("date,asset,price,Currency\n" + "".join(rows))
-    (warning,) = [f for f in check(path) if f.severity == "warning" and f.column]
+    (warning,) = [f for f in all_findings(path) if f.severity == "warning" and f.column]
     assert str(warning) == "column 'Currency': there are several currencies: X and Y"
     path.write_text("date,A\n" + "".join(f"{d},-$1\n" for d in days))
     with pytest.raises(QfolioError, match="is negative"):

@@ -9,7 +9,9 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.prices.table import Prices, check, load
+from qfolio.portfolio.prices.table import Prices, load
+
+from tables import all_findings
 
 DAYS = pd.bdate_range("2024-01-29", periods=4)
 ISO = [f"{day:%Y-%m-%d}" for day in DAYS]
@@ -36,7 +38,7 @@ def attempt(path: Path, **options: Any) -> Prices | str:
 
 
 def notes(path: Path) -> list[str]:
-    return [str(finding) for finding in check(path) if finding.severity == "note"]
+    return [str(finding) for finding in all_findings(path) if finding.severity == "note"]
 
 
 # Whole tables: a random one in each format.

@@ -8,7 +8,9 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.prices.findings import Finding
-from qfolio.portfolio.prices.table import Prices, check, describe, load
+from qfolio.portfolio.prices.table import Prices, describe, load
+
+from tables import all_findings
 
 ROWS = 80
 DAYS = pd.bdate_range("2020-01-01", periods=ROWS)
@@ -21,7 +23,7 @@ def prices(seed: int = 0) -> pd.DataFrame:
 
 
 def found(source: Any, severity: str, **options: Any) -> list[Finding]:
-    return [finding for finding in check(source, **options) if finding.severity == severity]
+    return [finding for finding in all_findings(source, **options) if finding.severity == severity]
 
 
 def test_returns_of_prices_give_the_prices_back():

@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 
 from qfolio.portfolio.prices.findings import Finding
-from qfolio.portfolio.prices.table import check
+
+from tables import all_findings
 
 ROWS, ASSETS = 500, 6
 DAYS = pd.bdate_range("2020-01-01", periods=ROWS)
@@ -18,7 +19,7 @@ def market(days: pd.DatetimeIndex = DAYS, seed: int = 0) -> pd.DataFrame:
 
 
 def found(table: pd.DataFrame, severity: str | None = None, **options: Any) -> list[Finding]:
-    return [f for f in check(table, **options) if severity in (None, f.severity)]
+    return [f for f in all_findings(table, **options) if severity in (None, f.severity)]
 
 
 def test_a_price_that_is_carried_forward_to_the_end():
@@ -119,6 +120,6 @@ def test_rows_on_which_nothing_moves_are_counted_in_a_note():
 
 def test_the_default_table_holds_prices_that_stood_still():
     """Range Resources in its first two years; no asset stands still at the end."""
-    (note,) = [str(finding) for finding in check() if "unchanged" in finding.message]
+    (note,) = [str(finding) for finding in all_findings() if "unchanged" in finding.message]
     assert "8 long spells" in note
     assert "'RRC' from 1990-01-02 to 1990-04-09 (68 rows)" in note

@@ -238,7 +238,7 @@ class Comparison:
         """The description of the comparison in the log."""
         config = self.config
         return {
-            "kind": "comparison",
+            "kind": config.kind,
             "task": config.task,
             "agents": list(config.agents),
             "seeds": config.seeds,

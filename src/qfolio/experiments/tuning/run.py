@@ -94,7 +94,7 @@ class _Share(Listener):
         self.tell(sum(self.shares.values()))
 
 
-class Study(Config, kw_only=True, frozen=True):
+class SearchConfig(Config, kw_only=True, frozen=True):
     """The configuration of a search."""
 
     kind: ClassVar[str] = "search"
@@ -128,7 +128,7 @@ class Study(Config, kw_only=True, frozen=True):
 class Tuning:
     """A search in its folder; make it with ``Tuning.create`` or ``Tuning.open``."""
 
-    def __init__(self, config: Study, folder: Path) -> None:
+    def __init__(self, config: SearchConfig, folder: Path) -> None:
         self.config, self.folder = config, folder
         self.task = task_of(config.task, config.task_settings)
         self.agent = agent_of(config.agent, config.agent_settings)
@@ -169,7 +169,7 @@ class Tuning:
             out: A new or empty folder.
         """
         _require_counts(trials=trials, batch=batch, seeds=seeds, fresh_seeds=fresh_seeds)
-        config = Study(
+        config = SearchConfig(
             **describe(task, agent),
             preset=preset,
             search={dim.name: str(dim) for dim in space},
@@ -197,7 +197,7 @@ class Tuning:
         trials: a new total number of configurations. batch: for this process alone.
         """
         folder = Path(folder)
-        config = read_config(folder / STUDY, Study)
+        config = read_config(folder / STUDY, SearchConfig)
         if trials is not None:
             _require_counts(trials=trials)
             config = msgspec.structs.replace(config, trials=trials)

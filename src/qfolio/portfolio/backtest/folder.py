@@ -222,6 +222,7 @@ class BacktestFolder:
                 market_names=tuple(config.prices.get("columns", ())),
                 listed=arrays.get("listed"),
                 members=arrays.get("members"),
+                levels=bool(config.prices.get("levels", False)),
             )
             first = prices.between(0, int(config.prices["rows"]))
         except (KeyError, TypeError, ValueError, QfolioError) as error:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from qfolio.core.errors import QfolioError
+from qfolio.portfolio.prices.findings import day
 
 
 class Fold(NamedTuple):
@@ -62,7 +63,7 @@ def walk_forward(
         start = end
     if not folds:
         raise QfolioError(
-            f"{len(dates)} rows, {str(dates[0])[:10]} to {str(dates[-1])[:10]}, leave nothing to "
+            f"{len(dates)} rows, {day(dates[0])} to {day(dates[-1])}, leave nothing to "
             f"test after train={train}; shorten it, or give more rows."
         )
     return folds
@@ -82,7 +83,7 @@ def require_fold(dates: np.ndarray, train: str, test: str, lag: int) -> None:
         whole = dates[-1] + grace >= _shift(dates[start], count, unit)
     if not whole:
         raise QfolioError(
-            f"{len(dates)} rows, {str(dates[0])[:10]} to {str(dates[-1])[:10]}, are fewer than "
+            f"{len(dates)} rows, {day(dates[0])} to {day(dates[-1])}, are fewer than "
             f"train={train} and one fold of test={test}; shorten them, or give more rows."
         )
 

@@ -16,6 +16,7 @@ from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel, Proportional, cashed
 from qfolio.portfolio.execution import Terms
 from qfolio.portfolio.mandate.feasible import Feasible, Mandated, exactly
+from qfolio.portfolio.prices.findings import day
 
 TOLERANCE = 1e-6
 """How far weights may be off the simplex or above the cap."""
@@ -232,7 +233,7 @@ def obeying(wanted: Floats, held: Floats, mandated: Feasible | None) -> Floats:
 def checked(name: str, wanted: ArrayLike, history: History) -> Floats:
     """A baseline's target weights; raises QfolioError if they are invalid."""
     target = np.asarray(wanted, dtype=float)
-    where = f"The baseline {name} at {str(history.dates[-1])[:10]}"
+    where = f"The baseline {name} at {day(history.dates[-1])}"
     if target.shape != (len(history.tradable) + 1,):
         raise QfolioError(
             f"{where} gives weights of the shape {target.shape}; it must be "

@@ -129,6 +129,14 @@ def _placed_weights(
                 f"{name} orders {asset} on {_day(prices, row)}, before its first price; give it "
                 "weight 0 until then."
             )
+        if row < days.stop and prices.listed is not None:
+            late = (weights[1:] != 0) & ~prices.listed[row] & (prices.first_rows <= row)
+            if late.any():
+                asset = prices.assets[int(late.argmax())]
+                raise QfolioError(
+                    f"{name} orders {asset} on {_day(prices, row)}, after its last price; give it "
+                    "weight 0 from then on."
+                )
         if days.start <= row < days.stop:
             decisions[row - days.start] = weights
     before = np.flatnonzero(rows < days.start)

@@ -16,7 +16,7 @@ from qfolio.portfolio.backtest.folder import BacktestConfig
 from qfolio.portfolio.backtest.folds import Fold, latest, walk_forward
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow, updates_of
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold
-from qfolio.portfolio.mandate.limits import settled
+from qfolio.portfolio.mandate.limits import mandate_text
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -154,7 +154,7 @@ class Plan:
             "cost_model": config.cost_model,
             "max_weight": config.cap,
             "calendar": config.calendar,
-            "mandate": settled(config.mandate, config.assets),
+            "mandate": mandate_text(config.mandate, config.assets),
         }
         entry = config.agents[name].task
         task = Portfolio.of(self._prices, **settings.convert(Portfolio, {**entry, **own}))

@@ -43,13 +43,14 @@ from qfolio.portfolio.backtest.statistics import assessment
 from qfolio.portfolio.backtest.trading_terms import PROPORTIONAL, TradingTerms
 from qfolio.portfolio.backtest.training import FoldsJob, TrainedFold, preparing
 from qfolio.portfolio.mandate import checks
-from qfolio.portfolio.mandate.limits import reach, settled
+from qfolio.portfolio.mandate.limits import mandate_text, reach
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.policy_folder import state_template
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.growth import require_grown
 from qfolio.portfolio.prices.table import Prices, describe, load, trials_on
+from qfolio.portfolio.task import Portfolio
 
 SMALL = 10**6
 """Number of prices below which two agents are replayed or explained side by side. Compiling their
@@ -223,7 +224,7 @@ class Backtest:
         memory.require(prices, config)
         if config.mandate is not None:
             every = np.ones(len(prices.assets), bool)
-            checks.require(settled(config.mandate, prices.assets), every, config.cap)
+            checks.require(mandate_text(config.mandate, prices.assets), every, config.cap)
         given = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
         backtest = cls(prices, config, None, given, field.own)
         if config.mandate is not None:
@@ -423,6 +424,11 @@ class Backtest:
         ]
 
     @property
+    def any_task(self) -> Portfolio:
+        """Any agent's task; costs, lag and limits are the same for all."""
+        return self._plan.any_task
+
+    @property
     def side_by_side(self) -> int:
         """Number of agents that are replayed or explained at once."""
         return 2 if self.prices.values.size < SMALL else 1
@@ -430,7 +436,7 @@ class Backtest:
     @cached_property
     def replay(self) -> Replay:
         """The rules that hold for all strategies."""
-        return Replay(self.prices, self.folds, self._plan.any_task, self.config.cap)
+        return Replay(self.prices, self.folds, self.any_task, self.config.cap)
 
     @property
     def dates(self) -> np.ndarray:
@@ -448,7 +454,7 @@ class Backtest:
             earlier_trials=self.config.trials + trials_on(table.source),
             risk_free=self.replay.growth[days, 0] - 1,
         )
-        if not self._plan.any_task.feasible.long_only:
+        if not self.any_task.feasible.long_only:
             return assessed  # accounts with debts may exceed a bound for weights without debts
         bound = constant_bound(self.replay.growth[days], table.periods_per_year)
         return dataclasses.replace(assessed, bound=bound)

@@ -16,7 +16,7 @@ from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.own import Own
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.calendars import band, decision_rows
-from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.allocation import NOISE, Allocation
 from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
 from qfolio.portfolio.desk.rule import Kind, Ordered, Rule, Untrained
@@ -60,7 +60,7 @@ class Desk:
     @property
     def debts(self) -> bool:
         """Whether its mandate lets assets be sold short or cash be borrowed."""
-        return not next(iter(self.run.tasks.values())).feasible.long_only
+        return not self.run.any_task.feasible.long_only
 
     @cached_property
     def own(self) -> dict[str, Own]:
@@ -89,7 +89,7 @@ class Desk:
         if kind == "agent":
             return self.run.policy(name, stored)
         config, assets = self.run.config, self.run.prices.assets
-        task = next(iter(self.run.tasks.values()))
+        task = self.run.any_task
         if kind == "strategy":
             return Ordered(name, self.own[name], assets, task, config.cap)
         return Rule(
@@ -169,8 +169,12 @@ class Desk:
         """
         terms, calendar = followed.task.terms, self.run.config.calendar
         days, within = table.dates, band(calendar)
-        if within and not allocation.trades.any():
-            return [f"Nothing is ordered: no weight is more than {within:g} from what is wanted."]
+        if not allocation.trades.any():
+            if allocation.turnover > NOISE:
+                return ["Nothing is ordered: the trades come to no whole share or lot."]
+            if within:
+                far = f"no weight is more than {within:g} from what is wanted"
+                return [f"Nothing is ordered: {far}."]
         started = any(record.moment < days[-1] for record in self.ledger.current())
         if not started or isinstance(followed, Ordered) or terms.calls(allocation.held):
             return []

@@ -46,7 +46,7 @@ def reference(
     config = run.config
     known = latest(name, table.dates[: first + 1], config.train, config.expanding)
     fold = known.complete(table.values)._replace(decisions=slice(first, first + count))
-    task = next(iter(run.tasks.values())).on(table).deciding_at(first)
+    task = run.any_task.on(table).deciding_at(first)
     replay = Replay(table, [fold], task, config.cap)
     if name not in own:
         return _earned(replay.baseline("baseline", name, run.baselines[name])[0]), ""

@@ -23,11 +23,11 @@ GAP, VERTICES = 0.01, 200
 """The least risk is known to within this share, unless that takes more vertices."""
 
 
-def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> list[str]:
-    """What is unusual about a mandate, a sentence each; arguments as for ``limits.feasible``.
+def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> None:
+    """Raises QfolioError if no weights obey a mandate; arguments as for ``limits.feasible``.
 
-    Raises QfolioError with limits that clash, if no weights obey it: without any one of those that
-    it names, the others could be met, or an asset of a group that the table does not have.
+    The message names limits that clash: without any one of them, the others could be met. Or it
+    names an asset of a group that the table does not have.
     """
     made = feasible(text, usable, most)
     _require_members(text)
@@ -63,7 +63,6 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
             f"The mandate cannot be met: {floors} assets have a floor, and trading.holdings is "
             f"{made.holdings}; change one of them."
         )
-    return unusual(text, usable, most)
 
 
 def unusual(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -> list[str]:

@@ -14,7 +14,7 @@ from qfolio.portfolio.mandate.mandate import Assets, Mandate
 from qfolio.portfolio.mandate.projection import Limits
 
 
-def settled(given: Any, assets: Sequence[str]) -> str:
+def mandate_text(given: Any, assets: Sequence[str]) -> str:
     """The text of a mandate.
 
     given: what ``Mandate.of`` takes, such a text, or nothing.

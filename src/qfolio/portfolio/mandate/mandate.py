@@ -117,7 +117,7 @@ class Exposure(Section, frozen=True):
     margin: Annotated[float, msgspec.Meta(gt=0, le=1)] | None = None
 
 
-class Limited(Section, frozen=True):
+class RiskLimits(Section, frozen=True):
     """Limits on the risk of an order, a year, as the last ``rows`` returns show it.
 
     benchmark: what tracking error is measured against: an asset, a baseline, or feature:NAME with
@@ -144,7 +144,7 @@ class Mandate(Section, frozen=True):
     cash: Cash = Cash()
     trading: Trading = Trading()
     exposure: Exposure = Exposure()
-    risk: Limited = Limited()
+    risk: RiskLimits = RiskLimits()
 
     @staticmethod
     def read(path: Path | str, limits: Sequence[str] = ()) -> "Mandate":
@@ -373,7 +373,7 @@ def _fields(place: str) -> list[str]:
     """The keys of a section."""
     section = place.partition(".")[0].partition("[")[0]
     kinds: dict[str, Any] = {"": Mandate, "assets": Assets, "groups": Group, "cash": Cash}
-    kinds |= {"trading": Trading, "exposure": Exposure, "risk": Limited}
+    kinds |= {"trading": Trading, "exposure": Exposure, "risk": RiskLimits}
     return list(kinds[section].__struct_fields__)
 
 

@@ -55,6 +55,7 @@ class Prices:
         listed: Whether an asset has a price, bool of shape (rows, assets); None if none ends.
         members: Whether an asset may be bought, of the same shape; None if all assets may be as
             long as they are listed.
+        levels: Whether ``values`` were cumulated from returns, so that they are no share prices.
 
     Raises:
         QfolioError: The arrays break one of these rules.
@@ -71,6 +72,7 @@ class Prices:
     market_names: tuple[str, ...] = ()
     listed: np.ndarray | None = None
     members: np.ndarray | None = None
+    levels: bool = False
 
     def __post_init__(self) -> None:
         dates = np.array(self.dates, dtype="datetime64[s]")
@@ -216,7 +218,7 @@ class Prices:
         return Prices(
             self.dates[rows], tuple(np.array(self.assets, dtype=object)[columns]),
             self.values[rows][:, columns], self.features[rows][:, columns], self.feature_names,
-            self.source, self.note, self.market[rows], self.market_names,
+            self.source, self.note, self.market[rows], self.market_names, levels=self.levels,
             **{name: mask[rows][:, columns] for name, mask in self.masks.items()},
         )  # fmt: skip
 
@@ -292,11 +294,6 @@ def accepted(prices: Prices | None, findings: Sequence[Finding], source: Any) ->
     return prices
 
 
-def check(source: Any = None, **options: Any) -> list[Finding]:
-    """All findings on a table, like ``inspect`` but without its prices."""
-    return inspect(source, **options)[1]
-
-
 def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Finding]]:
     """The prices, and all errors, warnings and notes on a table, by row and column.
 
@@ -331,7 +328,8 @@ def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Fin
         numbers = series(file, name, content["dates"])
         content["market"] = np.column_stack([content["market"], numbers])
         content["market_names"] += (name,)
-    prices = Prices(**content, source=label or table.source, note=note)
+    levels = choices.get("returns") is not None
+    prices = Prices(**content, source=label or table.source, note=note, levels=levels)
     if chosen.members is not None:
         prices = replace(prices, members=membership(chosen.members, prices.dates, prices.assets))
     return prices, findings
@@ -351,6 +349,7 @@ def describe(prices: Prices) -> dict[str, Any]:
         "late_assets": int((prices.first_rows > 0).sum()),
         "delisted_assets": 0 if prices.listed is None else int((~prices.listed[-1]).sum()),
         "has_members": prices.members is not None,
+        "levels": prices.levels,
         "digest": prices.digest,
         "note": prices.note,
     }

@@ -98,7 +98,7 @@ class StudyConfig(Config, frozen=True):
     """The content of study.json."""
 
     kind: ClassVar[str] = "study"
-    format: ClassVar[int] = 1
+    format: ClassVar[int] = 2
 
     tables: Annotated[dict[TableName, TableConfig], msgspec.Meta(min_length=1)]
     left_out: dict[TableName, str]

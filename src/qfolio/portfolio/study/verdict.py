@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT
-from qfolio.portfolio.backtest.statistics.verdict import p_value
+from qfolio.portfolio.backtest.statistics.verdict import p_text
 from qfolio.portfolio.study.folder import Result
 from qfolio.portfolio.study.pooling import Pooled, Pools
 
@@ -48,7 +48,7 @@ def _reference(pools: Pools) -> str:
 
 def _numbers(pooled: Pooled) -> str:
     interval = f"95% interval {percent(pooled.low)} to {percent(pooled.high)}"
-    chance = "" if pooled.p_holm is None else f", corrected p {p_value(pooled.p_holm)}"
+    chance = "" if pooled.p_holm is None else f", corrected p {p_text(pooled.p_holm)}"
     return (
         f"the mean difference in annual growth is {percent(pooled.growth)} ({interval}); "
         f"Stouffer’s z is {decimal(pooled.z)}{chance}"

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 from qfolio.report.figures.style import (
     LEAD,
     NARROW,
-    WIDE,
     Target,
     new_figure,
     percent_axis,
@@ -38,11 +37,6 @@ DECADES = 5
 def learning_curve(target: Target, data: ReportData) -> None:
     """Save the greedy return over training, and its regret if the optimum is known, as PNG."""
     save_png(target, draw_learning_curve, data, LEAD)
-
-
-def overestimation(target: Target, data: ReportData) -> None:
-    """Save the overestimation of action values over training as PNG."""
-    save_png(target, draw_overestimation, data, WIDE)
 
 
 def draw_learning_curve(data: ReportData, width: float) -> Figure:

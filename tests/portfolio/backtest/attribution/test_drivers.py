@@ -14,7 +14,7 @@ from qfolio.portfolio.backtest.attribution.drivers import (
 )
 from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.mandate.feasible import CappedSimplex
-from qfolio.portfolio.mandate.limits import feasible, settled
+from qfolio.portfolio.mandate.limits import feasible, mandate_text
 from qfolio.portfolio.policy import Policy
 
 from planted import ASSETS, Known, four_folds, planted
@@ -97,7 +97,7 @@ def test_the_limits_that_a_target_reaches_are_named():
         "groups": {"theme": {"metals": {"assets": ["C", "D"], "cap": 0.3}}},
         "cash": {"max": 0.2},
     }
-    allowed = feasible(settled(mandate, "ABCD"), np.ones(4, bool))
+    allowed = feasible(mandate_text(mandate, "ABCD"), np.ones(4, bool))
     weights = np.array([0.2, 0.4, 0.1, 0.2, 0.1])
     metals = ("the cap of theme metals",)
     assert _bounds(allowed, weights, weights) == [
@@ -105,7 +105,7 @@ def test_the_limits_that_a_target_reaches_are_named():
     ]  # fmt: skip
     weights = np.array([0.1, 0.3, 0.35, 0.15, 0.1])
     assert _bounds(allowed, weights, weights) == [()] * 4
-    trading = feasible(settled({"trading": {"turnover": 0.3}}, "ABCD"), np.ones(4, bool))
+    trading = feasible(mandate_text({"trading": {"turnover": 0.3}}, "ABCD"), np.ones(4, bool))
     held = np.array([0.4, 0.3, 0.2, 0.05, 0.05])
     assert _bounds(trading, weights, held) == [("the limit of turnover",)] * 4
     simplex = CappedSimplex(jnp.array([0.35, 1.0, 0.15, 0.0]))

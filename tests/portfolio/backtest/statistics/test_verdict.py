@@ -9,7 +9,7 @@ import pytest
 
 from qfolio.portfolio.backtest.statistics.assessment import Assessment, assess
 from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference
-from qfolio.portfolio.backtest.statistics.verdict import bound_sentence, luck, p_value, verdicts
+from qfolio.portfolio.backtest.statistics.verdict import bound_sentence, luck, p_text, verdicts
 
 from records import days, strategy
 
@@ -219,7 +219,7 @@ def test_the_bound_is_said_as_a_bound(assessment: Assessment) -> None:
     [(0.0009, "< 0.001"), (0.05, "= 0.050"), (0.0501, "= 0.051"), (0.412, "= 0.42"), (1, "= 1.00")],
 )
 def test_p_values_are_rounded_up(p: float, said: str) -> None:
-    assert p_value(p) == said
+    assert p_text(p) == said
 
 
 def test_verdicts_are_on_agents_alone(assessment: Assessment) -> None:

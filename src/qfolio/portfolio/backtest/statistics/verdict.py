@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from qfolio.core.text import listed
 from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment, StrategyAssessment
 from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
 from qfolio.portfolio.backtest.statistics.differences import Contrast, Difference, Finding
@@ -97,7 +98,7 @@ def _claim(name: str, difference: Difference, better: str, worse: str) -> str:
     Less volatility alone is no victory: cash has none.
     """
     parts = [
-        f"{verb} {other} in {_joined([_MEASURES[key] for key in found], 'and')}"
+        f"{verb} {other} in {listed([_MEASURES[key] for key in found])}"
         for verb, other, found in (
             ("beats", better, _gains(difference)),
             ("falls short of", worse, _gains(difference, "worse")),
@@ -115,7 +116,7 @@ def _claim(name: str, difference: Difference, better: str, worse: str) -> str:
 def _nothing(name: str, difference: Difference, other: str) -> str:
     """That nothing was found; volatility is added if it differs."""
     move = _MOVES.get(difference.volatility.finding or "")
-    measures = "growth or Sharpe ratio" if move else _joined(list(_MEASURES.values()), "or")
+    measures = "growth or Sharpe ratio" if move else listed(list(_MEASURES.values()), "or")
     word = "but" if move == "less" else "and"
     moves = f", {word} it fluctuates {move}" if move else ""
     return f"No evidence that {name} beats {other} in {measures} after costs{moves}"
@@ -144,8 +145,10 @@ def evidence(difference: Difference, assessment: Assessment) -> str:
                 what = "annual growth" if key == "growth" else _MEASURES[key]
                 lead = f"the difference in {what} to {difference.reference} is"
             texts.append(f"{lead} {_numbers(key, each, p)}")
+    if not texts:
+        return ""
     steady = "volatility" in tested and difference.volatility.value > math.log(STEADY)
-    return _joined(texts, "and") + (f"; {difference.reference} hardly fluctuates" if steady else "")
+    return listed(texts) + (f"; {difference.reference} hardly fluctuates" if steady else "")
 
 
 def comparable(key: Measured, contrast: Contrast) -> bool:
@@ -185,10 +188,10 @@ def _numbers(key: Measured, contrast: Contrast, p: str) -> str:
     digits = max(telling(end, least) for end in scaled[1:])
     middle, left, right = (f"{_number(value, digits, sign=True)}{unit}" for value in scaled)
     text = f"{middle} (95% interval {left} to {right}"
-    return text + (")" if contrast.p_holm is None else f"; {p} {p_value(contrast.p_holm)})")
+    return text + (")" if contrast.p_holm is None else f"; {p} {p_text(contrast.p_holm)})")
 
 
-def p_value(p: float) -> str:
+def p_text(p: float) -> str:
     """A p-value with its sign; rounded up, so that 0.0502 does not read as 0.05."""
     if p < 0.001:
         return "< 0.001"
@@ -234,12 +237,6 @@ def bound_sentence(assessment: Assessment) -> str:
         f"A bound: even without costs, no constant weights grew by more than {growth} a year. "
         "The best ones are known only in hindsight, so nobody could have followed them."
     )
-
-
-def _joined(texts: list[str], word: str) -> str:
-    """The texts with commas, and a word before the last."""
-    *first, last = texts
-    return f"{', '.join(first)} {word} {last}" if first else last
 
 
 def _number(value: float, digits: int, sign: bool = False) -> str:
