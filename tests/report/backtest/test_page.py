@@ -183,6 +183,22 @@ def test_costs_by_kind_have_a_table() -> None:
     assert "cash earns nothing" not in text
 
 
+def test_growth_by_cost_has_a_table() -> None:
+    """At the cost of the backtest it is the growth that all figures of the page are from."""
+    data = usual(60)
+    table = render_backtest(data).split("Table of growth by cost")[1].split("</table>")[0]
+    headings = re.findall(r"<th scope=\"col\">(.*?)</th>", table)[1:]
+    assert [re.sub(r"\D", "", heading) for heading in headings] == ["0", "25", "50", "125", "250"]
+    cells = re.findall(r"<td>(.*?)</td>", table)
+    growth = data.assessment.strategies["DQN"].measures["growth"].mean
+    assert cells[1] == percent(growth)
+    falling = [float(cell.strip("%").replace("\N{MINUS SIGN}", "-")) for cell in cells[:5]]
+    assert falling == sorted(falling, reverse=True)
+    # Without costs there is nothing to multiply.
+    free = {name: replace(each, cost=0 * each.cost) for name, each in data.strategies.items()}
+    assert "Table of growth by cost" not in render_backtest(replace(data, strategies=free))
+
+
 def test_growth_by_capital_has_a_table() -> None:
     data = usual(60)
     assert "Table of growth by capital" not in render_backtest(data)

@@ -23,7 +23,7 @@ def key_facts(data: BacktestData) -> list[str]:
         *_universe(data.prices),
     ]
     if "cost" in settings:
-        facts.append(f"{_basis_points(settings['cost'])} a trade")
+        facts.append(f"{basis_points(settings['cost'])} a trade")
     if "lag" in settings:
         facts.append(f"lag of {_counted(settings['lag'], unit)}")
     if data.folds:
@@ -90,7 +90,7 @@ def _counts(test: Assessment) -> str:
     return f"{text}, {kinds['strategy']} of your own" if kinds["strategy"] else text
 
 
-def _basis_points(fraction: float) -> str:
+def basis_points(fraction: float) -> str:
     return f"{1e4 * fraction:.6g}{THIN_SPACE}bp"
 
 
@@ -108,7 +108,7 @@ def account(data: BacktestData) -> dict[str, Any]:
     """Return the settings that describe the test; None for those that are unknown."""
     test, settings = data.assessment, data.config
     return {
-        "cost": _basis_points(settings["cost"]) if "cost" in settings else None,
+        "cost": basis_points(settings["cost"]) if "cost" in settings else None,
         **{key: settings.get(key) for key in ("lag", "train", "test", "expanding", "cap")},
         "mandate": "; ".join(_limits(settings.get("mandate") or {})),
         "model": None if settings.get("cost_model") in PLAIN else settings["cost_model"],

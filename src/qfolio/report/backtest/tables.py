@@ -12,10 +12,11 @@ from qfolio.core.statistics import FEWEST_SEEDS
 from qfolio.portfolio.backtest.statistics.assessment import JUDGED, Assessment
 from qfolio.portfolio.backtest.statistics.differences import Difference
 from qfolio.portfolio.backtest.statistics.estimates import MEASURED, Measured
-from qfolio.portfolio.backtest.statistics.measures import monthly
+from qfolio.portfolio.backtest.statistics.measures import growth_at, monthly
 from qfolio.portfolio.backtest.statistics.sampled import Measure
 from qfolio.portfolio.backtest.statistics.verdict import comparable, luck, shown, telling, wiped_out
 from qfolio.report.backtest.data import BacktestData, main_names
+from qfolio.report.backtest.facts import PLAIN, basis_points
 from qfolio.report.rendering import number, percent, place
 
 HEADINGS = {
@@ -49,6 +50,9 @@ _PERCENT = (
     *("growth", "volatility", "drawdown", "cost_drag"),
     *("active_return", "tracking_error", "up_capture", "down_capture", "active_share"),
 )
+
+MULTIPLES = (0, 1, 2, 5, 10)
+"""Multiples of the costs at which growth is shown."""
 
 _Year = tuple[int, list[tuple[str, str]]]
 
@@ -209,6 +213,21 @@ def cost_rows(names: list[str], data: BacktestData) -> list[tuple[str, list[str]
         shown = values if costs else [math.nan] * len(values)
         rows.append((name, ["–" if math.isnan(x) else percent(x, 2) for x in shown]))
     return rows
+
+
+def dearer_table(data: BacktestData) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Multiples of the costs as headings, and growth at each; no rows if nothing costs anything."""
+    one = data.config.get("cost", 0.0)
+    plain = one > 0 and data.config.get("cost_model") in PLAIN
+    headings = [basis_points(k * one) if plain else f"{k:g} ×" for k in MULTIPLES]
+    year = data.assessment.periods_per_year
+    rows = [
+        (name, [growth_at(k, series.returns, series.cost, year) for k in MULTIPLES])
+        for name in main_names(data)
+        for series in (data.strategies[name],)
+        if series.weighted and series.cost.any()
+    ]
+    return headings, [(name, list(map(percent, growth))) for name, growth in rows]
 
 
 def capacity_table(data: BacktestData) -> tuple[list[str], list[tuple[str, list[str]]]] | None:

@@ -7,7 +7,21 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.statistics.bootstrap import bootstrap_measures
-from qfolio.portfolio.backtest.statistics.measures import MEASURES, drawdown, measures, monthly
+from qfolio.portfolio.backtest.statistics.measures import (
+    MEASURES,
+    drawdown,
+    growth_at,
+    measures,
+    monthly,
+)
+
+
+def test_growth_at_other_costs_by_hand() -> None:
+    """A day that gained 10% before a cost of 1%, and one that gained nothing and cost nothing."""
+    returns, cost = np.array([[1.1 * 0.99 - 1, 0.0]]), np.array([[0.01, 0.0]])
+    found = [growth_at(multiple, returns, cost, 2) for multiple in (0, 1, 2, 200)]
+    assert found == pytest.approx([0.1, 1.1 * 0.99 - 1, 1.1 * 0.98 - 1, -1])
+    assert growth_at(0, np.array([[-1.0, 0.5]]), cost, 2) == -1  # ruin stays ruin
 
 
 def test_measures_by_hand() -> None:

@@ -195,6 +195,26 @@ def log_growth(returns: Floats) -> Floats:
         return np.log1p(returns)
 
 
+def growth_at(multiple: float, returns: Floats, cost: Floats, periods_per_year: float) -> float:
+    """Annual growth of the same orders if every cost had been a multiple of what it was.
+
+    It is exact up to the square of a cost, because orders are shares of the wealth.
+
+    Args:
+        multiple: 1 gives the growth after costs, 0 that without costs.
+        returns: Simple returns net of costs, of shape (seeds, periods).
+        cost: Costs as shares of the wealth, of the same shape.
+        periods_per_year: For example 252 for trading days.
+
+    Returns:
+        The mean over the seeds.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        paid = np.log1p(-np.minimum(multiple * cost, 1.0)) - np.log1p(-cost)
+    logs = np.where(returns == -1, -np.inf, log_growth(returns) + paid)
+    return float(np.expm1(periods_per_year * logs.mean(axis=-1)).mean())
+
+
 def deepest_drawdown(steps: Floats, days: NDArray[np.int32]) -> Floats:
     """The maximum drawdown of every resampled history.
 

@@ -206,17 +206,16 @@ def luck(name: str, assessment: Assessment) -> str:
     stocks usually have one. The second tests what an agent adds to the reference.
     """
     entry = assessment.strategies[name]
-    said = [_luck(f"The annual Sharpe ratio of {name}", entry.sharpe_test)]
-    if entry.active_test is not None:
-        subject = f"Its information ratio to {assessment.rebalanced}"
-        said.append(_luck(subject, entry.active_test))
+    sharpe, active = entry.sharpe_test, entry.active_test
+    best = f", the expected best of {sharpe.trials} trials without skill," * (sharpe.trials > 1)
+    said = [_luck(f"The annual Sharpe ratio of {name}", sharpe, best)]
+    if active is not None:
+        said.append(_luck(f"Its information ratio to {assessment.rebalanced}", active))
     return " ".join(said)
 
 
-def _luck(subject: str, test: SharpeTest) -> str:
-    bar = "zero"
-    if test.trials > 1:
-        bar = f"{test.threshold:.2f}, the expected best of {test.trials} trials without skill,"
+def _luck(subject: str, test: SharpeTest, best: str = "") -> str:
+    bar = f"{test.threshold:.2f}{best}" if test.trials > 1 else "zero"
     # Rounded down: 94.96 must not read as 95.0.
     chance = float(np.floor(1000 * test.deflated) / 10)
     claim, shortfall = "is more than luck is likely to explain", ""
