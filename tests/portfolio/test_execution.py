@@ -8,6 +8,7 @@ import pytest
 from qfolio.portfolio.backtest.baselines import Baseline
 from qfolio.portfolio.backtest.baselines.equal_weight import BuyAndHold
 from qfolio.portfolio.backtest.folds import Fold
+from qfolio.portfolio.backtest.notes import called
 from qfolio.portfolio.backtest.orders import AT_EVERY_ROW, orders
 from qfolio.portfolio.backtest.replay import Replay
 from qfolio.portfolio.calendars import decision_rows, elapsed
@@ -217,8 +218,8 @@ def test_a_margin_call_does_not_wait_for_a_baseline():
         assert abs(ordered[:, 1:]).sum(1).max() <= 1.7 + 1e-6
         said = [f"Trades that margin calls forced: hold ({calls})."]
         # With a band, every row decides.
-        assert replay.called({"hold": entry}, ()) == (said if calendar == "yearly" else [])
-        assert replay.called({"hold": entry}, ("hold",)) == []
+        assert called(replay, {"hold": entry}, ()) == (said if calendar == "yearly" else [])
+        assert called(replay, {"hold": entry}, ("hold",)) == []
 
 
 def test_terms_do_nothing_where_there_are_none():

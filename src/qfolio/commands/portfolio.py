@@ -68,6 +68,7 @@ def backtest(
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
+    from qfolio.portfolio.backtest.notes import mandated
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.report.backtest.finish import finish
 
@@ -93,7 +94,7 @@ def backtest(
             "with more rows."
         )
     console.say(console.describe_backtest(run))
-    for note in run.replay.mandated():
+    for note in mandated(run.replay):
         console.tell(note)
     resume = again("qfolio backtest --resume", folder, *run.parts, on=options.on)
     status = "Replaying all strategies, drawing histories, writing the report"

@@ -15,6 +15,7 @@ from qfolio.report import palette
 SIZE = 320
 FADE_FRAMES = 8
 HOLD_MILLISECONDS = 1200
+STEP_SECONDS = 0.05
 
 _SCALE = 3
 _CENTER = (160.0, 143.0)
@@ -30,7 +31,6 @@ def pendulum_gif(
     states: ArrayLike,
     torques: ArrayLike,
     rewards: ArrayLike,
-    dt: float = 0.05,
 ) -> None:
     """Save an episode of T steps as a GIF that plays in real time and repeats forever.
 
@@ -43,13 +43,12 @@ def pendulum_gif(
             shape (T + 1, 2).
         torques: Torques in N m, counter-clockwise positive, shape (T,).
         rewards: Rewards, shape (T,).
-        dt: Seconds per step.
 
     Raises:
         ValueError: The shapes do not match.
     """
-    frames = pendulum_frames(states, torques, rewards, dt)
-    step = round(1000 * dt)
+    frames = pendulum_frames(states, torques, rewards)
+    step = round(1000 * STEP_SECONDS)
     durations = [step] * (len(frames) - 1) + [HOLD_MILLISECONDS] + [step] * FADE_FRAMES
     frames += _fade(frames[-1], frames[0])
     table = _color_table()
@@ -65,9 +64,7 @@ def pendulum_gif(
     )
 
 
-def pendulum_frames(
-    states: ArrayLike, torques: ArrayLike, rewards: ArrayLike, dt: float = 0.05
-) -> list[Image.Image]:
+def pendulum_frames(states: ArrayLike, torques: ArrayLike, rewards: ArrayLike) -> list[Image.Image]:
     """Return the T + 1 pictures of an episode, SIZE x SIZE pixels each; see pendulum_gif."""
     angles, torques, totals = _checked(states, torques, rewards)
     font = ImageFont.load_default(size=13 * _SCALE)
@@ -79,7 +76,7 @@ def pendulum_frames(
         _draw_trail(pen, angles[max(0, number - _TRAIL) : number + 1])
         _draw_torque(pen, angle, torque)
         _draw_pendulum(pen, angle)
-        _draw_caption(pen, font, number * dt, total, number / max(1, len(angles) - 1))
+        _draw_caption(pen, font, number * STEP_SECONDS, total, number / max(1, len(angles) - 1))
         frames.append(image.reduce(_SCALE))
     return frames
 

@@ -12,6 +12,7 @@ from qfolio.experiments.presets import Preset
 from qfolio.portfolio.anchors import path
 from qfolio.portfolio.backtest.attribution.decomposition import decompose
 from qfolio.portfolio.backtest.attribution.explain import open_to
+from qfolio.portfolio.backtest.notes import mandated
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.desk.desk import Desk
@@ -253,6 +254,6 @@ def test_without_a_mandate_the_program_is_as_before():
     task = backtest.tasks["pathwise"]
     assert task.allowed is None
     assert type(task.feasible).__name__ == "CappedSimplex"
-    assert backtest.replay.mandated() == []
+    assert mandated(backtest.replay) == []
     capped = create(None, agents={"pathwise": AGENTS["pathwise"]}, cap=0.15).replay
-    assert capped.mandated() == ["The cap of 15% for each of 5 assets forces at least 25% cash."]
+    assert mandated(capped) == ["The cap of 15% for each of 5 assets forces at least 25% cash."]

@@ -29,7 +29,7 @@ class Fixed:
     def __init__(self, wanted, costs):
         self.wanted, self.costs = wanted, costs
 
-    def weights(self, prices, holdings=None):
+    def weights(self, prices, holdings=None, *, spent=0.0):
         return dict(zip(("cash", *prices.assets), self.wanted.tolist(), strict=True))
 
 

@@ -19,7 +19,7 @@ class Fixed:
     def __init__(self, wanted, cost):
         self.wanted, self.costs = wanted, Proportional(cost)
 
-    def weights(self, prices, holdings=None):
+    def weights(self, prices, holdings=None, *, spent=0.0):
         return dict(zip(("cash", *prices.assets), self.wanted.tolist(), strict=True))
 
 

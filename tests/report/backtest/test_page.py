@@ -15,9 +15,9 @@ from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.statistics.differences import Contrast
 from qfolio.portfolio.backtest.statistics.verdict import verdicts
 from qfolio.portfolio.prices.table import load
+from qfolio.report.backtest.collect import haircut
 from qfolio.report.backtest.data import BacktestData, StrategySeries, shown_order
 from qfolio.report.backtest.page import render_backtest
-from qfolio.report.collect import universe
 from qfolio.report.rendering import number, percent
 
 from backtests import Page, make_data, of_returns_alone, usual
@@ -95,11 +95,8 @@ def test_the_haircut_is_found_from_the_payout() -> None:
          "B": [10, 20, None, None], "C": [None, 1, 2, 3.0]}
     )  # fmt: skip
     prices = load(frame, late="join", ended="cash-out", delisting_haircut=0.3)
-    assert universe(prices) == {
-        "late_assets": 1, "delisted_assets": 1, "haircut": 0.3, "has_members": False,
-    }  # fmt: skip
-    whole = universe(load(frame[["date", "A"]]))
-    assert (whole["delisted_assets"], whole["haircut"]) == (0, None)
+    assert haircut(prices) == 0.3
+    assert haircut(load(frame[["date", "A"]])) is None
 
 
 def test_table_has_every_figure_with_its_intervals(data: BacktestData) -> None:

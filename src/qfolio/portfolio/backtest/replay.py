@@ -1,16 +1,14 @@
 """Replays agents and baselines over the folds of a backtest."""
 
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import PyTree
 
 from qfolio.core.mdp import Agent
 from qfolio.portfolio.backtest.baselines import Baseline
@@ -28,13 +26,9 @@ from qfolio.portfolio.following import begin, follow, ordered
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import Mandated
 from qfolio.portfolio.mandate.limits import feasible, largest_weight
-from qfolio.portfolio.prices.findings import first_of, listing
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
 from qfolio.portfolio.universe import Patterns
-
-BARELY = 1e-3
-"""Risk that exceeds a limit by a smaller share of it is a rounding error."""
 
 
 @dataclass(frozen=True)
@@ -95,20 +89,6 @@ def decide(agent: Agent, stretches: Sequence[Stretch], seeds: int, *, together: 
     return np.concatenate(parts, axis=1)
 
 
-@eqx.filter_jit
-def _risks(
-    task: Portfolio, rows: Int[Array, " trade"], weights: Float[Array, "trade asset"]
-) -> tuple[Float[Array, " trade"], Float[Array, " trade"]]:
-    """Annual volatility and tracking error of weights, as known at their rows."""
-
-    def each(row: Array, held: Array) -> tuple[Array, Array]:
-        risk = task.risk_at(row)
-        return risk.of(held), risk.of(held - risk.benchmark)
-
-    found: tuple[Array, Array] = lax.map(lambda given: each(*given), (rows, weights))
-    return found
-
-
 @dataclass(frozen=True)
 class Replay:
     """The rules that hold for all strategies of a backtest.
@@ -120,36 +100,6 @@ class Replay:
     folds: Sequence[Fold]
     task: Portfolio
     cap: float
-
-    def left_out(self) -> list[str]:
-        """A note on each fold that leaves out assets, or one on all that are delisted."""
-        listed, assets = self.prices.listed, self.prices.assets
-        if self.prices.tradable is not None:
-            last = np.ones(len(assets), bool) if listed is None else listed[-1]
-            names = [assets[j] for j in np.flatnonzero(~last)]
-            return [f"Delisted: {listing(names)}."] if names else []
-        folds = ((fold.name, fold.tradable(self.prices.values)) for fold in self.folds)
-        return [
-            f"Fold {name} leaves out {listing(late)}, which started too late."
-            for name, tradable in folds
-            if (late := [assets[j] for j in np.flatnonzero(~tradable)])
-        ]
-
-    def mandated(self) -> list[str]:
-        """Notes on what is unusual about caps and the mandate, and on what a fold cannot meet."""
-        every = np.ones(len(self.prices.assets), bool)
-        notes = checks.unusual(self.task.mandate, every, self.cap)
-        if not self.task.mandate:
-            return notes
-        if self._patterns is not None and (yields := self._patterns[1]):
-            said = ", ".join(yields)
-            notes.append(f"The mandate is relaxed to fit the assets that can be traded: {said}.")
-        return notes + [
-            f"In fold {fold.name} the mandate is relaxed to fit the assets that can be traded: "
-            f"{said}."
-            for fold, (_, lowered) in zip(self.folds, self._relaxed, strict=True)
-            for said in lowered
-        ]
 
     @cached_property
     def _complete(self) -> list[Fold]:
@@ -170,7 +120,8 @@ class Replay:
         )
 
     @cached_property
-    def _relaxed(self) -> list[tuple[Mandated, list[str]]]:
+    def relaxed(self) -> list[tuple[Mandated, list[str]]]:
+        """What the mandate allows in each fold, and which of its limits yield there, in words."""
         mandate, values = self.task.mandate, self.prices.values
         every = np.ones(values.shape[1], bool) if self.prices.tradable is not None else None
         return [
@@ -182,7 +133,7 @@ class Replay:
         ]
 
     @cached_property
-    def _patterns(self) -> tuple[Patterns, list[str]] | None:
+    def patterns(self) -> tuple[Patterns, list[str]] | None:
         """What the mandate allows where assets come and go, if they do."""
         tradable, mandate = self.prices.tradable, self.task.mandate
         return (
@@ -195,65 +146,16 @@ class Replay:
 
     def _feasible(self, fold: int, row: int) -> Mandated:
         """What the mandate allows at a row of a fold."""
-        made = self._relaxed[fold][0]
-        if self._patterns is not None:
-            made = self._patterns[0].at(row, made)
+        made = self.relaxed[fold][0]
+        if self.patterns is not None:
+            made = self.patterns[0].at(row, made)
         return made.knowing(self.task.risk_at(jnp.array(row))) if made.limits_risk else made
 
     @property
-    def _terms(self) -> Terms:
+    def terms(self) -> Terms:
+        """When and how orders are carried out, as arrays of numpy."""
         terms = self.task.terms
         return terms._replace(decides=np.asarray(terms.decides), elapsed=np.asarray(terms.elapsed))
-
-    def too_risky(self, entries: Mapping[str, Entry]) -> list[str]:
-        """A note on each limit of risk that trades exceed, with the strategies and how often."""
-        allowed = self.task.allowed
-        if allowed is None or not allowed.limits_risk:
-            return []
-        limits = {"volatility": allowed.volatility, "tracking error": allowed.tracking_error}
-        over: dict[str, list[str]] = {said: [] for said in limits}
-        for name, entry in entries.items():
-            if not entry.weighted:
-                continue
-            traded = ~np.isnan(entry.decisions[..., 0])
-            rows = self.folds[0].decisions.start + np.nonzero(traded)[1]
-            found = _risks(self.task, jnp.asarray(rows), jnp.asarray(entry.decisions[traded, 1:]))
-            for (said, most), risk in zip(limits.items(), np.asarray(found), strict=True):
-                if count := int((risk > most * (1 + BARELY)).sum()):
-                    most_of_all = f"{count:,} of {len(rows):,}, up to {risk.max():.3g}"
-                    over[said].append(f"{name} ({most_of_all})")
-        return [
-            f"Trades that leave a {said} above {limits[said]:.4g}: {first_of(names)}."
-            for said, names in over.items()
-            if names
-        ]
-
-    def called(self, entries: Mapping[str, Entry], own: Container[str]) -> list[str]:
-        """A note on margin calls: who traded at rows where the calendar had no decision.
-
-        own: names of strategies of the user's own, which have no margin calls.
-        """
-        terms, first = self._terms, self.folds[0].decisions.start
-        if terms.called == np.inf or not len(terms.decides):
-            return []
-        planned = np.convolve(terms.decides, np.ones(terms.fill))[first:] > 0
-        said = []
-        for name, entry in entries.items():
-            traded = ~np.isnan(entry.decisions[..., 0]) & (entry.simulation.wealth[:, :-1] > 0)
-            count = int((traded & ~planned[: traded.shape[1]]).sum())
-            if count and name not in own:
-                said.append(f"{name} ({count:,})")
-        return [f"Trades that margin calls forced: {first_of(said)}."] if said else []
-
-    def wiped_out(self, entries: Mapping[str, Entry]) -> list[str]:
-        """A note on each strategy that lost everything."""
-        counts = {name: int(entry.simulation.ruined.sum()) for name, entry in entries.items()}
-        return [
-            f"{name} was wiped out: its debts exceeded what it owned"
-            + (f", with {count} of {len(entries[name].decisions)} seeds." if count > 1 else ".")
-            for name, count in counts.items()
-            if count
-        ]
 
     def agent(
         self, name: str, agent: Agent, stretches: Sequence[Stretch], seeds: int
@@ -292,7 +194,7 @@ class Replay:
             cap=min(self.cap, largest_weight(text)) if text else self.cap,
             feasible=self._feasible if text else None,
             month=table.month,
-            terms=self._terms,
+            terms=self.terms,
         )
 
     def own(self, kind: str, placed: Placed) -> Entry:
@@ -327,9 +229,9 @@ class Replay:
         if not entry.weighted:
             return f"{name} has returns only, so whether it keeps the mandate is not known."
         first, allowed = self.folds[0].decisions.start, []
-        for fold, (made, _) in zip(self.folds, self._relaxed, strict=True):
+        for fold, (made, _) in zip(self.folds, self.relaxed, strict=True):
             rows = np.arange(fold.decisions.start, fold.decisions.stop)
-            here = made if self._patterns is None else self._patterns[0].at(rows, made)
+            here = made if self.patterns is None else self.patterns[0].at(rows, made)
             allowed.append((slice(rows[0] - first, rows[-1] + 1 - first), here))
         return kept(name, entry.decisions[0], entry.simulation.turnover[0], allowed)
 

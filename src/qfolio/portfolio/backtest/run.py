@@ -30,7 +30,7 @@ from qfolio.experiments.log import Log
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.presets import Preset
 from qfolio.experiments.records import Records
-from qfolio.portfolio.backtest import memory
+from qfolio.portfolio.backtest import memory, notes
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.benchmark import field_of, tracked
 from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
@@ -412,15 +412,15 @@ class Backtest:
 
         with ThreadPoolExecutor(self.side_by_side) as threads:
             found = list(threads.map(follow, self.agents))
-        others, notes = replay.others(self.baselines, self._own, self.config.benchmark)
+        others, said = replay.others(self.baselines, self._own, self.config.benchmark)
         entries = {name: entry for each in (*found, others) for name, entry in each.items()}
         return entries, [
-            *replay.left_out(),
-            *replay.mandated(),
-            *notes,
-            *replay.too_risky(entries),
-            *replay.called(entries, self._own),
-            *replay.wiped_out(entries),
+            *notes.left_out(replay),
+            *notes.mandated(replay),
+            *said,
+            *notes.too_risky(replay, entries),
+            *notes.called(replay, entries, self._own),
+            *notes.wiped_out(entries),
         ]
 
     @property

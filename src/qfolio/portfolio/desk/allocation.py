@@ -39,7 +39,9 @@ class Followed(Protocol):
     @property
     def mandate(self) -> str: ...
 
-    def weights(self, prices: Any, holdings: Any = None) -> dict[str, float]: ...
+    def weights(
+        self, prices: Any, holdings: Any = None, *, spent: float = 0.0
+    ) -> dict[str, float]: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,8 +105,8 @@ class Allocation:
                 )
             seen = np.append(0.0, held[1:] / held[1:].sum())
         names = ("cash", *prices.assets)
-        before: dict[str, Any] = {"spent": spent} if spent else {}  # not every policy takes it
-        targets = policy.weights(prices, dict(zip(names, seen.tolist(), strict=True)), **before)
+        holdings = dict(zip(names, seen.tolist(), strict=True))
+        targets = policy.weights(prices, holdings, spent=spent)
         weights = _ordered(np.array([targets[name] for name in names]), held)
         trades = np.zeros(len(shares))
         context = context_of(policy.costs, prices, wealth)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.mandate.feasible import Mandated
-from qfolio.portfolio.mandate.mandate import Assets, Mandate
+from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.mandate.projection import Limits
 
 
@@ -47,7 +47,8 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
     """
     assets, mandate = parse(text)
     can = usable & ~np.isin(assets, mandate.assets.forbidden)
-    cap, floor = (_by_asset(x, assets, default) for x, default in _bounds(mandate.assets))
+    cap = _by_asset(mandate.assets.cap, assets, 1.0)
+    floor = _by_asset(mandate.assets.floor, assets, 0.0)
     long = mandate.cash.min >= 0 and bool(floor.min() >= 0)
     most = most if long or most < 1 else np.inf
     high, low = np.where(can, np.minimum(cap, most), 0.0), np.where(can, floor, 0.0)
@@ -111,10 +112,6 @@ def reach(text: str, most: float = 1.0) -> float:
     """The largest size of an asset's weight, of either sign; most: as for ``feasible``."""
     low, high, *_ = feasible(text, np.ones(len(parse(text)[0]), bool), most).limits
     return float(abs(np.array([low, high])).max())
-
-
-def _bounds(assets: Assets) -> tuple[tuple[float | dict[str, float], float], ...]:
-    return (assets.cap, 1.0), (assets.floor, 0.0)
 
 
 def _by_asset(given: float | dict[str, float], assets: Sequence[str], default: float) -> np.ndarray:

@@ -12,8 +12,8 @@ from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.results import write_tables
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
+from qfolio.report.backtest.collect import backtest_data
 from qfolio.report.backtest.page import write_backtest_report
-from qfolio.report.collect import backtest_data
 
 
 class Finished(NamedTuple):

@@ -1,0 +1,115 @@
+"""What a backtest has to say of its strategies besides their figures, in sentences."""
+
+from collections.abc import Container, Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from qfolio.portfolio.backtest.replay import Entry, Replay
+from qfolio.portfolio.mandate import checks
+from qfolio.portfolio.prices.findings import first_of, listing
+from qfolio.portfolio.task import Portfolio
+
+BARELY = 1e-3
+"""Risk that exceeds a limit by a smaller share of it is a rounding error."""
+
+
+def left_out(replay: Replay) -> list[str]:
+    """A note on each fold that leaves out assets, or one on all that are delisted."""
+    listed, assets = replay.prices.listed, replay.prices.assets
+    if replay.prices.tradable is not None:
+        last = np.ones(len(assets), bool) if listed is None else listed[-1]
+        names = [assets[j] for j in np.flatnonzero(~last)]
+        return [f"Delisted: {listing(names)}."] if names else []
+    folds = ((fold.name, fold.tradable(replay.prices.values)) for fold in replay.folds)
+    return [
+        f"Fold {name} leaves out {listing(late)}, which started too late."
+        for name, tradable in folds
+        if (late := [assets[j] for j in np.flatnonzero(~tradable)])
+    ]
+
+
+def mandated(replay: Replay) -> list[str]:
+    """Notes on what is unusual about caps and the mandate, and on what a fold cannot meet."""
+    every = np.ones(len(replay.prices.assets), bool)
+    notes = checks.unusual(replay.task.mandate, every, replay.cap)
+    if not replay.task.mandate:
+        return notes
+    if replay.patterns is not None and (yields := replay.patterns[1]):
+        said = ", ".join(yields)
+        notes.append(f"The mandate is relaxed to fit the assets that can be traded: {said}.")
+    return notes + [
+        f"In fold {fold.name} the mandate is relaxed to fit the assets that can be traded: {said}."
+        for fold, (_, lowered) in zip(replay.folds, replay.relaxed, strict=True)
+        for said in lowered
+    ]
+
+
+def too_risky(replay: Replay, entries: Mapping[str, Entry]) -> list[str]:
+    """A note on each limit of risk that trades exceed, with the strategies and how often."""
+    allowed = replay.task.allowed
+    if allowed is None or not allowed.limits_risk:
+        return []
+    limits = {"volatility": allowed.volatility, "tracking error": allowed.tracking_error}
+    over: dict[str, list[str]] = {said: [] for said in limits}
+    for name, entry in entries.items():
+        if not entry.weighted:
+            continue
+        traded = ~np.isnan(entry.decisions[..., 0])
+        rows = replay.folds[0].decisions.start + np.nonzero(traded)[1]
+        found = _risks(replay.task, jnp.asarray(rows), jnp.asarray(entry.decisions[traded, 1:]))
+        for (said, most), risk in zip(limits.items(), np.asarray(found), strict=True):
+            if count := int((risk > most * (1 + BARELY)).sum()):
+                most_of_all = f"{count:,} of {len(rows):,}, up to {risk.max():.3g}"
+                over[said].append(f"{name} ({most_of_all})")
+    return [
+        f"Trades that leave a {said} above {limits[said]:.4g}: {first_of(names)}."
+        for said, names in over.items()
+        if names
+    ]
+
+
+def called(replay: Replay, entries: Mapping[str, Entry], own: Container[str]) -> list[str]:
+    """A note on margin calls: who traded at rows where the calendar had no decision.
+
+    own: names of strategies of the user's own, which have no margin calls.
+    """
+    terms, first = replay.terms, replay.folds[0].decisions.start
+    if terms.called == np.inf or not len(terms.decides):
+        return []
+    planned = np.convolve(terms.decides, np.ones(terms.fill))[first:] > 0
+    said = []
+    for name, entry in entries.items():
+        traded = ~np.isnan(entry.decisions[..., 0]) & (entry.simulation.wealth[:, :-1] > 0)
+        count = int((traded & ~planned[: traded.shape[1]]).sum())
+        if count and name not in own:
+            said.append(f"{name} ({count:,})")
+    return [f"Trades that margin calls forced: {first_of(said)}."] if said else []
+
+
+def wiped_out(entries: Mapping[str, Entry]) -> list[str]:
+    """A note on each strategy that lost everything."""
+    counts = {name: int(entry.simulation.ruined.sum()) for name, entry in entries.items()}
+    return [
+        f"{name} was wiped out: its debts exceeded what it owned"
+        + (f", with {count} of {len(entries[name].decisions)} seeds." if count > 1 else ".")
+        for name, count in counts.items()
+        if count
+    ]
+
+
+@eqx.filter_jit
+def _risks(
+    task: Portfolio, rows: Int[Array, " trade"], weights: Float[Array, "trade asset"]
+) -> tuple[Float[Array, " trade"], Float[Array, " trade"]]:
+    """Annual volatility and tracking error of weights, as known at their rows."""
+
+    def each(row: Array, held: Array) -> tuple[Array, Array]:
+        risk = task.risk_at(row)
+        return risk.of(held), risk.of(held - risk.benchmark)
+
+    found: tuple[Array, Array] = lax.map(lambda given: each(*given), (rows, weights))
+    return found

@@ -1,0 +1,112 @@
+"""Collects the data of a report from a finished backtest."""
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from qfolio.core.arrays import Floats
+from qfolio.core.text import listed
+from qfolio.portfolio.backtest.attribution.why import Why
+from qfolio.portfolio.backtest.capacity import capacity
+from qfolio.portfolio.backtest.replay import Entry
+from qfolio.portfolio.backtest.run import Backtest
+from qfolio.portfolio.backtest.simulation import Simulation
+from qfolio.portfolio.backtest.statistics.assessment import Assessment
+from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.table import Prices
+from qfolio.report.backtest.convergence import FoldTraining
+from qfolio.report.backtest.data import BacktestData, StrategySeries
+
+
+def backtest_data(
+    backtest: Backtest,
+    entries: dict[str, Entry],
+    assessment: Assessment,
+    notes: Sequence[str],
+    why: Why | None = None,
+) -> BacktestData:
+    """Collects everything ``write_backtest_report`` needs."""
+    config, dates = backtest.config, backtest.prices.dates
+    shift = config.lag + 1
+    date = lambda row: day(dates[row])  # noqa: E731
+    first, last = (str(backtest.dates[i])[:4] for i in (0, -1))
+    table = str(config.prices["source"]).rpartition(": ")[2]  # without its vendor
+    named = f"{listed(list(backtest.agents))} on {table}, {first} to {last}"
+    return BacktestData(
+        title=config.title or named,
+        command=config.command,
+        assessment=assessment,
+        dates=backtest.dates,
+        assets=backtest.prices.assets,
+        strategies={
+            name: StrategySeries(
+                entry.kind,
+                entry.simulation.returns,
+                entry.simulation.turnover,
+                entry.simulation.cost,
+                entry.mean_weights,
+                _costs(entry.simulation, backtest.prices.periods_per_year),
+            )
+            for name, entry in entries.items()
+        },
+        prices={**config.prices, "haircut": haircut(backtest.prices)},
+        config={
+            key: value
+            for key, value in msgspec.to_builtins(config).items()
+            if key not in ("prices", "assets")
+        },
+        folds=[
+            {
+                "name": fold.name,
+                "train_first": date(fold.train.start),
+                "train_last": date(fold.train.stop - 1),
+                "test_first": date(fold.decisions.start + shift),
+                "test_last": date(fold.decisions.stop - 1 + shift),
+            }
+            for fold in backtest.folds
+        ],
+        notes=list(notes),
+        training={name: folds for name in backtest.agents if (folds := _training(backtest, name))},
+        why=why,
+        moves=_moves(backtest),
+        capacity=capacity(backtest.replay, entries, assessment.reference),
+        risk_free=backtest.replay.growth[:, 0] - 1,
+    )
+
+
+def haircut(prices: Prices) -> float | None:
+    """The share of a holding that is lost when its asset ends, found from the payout.
+
+    None if no asset ends.
+    """
+    listed, rows = prices.listed, len(prices)
+    if listed is None or listed[-1].all():
+        return None
+    ended = np.flatnonzero(~listed[-1] & listed.any(axis=0))
+    last = rows - 1 - listed[::-1, ended].argmax(axis=0)
+    paid = prices.values[last + 1, ended] / prices.values[last, ended]
+    return round(float(1 - paid.min()), 8)
+
+
+def _costs(simulation: Simulation, year: float) -> dict[str, float]:
+    """Costs per year by kind, as shares of the wealth; interest or carry earned is negative."""
+    costs = {kind: year * float(paid.mean()) for kind, paid in simulation.costs.items()}
+    if simulation.financing is not None:
+        costs["interest and carry"] = -year * float(simulation.financing.mean())
+    return costs
+
+
+def _moves(backtest: Backtest) -> Floats:
+    """Simple returns of the assets on the days of the test, 0 before an asset's first price."""
+    begin = backtest.folds[0].decisions.start + backtest.config.lag
+    values = backtest.prices.values[begin : begin + 1 + len(backtest.dates)]
+    return np.nan_to_num(values[1:] / values[:-1] - 1)
+
+
+def _training(backtest: Backtest, agent: str) -> list[FoldTraining]:
+    """An agent's training in each fold; empty if a fold's records are missing."""
+    records = (backtest.records(agent, fold.name) for fold in backtest.folds)
+    folds = [FoldTraining.of(rows.column("return")) for rows in records]
+    known = [fold for fold in folds if fold is not None]
+    return known if len(known) == len(folds) else []
