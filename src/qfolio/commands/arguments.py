@@ -1,5 +1,9 @@
 """Arguments shared by several commands, with their form in --help."""
 
+import datetime
+import re
+import shlex
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -47,6 +51,17 @@ def budget_of(episodes: int | None, steps: int | None) -> Budget | None:
             "--episodes and --steps both set the length of training; give one of them."
         )
     return None if episodes is None and steps is None else Budget(episodes, steps)
+
+
+def new_folder(*words: str) -> Path:
+    """A folder in runs/ that is named by the words, such as task and agent, and the time."""
+    name = "-".join([re.sub("[/:]", "-", word) for word in words])
+    return Path("runs") / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+
+
+def typed() -> str:
+    """The command line as it was typed."""
+    return shlex.join(["qfolio", *sys.argv[1:]])
 
 
 def again(command: str, folder: Path, *parts: object, on: str = "here") -> str:

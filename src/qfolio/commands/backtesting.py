@@ -1,10 +1,7 @@
 """The options that ``backtest`` and ``study`` share, and the settings made from them."""
 
 import dataclasses
-import datetime
 import itertools
-import shlex
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +18,9 @@ from qfolio.commands.arguments import (
     Name,
     Sources,
     Trackers,
+    new_folder,
     sources,
+    typed,
 )
 from qfolio.commands.tables import READING, Reading
 from qfolio.core import registry, settings
@@ -123,7 +122,7 @@ class Options(Reading):
 
     def folder(self, kind: str) -> Path:
         """The path of the new folder: ``out``, or runs/KIND-TIME."""
-        return self.out or Path("runs") / f"{kind}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+        return self.out or new_folder(kind)
 
     def presets(self) -> "dict[str, Preset]":
         """The agents by their names in tables, with all settings; imports their modules."""
@@ -172,7 +171,7 @@ class Options(Reading):
             "seeds": max(seeds, default=1) if self.seeds is None else self.seeds,
             "seed": self.seed,
             "trials": self.trials,
-            "command": shlex.join(["qfolio", *sys.argv[1:]]),
+            "command": typed(),
         }
 
 

@@ -1,15 +1,20 @@
 """The command that trains several agents on one task and compares them."""
 
-import datetime
-import re
-import shlex
-import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Count, Folder, Modules, Name, Trackers, again, budget_of
+from qfolio.commands.arguments import (
+    Count,
+    Folder,
+    Modules,
+    Name,
+    Trackers,
+    again,
+    budget_of,
+    new_folder,
+    typed,
+)
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry
 from qfolio.core.errors import QfolioError
@@ -80,18 +85,16 @@ def compare(
     executor, following = executor_of(on), trackers(track)
     if resume is None:
         task = task or "pendulum"
-        now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
-        name = f"{re.sub('[/:]', '-', task)}-comparison-{now}"
         run = Comparison.create(
             _entrants(task, agents or "", preset, budget),
             seeds=10 if seeds is None else seeds,
             seed=seed or 0,
-            command=shlex.join(["qfolio", *sys.argv[1:]]),
+            command=typed(),
             note=""
             if budget is None
             else "The length of training was set by hand; learning-rate schedules and the like "
             "were tuned for the presets' own lengths.",
-            out=out or Path("runs") / name,
+            out=out or new_folder(task, "comparison"),
         )
     else:
         run = Comparison.open(resume)

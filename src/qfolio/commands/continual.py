@@ -1,15 +1,20 @@
 """The command that changes a task after training, and compares ways to adapt."""
 
-import datetime
-import re
-import shlex
-import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import Assignments, Count, Folder, Modules, Name, Trackers, again
+from qfolio.commands.arguments import (
+    Assignments,
+    Count,
+    Folder,
+    Modules,
+    Name,
+    Trackers,
+    again,
+    new_folder,
+    typed,
+)
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
@@ -89,9 +94,8 @@ def continual(
         options: dict[str, Any] = {k: x for k, x in shares.items() if x is not None}
         options |= {} if seed is None else {"seed": seed}
         plan = _plan(task, change, agent, preset, episodes, seeds, assignments, options)
-        name = f"{re.sub('[/:]', '-', task)}-continual-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-        folder = out or Path("runs") / name
-        continual.create(plan, folder, shlex.join(["qfolio", *sys.argv[1:]]))
+        folder = out or new_folder(task, "continual")
+        continual.create(plan, folder, typed())
     else:
         folder, plan = resume, continual.read(resume).plan()
     command = again("qfolio continual --resume", folder, plan.task, plan.agent)

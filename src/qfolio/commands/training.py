@@ -1,8 +1,6 @@
 """The commands that train agents on a task, grade them and show them."""
 
 import contextlib
-import datetime
-import re
 import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +17,7 @@ from qfolio.commands.arguments import (
     Trackers,
     again,
     budget_of,
+    new_folder,
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
@@ -107,9 +106,7 @@ def train(
         if resume is None:
             task, preset = task or "pendulum", preset or "fast"
             agent = agent or presets.default_agent(task)
-            now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
-            name = f"{re.sub('[/:]', '-', task)}-{registry.short(agent)}-{preset}-{now}"
-            folder = out or Path("runs") / name
+            folder = out or new_folder(task, registry.short(agent), preset)
             chosen = settings.parse(assignments)
             run = _new_run(task, agent, preset, budget, seeds, seed or 0, folder, chosen)
         elif assignments or any(x is not None for x in (task, agent, preset, seeds, seed, out)):

@@ -1,7 +1,5 @@
 """The command that searches hyperparameters and reports which ones matter."""
 
-import datetime
-import re
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +15,7 @@ from qfolio.commands.arguments import (
     Trackers,
     again,
     budget_of,
+    new_folder,
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
@@ -184,8 +183,6 @@ def _new(
         schedules = {"learning_rate_steps", "importance_steps"} & preset.settings.keys()
         scheduled = {name: round(preset.settings[name] * share, 1) for name in schedules}
     agent = preset.build(**{**scheduled, **chosen})
-    now = f"{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    name = f"tune-{re.sub('[/:]', '-', task_name)}-{registry.short(agent_name)}-{now}"
     return Tuning.create(
         settings.build(task_class, {**preset.task, **task_settings}),
         agent,
@@ -196,7 +193,7 @@ def _new(
         batch=16 if batch is None else batch,
         fresh_seeds=preset.seeds,
         preset=preset_name,
-        out=out or Path("runs") / name,
+        out=out or new_folder("tune", task_name, registry.short(agent_name)),
     )
 
 
