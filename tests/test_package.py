@@ -74,6 +74,7 @@ WRONG_TYPES = {
     "DQN(hidden=(64, 0.5))": "hidden is [64, 0.5]; it must be whole numbers separated by",
     "DQN(double='no')": 'double is "no"; it must be true or false.',
     "DQN(learning_rate='x')": 'learning_rate is "x"; it must be a number.',
+    "Pendulum(horizon=0)": "horizon is 0; it must be",
     "Pendulum(mass=None)": "mass is null; it must be a number.",
     "Portfolio.of(prices, anchor=3)": "anchor is 3; it must be text.",
     "preset('fast', Pendulum())": "task is Pendulum(); it must be text.",

@@ -1,4 +1,5 @@
 import contextlib
+import dataclasses
 import json
 import os
 import random
@@ -54,6 +55,23 @@ def test_n_and_n_episodes_equal_2n(task, agent, tmp_path):
     assert again.episodes == 12
     again.train(Budget(24))
     assert_same(tmp_path / "halves", tmp_path / "straight", same_plan=False)
+
+
+def test_a_run_is_opened_with_what_it_was_trained_with(task, agent, tmp_path):
+    """Another agent would train on, and config.json would still name the first."""
+    create(task, agent, tmp_path / "run", seeds=1).train()
+    assert Run.open(tmp_path / "run", task=task, agent=agent).episodes == 12
+    other = dataclasses.replace(agent, learning_rate=0.9)
+    with pytest.raises(QfolioError, match=r"agent_settings is .*but .* was trained with"):
+        Run.open(tmp_path / "run", agent=other)
+    with pytest.raises(QfolioError, match=r"task is .market/ar1., but .* was trained with"):
+        Run.open(tmp_path / "run", task=Ar1())
+
+
+@pytest.mark.parametrize("starts", [0, -1, 10**9])
+def test_a_grade_needs_starts(starts, task, agent):
+    with pytest.raises(QfolioError, match=f"starts is {starts}; it must be from 1 to 1048576"):
+        Run.create(task, agent, episodes=1).grade(starts)
 
 
 def test_a_run_says_what_it_is(task, agent, tmp_path):

@@ -23,6 +23,7 @@ from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import amount, listed
+from qfolio.experiments.budget import MOST_STARTS, require_whole
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -156,8 +157,8 @@ def evaluate(
             for environments of Gymnasium).
         trust: Modules of your own code that the folder may name (default: none).
     """
-    if episodes is not None and episodes < 1:
-        raise QfolioError(f"--episodes is {episodes}; it must be at least 1.")
+    if episodes is not None:
+        require_whole("--episodes", episodes, 1, MOST_STARTS)
     from qfolio.core import devices
 
     devices.configure()

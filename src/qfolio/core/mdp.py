@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from qfolio.core.fields import require_static
+from qfolio.core.fields import require, require_static
 
 
 class Discrete(eqx.Module):
@@ -117,6 +117,7 @@ class Task(eqx.Module):
 
     def __check_init__(self) -> None:
         require_static(self)
+        require(self, "horizon", lambda x: x >= 1, "at least 1")
 
     @property
     def name(self) -> str:

@@ -10,6 +10,10 @@ if TYPE_CHECKING:
     from qfolio.core.population import Population
 
 
+MOST_STARTS = 2**20
+"""Largest number of start states of a grade, which are played side by side."""
+
+
 @dataclass(frozen=True)
 class Budget:
     """The length of each member's training: in episodes, or in steps of all its environments.
@@ -23,7 +27,8 @@ class Budget:
     def __post_init__(self) -> None:
         if (self.episodes is None) == (self.steps is None):
             raise QfolioError("give each agent's training budget in either episodes or steps.")
-        _require(self.unit, self.amount, 1, 2**31 - 1)
+        require_whole(self.unit, self.amount, 1, 2**31 - 1)
+        object.__setattr__(self, self.unit, int(self.amount))  # a plain number, for files
 
     @property
     def unit(self) -> str:
@@ -61,12 +66,13 @@ def require_budget(value: object) -> Budget:
 
 def seed_range(seeds: int, seed: int) -> range:
     """``seeds`` consecutive seeds from ``seed``; raises QfolioError if one exceeds 32 bits."""
-    _require("seeds", seeds, 1, 2**20)
-    _require("seed", seed, 0, 2**32 - seeds)
-    return range(seed, seed + seeds)
+    require_whole("seeds", seeds, 1, 2**20)
+    require_whole("seed", seed, 0, 2**32 - seeds)
+    return range(int(seed), int(seed + seeds))  # plain numbers, which files can hold
 
 
-def _require(name: str, value: Any, low: int, high: int) -> None:
+def require_whole(name: str, value: Any, low: int, high: int) -> None:
+    """Raises QfolioError unless a value is a whole number in a range."""
     require_type(name, value, Integral, "a whole number")
     if not low <= value <= high:
         raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")

@@ -10,6 +10,7 @@ from qfolio.core.evaluation import greedy, start_keys
 from qfolio.core.mdp import Optimum
 from qfolio.core.population import Population
 from qfolio.core.statistics import mean_interval, regret
+from qfolio.experiments.budget import MOST_STARTS, require_whole
 from qfolio.solvers.followed import FollowedOptimum
 
 
@@ -18,6 +19,8 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
 
     starts: how many of the fixed start states (default: those of the population's kind).
     """
+    if starts is not None:
+        require_whole("starts", starts, 1, MOST_STARTS)
     task, keys = population.task, start_keys(starts or population.starts)
     played = population.evaluate(keys)
     returns = played.returns.mean(1)

@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import msgspec
 import numpy as np
 
 from qfolio.core import devices
-from qfolio.core.errors import require_type
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.files import locked, new_folder, path_of, require_new
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
 from qfolio.core.registry import short
-from qfolio.core.text import amount
-from qfolio.experiments.budget import Budget, require_budget
+from qfolio.core.text import amount, quote
+from qfolio.experiments.budget import Budget, require_budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener
@@ -71,13 +72,14 @@ class Run(Seeds):
         if preset is not None:
             require_type("preset", preset, str, "text")
         budget = Budget(episodes, steps) if budget is None else require_budget(budget)
+        every = seed_range(seeds, seed)
         config = RunConfig(
             **describe(task, agent),
             preset=preset,
             episodes=budget.episodes,
             steps=budget.steps,
-            seeds=seeds,
-            seed=seed,
+            seeds=len(every),
+            seed=every.start,
             **devices.circumstances("python", "jax", "equinox", "optax", "numpy"),
         )
         place = None if out is None else path_of("out", out)
@@ -99,16 +101,26 @@ class Run(Seeds):
         """A run as its last checkpoint left it.
 
         task, agent: needed only if the folder cannot restore them, because they hold arrays or
-        are a user's own and their module has not been imported.
+        are a user's own and their module has not been imported. Raises QfolioError if they are not
+        those of the run.
         """
         files = RunFolder(path_of("folder", folder))
         config = files.read_config()
-        run = cls(
-            task or task_of(config.task, config.task_settings),
-            agent or agent_of(config.agent, config.agent_settings),
-            config,
-            files,
-        )
+        given = [name for name, part in (("task", task), ("agent", agent)) if part is not None]
+        if task is None:
+            task = task_of(config.task, config.task_settings)
+        if agent is None:
+            agent = agent_of(config.agent, config.agent_settings)
+        require_type("task", task, Task, "a task, such as qfolio.Pendulum()")
+        require_type("agent", agent, Agent, "an agent, such as qfolio.DQN()")
+        described = msgspec.to_builtins(describe(task, agent))
+        for name in [key for part in given for key in (part, f"{part}_settings")]:
+            if described[name] != (trained := getattr(config, name)):
+                raise QfolioError(
+                    f"{name} is {quote(described[name])}, but {files.path} was trained with "
+                    f"{quote(trained)}; give what it was trained with."
+                )
+        run = cls(task, agent, config, files)
         run._read_checkpoint()
         return run
 

@@ -104,6 +104,14 @@ def test_hostile_lines_do_no_harm(tmp_path, line):
     assert [point[:2] for point in experiment.jobs[""].curves["return"].points] == [(1, 2)]
 
 
+def test_a_name_that_is_no_text_does_not_hide_the_others(tmp_path):
+    write(tmp_path / "good", start(), RUNNING)
+    write(Path(os.fsdecode(os.fsencode(tmp_path) + b"/bad\xff")), start(), RUNNING)
+    names = {run["name"] for run in Shelf(tmp_path).runs(0)["runs"]}
+    assert names == {"good", "bad\N{REPLACEMENT CHARACTER}"}
+    json.dumps(sorted(names)).encode()
+
+
 def test_hundreds_of_runs_that_write(tmp_path, monkeypatch):
     monkeypatch.setattr(shelves, "FRESH", 0.0)
     folders = [tmp_path / f"group-{i % 7}" / f"run-{i}" for i in range(300)]

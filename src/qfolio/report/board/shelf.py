@@ -79,6 +79,8 @@ class Shelf:
             path = Path(log)
             name = path.parent.relative_to(self.root).as_posix()
             name = self.root.name if name == "." else name
+            written = name.encode(errors="surrogateescape")  # which need not be UTF-8
+            name = written.decode(errors="replace")
             key = hashlib.sha256(log.encode(errors="surrogateescape")).hexdigest()[:16]
             found[key] = self._experiments.get(key) or Experiment(name, path)
         self._experiments = found
