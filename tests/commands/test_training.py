@@ -163,7 +163,7 @@ def test_progress_here_is_that_of_groups_of_seeds_where_a_run_has_some(begun):
         (["train", "--set", "learning_rate=inf"], "learning_rate is inf"),
         (["train", "--resume", "nowhere"], "nowhere is no run"),
         (["evaluate", "nowhere"], "nowhere is no run"),
-        (["evaluate", "nowhere", "--episodes", "0"], "at least 1"),
+        (["evaluate", "nowhere", "--episodes", "0"], "must be from 1 to"),
         (["watch", "nowhere"], "nowhere is no run"),
     ],
 )
