@@ -8,7 +8,8 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.dyna_q import Counts, DynaQ
 from qfolio.agents.tabular import DoubleQ, ExpectedSarsa, Move, QLearning, Sarsa, step_share
 from qfolio.core.errors import QfolioError
-from qfolio.core.mdp import Transition
+from qfolio.core.fields import static
+from qfolio.core.mdp import Discrete, Step, Task, Transition
 from qfolio.core.population import Population
 from qfolio.experiments.presets import preset
 from qfolio.experiments.run import train
@@ -28,6 +29,30 @@ def anywhere(task, **changes):
         task.transitions, task.rewards, terminal=task.terminal, successors=task.successors,
         **{"horizon": 20, **changes},
     )  # fmt: skip
+
+
+class Longer(Task):
+    """A walk over more cells than it says there are."""
+
+    horizon: int = static(8)
+    actions = Discrete(2)
+    states = 3
+
+    def reset(self, key):
+        return jnp.array(0, jnp.int32)
+
+    def observe(self, state):
+        return state
+
+    def step(self, state, action, key):
+        return Step(state + 1, jnp.array(1.0), jnp.array(False))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_states_beyond_the_last_are_refused(kind):
+    """They would share the entries of the last one without a word."""
+    with pytest.raises(QfolioError, match="observation of Longer is not from 0 to 2 after step 3"):
+        train(Longer(), kind(), steps=400)
 
 
 def trained(task, agent, steps, seeds=(100,)):

@@ -146,6 +146,9 @@ class Tabular(Agent):
         cells = state.cells.reshape(-1, 2)
         value, visits = cells[entry].T
         error = td_target(move.reward, move.terminated, following, self.discount) - value
+        # An array that is read beyond its end gives its last entry, so two states would share it.
+        both = jnp.stack([move.state, move.next_state])
+        error = jnp.where(((both >= 0) & (both < states)).all(0), error, jnp.nan)
         rate = self.learning_rate / (1 + self.learning_rate_decay * visits)
         step = jnp.stack([step_share(entry, rate) * error, jnp.ones_like(error)], 1)
         if len(entry) == 1:  # a dummy row: XLA scatters two in place, but not one

@@ -12,15 +12,17 @@ from qfolio.core.training import episode_steps
 def find(task: Task, agent: Agent, seed: int) -> str | None:
     """A sentence on the first observation or reward that is not finite; None if all are.
 
-    Checks one episode of each environment under the untrained agent.
+    Observations of a task with ``states`` have to be numbers of states. Checks one episode of each
+    environment under the untrained agent.
     """
     observed, paid = jax.jit(lambda key: _finite(task, agent, key))(jax.random.key(seed))
     for time, (seen, reward) in enumerate(zip(observed.tolist(), paid.tolist(), strict=True)):
         if not seen:
             where = f"after step {time}" if time else "at the start"
+            wrong = "finite" if task.states is None else f"from 0 to {task.states - 1}"
             return (
-                f"The observation of {task.name} is not finite {where} of an episode; check its "
-                "observe, step and reset."
+                f"The observation of {task.name} is not {wrong} {where} of an episode; check its "
+                f"observe, step and reset{'' if task.states is None else ', and its states'}."
             )
         if not reward:
             return (
@@ -45,7 +47,10 @@ def _finite(
         observation = jax.vmap(task.observe)(states)
         action = agent.act(state, observation, act_key)
         after = jax.vmap(task.step)(states, action, jax.random.split(step_key, count))
-        leaves = [jnp.isfinite(x).reshape(count, -1).all(1) for x in jax.tree.leaves(observation)]
+        most = jnp.inf if task.states is None else task.states - 1
+        least = -jnp.inf if task.states is None else 0
+        valid = lambda x: jnp.isfinite(x) & (least <= x) & (x <= most)  # noqa: E731
+        leaves = [valid(x).reshape(count, -1).all(1) for x in jax.tree.leaves(observation)]
         seen = jnp.stack(leaves).all(0)
         fine = (seen | over).all(), (jnp.isfinite(after.reward) | over).all()
         return (after.state, over | after.terminated), fine
