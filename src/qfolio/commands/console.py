@@ -370,8 +370,11 @@ def print_allocation(
         if held[1 + i] or targets[1 + i] or trade:
             weights = (figure(float(x[1 + i]), ".2%") for x in (held, targets, after))
             money = figure(trade * price, "+,.2f")
-            cost, count = (figure(price, ",.2f" if price >= 1 else ".4g"), figure(trade, "+,.4g"))
-            rows.append((asset, cost if shares else "–", *weights, money, count if shares else "–"))
+            quoted, count = "–", "–"
+            if shares:
+                quoted = figure(price, ",.2f" if price >= 1 else ".4g")
+                count = figure(trade, "+,.4g")
+            rows.append((asset, quoted, *weights, money, count))
     cash = (figure(float(x[0]), ".2%") for x in (held, targets, after))
     print_table(heads, [*rows, ("cash", "", *cash, "", "")])
     kinds = ", ".join(f"{kind} {figure(money, ',.2f')}" for kind, money in allocation.costs.items())

@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import msgspec
 import numpy as np
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError, require_type
+from qfolio.core.errors import require_type
 from qfolio.core.files import locked, new_folder, path_of, require_new
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
 from qfolio.core.registry import short
-from qfolio.core.text import amount, quote
+from qfolio.core.text import amount
 from qfolio.experiments.budget import Budget, require_budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
@@ -106,21 +105,12 @@ class Run(Seeds):
         """
         files = RunFolder(path_of("folder", folder))
         config = files.read_config()
-        given = [name for name, part in (("task", task), ("agent", agent)) if part is not None]
-        if task is None:
-            task = task_of(config.task, config.task_settings)
-        if agent is None:
-            agent = agent_of(config.agent, config.agent_settings)
-        require_type("task", task, Task, "a task, such as qfolio.Pendulum()")
-        require_type("agent", agent, Agent, "an agent, such as qfolio.DQN()")
-        described = msgspec.to_builtins(describe(task, agent))
-        for name in [key for part in given for key in (part, f"{part}_settings")]:
-            if described[name] != (trained := getattr(config, name)):
-                raise QfolioError(
-                    f"{name} is {quote(described[name])}, but {files.path} was trained with "
-                    f"{quote(trained)}; give what it was trained with."
-                )
-        run = cls(task, agent, config, files)
+        run = cls(
+            task_of(config.task, config.task_settings, task),
+            agent_of(config.agent, config.agent_settings, agent),
+            config,
+            files,
+        )
         run._read_checkpoint()
         return run
 

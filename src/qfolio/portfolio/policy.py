@@ -180,13 +180,13 @@ class Policy:
         table = table.between(max(0, len(table) - self.rows), None)
         task = self._moved(table)
         of_now: Any = self.agent
-        rates = {
-            "learning_rate": getattr(of_now, "learning_rate", 0.0) * UPDATE_RATE,
-            "learning_rate_final": 1.0,  # the schedule may have ended
-        }
+        rates = {}
         known = {field.name for field in dataclasses.fields(of_now)}  # a user's may have no rate
-        changed = {name: rate for name, rate in rates.items() if name in known}
-        agent: Agent = dataclasses.replace(of_now, **changed)
+        if "learning_rate" in known:
+            rates["learning_rate"] = of_now.learning_rate * UPDATE_RATE
+        if "learning_rate_final" in known:
+            rates["learning_rate_final"] = 1.0  # the schedule may have ended
+        agent: Agent = dataclasses.replace(of_now, **rates)
         draws = [np.random.SeedSequence((i, self.updates + 1)) for i in range(self.seeds)]
         seeds = [int(draw.generate_state(1)[0]) for draw in draws]
         unlearned = -(-agent.warm_up() // episode_steps(task, agent)) * agent.num_envs

@@ -220,6 +220,15 @@ def test_seeds_differ_and_opening_gives_the_same(finished):
         assert not np.array_equal(returns[0], returns[1])
 
 
+def test_a_backtest_is_opened_with_the_agents_that_it_trained(finished):
+    """Another agent would train the folds that are missing, under the first one's name."""
+    agent = finished.agents["dqn"]
+    assert Backtest.open(finished.folder, {"dqn": agent}).agents["dqn"] is agent
+    other = AGENTS["dqn"].build(learning_rate=0.5)
+    with pytest.raises(QfolioError, match=r"agent_settings is .* give that agent"):
+        Backtest.open(finished.folder, {"dqn": other})
+
+
 def test_what_was_trained_stays(finished, tmp_path):
     """A backtest that is stopped goes on behind its finished folds, and ends up the same."""
     stopped = create(tmp_path / "run", agents={"pathwise": AGENTS["pathwise"]})

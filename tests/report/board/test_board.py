@@ -110,6 +110,9 @@ def test_a_name_that_is_no_text_does_not_hide_the_others(tmp_path):
     names = {run["name"] for run in Shelf(tmp_path).runs(0)["runs"]}
     assert names == {"good", "bad\N{REPLACEMENT CHARACTER}"}
     json.dumps(sorted(names)).encode()
+    assert Shelf(Path(os.fsdecode(os.fsencode(tmp_path) + b"/bad\xff"))).runs(0)["root"] == (
+        "bad\N{REPLACEMENT CHARACTER}"
+    )
 
 
 def test_hundreds_of_runs_that_write(tmp_path, monkeypatch):

@@ -121,22 +121,19 @@ def _placed_weights(
             f"{'is' if moved.size == 1 else 'are'} not among those of the prices; each order is "
             "decided at the next row."
         )
+    unpriced = np.isnan(prices.known)
     for row, weights in zip(rows, own.values, strict=True):
-        early = (weights[1:] != 0) & (prices.first_rows > row)
-        if row < days.stop and early.any():
-            asset = prices.assets[int(early.argmax())]
-            raise QfolioError(
-                f"{name} orders {asset} on {_day(prices, row)}, before its first price; give it "
-                "weight 0 until then."
+        wrong = (weights[1:] != 0) & unpriced[row]
+        if row < days.stop and wrong.any():
+            asset = int(wrong.argmax())
+            early = prices.first_rows[asset] > row
+            when, until = (
+                ("before its first", "until then") if early else ("after its last", "from then on")
             )
-        if row < days.stop and prices.listed is not None:
-            late = (weights[1:] != 0) & ~prices.listed[row] & (prices.first_rows <= row)
-            if late.any():
-                asset = prices.assets[int(late.argmax())]
-                raise QfolioError(
-                    f"{name} orders {asset} on {_day(prices, row)}, after its last price; give it "
-                    "weight 0 from then on."
-                )
+            raise QfolioError(
+                f"{name} orders {prices.assets[asset]} on {_day(prices, row)}, {when} price; give "
+                f"it weight 0 {until}."
+            )
         if days.start <= row < days.stop:
             decisions[row - days.start] = weights
     before = np.flatnonzero(rows < days.start)

@@ -51,7 +51,7 @@ class Plan:
         self.folds = every[: len(folds)]
         self.trainings = [*self.folds, every[-1]]
         self.agents = {
-            name: agents[name] if name in agents else agent_of(entry.agent, entry.settings)
+            name: agent_of(entry.agent, entry.settings, agents.get(name))
             for name, entry in config.agents.items()
         }
         self.tasks = {name: self._task(name) for name in self.agents}

@@ -243,7 +243,8 @@ class Backtest:
     def open(cls, folder: Path | str, agents: Mapping[str, Agent] | None = None) -> "Backtest":
         """A backtest as its last finished group of folds left it.
 
-        agents: by name, those that are not registered with qfolio.
+        agents: by name, those that are not registered with qfolio. Raises QfolioError if one is not
+        the backtest's.
         """
         files = BacktestFolder(path_of("folder", folder))
         config = files.read_config()

@@ -36,7 +36,7 @@ class Shelf:
             self._refresh()
             return {
                 "version": self._version,
-                "root": self.root.name,
+                "root": _readable(self.root.name),
                 "keys": list(self._experiments),
                 "runs": [
                     experiment.summary(key)
@@ -79,14 +79,17 @@ class Shelf:
             path = Path(log)
             name = path.parent.relative_to(self.root).as_posix()
             name = self.root.name if name == "." else name
-            written = name.encode(errors="surrogateescape")  # which need not be UTF-8
-            name = written.decode(errors="replace")
             key = hashlib.sha256(log.encode(errors="surrogateescape")).hexdigest()[:16]
-            found[key] = self._experiments.get(key) or Experiment(name, path)
+            found[key] = self._experiments.get(key) or Experiment(_readable(name), path)
         self._experiments = found
         for experiment in found.values():
             experiment.refresh(self._version)
         self._read = perf_counter()
+
+
+def _readable(name: str) -> str:
+    """The name of a file, whose bytes need not be UTF-8."""
+    return name.encode(errors="surrogateescape").decode(errors="replace")
 
 
 def _logs(folder: str, depth: int) -> Iterator[str]:

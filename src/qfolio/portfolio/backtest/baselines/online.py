@@ -19,7 +19,7 @@ from qfolio.portfolio.backtest.baselines.base import (
 )
 
 FEWEST = 5
-"""Rows that a step may use, of any length of row; a training window has more."""
+"""Least number of rows that a step sees, however few a month has: those that OLMAR averages."""
 
 
 class Online(Baseline):
@@ -33,7 +33,7 @@ class Online(Baseline):
 
         Args:
             target: The weights of the last order, of shape (assets,).
-            prices: The latest prices of shape (rows, assets), those of ``FEWEST`` rows or more.
+            prices: The latest prices of shape (rows, assets): a month's, or ``FEWEST`` rows.
         """
 
     def decide(self, history: History, held: Floats) -> Floats:
