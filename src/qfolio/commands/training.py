@@ -21,9 +21,9 @@ from qfolio.commands.arguments import (
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_whole
 from qfolio.core.text import amount, listed
-from qfolio.experiments.budget import MOST_STARTS, require_whole
+from qfolio.experiments.budget import MOST_STARTS
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget

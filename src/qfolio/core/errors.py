@@ -1,10 +1,12 @@
-"""The exception for errors that a user can fix, and a check that raises it."""
+"""The exception for errors that a user can fix, and checks that raise it."""
 
 import reprlib
 import traceback
 from collections.abc import Collection
+from numbers import Integral
 from pathlib import PurePath
 from types import UnionType
+from typing import Any
 
 
 class QfolioError(Exception):
@@ -21,6 +23,13 @@ def require_type(name: str, value: object, kinds: type | tuple[type, ...], wante
     """
     if not _is(value, kinds):
         raise QfolioError(f"{name} is {reprlib.repr(value)}; it must be {wanted}.")
+
+
+def require_whole(name: str, value: Any, low: int, high: int) -> None:
+    """Raises QfolioError unless an argument is a whole number in a range."""
+    require_type(name, value, Integral, "a whole number")
+    if not low <= value <= high:
+        raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")
 
 
 def require_list(name: str, value: object, kinds: type | UnionType, wanted: str) -> None:

@@ -1,10 +1,9 @@
 """Training budgets and seeds."""
 
 from dataclasses import dataclass
-from numbers import Integral
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from qfolio.core.errors import QfolioError, require_type
+from qfolio.core.errors import QfolioError, require_type, require_whole
 
 if TYPE_CHECKING:
     from qfolio.core.population import Population
@@ -69,10 +68,3 @@ def seed_range(seeds: int, seed: int) -> range:
     require_whole("seeds", seeds, 1, 2**20)
     require_whole("seed", seed, 0, 2**32 - seeds)
     return range(int(seed), int(seed + seeds))  # plain numbers, which files can hold
-
-
-def require_whole(name: str, value: Any, low: int, high: int) -> None:
-    """Raises QfolioError unless a value is a whole number in a range."""
-    require_type(name, value, Integral, "a whole number")
-    if not low <= value <= high:
-        raise QfolioError(f"{name} is {value}; it must be from {low} to {high}.")

@@ -6,11 +6,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from qfolio.core.errors import require_whole
 from qfolio.core.evaluation import greedy, start_keys
 from qfolio.core.mdp import Optimum
 from qfolio.core.population import Population
 from qfolio.core.statistics import mean_interval, regret
-from qfolio.experiments.budget import MOST_STARTS, require_whole
+from qfolio.experiments.budget import MOST_STARTS
 from qfolio.solvers.followed import FollowedOptimum
 
 

@@ -437,6 +437,7 @@ def test_a_wrong_baseline_of_ones_own_is_found_before_the_training(tmp_path, mon
     [
         ({"train": "300d"}, "nothing to test"), ({"test": "1 year"}, "like 5y"),
         ({"train": "25d"}, "rows are too few"), ({"cost": 0.5}, "cost is 0.5"),
+        ({"trials": -1}, "trials is -1; it must be from 0"),
         ({"lag": -1}, "lag is -1"), ({"agents": {}}, "at least one agent"),
         ({"cap": 1.5}, "The cap is 1.5; it must be above 0"), ({"cap": np.nan}, "The cap is nan"),
         ({"baselines": "momentum"}, "baselines is 'momentum'; it must be a list"),

@@ -198,6 +198,7 @@ def test_a_fold_may_end_on_a_holiday():
     ("options", "message"),
     [
         ({"tables": {}}, "needs at least one table"),
+        ({"trials": -1}, "trials is -1; it must be from 0"),
         ({"costs": ()}, "needs at least one lag and one cost"),
         ({"tables": {"../a": TABLES["one"]}}, "A table is called '../a'"),
         ({"tables": {"a": TABLES["one"], "b": TABLES["one"]}}, "a and b are the same table"),

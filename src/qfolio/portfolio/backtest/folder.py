@@ -57,6 +57,9 @@ TOGETHER = "-together"
 RISK_FREE = "risk_free"
 """The column of returns.csv with the returns of cash, if it earns any."""
 
+MOST_TRIALS = 10**9
+"""Largest number of earlier trials on a table."""
+
 STRATEGIES = "strategies.safetensors"
 
 MOST_WEIGHTS = 10_000_000
@@ -140,7 +143,7 @@ class BacktestConfig(Config, frozen=True):
     baselines: list[str]
     seeds: int
     seed: int
-    trials: Annotated[int, msgspec.Meta(ge=0, le=10**9)]
+    trials: Annotated[int, msgspec.Meta(ge=0, le=MOST_TRIALS)]
     command: str
     agents: Annotated[dict[AgentName, AgentConfig], msgspec.Meta(min_length=1)]
     device: str

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError, require_list, require_type
+from qfolio.core.errors import QfolioError, require_list, require_type, require_whole
 from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
@@ -33,7 +33,12 @@ from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest import memory, notes
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.backtest.benchmark import field_of, tracked
-from qfolio.portfolio.backtest.folder import AgentConfig, BacktestConfig, BacktestFolder
+from qfolio.portfolio.backtest.folder import (
+    MOST_TRIALS,
+    AgentConfig,
+    BacktestConfig,
+    BacktestFolder,
+)
 from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow
 from qfolio.portfolio.backtest.own import Own, place
@@ -166,7 +171,8 @@ class Backtest:
             QfolioError: There is no agent, a name or a setting is invalid, the arguments do not fit
                 the table, or the machine has too little memory.
         """
-        _require_types(agents, strategies, lag=lag, seeds=seeds, seed=seed, trials=trials)
+        _require_types(agents, strategies, lag=lag, seeds=seeds, seed=seed)
+        require_whole("trials", trials, 0, MOST_TRIALS)
         require_type("expanding", expanding, bool, "True or False")
         for argument, text in (("command", command), ("title", title)):
             require_type(argument, text, str, "text")

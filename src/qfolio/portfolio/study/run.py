@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError, require_list, require_type
+from qfolio.core.errors import QfolioError, require_list, require_type, require_whole
 from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
@@ -30,6 +30,7 @@ from qfolio.experiments.machines.choice import on
 from qfolio.experiments.presets import Preset
 from qfolio.portfolio.backtest.attribution.explain import explain
 from qfolio.portfolio.backtest.attribution.why import Why
+from qfolio.portfolio.backtest.folder import MOST_TRIALS
 from qfolio.portfolio.backtest.folds import parse_length, require_fold
 from qfolio.portfolio.backtest.replay import Entry
 from qfolio.portfolio.backtest.results import write_tables
@@ -114,7 +115,7 @@ class Study:
         require_list("lags", lags, Integral, "a list of whole numbers, such as [1, 2]")
         require_list("costs", costs, Real, "a list of numbers, such as [0.001, 0.005]")
         require_list("after", after, str | os.PathLike, 'a list of folders, such as ["runs/study"]')
-        require_type("trials", trials, Integral, "a whole number")
+        require_whole("trials", trials, 0, MOST_TRIALS)
         require_type("command", command, str, "text")
         place = path_of("out", out)
         tables = {name: load(table) for name, table in tables.items()}
@@ -131,7 +132,7 @@ class Study:
             raise QfolioError(reasons)
         config = StudyConfig(
             tables={
-                name: _table_config(table, trials + _count(earlier, table.digest))
+                name: _table_config(table, int(trials) + _count(earlier, table.digest))
                 for name, table in kept.items()
             },
             left_out=left_out,
