@@ -22,13 +22,14 @@ os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={DEVICES}"
 import jax  # noqa: E402  # it reads the flags when it is imported
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
-import optax  # noqa: E402
 from jax import lax  # noqa: E402
 from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
+from qfolio.learning import optimizer  # noqa: E402
+
 UPDATES, ROUNDS, ROWS = 400, 11, 50_000
 SIZES = (3, 256, 256, 11)
-ADAM = optax.adam(1e-3)
+LEARNING_RATE = 1e-3
 
 
 def values(layers, rows):
@@ -39,7 +40,7 @@ def values(layers, rows):
 
 
 def update(replay, state, key):
-    layers, target, moments = state
+    layers, target, adam = state
     share = BATCH // DEVICES
     index = jax.random.randint(key, (BATCH,), 0, ROWS - 1)
     index = lax.dynamic_slice(index, (lax.axis_index("device") * share,), (share,))
@@ -52,8 +53,8 @@ def update(replay, state, key):
     gradient = jax.grad(loss)(layers)
     if DEVICES > 1:
         gradient = lax.psum(gradient, "device")
-    step, moments = ADAM.update(gradient, moments)
-    return (optax.apply_updates(layers, step), target, moments), None
+    layers, adam = optimizer.descend(layers, gradient, adam, LEARNING_RATE)
+    return (layers, target, adam), None
 
 
 def main():
@@ -70,7 +71,7 @@ def main():
     def run(replay, state, keys):
         return lax.scan(partial(update, replay), state, keys)[0]
 
-    state = layers, layers, ADAM.init(layers)
+    state = layers, layers, optimizer.begin(layers)
     keys = jax.random.split(jax.random.key(1), UPDATES)
     seconds = []
     for _ in range(1 + ROUNDS):

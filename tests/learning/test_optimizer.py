@@ -1,5 +1,7 @@
 """Gradient steps against their formulas."""
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -41,9 +43,21 @@ def test_plain_descent_by_hand():
 
 
 def test_adam_by_hand():
-    """Its first step is g / (|g| + ε)."""
-    np.testing.assert_allclose(stepped(2.0, optimizer_epsilon=2.0), [-0.5], rtol=1e-4)
+    """Its first step is g / (|g| + ε); the second has means over two gradients, corrected for 0."""
+    first, mean, square = -2 / 3, (0.9 * 0.2 - 0.1) / 0.19, (0.999 * 0.004 + 0.001) / 0.001999
+    path = stepped(2.0, -1.0, optimizer_epsilon=1.0)
+    np.testing.assert_allclose(path, [first, first - mean / (square**0.5 + 1)], rtol=1e-4)
     np.testing.assert_allclose(stepped(-2.0), [1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("largest", [1.0, 5.0, 10.0, math.inf])
+def test_gradients_are_clipped_to_a_norm(largest):
+    gradient = {"weights": jnp.array([[3.0], [0.0]]), "bias": jnp.array([4.0])}
+    assert optimizer.norm(gradient) == 5
+    clipped = optimizer.clip(gradient, largest)
+    share = min(1, largest / 5)
+    np.testing.assert_allclose(clipped["weights"], [[3 * share], [0]], rtol=1e-6)
+    np.testing.assert_allclose(clipped["bias"], [4 * share], rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.fields import constant, number, require, require_counts, sizes, static
@@ -252,7 +251,7 @@ class OnPolicy(Agent):
     def descend(self, state: OnPolicyState, batch: Batch) -> tuple[OnPolicyState, Metrics]:
         """One gradient step."""
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.weights, batch)
-        metrics["gradient_norm"] = jnp.minimum(optax.tree.norm(gradient), LARGEST)
+        metrics["gradient_norm"] = jnp.minimum(optimizer.norm(gradient), LARGEST)
         gradient = optimizer.clip(gradient, self.max_grad_norm)
         rate = self._schedule(state.optimizer.count + 1)
         weights, adam = optimizer.descend(state.weights, gradient, state.optimizer, rate)

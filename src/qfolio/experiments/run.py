@@ -79,7 +79,7 @@ class Run(Seeds):
             steps=budget.steps,
             seeds=len(every),
             seed=every.start,
-            **devices.circumstances("python", "jax", "equinox", "optax", "numpy"),
+            **devices.circumstances("python", "jax", "equinox", "numpy"),
         )
         place = None if out is None else path_of("out", out)
         if place is not None:

@@ -4,12 +4,12 @@ The learning rate follows a cosine (Loshchilov & Hutter 2017).
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
@@ -37,6 +37,9 @@ class OptimizerConfig(NamedTuple):
 
 ADAM = OptimizerConfig()
 
+FIRST_DECAY, SECOND_DECAY = 0.9, 0.999
+"""Adam's decay rates β₁ and β₂ of the running means of gradients and of their squares."""
+
 
 class Optimizer(eqx.Module):
     """The state of an optimizer; arrays that its kind does not use stay zero."""
@@ -49,18 +52,25 @@ class Optimizer(eqx.Module):
     def direction(self, gradient: Weights) -> tuple[Weights, "Optimizer"]:
         """The direction of descent, and the new state."""
         kind, decay, epsilon = self.config
+        count, direction, mu, nu = self.count + 1, gradient, self.mu, self.nu
         if kind == "adam":
-            state = optax.ScaleByAdamState(self.count, self.mu, self.nu)
-            direction, state = optax.scale_by_adam(eps=epsilon).update(gradient, state)
-            return direction, Optimizer(state.count, state.mu, state.nu, self.config)
-        direction, mu, nu = gradient, self.mu, self.nu
-        if kind != "sgd":
-            mean = lambda old, new: decay * old + (1 - decay) * new  # noqa: E731
-            nu = jax.tree.map(lambda n, g: mean(n, g**2), nu, gradient)
-            mu = jax.tree.map(mean, mu, gradient) if kind == "rmsprop-centered" else mu
-            scaled = lambda g, m, n: g / jnp.sqrt(jnp.maximum(n - m**2, 0) + epsilon)  # noqa: E731
-            direction = jax.tree.map(scaled, gradient, mu, nu)
-        return direction, Optimizer(self.count + 1, mu, nu, self.config)
+            mu = jax.tree.map(partial(_mean, FIRST_DECAY), mu, gradient)
+            nu = jax.tree.map(partial(_mean, SECOND_DECAY), nu, _squares(gradient))
+            # The correction of means that start at 0 is a factor of all weights (Adam, section 2):
+            # a division of each mean would cost more than all other passes over the weights.
+            root = jnp.sqrt(1 - SECOND_DECAY**count)
+            factor = root / (1 - FIRST_DECAY**count)
+            direction = jax.tree.map(
+                lambda m, n: factor * m / (jnp.sqrt(n) + epsilon * root), mu, nu
+            )
+        elif kind != "sgd":
+            nu = jax.tree.map(partial(_mean, decay), nu, _squares(gradient))
+            if kind == "rmsprop-centered":
+                mu = jax.tree.map(partial(_mean, decay), mu, gradient)
+            direction = jax.tree.map(
+                lambda g, m, n: g / jnp.sqrt(jnp.maximum(n - m**2, 0) + epsilon), gradient, mu, nu
+            )
+        return direction, Optimizer(count, mu, nu, self.config)
 
 
 class CosineSchedule(NamedTuple):
@@ -86,8 +96,8 @@ class CosineSchedule(NamedTuple):
 
 def begin(weights: Weights, config: OptimizerConfig = ADAM) -> Optimizer:
     """The state before the first gradient step."""
-    state = optax.scale_by_adam().init(weights)
-    return Optimizer(state.count, state.mu, state.nu, config)
+    zeros = jax.tree.map(jnp.zeros_like, weights)
+    return Optimizer(jnp.array(0, jnp.int32), zeros, zeros, config)
 
 
 def descend(
@@ -95,8 +105,7 @@ def descend(
 ) -> tuple[Weights, Optimizer]:
     """One step down the gradient."""
     direction, optimizer = optimizer.direction(gradient)
-    updates = jax.tree.map(lambda d: -rate * d, direction)
-    return optax.apply_updates(weights, updates), optimizer
+    return jax.tree.map(lambda w, d: w - rate * d, weights, direction), optimizer
 
 
 def minimize(
@@ -124,6 +133,21 @@ def repeat(
     return weights, {name: value.mean() for name, value in metrics.items()}
 
 
-def clip(gradient: Weights, norm: Scalar) -> Weights:
-    """The gradient, rescaled to ``norm`` if it is longer."""
-    return optax.clip_by_global_norm(norm).update(gradient, optax.EmptyState())[0]
+def norm(gradient: Weights) -> Float[Array, ""]:
+    """The Euclidean norm over all weights."""
+    return jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
+
+
+def clip(gradient: Weights, largest: Scalar) -> Weights:
+    """The gradient, rescaled to the norm ``largest`` if it is longer."""
+    length = norm(gradient)
+    factor = jnp.where(length > largest, largest / length, 1.0)
+    return jax.tree.map(lambda leaf: factor * leaf, gradient)
+
+
+def _mean(decay: float, old: Array, new: Array) -> Array:
+    return decay * old + (1 - decay) * new
+
+
+def _squares(gradient: Weights) -> Weights:
+    return jax.tree.map(jnp.square, gradient)
