@@ -1,4 +1,5 @@
-from qfolio.commands.console import console, print_rule
+from qfolio.commands.console import console
+from qfolio.commands.console.training import print_rule
 from qfolio.report.rule import Row, rows
 
 

@@ -84,6 +84,8 @@ def allocate(
     devices.configure()
     registry.trust(trust)
     from qfolio.commands import console
+    from qfolio.commands.console.desk import print_allocation
+    from qfolio.commands.console.tables import print_warnings
     from qfolio.core.text import amount
     from qfolio.portfolio.backtest.attribution.drivers import reasons, sentence
     from qfolio.portfolio.desk.allocation import Allocation, require_fresh
@@ -120,7 +122,7 @@ def allocate(
             "(--prices, without --returns)."
         )
     if prices is not None:
-        console.print_warnings(prices.name, desk.news)
+        print_warnings(prices.name, desk.news)
     require_fresh(table, as_of)
     held = read_holdings(holdings, table.assets, capital, debts=desk.debts)
     shares, cash, gone = cashed_out(*held, table)
@@ -161,7 +163,7 @@ def allocate(
         trained = "an unknown date" if np.isnat(followed.learned) else day(followed.learned)
     else:
         notes = followed.notes(table)
-    console.print_allocation(allocation, standing, trained, shares=not table.levels)
+    print_allocation(allocation, standing, trained, shares=not table.levels)
     for reason in why:
         console.tell(f"Why {sentence(reason)}")
     for line in (*gone, *notes, *desk.terms(followed, table, allocation, spent), said):
@@ -214,6 +216,8 @@ def follow(
     devices.configure()
     registry.trust(trust)
     from qfolio.commands import console
+    from qfolio.commands.console.desk import print_following
+    from qfolio.commands.console.tables import print_warnings
     from qfolio.core.files import write_bytes
     from qfolio.portfolio.desk.consistency import ALARM
     from qfolio.portfolio.desk.desk import Desk
@@ -223,7 +227,7 @@ def follow(
     desk = Desk.open(folder, returns=returns, **latest.reading)
     following = marked(desk, prices, benchmark)
     if prices is not None:
-        console.print_warnings(prices.name, desk.news)
+        print_warnings(prices.name, desk.news)
     path = folder / "follow.csv" if out is None else out
     following.write(path)
     page, live = path.with_suffix(".html"), following.live
@@ -240,7 +244,7 @@ def follow(
         title = f"{following.agent}, live and in the backtest"
         text = render_following(title, following.sentences(), rows, following.rows())
         write_bytes(page, text.encode())
-    console.print_following(following)
+    print_following(following)
     console.say(f"Rows: {path}" + (f", page: {page}" if len(live.returns) else ""))
     return following.to_json()
 

@@ -24,16 +24,16 @@ def prices(file: Positional[File] = None, *, reading: Read = READING) -> Documen
             yfinance saves it, or a folder with a file for each asset (default: the 20 US stocks
             that come with skfolio).
     """
-    from qfolio.commands import console
+    from qfolio.commands.console.tables import print_findings, print_prices
     from qfolio.portfolio.prices.table import describe, inspect
 
     table, findings = inspect(file, **reading.reading)
-    console.print_findings(findings)
+    print_findings(findings)
     found: Document = {"findings": [dataclasses.asdict(finding) for finding in findings]}
     if table is None:
         raise Failed(found)
     facts = describe(table)
-    console.print_prices(facts)
+    print_prices(facts)
     return facts | found
 
 
@@ -63,6 +63,7 @@ def backtest(
     registry.trust(options.trust)
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
+    from qfolio.commands.console.backtest import describe_backtest, print_assessment
     from qfolio.commands.progress import JobsProgress, stop
     from qfolio.core.files import read_json
     from qfolio.experiments.interrupts import resumable
@@ -93,7 +94,7 @@ def backtest(
             "--resume keeps the backtest's settings; add only --on, --track, --trust, or a table "
             "with more rows."
         )
-    console.say(console.describe_backtest(run))
+    console.say(describe_backtest(run))
     for note in mandated(run.replay):
         console.tell(note)
     resume = again("qfolio backtest --resume", folder, *run.parts, on=options.on)
@@ -105,7 +106,7 @@ def backtest(
             stop(resume)
         with console.console.status(status):
             found = finish(run)
-    console.print_assessment(found.assessment)
+    print_assessment(found.assessment)
     for sentences in found.why.diagnosis.values():
         for sentence in sentences:
             console.tell(f"Diagnosis: {sentence}")

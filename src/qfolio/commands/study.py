@@ -53,6 +53,7 @@ def study(
     registry.trust(options.trust)
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
+    from qfolio.commands.console.study import describe_study, print_study, spell
     from qfolio.commands.progress import JobsProgress, stop
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
@@ -80,14 +81,14 @@ def study(
         raise QfolioError(
             "--resume keeps the study's settings; add only --on, --track and --trust."
         )
-    console.say(console.describe_study(run))
+    console.say(describe_study(run))
     parts = run.backtest(next(iter(run.config.tables))).parts
     resume = again("qfolio study --resume", run.folder, *parts, on=options.on)
     with resumable(resume), console.bar("") as update, tracked(*following):
 
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1
-            console.say(f"{place} of {len(run.places)}: {table}, {console.spell(variant)}")
+            console.say(f"{place} of {len(run.places)}: {table}, {spell(variant)}")
             return JobsProgress(update)
 
         run.run(listen, write_page, executor)
@@ -96,7 +97,7 @@ def study(
     with resumable(resume), console.console.status("Pooling the evidence, writing the report"):
         result = run.result()
         write_study_report(run)
-    console.print_study(result)
+    print_study(result)
     console.say(f"Report: {run.folder / PAGE}")
     return outcome(run.folder, msgspec.to_builtins(result))
 

@@ -79,13 +79,13 @@ class Reading:
 
         Without a file, the table is the 20 US stocks that come with skfolio.
         """
-        from qfolio.commands import console
+        from qfolio.commands.console.tables import print_warnings
         from qfolio.portfolio.prices.table import accepted, inspect
 
         prices, findings = inspect(file, **self.reading)
         table = accepted(prices, findings, file)
         if file is not None:
-            console.print_warnings(file.name, findings)
+            print_warnings(file.name, findings)
         return table
 
 

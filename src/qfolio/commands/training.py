@@ -89,6 +89,7 @@ def train(
     registry.trust(trust)
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
+    from qfolio.commands.console.training import describe_run
     from qfolio.commands.progress import stop
     from qfolio.experiments import presets
     from qfolio.experiments.interrupts import resumable
@@ -117,7 +118,7 @@ def train(
             if live:
                 _require_seen(run.config.task)
         budget = budget or run.budget
-        console.say(console.describe_run(run, budget))
+        console.say(describe_run(run, budget))
         if not budget.left(run.population):
             trained = amount(run.done(budget.unit), budget.unit.removesuffix("s"))
             console.say(
@@ -163,7 +164,7 @@ def evaluate(
 
     devices.configure()
     registry.trust(trust)
-    from qfolio.commands.console import print_result
+    from qfolio.commands.console.training import print_result
     from qfolio.experiments.run import Run
 
     run = Run.open(folder)
@@ -317,7 +318,8 @@ def write_again(folder: Path) -> None:
 
 
 def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
-    from qfolio.commands.console import console, print_result, print_rule, say
+    from qfolio.commands.console import console, say
+    from qfolio.commands.console.training import print_result, print_rule
     from qfolio.report.collect import report_data
     from qfolio.report.training import write_report
 

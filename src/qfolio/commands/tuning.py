@@ -87,6 +87,7 @@ def tune(
     tuning = _tuning()
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
+    from qfolio.commands.console.tuning import describe_search
     from qfolio.commands.progress import SearchProgress, stop
     from qfolio.experiments import presets
     from qfolio.experiments.interrupts import resumable
@@ -109,7 +110,7 @@ def tune(
     else:
         work = tuning.Tuning.open(join, trials=trials, batch=batch)
     resume = again("qfolio tune --join", work.folder, work.task, work.agent, on=on)
-    console.say(console.describe_search(work))
+    console.say(describe_search(work))
     with resumable(resume), SearchProgress() as progress, tracked(*following):
         work.run(progress.batch, progress.chunk, executor)
     if work.interrupted:
@@ -198,7 +199,8 @@ def _new(
 
 
 def _conclude(work: "Tuning", resume: str, executor: "Executor") -> Document:
-    from qfolio.commands.console import console, print_search, say
+    from qfolio.commands.console import console, say
+    from qfolio.commands.console.tuning import print_search
     from qfolio.report.sweep import sweep
     from qfolio.report.tuning import write_tuning_report
 

@@ -1,0 +1,79 @@
+"""What commands print; the modules of this package print the results of one kind of work each."""
+
+import contextlib
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from functools import partial
+from textwrap import fill
+from typing import Literal
+
+import rich.progress
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from qfolio.core.text import figure, printable
+
+console = Console(highlight=False)
+if not console.is_terminal:
+    console.width = 10_000  # files and pipes have no width: nothing is folded there
+
+
+def say(text: str) -> None:
+    """Prints lines; control characters are escaped."""
+    print("\n".join(map(printable, text.split("\n"))), flush=True)
+
+
+def tell(sentences: str) -> None:
+    """Prints sentences; a terminal breaks them between words."""
+    if console.is_terminal:
+        sentences = fill(sentences, console.width, break_long_words=False, break_on_hyphens=False)
+    say(sentences)
+
+
+@contextlib.contextmanager
+def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., None]]:
+    """A bar with text beside it, on terminals only, removed at the end.
+
+    Yields the function that moves it: ``update(completed=…)``, with ``description=…`` for new text.
+    """
+    columns = (
+        rich.progress.BarColumn(bar_width=24),
+        rich.progress.TextColumn("{task.description}"),
+    )
+    with rich.progress.Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as live:
+        yield partial(live.update, live.add_task(text, total=total, completed=done))
+
+
+def print_table(
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    bold: Container[str] = (),
+    width: int = 0,
+) -> None:
+    """A table; its first column names the rows, and numbers in the others are aligned.
+
+    Args:
+        heads: The columns' names.
+        rows: Their cells.
+        bold: Names of the rows to emphasize.
+        width: Characters that each column has at least.
+    """
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for i, head in enumerate(heads):
+        side: Literal["left", "right"] = "right" if i else "left"
+        # On a narrow terminal names are folded, so that no digit is cut off.
+        whole = i > 0
+        name = Text(printable(head))
+        table.add_column(name, justify=side, no_wrap=whole, overflow="fold", min_width=width)
+    for row in rows:
+        cells = (Text(printable(cell)) for cell in row)
+        table.add_row(*cells, style="bold" if row[0] in bold else None)
+    console.print(table)
+
+
+def number(value: float | None) -> str:
+    """One decimal, or four significant digits for small numbers."""
+    return figure(value, ",.1f" if not value or abs(value) >= 10 else "#.4g")

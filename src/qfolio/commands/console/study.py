@@ -1,0 +1,64 @@
+"""What a study prints: its extent before it starts, and the pooled evidence."""
+
+from typing import TYPE_CHECKING
+
+from qfolio.commands.console import print_table, say, tell
+from qfolio.core.text import amount, figure
+
+if TYPE_CHECKING:
+    from qfolio.portfolio.study.folder import Result, Variant
+    from qfolio.portfolio.study.pooling import Active, Pooled
+    from qfolio.portfolio.study.run import Study
+
+
+def describe_study(study: "Study") -> str:
+    """Tables, variants and agents of a study, and why tables are left out."""
+    config = study.config
+    variants = amount(len(config.variants), "variant")
+    tables = amount(len(config.tables), "table")
+    left_out = (f"{name} is left out: {why}" for name, why in config.left_out.items())
+    about = f"{tables} · {variants} · {' and '.join(config.agents)} · {config.device}"
+    return "\n".join([about, *left_out])
+
+
+def spell(variant: "Variant") -> str:
+    """A variant of a study in words: lag 1, 10 bp."""
+    return f"lag {variant.lag}, {variant.bps:g} bp"
+
+
+def print_study(result: "Result") -> None:
+    """A row for each table and each variant pooled, by agent, and the verdicts."""
+    from qfolio.portfolio.study.verdict import decimal, looks_sentence
+
+    main, *_ = result.variants
+    for agent, pools in main.agents.items():
+        rows: list[tuple[str, ...]] = []
+        for name, known in pools.evidence.items():
+            active = known.to_reference
+            ratios = (active.information_ratio, active.t, known.to_rebalanced.t, known.sharpe)
+            rows.append((name, *_growth(active), *map(decimal, ratios)))
+        for entry in result.variants:
+            found = entry.agents[agent]
+            numbers = (found.to_reference.z, found.to_rebalanced.z, found.sharpe.difference)
+            cells = (*_growth(found.to_reference), "", *map(decimal, numbers))
+            rows.append((_pooled(entry.variant), *cells))
+        heads = (agent, "a year", "95% interval", "IR", "t", "rebal.", "Sharpe")
+        print_table(heads, rows, bold=[_pooled(main.variant)])
+    say(
+        "Growth is what exceeds the benchmark's, t against it (pooled: Stouffer's z), rebal. the t "
+        "(or z) against its best rebalancing, Sharpe the ratio less that of the best baseline."
+    )
+    for sentences in result.verdicts.values():
+        for sentence in sentences:
+            tell(sentence)
+    tell(looks_sentence(result))
+
+
+def _pooled(variant: "Variant") -> str:
+    return f"pooled, {spell(variant)}"
+
+
+def _growth(entry: "Active | Pooled") -> tuple[str, str]:
+    """An active growth and its interval."""
+    growth, low, high = (figure(x, "+.1%") for x in (entry.growth, entry.low, entry.high))
+    return growth, f"{low.removesuffix('%')} … {high}"

@@ -1,0 +1,39 @@
+"""What a search prints: its space before it starts, and the best configuration."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from qfolio.commands.console import say, tell
+from qfolio.core.registry import short
+from qfolio.core.text import amount, figure
+
+if TYPE_CHECKING:
+    from qfolio.experiments.tuning.run import Tuning
+
+
+def describe_search(work: "Tuning") -> str:
+    """What a search trains, in a line, and each searched setting with its range and scale."""
+    config, budget = work.config, work.config.budget
+    seeds = amount(config.seeds, "seed")
+    space = "\n".join(f"  {dim.name:<20} {dim}  ({dim.scale})" for dim in work.space)
+    return (
+        f"{short(config.agent).upper()} on {config.task} · preset {config.preset} · "
+        f"{config.trials} trials × {seeds} · {budget.amount:,} {budget.unit} · "
+        f"{config.device}\n{space}"
+    )
+
+
+def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
+    """The best configuration beside the preset and the optimum, and the search's verdicts."""
+    say("")
+    for name, row in (("best", "return_per_seed"), ("preset", "preset_return_per_seed")):
+        returns = [math.nan if x is None else x for x in summary[row]]
+        mean = sum(returns) / len(returns)
+        worst = figure(min(returns), ".2f")
+        say(f"{name:<8}{figure(mean, '.2f'):>9}   worst seed {worst}")
+    if summary["optimum"] is not None:
+        seeds = amount(len(returns), "fresh seed")
+        say(f"optimum {figure(summary['optimum'], '.2f'):>9}   ({seeds}, graded starts)")
+    say("")
+    for sentence in verdicts:
+        tell(sentence)
