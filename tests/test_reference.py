@@ -1,5 +1,6 @@
 """What docs/reference/ must have: every public name, and what each setting means."""
 
+import dataclasses
 import importlib.util
 import inspect
 import re
@@ -13,6 +14,15 @@ import qfolio
 from qfolio.cli import commands
 from qfolio.core import settings
 from qfolio.core.registry import ENTRIES, find
+from qfolio.portfolio.backtest.statistics.assessment import (
+    KINDS,
+    Assessment,
+    StrategyAssessment,
+)
+from qfolio.portfolio.backtest.statistics.measures import MEASURES
+from qfolio.portfolio.backtest.statistics.sharpe import SharpeTest
+from qfolio.portfolio.desk.follow import COLUMNS
+from qfolio.portfolio.study.pooling import Active, Evidence
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = "\n".join(page.read_text() for page in sorted((DOCS / "reference").glob("*.md")))
@@ -75,3 +85,13 @@ def test_every_setting_has_a_meaning(kind, name):
 def test_every_command_says_what_it_does():
     assert {name for name, command in commands().items() if not inspect.getdoc(command)} == set()
     assert "{commands}" in PAGES
+
+
+def test_every_column_and_key_of_a_file_is_explained():
+    page = (DOCS / "reference" / "files.md").read_text()
+    forms = (Assessment, StrategyAssessment, SharpeTest)
+    written = {field.name for form in forms for field in dataclasses.fields(form)}
+    written |= {*KINDS, *MEASURES, *COLUMNS, *Active.__struct_fields__, *Evidence.__struct_fields__}
+    shared = {"to_reference", "to_rebalanced"}  # the start of a name in study.csv
+    assert {f"`{name}_…`" for name in shared} <= set(re.findall(r"`[^`]+`", page))
+    assert written - set(re.findall(r"`(\w+)`", page)) == set()

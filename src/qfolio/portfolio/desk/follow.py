@@ -23,6 +23,12 @@ from qfolio.portfolio.desk.reference import reference
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 
+COLUMNS = (
+    "date", "return", "wealth", "cash", "cost", "flow", "growth", "benchmark", "band_low",
+    "band_middle", "band_high", "evidence",
+)  # fmt: skip
+"""Columns of follow.csv; docs/reference/files.md explains them."""
+
 SEED = 0
 """Seed of the bootstrap: the same ledger gives the same evidence whenever one looks."""
 
@@ -153,16 +159,12 @@ class Following:
     def write(self, path: Path) -> None:
         """Writes a CSV file with a row for each live row."""
         live = self.live
-        header = [
-            "date", "return", "wealth", "cash", "cost", "flow", "growth", "benchmark",
-            "band_low", "band_middle", "band_high", "evidence",
-        ]  # fmt: skip
         columns = (
             live.returns, live.wealth, live.cash, live.costs, live.flows, self.growth,
             np.cumprod(1 + self.reference), *self.band, self.evidence,
         )  # fmt: skip
         days = spell_all(live.dates, live.dates) if len(live.dates) else []
-        write_csv(path, header, zip(days, *(x.tolist() for x in columns), strict=True))
+        write_csv(path, COLUMNS, zip(days, *(x.tolist() for x in columns), strict=True))
 
     def to_json(self) -> dict[str, Any]:
         return {
