@@ -71,6 +71,17 @@ def planted(rows=800, seed=2):
     return Prices(dates, tuple("ABCDEF"), np.exp(logs))
 
 
+def with_a_delisted_asset(prices, rows=100):
+    """The prices and a seventh asset, which is delisted after some rows."""
+    rng = np.random.default_rng(0)
+    own = 50 * np.exp(rng.normal(0, 0.02, len(prices)).cumsum())
+    own[rows:] = own[rows - 1]
+    values = np.concatenate([prices.values, own[:, None]], 1)
+    listed = np.ones(values.shape, bool)
+    listed[rows:, -1] = False
+    return Prices(prices.dates, (*prices.assets, "G"), values, listed=listed)
+
+
 def persistent(rows=700, assets=6, seed=0, market=0.0):
     """Prices whose relative returns persist for a while; the market adds noise to all of them."""
     rng = np.random.default_rng(seed)

@@ -231,3 +231,19 @@ def test_a_column_of_the_table_is_ranked_like_a_signal():
     np.testing.assert_array_equal(found[..., 0], column.argsort(1).argsort(1) - 1.0)
     with pytest.raises(QfolioError, match="feature:value names no column"):
         signals.compute(signals.parse("feature:value"), values)
+
+
+@pytest.mark.parametrize("text", ["residual-volatility:20", "correlation:20"])
+@pytest.mark.parametrize("scale", ["rank", "z-score"])
+def test_two_assets_tie_where_rounding_alone_tells_them_apart(text, scale):
+    """Their residuals on the market, their mean, are opposite, and their correlation is one."""
+    known = slice(25 + 20, None)
+    raw = signal(text, prices(assets=2))[known]
+    assert 0 < abs(raw[:, 0] - raw[:, 1]).max() < 1e-10
+    assert not signals.compute(signals.parse(text), prices(assets=2), scale)[known].any()
+    three = signals.compute(signals.parse(text), prices(assets=3), scale)[known, :, 0]
+    assert (abs(three).max(1) > 0.5).all()
+
+
+def test_an_asset_that_is_the_market_has_no_residual():
+    assert np.isnan(signal("residual-volatility:20", prices(assets=1))).all()

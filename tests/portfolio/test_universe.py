@@ -474,6 +474,19 @@ def test_what_a_delisting_paid_counts_as_cash_for_baselines() -> None:
     assert decisions[16, 0] == pytest.approx(decisions[15, 0] - 0.1, abs=0.02)
 
 
+def test_what_a_delisting_paid_earns_what_cash_earns() -> None:
+    """In the returns that are attributed, too, and not what is paid to hold assets."""
+    frame = frame_of(40, 3)
+    frame.iloc[25:, 0] = np.nan
+    costs = {"cost_model": "itemized(cash_rate=0.05,carry_rate=0.02)"}
+    task = Portfolio.of(load(frame, ended="cash-out"), window=5, horizon=5, **costs)
+    folds = [Fold("one", slice(0, 10), slice(10, 38), slice(0, 10))]
+    cash, paid, *others = Replay(load(frame, ended="cash-out"), folds, task, 1.0).growth.T
+    assert (cash > 1).all()
+    np.testing.assert_allclose(paid[14:], cash[14:], rtol=1e-12)
+    assert (others[0][14:] != cash[14:]).all()
+
+
 @pytest.mark.parametrize("menu", ["grid:4", "tilts:0.2", "overweight:0.2"])
 def test_menus_order_what_is_there(menu: str) -> None:
     prices, _ = moving(2, 60, 5)

@@ -30,6 +30,9 @@ LENGTHS = {"d": 1, "w": 5, "m": 21, "y": 252}
 """Rows in a day, a week, a month and a year of a daily table. A slower table has fewer, at least
 one; in a faster one, whose prices move on another scale, they are the same numbers of rows."""
 
+ROUNDING = 1e-9
+"""Differences between assets that are smaller than this share of the largest number are none."""
+
 SCALES = ("rank", "z-score", "centered", "raw")
 """How signals are scaled across assets, row by row: ranks from −1 to 1; distances from the mean in
 standard deviations, clipped at ±3; distances from the mean; or the numbers themselves."""
@@ -173,8 +176,9 @@ class ResidualVolatility(Signal):
         returns = _returns(prices)
         market = _market(returns)
         slope = _slope(returns, market, rows)
-        explained = slope**2 * _deviation(market, rows) ** 2
-        return _log(np.sqrt(np.maximum(_deviation(returns, rows) ** 2 - explained, 0)))
+        total = _deviation(returns, rows) ** 2
+        rest = total - slope**2 * _deviation(market, rows) ** 2
+        return _log(np.sqrt(np.where(rest > ROUNDING * total, rest, 0)))
 
 
 class Correlation(Signal):
@@ -355,17 +359,26 @@ def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
     if not shared and scale == "rank":
         import pandas as pd
 
-        ranks = pd.DataFrame(values).rank(axis=1).to_numpy()
+        ranks = pd.DataFrame(np.round(values / _unit(values))).rank(axis=1).to_numpy()
         count = (~np.isnan(values)).sum(1, keepdims=True)
         values = np.where(count > 1, 2 * (ranks - 1) / np.maximum(count - 1, 1) - 1, 0)
     elif not shared and scale in ("z-score", "centered"):
-        known = ~np.isnan(values)
+        known, unit = ~np.isnan(values), _unit(values)
         count = np.maximum(known.sum(1, keepdims=True), 1)
         values = values - np.nansum(values, 1, keepdims=True) / count
         if scale == "z-score":
             spread = np.sqrt(np.nansum(values**2, 1, keepdims=True) / count)
-            values = np.clip(values / np.where(spread > 0, spread, 1), -3, 3)
+            values = np.clip(values / np.where(spread > unit, spread, np.inf), -3, 3)
     return np.nan_to_num(values, posinf=0, neginf=0)
+
+
+def _unit(values: Floats) -> Floats:
+    """The least difference between the numbers of a row that is not rounding, shape (row, 1).
+
+    Two assets, for example, always have the same correlation with each other.
+    """
+    largest = np.max(abs(values), 1, keepdims=True, initial=0, where=np.isfinite(values))
+    return ROUNDING * np.where(largest > 0, largest, 1)
 
 
 def _before(values: Floats, rows: int) -> Floats:

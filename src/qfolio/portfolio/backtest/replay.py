@@ -20,7 +20,7 @@ from qfolio.portfolio.backtest.own import Placed, kept
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.backtest.statistics.assessment import Strategy
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.costs import CostModel
+from qfolio.portfolio.costs import CostModel, delisted
 from qfolio.portfolio.execution import Terms
 from qfolio.portfolio.following import begin, follow, ordered
 from qfolio.portfolio.mandate import checks
@@ -115,9 +115,9 @@ class Replay:
         begin, end = self.folds[0].decisions.start, self.folds[-1].decisions.stop
         rows, values = np.arange(begin, end) + self.task.lag, self.prices.values
         relatives = np.nan_to_num(values[rows + 1] / values[rows], nan=1.0)
-        return np.asarray(
-            self.task.costs.carry(relatives, self._conditions.holding(rows, rows + 1))
-        )
+        context = self._conditions.holding(rows, rows + 1)
+        growth = np.asarray(self.task.costs.carry(relatives, context))
+        return np.asarray(delisted(growth, relatives, context.listed))
 
     @cached_property
     def relaxed(self) -> list[tuple[Mandated, list[str]]]:

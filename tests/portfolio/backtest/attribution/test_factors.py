@@ -6,7 +6,7 @@ import pytest
 from qfolio.portfolio.backtest.attribution.factors import exposures, factor_returns
 from qfolio.portfolio.backtest.folds import walk_forward
 
-from planted import planted
+from planted import planted, with_a_delisted_asset
 
 
 def test_factors_see_nothing_of_the_future(prices, stretches):
@@ -84,3 +84,13 @@ def test_few_assets_have_few_components(prices, stretches, assets, components):
     left = exposures(found["market"] + 1e-3, found, 252)
     assert left is not None
     assert left.factors[0].beta == pytest.approx(1)
+
+
+def test_factors_do_not_hold_what_is_delisted(prices, stretches):
+    folds = [fold for *_, fold in stretches][1:]
+    full = with_a_delisted_asset(prices)
+    expected = factor_returns(prices.values, folds, 1, 252)
+    found = factor_returns(full.values, folds, 1, 252, full.tradable)
+    assert list(found) == list(expected)
+    for name, series in expected.items():
+        np.testing.assert_allclose(found[name], series, atol=1e-12, err_msg=name)

@@ -12,7 +12,7 @@ from qfolio.portfolio.backtest.attribution.importance import importance
 from qfolio.portfolio.backtest.attribution.replays import Shuffle, Shuffles, replay
 from qfolio.portfolio.backtest.replay import decide
 
-from planted import NAMES, Known, four_folds, planted
+from planted import NAMES, Known, four_folds, planted, with_a_delisted_asset
 
 
 def found(rule, stretches, prices):
@@ -133,3 +133,25 @@ def test_a_policy_that_is_wiped_out_is_explained():
     worth, _ = found("constant", stretches, prices)
     assert worth.ignored
     assert worth.everything.lost == 0
+
+
+def test_a_delisted_asset_takes_no_part():
+    """Signals are 0 where an asset is delisted; those that all others share are shared still."""
+    prices = with_a_delisted_asset(planted())
+    stretches = four_folds(prices)
+    worth, _ = found("market", stretches, prices)
+    assert [each.shared for each in worth.signals] == [False, False, False, True]
+    assert worth.signals[3].high > worth.signals[3].low
+    drawn = Shuffles.drawn(stretches, 2, 63, 0)
+    assert (drawn.assets[..., 6] == 6).all()
+    assert (drawn.assets[1:, :, :6] != np.arange(6)).any()
+    volatility, momentum = drawn.values[..., 3], drawn.values[..., 1]
+    assert (volatility[:, 6] == volatility[:, 0]).all()
+    assert not momentum[100:, 6].any()
+
+
+def test_moves_that_are_rounding_are_worth_nothing(stretches, prices, monkeypatch):
+    monkeypatch.setattr(module, "UNMOVED", 2.0)
+    worth, _ = found("momentum", stretches, prices)
+    assert {(each.lost, each.t) for each in (*worth.signals, worth.everything)} == {(0, 0)}
+    assert worth.ignored

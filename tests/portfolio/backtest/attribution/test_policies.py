@@ -9,7 +9,7 @@ from qfolio.portfolio.backtest.attribution.replays import channels
 from qfolio.portfolio.backtest.attribution.slices import slices
 from qfolio.portfolio.backtest.replay import decide
 
-from planted import ASSETS, NAMES, Known
+from planted import ASSETS, NAMES, Known, four_folds, planted, with_a_delisted_asset
 
 SHARED = [False, False, False, True]
 
@@ -81,3 +81,17 @@ def test_a_single_asset_has_no_rule():
     one = np.random.default_rng(0).uniform(size=(40, 1))
     rule = distil(one, 0 * one, one[..., None], ["x"], np.ones_like(one), np.arange(40) < 20)
     assert (rule.terms, rule.r2, rule.shared) == ([], None, ["x"])
+
+
+def test_a_delisted_asset_dilutes_no_average(stretches):
+    """It has no weight that a signal could move, and its signals of 0 are no observations."""
+    apart = four_folds(with_a_delisted_asset(planted()))
+    weights = np.full((600, ASSETS + 2), 1 / (ASSETS + 2))
+    found = integrated_gradients(Known("momentum"), apart, NAMES, weights)
+    assert found is not None
+    momentum = next(pull for pull in found.pulls if pull.name == "momentum:20")
+    expected = 0.5 / ASSETS * abs(np.linspace(-1, 1, ASSETS)).mean()  # as without it
+    assert momentum.size == pytest.approx(expected, rel=1e-3)
+    drawn = slices(Known("market"), apart, NAMES, list("ABCDEFG"), weights, SHARED).signals[3]
+    alone = slices(Known("market"), stretches, NAMES, list("ABCDEF"), held(), SHARED).signals[3]
+    assert drawn.x == pytest.approx(alone.x, abs=1e-4)

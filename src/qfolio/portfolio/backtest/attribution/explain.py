@@ -16,7 +16,7 @@ from qfolio.portfolio.backtest.attribution.distillation import Rule, distil
 from qfolio.portfolio.backtest.attribution.factors import exposures, factor_returns
 from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
 from qfolio.portfolio.backtest.attribution.importance import importance, of_seeds
-from qfolio.portfolio.backtest.attribution.replays import channel_names, channels
+from qfolio.portfolio.backtest.attribution.replays import channel_names, channels, open_to
 from qfolio.portfolio.backtest.attribution.slices import slices
 from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
 from qfolio.portfolio.backtest.folder import followed
@@ -28,7 +28,7 @@ def explain(backtest: Backtest, entries: Mapping[str, Entry]) -> Why:
     """Explain every agent of a finished backtest, from the replays of ``Backtest.entries``."""
     prices, config = backtest.prices, backtest.config
     year = prices.periods_per_year
-    factors = factor_returns(prices.values, backtest.folds, config.lag, year)
+    factors = factor_returns(prices.values, backtest.folds, config.lag, year, prices.tradable)
     one = lambda name: _explained(name, backtest, entries, factors)  # noqa: E731
     with ThreadPoolExecutor(backtest.side_by_side) as threads:
         found = list(threads.map(one, backtest.agents))
@@ -87,12 +87,6 @@ def _explained(
     }
     said[traded] += idle(traded, entry, config.benchmark, entries[config.benchmark])
     return why, said
-
-
-def open_to(stretches: list[Stretch]) -> np.ndarray:
-    """Which assets a fold, and a mandate if there is one, let be held; of shape (days, assets)."""
-    days = [len(range(fold.decisions.start, fold.decisions.stop)) for *_, fold in stretches]
-    return np.repeat([np.asarray(part.limits) > 0 for part, *_ in stretches], days, axis=0)
 
 
 def _rule(decisions: np.ndarray, stretches: list[Stretch], names: list[str]) -> Rule:

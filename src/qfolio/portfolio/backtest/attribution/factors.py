@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from qfolio.core.arrays import Floats
+from qfolio.core.arrays import Bools, Floats
 from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.attribution.hac import regress
 from qfolio.portfolio.backtest.folds import Fold
@@ -74,7 +74,11 @@ def exposures(
 
 
 def factor_returns(
-    values: Floats, folds: Sequence[Fold], lag: int, periods_per_year: float
+    values: Floats,
+    folds: Sequence[Fold],
+    lag: int,
+    periods_per_year: float,
+    tradable: Bools | None = None,
 ) -> dict[str, Floats]:
     """The returns of every factor on the days of a test.
 
@@ -83,23 +87,27 @@ def factor_returns(
         folds: The folds, in order and without gaps.
         lag: Rows from a decision to its execution.
         periods_per_year: Sets the number of rows in a year, a month and a week.
+        tradable: Whether a factor may hold an asset from a row to the next, of the same shape as
+            the prices (default: from its first price on).
 
     Returns:
         Series of shape (D,), by the name of the factor.
     """
+    there = ~np.isnan(values) if tradable is None else tradable
+    held = np.zeros(values.shape, bool)
+    held[1:] = there[:-1]
     moves = np.zeros(values.shape)
-    moves[1:] = np.nan_to_num(values[1:] / values[:-1] - 1)
-    known = np.zeros(values.shape)
-    known[1:] = ~np.isnan(values[:-1])
+    moves[1:] = np.where(held[1:], values[1:] / values[:-1] - 1, 0)
     shift = lag + 1
     days = slice(folds[0].decisions.start + shift, folds[-1].decisions.stop + shift)
-    market = moves.sum(1) / np.maximum(known.sum(1), 1)
+    market = moves.sum(1) / np.maximum(held.sum(1), 1)
     found = {"market": market[days]}
     for name, signal in _signals(periods_per_year).items():
-        ranks = signals.compute([signal], values)[..., 0]
+        ranks = signals.compute([signal], values, tradable=there)[..., 0]
         weights = _long_short(-ranks if name == "low volatility" else ranks)
         found[name] = (weights[:-1] * moves[1:]).sum(1)[days.start - 1 : days.stop - 1]
-    return found | _components(values, moves - market[:, None], folds, shift)
+    active = np.where(held, moves - market[:, None], 0)
+    return found | _components(values, there, active, folds, shift)
 
 
 def _signals(periods_per_year: float) -> dict[str, signals.Signal]:
@@ -122,13 +130,13 @@ def _long_short(scores: Floats) -> Floats:
 
 
 def _components(
-    values: Floats, active: Floats, folds: Sequence[Fold], shift: int
+    values: Floats, there: Bools, active: Floats, folds: Sequence[Fold], shift: int
 ) -> dict[str, Floats]:
     """The components' returns, with each fold's weights from its training rows only."""
     series: list[Floats] = []
     last: Floats | None = None
     for fold in folds:
-        tradable = fold.tradable(values)
+        tradable = fold.tradable(values) & there[fold.train.stop - 1]
         seen = active[fold.train.start + 1 : fold.train.stop] * tradable
         seen = seen - np.where(tradable, seen.sum(1, keepdims=True) / max(1, tradable.sum()), 0.0)
         vectors = np.linalg.eigh(seen.T @ seen)[1][:, ::-1][:, :COMPONENTS].T

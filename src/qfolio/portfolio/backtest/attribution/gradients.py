@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from qfolio.core.mdp import Agent
+from qfolio.portfolio.backtest.attribution.replays import open_to
 from qfolio.portfolio.backtest.attribution.slices import answer
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.task import Portfolio
@@ -60,6 +61,7 @@ def integrated_gradients(
     each = -(-DAYS // len(stretches))
     begin = stretches[0].fold.decisions.start
     parts, seen, whole, gaps = [], [], [], []
+    there = open_to(stretches)
     for task, members, fold in stretches:
         rows = np.linspace(fold.decisions.start, fold.decisions.stop - 1, each + 2)[1:-1].astype(
             int
@@ -67,11 +69,11 @@ def integrated_gradients(
         holding = jnp.asarray(held[rows - begin], jnp.float32)
         given = jnp.asarray(rows, jnp.int32), holding
         moved, latest, change = (np.asarray(x) for x in integrated(task, agent, members, *given))
-        open_to = np.asarray(task.limits) > 0
-        parts.append(moved[..., open_to].swapaxes(1, 2).reshape(-1, len(names)))
-        seen.append(latest[:, open_to].reshape(-1, len(names)))
-        whole.append(abs(change[:, open_to]).mean())
-        gaps.append(abs(moved.sum(1) - change)[:, open_to].mean())
+        bought = there[rows - begin]
+        parts.append(moved.swapaxes(1, 2)[bought])
+        seen.append(latest[bought])
+        whole.append(abs(change[bought]).mean())
+        gaps.append(abs(moved.sum(1) - change)[bought].mean())
     pulled, shown = np.concatenate(parts), np.concatenate(seen)
     return Gradients(
         pulls=[

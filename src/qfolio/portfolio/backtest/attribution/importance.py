@@ -18,7 +18,6 @@ from qfolio.portfolio.backtest.attribution.hac import mean_t
 from qfolio.portfolio.backtest.attribution.replays import (
     Shuffle,
     Shuffles,
-    channels,
     replay,
 )
 from qfolio.portfolio.backtest.replay import Stretch
@@ -84,9 +83,9 @@ def importance(
     signals, draws, seeds = _affordable(stretches, len(names))
     stretches = of_seeds(stretches, seeds)
     count = len(names) if signals else 0
-    shared = _shared(stretches)[:count]
     block = max(1, round(periods_per_year / 4))
     shuffles = Shuffles.drawn(stretches, draws, block, SEED)
+    shared = shuffles.shared[:count].astype(int).tolist()
     each_draw = range(1, draws + 1)
     wanted = [Shuffle(np.zeros(len(names), int), 0, 0)]
     for mask, in_time in zip(np.eye(len(names), dtype=int)[:count], shared, strict=True):
@@ -114,7 +113,9 @@ def importance(
             )
             # Growth after ruin is not finite; use the floor of training.
             logs.append(np.maximum(replayed.growth, np.log(RUIN)))
-    lost = (logs[0] - np.array(logs[1:])).reshape(count + 1, draws, -1)
+    lost = logs[0] - np.array(logs[1:])
+    lost[np.array(moved[1:]) < UNMOVED] = 0
+    lost = lost.reshape(count + 1, draws, -1)
     each = periods_per_year * lost.mean(2)
     worth = [
         Worth(
@@ -147,12 +148,3 @@ def _affordable(stretches: Sequence[Stretch], count: int) -> tuple[bool, int, in
         if read * followed * (1 + draws * (count + 1)) <= WORK:
             return True, draws, followed
     return False, 1, 1
-
-
-def _shared(stretches: Sequence[Stretch]) -> list[int]:
-    """For each channel, 1 if it is the same for all assets on the days of the test, else 0."""
-    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
-    shown = np.asarray(channels(stretches[0].task))[begin:end]
-    open_to = np.any([np.asarray(task.limits) > 0 for task, *_ in stretches], axis=0)
-    shown = shown[:, open_to]
-    return np.all(shown == shown[:, :1], axis=(0, 1)).astype(int).tolist()

@@ -68,10 +68,12 @@ class Shuffles(NamedTuple):
     begin: int  # first of these rows
     rows: np.ndarray  # (draw, row): the row that is seen instead
     assets: np.ndarray  # (draw, row, asset): the asset that is seen instead
+    shared: np.ndarray  # (channel,): whether it is the same for all assets
+    values: Array  # (row, asset, channel): what is seen instead, on all rows of the table
 
     @staticmethod
     def drawn(stretches: Sequence[Stretch], count: int, block: int, seed: int) -> "Shuffles":
-        """Draws with a fixed seed, in blocks of rows; only tradable assets are relabeled."""
+        """Draws with a fixed seed, in blocks of rows; assets tradable throughout are relabeled."""
         task, folds = stretches[0].task, [fold for *_, fold in stretches]
         longest = max(fold.decisions.stop - fold.decisions.start for fold in folds)
         begin, end = folds[0].decisions.start - task.window + 1, folds[-1].decisions.stop
@@ -81,17 +83,26 @@ class Shuffles(NamedTuple):
         rows = np.tile(np.arange(begin, end, dtype=np.int32), (count + 1, 1))
         shown = np.tile(np.arange(assets, dtype=np.int32), (count + 1, length, 1))
         pieces = np.array_split(np.arange(begin, end), max(1, length // block))
+        there = np.ones((end, assets), bool) if task.tradable is None else np.asarray(task.tradable)
         starts = np.array([fold.decisions.start for fold in folds])
         for draw in range(1, count + 1):
             rows[draw] = np.concatenate([pieces[i] for i in rng.permutation(len(pieces))])
             for piece in pieces:
                 # Tradable in the fold that decides in these rows.
                 fold = max(0, int(np.searchsorted(starts, piece[0], side="right")) - 1)
-                open_to = np.flatnonzero(np.asarray(stretches[fold].task.limits) > 0)
-                shown[draw, piece - begin, open_to[:, None]] = rng.permutation(open_to)[:, None]
+                limits = np.asarray(stretches[fold].task.limits)
+                swapped = np.flatnonzero((limits > 0) & there[piece].all(0))
+                shown[draw, piece - begin, swapped[:, None]] = rng.permutation(swapped)[:, None]
         # The last fold is followed beyond its end, as long as the longest.
         pad = ((0, 0), (0, longest))
-        return Shuffles(begin, np.pad(rows, pad, "edge"), np.pad(shown, (*pad, (0, 0)), "edge"))
+        rows, shown = np.pad(rows, pad, "edge"), np.pad(shown, (*pad, (0, 0)), "edge")
+        values, shared = channels(task), _shared(stretches)
+        if task.tradable is not None:
+            # Where an asset is not tradable its signals are 0, those that all share as well. It
+            # may be tradable in the row that sees them, so it gets another's.
+            common = values[jnp.arange(len(values)), task.tradable.argmax(1)]
+            values = jnp.where(jnp.asarray(shared), common[:, None], values)
+        return Shuffles(begin, rows, shown, shared, values)
 
 
 class Replays(NamedTuple):
@@ -109,6 +120,24 @@ def channel_names(task: Portfolio, feature_names: Sequence[str]) -> list[str]:
 def channels(task: Portfolio) -> Float[Array, "row asset channel"]:
     """All channels on all rows of the table, before scaling."""
     return jnp.concatenate([task.log_relatives[..., None], task.extra], -1)
+
+
+def open_to(stretches: Sequence[Stretch]) -> np.ndarray:
+    """Which assets the fold, the mandate and the table let be bought, of shape (days, assets)."""
+    days = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
+    allowed = np.repeat([np.asarray(task.limits) > 0 for task, *_ in stretches], days, axis=0)
+    tradable, begin = stretches[0].task.tradable, stretches[0].fold.decisions.start
+    if tradable is None:
+        return allowed
+    return np.asarray(allowed & np.asarray(tradable)[begin : begin + len(allowed)])
+
+
+def _shared(stretches: Sequence[Stretch]) -> np.ndarray:
+    """Whether a channel is the same for all assets that may be bought on the days of the test."""
+    begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
+    shown, there = np.asarray(channels(stretches[0].task))[begin:end], open_to(stretches)[..., None]
+    least, most = np.where(there, shown, np.inf).min(1), np.where(there, shown, -np.inf).max(1)
+    return np.asarray((most <= least).all(0))
 
 
 def replay(
@@ -145,7 +174,7 @@ def _replay(
         first = jnp.array(start, jnp.int32)
         ends = _paths(
             task,
-            raw,
+            (raw, shuffles.values),
             agent,
             together,
             first,
@@ -163,15 +192,16 @@ def _replay(
 
 @eqx.filter_jit(donate="none")
 def _paths(
-    task: Portfolio, raw: Array, agent: Agent, members: PyTree, first: Array, held: Holding,
-    shuffled: tuple[Array, ...], count: int,
+    task: Portfolio, channels: tuple[Array, Array], agent: Agent, members: PyTree, first: Array,
+    held: Holding, shuffled: tuple[Array, ...], count: int,
 ) -> tuple[Float[Array, "replay time entry"], Holding]:  # fmt: skip
     rows, assets, masks, *draws = shuffled
+    own, others = channels
 
     def one(given: tuple[Any, ...]) -> tuple[Array, Holding]:
         held, mask, row_draw, asset_draw = given
-        seen = jnp.take_along_axis(raw[rows[row_draw]], assets[asset_draw][..., None], 1)
-        mixed = jnp.where(mask > 0, seen, raw[rows[0]])
+        seen = jnp.take_along_axis(others[rows[row_draw]], assets[asset_draw][..., None], 1)
+        mixed = jnp.where(mask > 0, seen, own[rows[0]])
         observed = (mixed - task.center) / task.scale
         blind = Observed.given(task, observed, first - task.window + 1)
         start = jax.tree.map(lambda x: x[None], held)

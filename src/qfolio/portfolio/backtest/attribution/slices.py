@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from qfolio.core.mdp import Agent
-from qfolio.portfolio.backtest.attribution.replays import Observed, channels
+from qfolio.portfolio.backtest.attribution.replays import Observed, channels, open_to
 from qfolio.portfolio.backtest.replay import Stretch
 from qfolio.portfolio.task import Portfolio
 
@@ -78,17 +78,16 @@ def slices(
         held: Weights held when deciding, shape (D, entry).
         shared: Whether a channel is the same for all assets.
     """
-    tradable = np.all([np.asarray(task.limits) > 0 for task, *_ in stretches], axis=0)
-    typical = held.mean(0)
+    there, typical = open_to(stretches), held.mean(0)
+    tradable = there.all(0) if there.all(0).any() else there.any(0)
     order = np.argsort(-np.where(tradable, typical[1:], -1.0), kind="stable") + 1
     asset = int(order[0])
     partner = int(order[1]) if tradable.sum() > 1 else 0
     begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
     seen = np.asarray(channels(stretches[0].task))[begin:end]
     grids = []
-    for channel, everywhere in enumerate(shared):
-        shown = seen[..., asset - 1 if everywhere else tradable, channel]
-        low, high = (float(end) for end in np.quantile(shown, (TAIL, 1 - TAIL)))
+    for channel in range(len(names)):
+        low, high = np.quantile(seen[there, channel], (TAIL, 1 - TAIL)).tolist()
         grids.append(np.linspace(low, high, POINTS))
     entries = np.arange(1, len(typical))
     opposite = 1.0 * (entries == asset) - (entries == partner)
