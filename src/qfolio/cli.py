@@ -1,6 +1,7 @@
 """The entry point; slow imports are left to the commands that need them."""
 
 import functools
+import io
 import os
 import sys
 from collections.abc import Callable
@@ -27,6 +28,9 @@ Examples:
 def main() -> NoReturn:
     """Runs the program; Ctrl-C ends it at once, or after the current chunk of a training."""
     exit_on_ctrl_c()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a file may have an encoding without "·" or "−"
     run()
 
 

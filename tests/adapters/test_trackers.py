@@ -125,6 +125,52 @@ def test_a_tracker_that_fails_is_left_out(tmp_path):
     assert [event["event"] for event in read(tmp_path / "events.jsonl")[0]].count("record") == 3
 
 
+class Broken(Tracker):
+    """Breaks at the start or at the end."""
+
+    def __init__(self, place):
+        self.place, self.heard = place, []
+
+    def start(self, folder, about):
+        self.call("start")
+
+    def log(self, values, step):
+        self.call("log")
+
+    def finish(self):
+        self.call("finish")
+
+    def call(self, place):
+        self.heard.append(place)
+        if place == self.place:
+            raise OSError("No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("place", "heard"), [("start", ["start"]), ("finish", ["start", "log", "finish"])]
+)
+def test_a_tracker_that_fails_at_either_end_stops_nothing(tmp_path, place, heard):
+    broken, other = Broken(place), Broken("nowhere")
+    with (
+        pytest.warns(UserWarning, match=r"The tracker Broken is left out: .*No space left"),
+        tracked(broken, other),
+        Log(tmp_path).opened() as log,
+    ):
+        log.job().record(1, {"loss": [1.0]})
+    assert (broken.heard, other.heard) == (heard, ["start", "log", "finish"])
+    assert read(tmp_path / "events.jsonl")[0][-1]["state"] == "done"
+
+
+class Unmade(Tracker):
+    def __init__(self):
+        raise RuntimeError("no key")
+
+
+def test_a_tracker_that_cannot_be_made_is_named():
+    with pytest.raises(QfolioError, match=r"Unmade cannot be made without arguments: .*no key"):
+        trackers([f"{__name__}:Unmade"])
+
+
 OWN = """
 from pathlib import Path
 import qfolio

@@ -1,5 +1,9 @@
 """Every command that reads prices reads returns and columns of the market, too."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -73,3 +77,14 @@ def test_costs_read_a_column_of_the_market(table):
     prices = Options(returns="percent", columns=("rate",)).load(table)
     known = Conditions.of(prices, ["rate"]).values["rate"]
     np.testing.assert_array_equal(known, prices.market)
+
+
+def test_output_may_have_an_encoding_that_lacks_a_letter(tmp_path):
+    frame = pd.DataFrame({"A": [1.0, 2.0, 3.0]}, pd.date_range("2020-01-01", periods=3))
+    frame.rename_axis("date").to_csv(tmp_path / "é.csv")
+    done = subprocess.run(
+        [sys.executable, "-m", "qfolio", "prices", "é.csv"], cwd=tmp_path, capture_output=True,
+        text=True, check=False, env=os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "1"},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "?.csv: 3 rows of 1 asset" in done.stdout

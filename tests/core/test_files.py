@@ -18,6 +18,7 @@ from qfolio.core.files import (
     cache_directory,
     csv_lines,
     locked,
+    naming,
     new_folder,
     read_arrays,
     write_arrays,
@@ -25,6 +26,12 @@ from qfolio.core.files import (
 )
 
 ARRAYS = {"weights": np.arange(6, dtype=np.float32).reshape(2, 3), "steps": np.array(7)}
+
+
+def test_a_full_disk_names_the_file(tmp_path):
+    with pytest.raises(OSError, match="No space") as raised, naming(tmp_path / "log"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert raised.value.filename == str(tmp_path / "log")
 
 
 def test_arrays_come_back(tmp_path):

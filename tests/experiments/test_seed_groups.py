@@ -107,6 +107,19 @@ def test_a_stopped_run_asks_for_what_is_missing(task, agent, tmp_path, folder):
     same(alone, run)
 
 
+def test_a_run_that_was_stopped_before_its_first_group_keeps_its_steps(task, agent, tmp_path):
+    """Episodes may end early: resumed in this process, it has to take the steps of its groups."""
+    run = start(task, agent, tmp_path / "run")
+    run.train(executor=Elsewhere(), listen=lambda *_: [Interrupt()])
+    assert not run.groups.begun
+    again = Run.open(tmp_path / "run")
+    assert again.budget == Budget(steps=300)
+    again.train()
+    elsewhere = start(task, agent)
+    elsewhere.train(executor=Elsewhere())
+    same(elsewhere, again)
+
+
 def test_groups_that_were_all_there(task, agent, tmp_path):
     """The driver was killed before it could make them the run, or after that."""
     run = start(task, agent, tmp_path / "run")

@@ -72,7 +72,7 @@ def trackers(names: Iterable[str]) -> list[Tracker]:
     """The trackers of these names, each once; imports the modules of a user's own.
 
     Raises:
-        QfolioError: There is none of this name, its package is missing, or it needs arguments.
+        QfolioError: There is none of this name, its package is missing, or it cannot be made.
     """
     return [_made(name) for name in dict.fromkeys(names)]
 
@@ -80,7 +80,9 @@ def trackers(names: Iterable[str]) -> list[Tracker]:
 def _made(name: str) -> Tracker:
     try:
         return registry.find("tracker", name)()
-    except TypeError as error:
+    except QfolioError:
+        raise
+    except Exception as error:
         raise QfolioError(
             f"the tracker {name} cannot be made without arguments: {one_line(error)}."
         ) from None

@@ -50,8 +50,14 @@ the compiler instead of a flag, because a version that does not know a flag ends
 def configure() -> None:
     """Makes each core a device, compiles for speed, multiplies precisely, keeps programs on disk.
 
-    Has an effect only before jax first computes; settings that the user has made are kept.
+    Has an effect only before jax first computes; settings that the user has made are kept. Raises
+    QfolioError if one of them is for double precision.
     """
+    if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+        raise QfolioError(
+            "qfolio computes in single precision, but JAX_ENABLE_X64 (jax_enable_x64) is set; "
+            "unset it."
+        )
     flags = os.environ.get("XLA_FLAGS", "")
     loops = (
         f"xla_cpu_small_while_loop_byte_threshold={SMALL_LOOP},-unroll-full-max-count={UNROLLED}"
@@ -79,9 +85,15 @@ def cores() -> list[int]:
 
 
 def describe() -> str:
-    """The number, kind and platform of the devices."""
-    device = jax.devices()[0]
-    return f"{len(jax.devices())} × {device.device_kind} ({device.platform})"
+    """The number, kind and platform of the devices. Raises QfolioError if jax finds none."""
+    try:
+        devices = jax.devices()
+    except (AssertionError, RuntimeError):  # the first without the plugin of a platform
+        raise QfolioError(
+            f"jax finds no device of JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}; unset "
+            "it, or install jax for this platform."
+        ) from None
+    return f"{len(devices)} × {devices[0].device_kind} ({devices[0].platform})"
 
 
 def circumstances(*programs: str) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from qfolio.core.errors import QfolioError, one_line
+from qfolio.core.files import naming
 from qfolio.experiments.events import BEAT, EVENTS
 from qfolio.experiments.fit import Listener, Training
 from qfolio.experiments.records import Records
@@ -88,10 +89,10 @@ class Log:
                 stack.enter_context(_heartbeat(self.folder / EVENTS))
             here = {"pid": os.getpid(), "host": platform.node()}
             self.write("start", **about, **here)
+            stack.callback(self._tell, lambda tracker: tracker.finish())
             for tracker in trackers:
-                tracker.start(self.folder, about)
-                stack.callback(tracker.finish)
-            self._trackers = list(trackers)
+                if self._heard(tracker, lambda each: each.start(self.folder, about), QfolioError):
+                    self._trackers.append(tracker)
             try:
                 yield self
             except BaseException as error:
@@ -104,8 +105,9 @@ class Log:
     def write(self, event: str, **values: Any) -> None:
         """Appends an event in one write, so that several processes can share a log."""
         content = {"event": event, "time": round(time.time(), 3), **values}
-        if self._file >= 0:
-            os.write(self._file, msgspec.json.encode(content) + b"\n")
+        if self.folder is not None and self._file >= 0:
+            with naming(self.folder / EVENTS):
+                os.write(self._file, msgspec.json.encode(content) + b"\n")
         self._tell(lambda tracker: tracker.event(content))
 
     def settle(self, finished: bool) -> None:
@@ -134,13 +136,21 @@ class Log:
 
     def _tell(self, tell: Callable[[Tracker], None]) -> None:
         """Calls all trackers; one that fails is dropped with a warning, and training goes on."""
-        for tracker in list(self._trackers):
-            try:
-                tell(tracker)
-            except Exception as error:
-                self._trackers.remove(tracker)
-                name = type(tracker).__name__
-                warnings.warn(f"The tracker {name} is left out: {one_line(error)}", stacklevel=2)
+        self._trackers = [tracker for tracker in self._trackers if self._heard(tracker, tell)]
+
+    def _heard(
+        self, tracker: Tracker, tell: Callable[[Tracker], None], *fatal: type[Exception]
+    ) -> bool:
+        """Whether a call of a tracker succeeded; warns if not, unless the error is fatal."""
+        try:
+            tell(tracker)
+        except fatal:
+            raise
+        except Exception as error:
+            name = type(tracker).__name__
+            warnings.warn(f"The tracker {name} is left out: {one_line(error)}", stacklevel=2)
+            return False
+        return True
 
     def _close(self) -> None:
         os.close(self._file)

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from qfolio.core.config import Config, read_config, write_config
-from qfolio.core.files import UNFINISHED, read_tree, write_bytes, write_json, write_tree
+from qfolio.core.files import UNFINISHED, naming, read_tree, write_bytes, write_json, write_tree
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.records import Records, Row
 
@@ -82,7 +82,7 @@ class RunFolder:
     def append(self, name: str, rows: Records) -> None:
         """Appends rows to a table, with a header if it is new."""
         if rows:
-            with (self.path / name).open("ab") as file:
+            with naming(self.path / name), (self.path / name).open("ab") as file:
                 file.write(rows.csv(header=file.tell() == 0))
 
     def rows(self, name: str, episodes: dict[int, int], steps: int) -> Records:

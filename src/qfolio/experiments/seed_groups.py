@@ -105,7 +105,8 @@ class SeedGroups:
                     f"Some seeds of the run have been trained for {part.config.steps:,} steps, not "
                     f"for {steps:,}; finish that training first."
                 )
-        run.aim_at(budget)
+        # In steps, so that a run resumed in this process trains as long as its groups would.
+        run.aim_at(Budget(steps=steps))
         if not (missing := self.missing):
             self._join()
         groups = _groups(missing, executor)

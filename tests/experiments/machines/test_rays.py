@@ -50,6 +50,16 @@ def test_without_ray(monkeypatch):
         on("ray")
 
 
+@pytest.mark.parametrize("address", [None, "127.0.0.1:1"])
+def test_a_cluster_that_does_not_answer(address, monkeypatch):
+    fake = Mock(is_initialized=lambda: False)
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    with pytest.raises(QfolioError, match=r"cannot be reached .*RAY_AUTH_MODE=token"):
+        rays._connected(address)
+    assert not fake.init.called
+
+
 SLOW = [ConnectionAbortedError("late"), RuntimeError("Starting Ray client server failed. See x")]
 
 

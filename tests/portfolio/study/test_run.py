@@ -125,6 +125,16 @@ def test_each_table_is_an_ordinary_backtest(finished):
         finished.backtest("three")
 
 
+def test_a_table_whose_summary_is_lost_can_be_written_again(finished):
+    place = finished.backtest("one").folder
+    (place / "summary.json").rename(place / "lost.json")
+    try:
+        with pytest.raises(QfolioError, match="damaged; write its tables again with qfolio backt"):
+            finished.result()
+    finally:
+        (place / "lost.json").rename(place / "summary.json")
+
+
 def test_looks_are_counted_and_inherited(finished, tmp_path):
     result = finished.config.result
     assert (result.looks, result.earlier, result.trials) == (4, 0, 2)

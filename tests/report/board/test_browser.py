@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -125,6 +126,34 @@ def test_runs_are_compared(board: Board, browser: Browser, tmp_path: Path) -> No
     names = browser.evaluate("document.getElementById('legend').innerText")
     assert "first" in names
     assert "second" in names
+
+
+def test_a_run_that_is_deleted_leaves_the_page(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    for name in ("first", "second"):
+        write(tmp_path / "runs" / name, agents=["dqn"])
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length > 0")
+    browser.click("#runs li:not(.chosen) .pick")
+    browser.wait("document.getElementById('title').innerText === '2 runs side by side'")
+    shutil.rmtree(tmp_path / "runs" / "first")
+    browser.wait("document.getElementById('title').innerText === 'second'")
+    shutil.rmtree(tmp_path / "runs" / "second")
+    browser.wait("document.getElementById('shown').hidden")
+    assert browser.evaluate("document.getElementById('counts').innerText") == "No runs yet"
+
+
+def test_a_metric_may_be_named_like_what_each_object_has(
+    board: Board, browser: Browser, tmp_path: Path
+) -> None:
+    write(tmp_path / "runs" / "plain", agents=["dqn"])
+    write(tmp_path / "runs" / "odd", agents=["dqn"])
+    log = tmp_path / "runs" / "odd" / EVENTS
+    log.write_text(log.read_text().replace('"return"', '"constructor"'))
+    browser.show(board.url, 1280, "document.querySelectorAll('#charts .line').length > 0")
+    browser.click("#runs li:not(.chosen) .pick")
+    browser.wait("document.getElementById('charts').innerText.includes('Constructor')")
+    assert "stopped" not in browser.evaluate("document.getElementById('counts').innerText")
 
 
 def test_agents_of_a_backtest_have_charts_of_their_own(

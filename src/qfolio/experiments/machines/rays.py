@@ -6,8 +6,10 @@ everything again.
 
 import contextlib
 import logging
+import os
 import pickle
 import re
+import socket
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -24,6 +26,9 @@ from qfolio.experiments.machines.parcels import Packer
 from qfolio.experiments.machines.worker import Actor, environment
 
 R = TypeVar("R")
+
+ANSWER = 10.0
+"""Seconds that a cluster may take to accept a connection."""
 
 PLACE = 30.0
 """Seconds that the first worker may wait for a place, if the cluster seemed to have room."""
@@ -173,15 +178,24 @@ def _connected(address: str | None) -> Any:
         ) from None
     if not ray.is_initialized():
         try:
+            _require_open(address or os.environ.get("RAY_ADDRESS", ""))
             _connect(ray, address)
-        except (ConnectionError, ValueError, RuntimeError) as error:
+        except (OSError, ValueError, RuntimeError) as error:
             lines = str(error).strip().splitlines() or [type(error).__name__]
             why = lines[-1] if isinstance(error, ConnectionAbortedError) else lines[0]
             raise QfolioError(
                 f"The Ray cluster {address or 'of this machine'} cannot be reached "
-                f"({why.rstrip('.')}); check its address, and that it is running."
+                f"({why.rstrip('.')}); check its address, and that it is running. If it asks for "
+                "a token, set RAY_AUTH_MODE=token."
             ) from None
     return ray
+
+
+def _require_open(address: str) -> None:
+    """Raises OSError if HOST:PORT does not answer, for which Ray would wait for minutes."""
+    host, _, port = address.rpartition(":")
+    if port.isdigit() and "/" not in host:
+        socket.create_connection((host, int(port)), timeout=ANSWER).close()
 
 
 def _connect(ray: Any, address: str | None, more: int = 2) -> None:

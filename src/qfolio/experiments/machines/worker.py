@@ -20,7 +20,7 @@ from qfolio.experiments.machines.messages import Done, Failed, Message, Ready, p
 if TYPE_CHECKING:
     from qfolio.experiments.machines.parcels import Parcel, Unpacker
 
-_COUNT = "--xla_force_host_platform_device_count"
+_COUNT, _CPUS = "--xla_force_host_platform_device_count", "JAX_NUM_CPU_DEVICES"
 
 
 def prepare(environment: Mapping[str, str]) -> Ready:
@@ -33,9 +33,12 @@ def prepare(environment: Mapping[str, str]) -> Ready:
 
 
 def environment(cores: int) -> dict[str, str]:
-    """XLA's flags of this process, adapted to a worker with ``cores`` cores."""
+    """This process's settings of XLA and jax, adapted to a worker with ``cores`` cores."""
     flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if _COUNT not in flag]
-    return {"XLA_FLAGS": " ".join([*flags, f"{_COUNT}={cores}"])}
+    adapted = {"XLA_FLAGS": " ".join([*flags, f"{_COUNT}={cores}"])}
+    if _CPUS in os.environ:  # it would take the place of the flag
+        adapted[_CPUS] = str(cores)
+    return adapted
 
 
 def work(unpacker: "Unpacker", parcel: "Parcel", send: Callable[[Message], None]) -> None:

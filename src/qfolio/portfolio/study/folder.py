@@ -142,8 +142,8 @@ class StudyFolder:
         """
         files = BacktestFolder(self.place(table, variant))
         days, columns = files.read_returns()
-        summary = read_json(files.path / "summary.json")
         try:
+            summary = read_json(files.path / "summary.json")
             kinds = {name: entry["kind"] for name, entry in summary["strategies"].items()}
             reference = summary["reference"]
             baselines = _of_kind("baseline", kinds, columns)
@@ -155,7 +155,7 @@ class StudyFolder:
                 baselines,
                 None if RISK_FREE in kinds else columns.get(RISK_FREE),
             )
-        except (AttributeError, KeyError, StopIteration, TypeError, ValueError):
+        except (AttributeError, KeyError, QfolioError, StopIteration, TypeError, ValueError):
             raise QfolioError(
                 f"{files.path} is damaged; write its tables again with qfolio backtest --resume "
                 f"{files.path}."

@@ -356,12 +356,12 @@ function charts(found) { // agents of a backtest differ in losses and steps: eac
 
 function plot(chart, name, found, of) {
   const svg = chart.querySelector("svg"), width = svg.clientWidth || 340;
-  const shown = NAMES[name] || name.replaceAll("_", " ").replace(/^./, (c) => c.toUpperCase());
+  const shown = Object.hasOwn(NAMES, name) ? NAMES[name] : name.replaceAll("_", " ").replace(/^./, (c) => c.toUpperCase());
   const title = [shown, of].filter(Boolean).join(" · ");
   say(chart.querySelector("h3 span"), title);
   svg.setAttribute("viewBox", `0 0 ${width} ${HEIGHT}`);
   svg.setAttribute("aria-label", title);
-  const lines = found.flatMap((group) => group.jobs.filter((job) => job.curves[name]?.length).map((job) => ({
+  const lines = found.flatMap((group) => group.jobs.filter((job) => Object.hasOwn(job.curves, name) && job.curves[name].length).map((job) => ({
     group, job, points: job.curves[name], alone: group.jobs.length === 1,
     now: stateOf(group.run, job) === "running",
   })));
@@ -453,35 +453,34 @@ function ticks([low, high], count) {
 // Asking --------------------------------------------------------------------------------------
 
 async function ask(path) {
-  const answer = await fetch(path, { cache: "no-store" });
-  return answer.ok ? answer.json() : null;
+  const answer = await fetch(path, { cache: "no-store" }).catch(() => null);
+  return answer?.ok ? answer.json().catch(() => null) : null;
 }
 
 async function look() {
-  try {
-    const news = await ask(`/runs?since=${version}`);
-    if (!news) throw new Error("no answer");
-    if (news.version < version) { // the server is another one
-      version = 0;
-      runs.clear(); details.clear();
-      return;
-    }
-    connected = true;
-    version = news.version;
-    say(find("root"), news.root);
-    for (const run of news.runs) { runs.set(run.key, run); item(run); }
-    const keys = new Set(news.keys);
-    for (const key of [...runs.keys()]) {
-      if (!keys.has(key)) { runs.delete(key); items.get(key).remove(); items.delete(key); details.delete(key); }
-    }
-    list();
-    const told = await Promise.all(chosen.map(refresh));
-    if (told.some(Boolean) || news.runs.some((run) => chosen.includes(run.key))) draw();
-    else if (chosen.some((key) => runs.get(key)?.state === "running")) header(chosen.map((key) => runs.get(key)).filter(Boolean), chosen.length === 1 ? runs.get(chosen[0]) : null);
-  } catch {
-    connected = false;
-    list();
+  const news = await ask(`/runs?since=${version}`);
+  connected = Boolean(news);
+  if (!news) { list(); return; }
+  if (news.version < version) { // the server is another one
+    version = 0;
+    runs.clear(); details.clear(); items.clear();
+    find("runs").replaceChildren();
+    chosen = []; following = true;
+    return;
   }
+  version = news.version;
+  say(find("root"), news.root);
+  for (const run of news.runs) { runs.set(run.key, run); item(run); }
+  const keys = new Set(news.keys);
+  for (const key of [...runs.keys()]) {
+    if (!keys.has(key)) { runs.delete(key); items.get(key).remove(); items.delete(key); details.delete(key); }
+  }
+  const gone = chosen.some((key) => !keys.has(key));
+  chosen = chosen.filter((key) => keys.has(key));
+  list();
+  const told = await Promise.all(chosen.map(refresh));
+  if (gone || told.some(Boolean) || news.runs.some((run) => chosen.includes(run.key))) draw();
+  else if (chosen.some((key) => runs.get(key)?.state === "running")) header(chosen.map((key) => runs.get(key)).filter(Boolean), chosen.length === 1 ? runs.get(chosen[0]) : null);
 }
 
 async function refresh(key) {
@@ -496,8 +495,7 @@ async function refresh(key) {
 }
 
 async function forever() {
-  await look();
-  setTimeout(forever, document.hidden ? 4 * EVERY : EVERY);
+  try { await look(); } finally { setTimeout(forever, document.hidden ? 4 * EVERY : EVERY); }
 }
 
 find("filter").addEventListener("input", list);

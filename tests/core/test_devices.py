@@ -1,0 +1,33 @@
+"""What is asked of jax before it computes."""
+
+import jax
+import pytest
+
+from qfolio.core import devices
+from qfolio.core.errors import QfolioError
+from qfolio.experiments.machines import worker
+
+
+def test_double_precision_is_refused():
+    with jax.enable_x64(True), pytest.raises(QfolioError, match=r"JAX_ENABLE_X64 .* is set; unset"):
+        devices.configure()
+
+
+@pytest.mark.parametrize("error", [AssertionError(), RuntimeError("Unable to initialize backend")])
+def test_a_platform_without_a_device_is_named(monkeypatch, error):
+    def none():
+        raise error
+
+    monkeypatch.setattr(jax, "devices", none)
+    monkeypatch.setenv("JAX_PLATFORMS", "banana")
+    with pytest.raises(QfolioError, match="no device of JAX_PLATFORMS=banana; unset it"):
+        devices.describe()
+
+
+def test_a_worker_has_its_own_number_of_cores(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_a=1 --xla_force_host_platform_device_count=8")
+    monkeypatch.delenv("JAX_NUM_CPU_DEVICES", raising=False)
+    flags = {"XLA_FLAGS": "--xla_a=1 --xla_force_host_platform_device_count=2"}
+    assert worker.environment(2) == flags
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "4")
+    assert worker.environment(2) == flags | {"JAX_NUM_CPU_DEVICES": "2"}
