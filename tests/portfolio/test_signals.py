@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
@@ -247,3 +248,15 @@ def test_two_assets_tie_where_rounding_alone_tells_them_apart(text, scale):
 
 def test_an_asset_that_is_the_market_has_no_residual():
     assert np.isnan(signal("residual-volatility:20", prices(assets=1))).all()
+
+
+class Framed(Tomorrow):
+    """A data frame, as pandas makes of one."""
+
+    def measure(self, prices, rows):
+        return pd.DataFrame(prices).pct_change(rows)
+
+
+def test_a_signal_may_be_a_data_frame():
+    prices = 50 * np.exp(np.random.default_rng(0).normal(0, 0.01, (60, 4)).cumsum(0))
+    assert np.isfinite(signals.compute([Framed(rows=5)], prices)).all()

@@ -347,7 +347,8 @@ def _checked(signal: Signal, prices: Floats) -> Floats:
         )
     if f"{type(signal).__module__}:{name}" not in SIGNALS.values():
         for cut in np.linspace(1, len(prices) - 1, 4).astype(int):
-            if not np.array_equal(signal(prices[:cut])[-1], found[cut - 1], equal_nan=True):
+            then = np.asarray(signal(prices[:cut]), float)  # perhaps a data frame
+            if not np.array_equal(then[-1:], found[cut - 1 : cut], equal_nan=True):
                 raise QfolioError(
                     f"The signal {name} looks ahead: its value at row {cut - 1} changes when later "
                     "rows are taken away."
