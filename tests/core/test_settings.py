@@ -7,6 +7,7 @@ import pytest
 from qfolio.agents.dqn import DQN
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
+from qfolio.core.fields import number
 
 from probes import OneState
 
@@ -112,3 +113,14 @@ def test_settings_are_divided_by_their_owners():
     assert parts == [{"horizon": "3"}, {"discount": "0.5"}]
     with pytest.raises(QfolioError, match=r"neither OneState nor DQN .* did you mean discount\?"):
         settings.divide({"discont": 1}, OneState, DQN)
+
+
+def test_a_default_that_would_change_nothing_is_refused():
+    """Python keeps the inherited default if a subclass gives a value without a type."""
+    with pytest.raises(QfolioError, match=r"declare it as learning_rate: float = number\(…\)"):
+        type("Own", (DQN,), {"learning_rate": 1e-5})()
+
+    class Slow(DQN):
+        learning_rate: float = number(1e-5)
+
+    assert Slow().learning_rate == 1e-5

@@ -1,6 +1,7 @@
 """How agents and tasks declare and check their settings."""
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -70,15 +71,25 @@ def require_counts(instance: Any, names: str, least: int = 1) -> None:
 
 
 def require_static(instance: Any) -> None:
-    """Raises QfolioError if an integer setting is not declared as ``static``.
+    """Raises QfolioError if an integer setting is not ``static``, or a default is not declared.
 
-    Integers are counts, and counts shape the compiled program.
+    Integers are counts, and counts shape the compiled program. A subclass that gives an inherited
+    setting a value without its type would change nothing.
     """
+    name = type(instance).__name__
     for field in dataclasses.fields(instance):
-        if field.type in (int, "int") and not field.metadata.get("static"):
+        fixed, kind = field.metadata.get("static"), getattr(field.type, "__name__", field.type)
+        if kind == "int" and not fixed:
             raise QfolioError(
-                f"{field.name} of {type(instance).__name__} is a whole number, which shapes the "
-                f"program; declare it as {field.name}: int = static(…), from qfolio.core.fields."
+                f"{field.name} of {name} is a whole number, which shapes the program; declare it "
+                f"as {field.name}: int = static(…), from qfolio.core.fields."
+            )
+        first = next((each for each in type(instance).__mro__ if field.name in vars(each)), None)
+        if first and field.name not in inspect.get_annotations(first):
+            raise QfolioError(
+                f"{field.name} of {name} is a setting, whose default needs its type; declare it as "
+                f"{field.name}: {kind} = {'static' if fixed else 'number'}(…), from "
+                "qfolio.core.fields."
             )
 
 
