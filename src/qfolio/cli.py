@@ -56,8 +56,8 @@ def commands() -> dict[str, Callable[..., Any]]:
 
 
 def run() -> NoReturn:
-    """Runs the command line; a QfolioError becomes one sentence and exit code 2."""
-    from qfolio.core.errors import QfolioError
+    """Runs the command line; an error of the user becomes one sentence and exit code 2."""
+    from qfolio.core.errors import QfolioError, one_line, own_frame
 
     try:
         try:
@@ -73,10 +73,12 @@ def run() -> NoReturn:
         _refuse(f"{where}{error.strerror or error}.")
     except MemoryError:
         _refuse(OUT_OF_MEMORY)
-    except RuntimeError as error:  # jax's own, which cannot be imported here
-        if "RESOURCE_EXHAUSTED" not in str(error):
+    except Exception as error:
+        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error):  # jax's own
+            _refuse(OUT_OF_MEMORY)
+        if (own := own_frame(error)) is None:
             raise
-        _refuse(OUT_OF_MEMORY)
+        _refuse(f"{own.name} failed: {one_line(error)}.")
     except KeyboardInterrupt:
         print("qfolio: interrupted", file=sys.stderr)
         sys.exit(EXIT_CODE)

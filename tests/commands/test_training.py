@@ -213,3 +213,38 @@ def test_resume_finishes_a_contrast_that_was_interrupted(run, monkeypatch, capsy
     assert (folder / "contrast" / "checkpoint.safetensors").exists()
     assert (folder / "report.html").exists()
     assert not (folder / "contrast" / "contrast").exists()
+
+
+OWN = """
+import jax.numpy as jnp
+from qfolio.core.mdp import Step
+from qfolio.tasks.catch import Catch
+
+class Failing(Catch):
+    def step(self, state, action, key):
+        return {}["price"]
+
+class Short(Catch):
+    def step(self, state, action, key):
+        return Step(state._replace(row=1.0), 1.0, False)
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("Failing", "qfolio: step failed: KeyError: 'price' (failing_parts.py, line 8)."),
+        ("Short", "qfolio: Short.step returns float32[] as state at .row; it must be int32[], "),
+    ],
+)
+def test_faults_of_own_code_are_one_sentence(name, says, tmp_path, monkeypatch, capsys):
+    """With the place in the user's file; nothing is left behind."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "failing_parts.py").write_text(OWN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert (
+        qfolio(monkeypatch, "train", f"failing_parts:{name}", "--agent", "dqn", "--out", "x") == 2
+    )
+    assert says in capsys.readouterr().err.replace("\n", " ")
+    assert not (tmp_path / "x").exists()
+    sys.modules.pop("failing_parts", None)

@@ -12,8 +12,11 @@ from qfolio.tasks.catch import Catch
 OWN = """
 from qfolio.agents.dqn import DQN
 from qfolio.core.mdp import Task
+from qfolio.portfolio.rewards import Reward
 from qfolio.tasks.catch import Catch
 
+class Flat(Reward):
+    def __call__(self, outcome): return 0.0, None
 class Mine(Catch): pass
 class Half(Task):
     def reset(self, key): ...
@@ -64,6 +67,8 @@ def test_a_class_in_the_current_directory(own):
         ("agent", "own_parts:Mine", "there is no agent 'own_parts:Mine'"),
         ("agent", "tilts:low-risk", "'tilts:low-risk'; set agent to tilts and preset to low-risk."),
         ("task", "own_parts:Half", "is not complete: it lacks actions, horizon, observe, step"),
+        ("reward", "own_parts:Flat",
+         "Flat.__call__ must be a method that takes self, state and outcome."),
         ("task", "elsewhere:Mine", "a module elsewhere is neither installed nor in this folder"),
         ("task", "broken_parts:Mine", r"broken_parts cannot be imported: AttributeError: .*"
                                       r"\(broken_parts.py, line 3\)"),

@@ -1,12 +1,16 @@
 """The exception for errors that a user can fix, and checks that raise it."""
 
+import inspect
 import reprlib
+import sysconfig
 import traceback
 from collections.abc import Collection
 from numbers import Integral
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from types import UnionType
 from typing import Any
+
+from qfolio.core.text import listed
 
 
 class QfolioError(Exception):
@@ -16,7 +20,9 @@ class QfolioError(Exception):
     """
 
 
-def require_type(name: str, value: object, kinds: type | tuple[type, ...], wanted: str) -> None:
+def require_type(
+    name: str, value: object, kinds: type | UnionType | tuple[type, ...], wanted: str
+) -> None:
     """Raises QfolioError unless an argument has one of some types.
 
     wanted: what it must be, for the message.
@@ -45,6 +51,23 @@ def require_list(name: str, value: object, kinds: type | UnionType, wanted: str)
         raise QfolioError(f"{name} is {reprlib.repr(value)}; it must be {wanted}.")
 
 
+def require_methods(kind: type, *bases: type) -> None:
+    """Raises QfolioError unless a class's methods take the arguments that those of its bases do."""
+    for base in bases:
+        for name, method in vars(base).items():
+            public = name == "__call__" or not name.startswith("_")
+            if not (issubclass(kind, base) and public and inspect.isfunction(method)):
+                continue
+            wanted = [*inspect.signature(method).parameters]
+            bound = isinstance(inspect.getattr_static(kind, name), staticmethod | classmethod)
+            try:
+                inspect.signature(getattr(kind, name)).bind(*wanted[bound:])
+            except TypeError:
+                raise QfolioError(
+                    f"{kind.__name__}.{name} must be a method that takes {listed(wanted)}."
+                ) from None
+
+
 def _is(value: object, kinds: type | UnionType | tuple[type, ...]) -> bool:
     """Whether a value has one of some types; True and False are no numbers here."""
     return isinstance(value, kinds) and (kinds is bool or not isinstance(value, bool))
@@ -54,8 +77,25 @@ def one_line(error: BaseException) -> str:
     """An exception from a user's code, on one line: its type, message and location."""
     message = " ".join(str(error).split()).rstrip(".")
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if not frame.filename.startswith("<")]
+    known = [frame for frame in frames if not frame.filename.startswith("<")]
+    frame = own_frame(error) or (known[-1] if known else None)
     text = f"{type(error).__name__}: {message}" if message else type(error).__name__
-    if isinstance(error, SyntaxError) or not own:  # a SyntaxError's message names the place
+    if isinstance(error, SyntaxError) or not frame:  # a SyntaxError's message names the place
         return text
-    return f"{text} ({PurePath(own[-1].filename).name}, line {own[-1].lineno})"
+    return f"{text} ({PurePath(frame.filename).name}, line {frame.lineno})"
+
+
+def own_frame(error: BaseException) -> traceback.FrameSummary | None:
+    """The last place in a user's own code that an exception passed; None if there is none."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = PurePath(frame.filename)
+        if path.is_absolute() and not any(path.is_relative_to(place) for place in _NOT_OWN):
+            return frame
+    return None
+
+
+_NOT_OWN = [
+    str(Path(__file__).parents[1]),
+    *map(sysconfig.get_path, ("stdlib", "purelib", "platlib")),
+]
+"""Where Python, the libraries and qfolio are."""

@@ -56,6 +56,8 @@ class Facts(Protocol):
 class HostTask(Task):
     """A task whose environment is stepped from Python, by Gymnasium's interface."""
 
+    compiled = False
+
     @property
     @abc.abstractmethod
     def facts(self) -> Facts:

@@ -8,7 +8,8 @@ know only this file.
 import abc
 import math
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from numbers import Integral
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
+from qfolio.core.errors import require_type, require_whole
 from qfolio.core.fields import require, require_static
 
 
@@ -23,6 +25,9 @@ class Discrete(eqx.Module):
     """A choice among ``n`` actions, numbered from 0."""
 
     n: int = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        require_whole("n of Discrete", self.n, 1, 2**31 - 1)
 
 
 class Simplex(eqx.Module):
@@ -33,6 +38,9 @@ class Simplex(eqx.Module):
 
     assets: int = eqx.field(static=True)
     cap: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self) -> None:
+        require_whole("assets of Simplex", self.assets, 1, 2**31 - 1)
 
     unit = 1.0  # the scale of actions for noise and critics
 
@@ -47,6 +55,9 @@ class Box(eqx.Module):
 
     n: int = eqx.field(static=True)
     bound: float = eqx.field(static=True, default=math.inf)
+
+    def __check_init__(self) -> None:
+        require_whole("n of Box", self.n, 1, 2**31 - 1)
 
     @property
     def unit(self) -> float:
@@ -104,6 +115,9 @@ class Task(eqx.Module):
     are Discrete, Simplex or Box.
     """
 
+    compiled: ClassVar[bool] = True
+    """Whether its steps are part of compiled programs."""
+
     if TYPE_CHECKING:  # each task has them; for type checkers, Task takes no arguments
 
         @property
@@ -117,7 +131,10 @@ class Task(eqx.Module):
 
     def __check_init__(self) -> None:
         require_static(self)
+        name = type(self).__name__
+        require_type(f"horizon of {name}", self.horizon, Integral, "a whole number")
         require(self, "horizon", lambda x: x >= 1, "at least 1")
+        require_type(f"actions of {name}", self.actions, Actions, "Discrete, Simplex or Box")
 
     @property
     def name(self) -> str:
@@ -275,6 +292,9 @@ class Agent(eqx.Module):
 
     def __check_init__(self) -> None:
         require_static(self)
+        for name, least in (("num_envs", 1), ("episode_steps", 0), ("rollout_steps", 1)):
+            of = f"{name} of {type(self).__name__}"
+            require_whole(of, getattr(self, name), least, 2**31 - 1)
 
     @property
     def rollout_steps(self) -> int:

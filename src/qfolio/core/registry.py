@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
 from qfolio.core import settings
-from qfolio.core.errors import QfolioError, one_line
+from qfolio.core.errors import QfolioError, one_line, require_methods
 from qfolio.core.text import closest
 
 TASKS = {
@@ -162,17 +162,19 @@ def find(kind: Kind, name: str) -> type[Any]:
     if not attribute or (where is None and not exists(module)):
         raise _unknown(kind, name)
     found = getattr(import_own(module), attribute, None)
-    home, _, base = ENTRIES[kind].base.partition(":")
-    if not (isinstance(found, type) and issubclass(found, getattr(import_module(home), base))):
+    home, _, above = ENTRIES[kind].base.partition(":")
+    base = getattr(import_module(home), above)
+    if not (isinstance(found, type) and issubclass(found, base)):
         raise QfolioError(
             f"there is no {kind} {name!r}: {module} has no class {attribute} that inherits from "
-            f"{home}.{base}."
+            f"{home}.{above}."
         )
     missing = {*getattr(found, "__abstractmethods__", ()), *getattr(found, "__abstractvars__", ())}
     if missing:
         raise QfolioError(
             f"the {kind} {name} is not complete: it lacks {', '.join(sorted(missing))}."
         )
+    require_methods(found, base)
     return found
 
 

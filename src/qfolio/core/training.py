@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
+from qfolio.core.contract import require_agent, require_task
+from qfolio.core.errors import require_methods
 from qfolio.core.mdp import Agent, Metrics, Task, Transition
 
 CHUNK = 400
@@ -53,8 +55,13 @@ class Episodes(NamedTuple):
 
 
 def begin(task: Task, agent: Agent, seed: UInt32[Array, ""]) -> TrainingState:
-    """A member before its first step; all its randomness derives from ``seed``."""
+    """A member before its first step; all its randomness derives from ``seed``.
+
+    Raises QfolioError if a method of the task or the agent does not return what it has to.
+    """
     agent_key, task_key, key = jax.random.split(jax.random.key(seed), 3)
+    step = require_task(task, task_key)
+    require_methods(type(agent), Agent)
     state = agent.init(task, agent_key)
     environments = agent.num_envs
     zeros = jnp.zeros(environments)
@@ -69,21 +76,8 @@ def begin(task: Task, agent: Agent, seed: UInt32[Array, ""]) -> TrainingState:
         episodes=zero,
         healthy=jnp.array(True),
     )
-
-    def learned(state: TrainingState) -> tuple[Metrics, Metrics]:
-        """The metrics of a blank rollout, and what the task measures; only names are used."""
-        observation = jax.vmap(task.observe)(state.task)
-        action = agent.act(state.agent, observation, task_key)
-        no = jnp.zeros(environments, bool)
-        step = Transition(state.task, observation, action, zeros, state.task, observation, no, no)
-        time = agent.rollout_steps
-        rollout = jax.tree.map(lambda x: jnp.broadcast_to(x, (time, *x.shape)), step)
-        measured = jax.vmap(partial(agent.measure, task))(step)
-        tally = state.tally._replace(measured=dict.fromkeys(measured, zeros))
-        state = eqx.tree_at(lambda s: s.tally, state, tally)
-        return absorb(task, agent, state, rollout, learning=True)[2], measured
-
-    names = (dict.fromkeys(metrics, zeros) for metrics in jax.eval_shape(learned, started))
+    reported = require_agent(task, agent, state, step, task_key)
+    names = (dict.fromkeys(metrics, zeros) for metrics in reported)
     return eqx.tree_at(lambda s: (s.tally.metrics, s.tally.measured), started, tuple(names))
 
 
@@ -145,7 +139,7 @@ def _rollout(
             state=states,
             observation=observation,
             action=action,
-            reward=after.reward,
+            reward=after.reward.astype(jnp.float32),
             next_state=after.state,
             next_observation=jax.vmap(task.observe)(after.state),
             terminated=after.terminated,

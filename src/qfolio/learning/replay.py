@@ -133,7 +133,7 @@ class Replay(eqx.Module):
         steps: writes that a row needs before it can be drawn, its own included.
         """
         capacity = -(-capacity // width) * width
-        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), row)
+        like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), row)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(like))
         zero = jnp.array(0, jnp.int32)
         priorities = Priorities.empty(capacity) if prioritized else None

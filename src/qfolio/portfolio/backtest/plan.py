@@ -4,11 +4,14 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Agent
+from qfolio.core.registry import own_modules
+from qfolio.core.training import begin
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.described import agent_of
 from qfolio.experiments.executor import Executor, Job, at_once
@@ -123,12 +126,17 @@ class Plan:
     def require_able(self) -> None:
         """Raises QfolioError if an agent cannot begin, such as one with a wrong menu or rollout.
 
-        Some settings can be checked only with a task. Only shapes are traced.
+        Some settings can be checked only with a task. Only shapes are traced: of all methods of a
+        user's own agent, which takes seconds, and otherwise of ``init``.
         """
+        key, seed = jax.random.key(0), jnp.uint32(0)
         for name, agent in self.agents.items():
             task = self.part(name, self.folds[0].name)
             try:
-                jax.eval_shape(partial(agent.init, task), jax.random.key(0))
+                if own_modules(agent):
+                    jax.eval_shape(partial(begin, task, agent), seed)
+                else:
+                    jax.eval_shape(partial(agent.init, task), key)
             except QfolioError as error:
                 raise QfolioError(f"{name}: {error}") from None
 

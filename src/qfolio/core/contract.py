@@ -1,0 +1,163 @@
+"""What the methods of a task and an agent must return, checked on shapes before the first step."""
+
+from functools import wraps
+from numbers import Integral
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.tree_util import keystr
+from jaxtyping import PRNGKeyArray, PyTree
+
+from qfolio.core.errors import QfolioError, require_methods, require_type, require_whole
+from qfolio.core.mdp import Actions, Agent, Box, Discrete, ExogenousTask, Step, Task, Transition
+
+SHOWN = 200
+"""Most characters of a message that show what a method returned."""
+
+NUMBER: Any = jax.ShapeDtypeStruct((), jnp.float32)
+TRUTH: Any = jax.ShapeDtypeStruct((), jnp.bool_)
+
+
+def require_task(task: Task, key: PRNGKeyArray) -> Any:
+    """The shapes of a Transition of a task; raises QfolioError unless its methods fit each other.
+
+    Each is traced once; an exception of its own is left as it is.
+    """
+    require_methods(type(task), Task, ExogenousTask)
+    start = _shapes(task, "reset", key)
+    seen = _shapes(task, "observe", start)
+    _require_observation(task, seen)
+    action = _form(task.actions)
+    if task.compiled:
+        after = _shapes(task, "step", start, action, key)
+        if not isinstance(after, Step):
+            raise _refused(task, "step", after, "Step(state, reward, terminated)")
+        _require_like(task, "step", after.state, start, " as state", "reset")
+        if after.reward.shape or jnp.issubdtype(after.reward.dtype, jnp.complexfloating):
+            raise _refused(task, "step", after.reward, _shown(NUMBER), " as reward")
+        _require_like(task, "step", after.terminated, TRUTH, " as terminated")
+    step = Transition(start, seen, action, NUMBER, start, seen, TRUTH, TRUTH)
+    _require_metrics(task, "measure", _shapes(task, "measure", step))
+    return step
+
+
+def require_agent(
+    task: Task, agent: Agent, state: Any, step: Any, key: PRNGKeyArray
+) -> tuple[Any, Any]:
+    """The shapes of the metrics that an agent reports of learning, and measures of a step.
+
+    Raises QfolioError unless the agent's methods fit each other and the task. Each is traced once;
+    an exception of its own is left as it is.
+
+    state: the agent's, before any experience. step: from ``require_task``.
+    """
+    require_whole(f"{type(agent).__name__}.warm_up()", agent.warm_up(), 0, 2**31 - 1)
+    state = jax.eval_shape(lambda: _arrays(agent, "init", state))
+    batch = _repeated(step, agent.num_envs)
+    rollout = _repeated(batch, agent.rollout_steps)
+    acts = _shapes(agent, "act", state, batch.observation, key)
+    _require_like(agent, "act", acts, batch.action)
+    stored = _shapes(agent, "observe", state, rollout)
+    _require_like(agent, "observe", stored, state, like="init")
+    learned = _shapes(agent, "learn", state, rollout, key, of=(task,))
+    if not (isinstance(learned, tuple) and len(learned) == 2):
+        raise _refused(agent, "learn", learned, "the next state, and a dict of metrics")
+    _require_like(agent, "learn", learned[0], state, " as state", "init")
+    _require_metrics(agent, "learn", learned[1])
+    _require_metrics(agent, "monitor", _shapes(agent, "monitor", state))
+    measured = _shapes(agent, "measure", step, of=(task,))
+    _require_metrics(agent, "measure", measured)
+    weights = _shapes(agent, "weights", state)
+    if not jax.tree.leaves(weights):
+        raise _refused(agent, "weights", weights, "an array, or several")
+    starts = _repeated(step, agent.num_envs + 1)  # an evaluation has batches of another size
+    chosen = _shapes(agent, "policy", weights, starts.observation)
+    _require_like(agent, "policy", chosen, starts.action)
+    values = _shapes(agent, "action_values", weights, starts.observation)
+    if values is not None and isinstance(task.actions, Discrete):
+        each = jax.ShapeDtypeStruct((agent.num_envs + 1, task.actions.n), jnp.float32)
+        _require_like(agent, "action_values", values, each)
+    return learned[1], measured
+
+
+def _form(actions: Actions) -> Any:
+    """Shape and type of an action."""
+    if isinstance(actions, Discrete):
+        return jax.ShapeDtypeStruct((), jnp.int32)
+    length = actions.n if isinstance(actions, Box) else 1 + actions.assets
+    return jax.ShapeDtypeStruct((length,), jnp.float32)
+
+
+def _repeated(tree: PyTree, count: int) -> Any:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), tree)
+
+
+def _shapes(owner: Task | Agent, name: str, *args: Any, of: tuple[Task, ...] = ()) -> Any:
+    """The shapes of what a method returns; of: its first arguments, if it takes a task."""
+    method = getattr(owner, name)
+    checked = wraps(method)(lambda *args: _arrays(owner, name, method(*of, *args)))
+    return jax.eval_shape(checked, *args)
+
+
+def _arrays(owner: Task | Agent, name: str, found: Any) -> Any:
+    """What a method returns; raises QfolioError unless it consists of arrays and numbers."""
+    for leaf in jax.tree.leaves(found):
+        if not eqx.is_array_like(leaf):
+            raise QfolioError(
+                f"{type(owner).__name__}.{name} returns {type(leaf).__name__}; it must return "
+                "arrays, perhaps in tuples, dicts or modules of equinox."
+            )
+    return found
+
+
+def _require_observation(task: Task, seen: PyTree) -> None:
+    """Raises QfolioError unless an observation is of numbers, or one of a task's states."""
+    leaves = jax.tree.leaves(seen)
+    numbers = [jnp.issubdtype(x.dtype, jnp.number) or x.dtype == bool for x in leaves]
+    if not (numbers and all(numbers)):
+        raise _refused(task, "observe", seen, "an array of numbers, or several")
+    if task.states is not None:
+        require_type(f"states of {type(task).__name__}", task.states, Integral, "a whole number")
+        if leaves != [seen] or seen.shape or not jnp.issubdtype(seen.dtype, jnp.integer):
+            raise _refused(task, "observe", seen, f"a whole number below its states, {task.states}")
+
+
+def _require_like(
+    owner: Task | Agent, name: str, found: PyTree, wanted: PyTree, place: str = "", like: str = ""
+) -> None:
+    """Raises QfolioError unless a result has the structure, shapes and types that are wanted.
+
+    like: the method whose result it has to be like.
+    """
+    like = like and f", like that of {type(owner).__name__}.{like}"
+    forms: list[Any] = [jax.tree.structure(x) for x in (found, wanted)]
+    if forms[0] != forms[1]:
+        raise _refused(owner, name, found, _shown(wanted) + like, place)
+    each = zip(jax.tree.leaves_with_path(found), jax.tree.leaves(wanted), strict=True)
+    for (path, leaf), want in each:
+        if (leaf.shape, leaf.dtype) != (want.shape, want.dtype):
+            place += f" at {keystr(path)}" if path else ""
+            raise _refused(owner, name, leaf, _shown(want) + like, place)
+
+
+def _require_metrics(owner: Task | Agent, name: str, found: Any) -> None:
+    """Raises QfolioError unless metrics are named scalars."""
+    if not isinstance(found, dict) or any(getattr(x, "shape", 1) for x in found.values()):
+        raise _refused(owner, name, found, "a dict of names and scalars", " as metrics")
+
+
+def _refused(
+    owner: Task | Agent, name: str, found: PyTree, wanted: str, place: str = ""
+) -> QfolioError:
+    return QfolioError(
+        f"{type(owner).__name__}.{name} returns {_shown(found)}{place}; it must be {wanted}."
+    )
+
+
+def _shown(tree: PyTree) -> str:
+    """Shapes and types on one line, such as (float32[3], bool[])."""
+    short = lambda x: f"{x.dtype}[{','.join(map(str, x.shape))}]"  # noqa: E731
+    text = " ".join(str(jax.tree.map(short, tree)).replace("'", "").split())
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}…"
