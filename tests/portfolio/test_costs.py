@@ -1,12 +1,14 @@
 """The cost model against its equation, on numpy and on jax."""
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Position
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.costs import (
@@ -260,3 +262,50 @@ def test_training_and_replay_charge_what_a_model_of_ones_own_says(lag: int) -> N
     grown = wanted @ np.append(1.01, values[6 + lag] / values[5 + lag])
     assert replay.returns[0] == pytest.approx(left * grown - 1, abs=1e-12)
     assert replay.cost[0] == pytest.approx(1 - left, abs=1e-12)
+
+
+@dataclass(frozen=True)
+class Wrong(WithInterest):
+    """A model of a user's own with one mistake."""
+
+    mistake: ClassVar[str] = ""
+
+    def trade(self, before, after, context):
+        left, paid = super().trade(before, after, context)
+        kinds: dict[str, Any] = {
+            "alone": left,
+            "scalar": (float(left[0]), paid),
+            "gain": (left * 1.01, paid),
+            "unknown": (left * float("nan"), paid),
+            "always": (left - 0.001, {**paid, "more": 0.001 + 0 * left}),
+            "sum": (left, {"fee": 0 * left}),
+        }
+        return kinds.get(self.mistake, (left, paid))
+
+    def carry(self, relatives, context):
+        growth = super().carry(relatives, context)
+        return {"short": growth[..., 1:], "lost": -growth}.get(self.mistake, growth)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "says"),
+    [
+        ("alone", "Wrong.trade must return the share of wealth that remains, and its costs by ki"),
+        (
+            "scalar",
+            r"Wrong.trade must return numbers of shape \(...\) for weights of shape \(..., N",
+        ),
+        ("gain", "Wrong.trade must return shares of wealth above 0 and at most 1."),
+        ("unknown", "Wrong.trade must return shares of wealth above 0 and at most 1."),
+        ("always", "Wrong.trade must return exactly 1 where nothing is traded."),
+        ("sum", "Wrong.trade must return costs that sum to 1 minus the share of wealth that rem"),
+        ("short", "Wrong.carry must return growth factors of cash and of each of 3 assets, of s"),
+        ("lost", "Wrong.carry must return positive growth factors."),
+    ],
+)
+def test_a_model_of_ones_own_is_tried(mistake, says, monkeypatch):
+    dates = np.datetime64("2020-01-01") + np.arange(30, dtype="m8[D]")
+    prices = Prices(dates, ("a", "b", "c"), np.exp(np.random.default_rng(0).normal(size=(30, 3))))
+    monkeypatch.setattr(Wrong, "mistake", mistake)
+    with pytest.raises(QfolioError, match=says):
+        Portfolio.of(prices, window=5, horizon=10, cost_model=f"{__name__}:Wrong")

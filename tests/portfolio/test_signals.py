@@ -99,6 +99,11 @@ class Tomorrow(signals.Signal):
         return np.vstack([prices[1:], prices[-1:]])
 
 
+class Words(signals.Signal):
+    def measure(self, prices, rows):
+        return "up"
+
+
 class Short(signals.Signal):
     def measure(self, prices, rows):
         return prices[:-1]
@@ -160,7 +165,12 @@ def test_the_names_alone_need_lengths_that_can_be_read():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"), [(Tomorrow(), "Tomorrow looks ahead: its value at row"), (Short(), "shape")]
+    ("wrong", "says"),
+    [
+        (Tomorrow(), "Tomorrow looks ahead: its value at row"),
+        (Short(), "shape"),
+        (Words(), "The signal Words returns 'up'; it must return an array of numbers."),
+    ],
 )
 def test_a_signal_of_ones_own_is_checked(wrong, says):
     with pytest.raises(QfolioError, match=says):

@@ -25,6 +25,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from qfolio.core.errors import QfolioError
+
 
 class Context(NamedTuple):
     """The circumstances of a trade, or of a holding period, besides price relatives.
@@ -106,6 +108,43 @@ class CostModel(abc.ABC):
         """Weights after a holding period without a trade; assets delisted by then are cash."""
         after = grown(weights, self.growth(weights, relatives, context))
         return after if context.listed is None else cashed(after, context.listed)
+
+
+def require_sound(model: CostModel, trade: Context, relatives: Any, holding: Context) -> None:
+    """Tries a model of a user's own; raises QfolioError unless it answers as ``CostModel`` says.
+
+    Args:
+        trade: The circumstances of some trade.
+        relatives: Price relatives of a holding period, of shape (N,).
+        holding: Its circumstances.
+    """
+
+    def require(method: str, right: Any, wanted: str) -> None:
+        if not right:
+            raise QfolioError(f"{type(model).__name__}.{method} must return {wanted}.")
+
+    assets = relatives.shape[-1]
+    cash, last = np.eye(1 + assets)[[0, -1]]
+    before, after = np.stack([[cash, cash, last, last], [cash, last, cash, last]])
+    answer = model.trade(before, after, trade)
+    pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Mapping)
+    require("trade", pair, "the share of wealth that remains, and its costs by kind in a dict")
+    left, paid = np.asarray(answer[0]), [np.asarray(each) for each in answer[1].values()]
+    shapes = {each.shape for each in (left, *paid)}
+    require("trade", shapes == {(4,)}, "numbers of shape (...) for weights of shape (..., N + 1)")
+    require("trade", ((left > 0) & (left <= 1)).all(), "shares of wealth above 0 and at most 1")
+    require("trade", (left[[0, 3]] == 1).all(), "exactly 1 where nothing is traded")
+    gap = abs(sum(paid) - (1 - left)).max()
+    require("trade", gap < 1e-9, "costs that sum to 1 minus the share of wealth that remains")
+    for method in ("carry", "owe"):
+        found = getattr(model, method)(relatives, holding)
+        if method == "carry" or found is not None:
+            grown = np.asarray(found)
+            entries = (
+                f"growth factors of cash and of each of {assets} assets, of shape (..., N + 1)"
+            )
+            require(method, grown.shape == (1 + assets,), entries)
+            require(method, ((grown > 0) & (grown < np.inf)).all(), "positive growth factors")
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import numpy as np
 
-from qfolio.core.arrays import Bools, Floats
+from qfolio.core.arrays import Bools, Floats, numbers
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import static
 from qfolio.core.registry import SIGNALS, build
@@ -339,7 +339,7 @@ def _named(text: str, pace: float) -> Signal:
 def _checked(signal: Signal, prices: Floats) -> Floats:
     """The signal; a user's own is computed again without the latest rows."""
     name = type(signal).__name__
-    found = np.asarray(signal(prices), float)
+    found = numbers(f"The signal {name}", signal(prices))
     if found.shape != prices.shape:
         raise QfolioError(
             f"The signal {name} has the shape {found.shape}; it must be {prices.shape}, one number "
@@ -347,7 +347,7 @@ def _checked(signal: Signal, prices: Floats) -> Floats:
         )
     if f"{type(signal).__module__}:{name}" not in SIGNALS.values():
         for cut in np.linspace(1, len(prices) - 1, 4).astype(int):
-            then = np.asarray(signal(prices[:cut]), float)  # perhaps a data frame
+            then = numbers(f"The signal {name}", signal(prices[:cut]))
             if not np.array_equal(then[-1:], found[cut - 1 : cut], equal_nan=True):
                 raise QfolioError(
                     f"The signal {name} looks ahead: its value at row {cut - 1} changes when later "

@@ -21,11 +21,12 @@ from qfolio.core import simplex
 from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Actions, Box, Position, Simplex
+from qfolio.core.registry import own_modules
 from qfolio.portfolio import anchors, signals, universe
 from qfolio.portfolio.backtest.baselines import baseline
 from qfolio.portfolio.calendars import band, decision_rows, elapsed
 from qfolio.portfolio.conditions import Conditions
-from qfolio.portfolio.costs import cashed
+from qfolio.portfolio.costs import cashed, require_sound
 from qfolio.portfolio.execution import Plan, Terms
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.feasible import CappedSimplex, Feasible, Mandated
@@ -145,6 +146,10 @@ class Portfolio(Market):
             can = buyable(self.mandate) if self.mandate else None
             followed = anchors.path(self.anchor, prices, can)
         then = Conditions.of(prices, self.costs.columns)
+        if own_modules(self.costs):
+            row = len(prices.dates) - 2
+            moves = np.nan_to_num(prices.values[-1] / prices.values[-2], nan=1.0)
+            require_sound(self.costs, then.trade(row, 1), moves, then.holding(row, row + 1))
         terms, risk = self.written.trading, self.written.risk
         passed = elapsed(prices.dates) if terms.turnover_a_year else np.zeros(0)
         compared = anchors.path(risk.benchmark, prices) if risk.benchmark else logs[:0]

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pytest
@@ -291,17 +291,26 @@ def test_what_is_held_drifts_with_prices() -> None:
         ([np.nan] * 5, "sum to nan"),
         ([0, 1, 0, 0, 0], "an asset 1, more than the cap of 0.8"),
         ([0.5, 0, 0, 0, 0.5], "an asset that this fold may not hold"),
+        ("all", "decide of the baseline own returns 'all'; it must return an array of numbers"),
     ],
 )
-def test_weights_that_cannot_be(wanted: list[float], message: str) -> None:
+def test_weights_that_cannot_be(wanted: Any, message: str) -> None:
     class Wrong(Baseline):
-        def decide(self, history: History, held: np.ndarray) -> np.ndarray:
-            return np.array(wanted)
+        def decide(self, history: History, held: np.ndarray) -> Any:
+            return wanted
 
     values = prices()
     values[0, 3] = np.nan
     with pytest.raises(QfolioError, match=message):
         ask(Wrong(), FOLDS, values, cap=0.8)
+
+
+def test_a_calendar_that_there_is_not() -> None:
+    class Weekly(LastWinner):
+        calendar: ClassVar[Any] = "weekly"
+
+    with pytest.raises(QfolioError, match="of Weekly is 'weekly'; it must be one of fold, month, "):
+        ask(Weekly(), FOLDS, prices())
 
 
 def test_a_baseline_of_a_users_own_is_found_by_its_module(

@@ -3,14 +3,14 @@
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qfolio.core.arrays import Bools, Floats
+from qfolio.core.arrays import Bools, Floats, numbers
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.backtest.baselines.base import Baseline, History
+from qfolio.portfolio.backtest.baselines.base import Baseline, Calendar, History
 from qfolio.portfolio.backtest.growth import Growth, filled_in
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel, Proportional, cashed
@@ -153,6 +153,11 @@ def _calendar(
 
     changing: whether assets come and go.
     """
+    if baseline.calendar not in get_args(Calendar):
+        raise QfolioError(
+            f"calendar of {type(baseline).__name__} is {baseline.calendar!r}; it must be one of "
+            f"{', '.join(get_args(Calendar))}."
+        )
     gives = np.ones(rows, bool)
     if len(terms.decides):
         gives = terms.decides
@@ -232,7 +237,7 @@ def obeying(wanted: Floats, held: Floats, mandated: Feasible | None) -> Floats:
 
 def checked(name: str, wanted: ArrayLike, history: History) -> Floats:
     """A baseline's target weights; raises QfolioError if they are invalid."""
-    target = np.asarray(wanted, dtype=float)
+    target = numbers(f"decide of the baseline {name}", wanted)
     where = f"The baseline {name} at {day(history.dates[-1])}"
     if target.shape != (len(history.tradable) + 1,):
         raise QfolioError(

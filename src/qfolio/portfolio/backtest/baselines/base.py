@@ -11,6 +11,8 @@ from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import imported
 
+Calendar = Literal["fold", "month", "row"]
+
 
 class History(NamedTuple):
     """The data of a baseline's decision, with T rows up to the decision and N assets."""
@@ -57,7 +59,7 @@ class Baseline(ABC):
             available at the decision, where assets come and go.
     """
 
-    calendar: ClassVar[Literal["fold", "month", "row"]] = "fold"
+    calendar: ClassVar[Calendar] = "fold"
     estimates: ClassVar[bool] = True
 
     @abstractmethod
