@@ -145,7 +145,7 @@ def test_a_delisted_asset_takes_no_part():
     drawn = Shuffles.drawn(stretches, 2, 63, 0)
     assert (drawn.assets[..., 6] == 6).all()
     assert (drawn.assets[1:, :, :6] != np.arange(6)).any()
-    volatility, momentum = drawn.values[..., 3], drawn.values[..., 1]
+    volatility, momentum = drawn.others[..., 3], drawn.others[..., 1]
     assert (volatility[:, 6] == volatility[:, 0]).all()
     assert not momentum[100:, 6].any()
 

@@ -69,7 +69,8 @@ class Shuffles(NamedTuple):
     rows: np.ndarray  # (draw, row): the row that is seen instead
     assets: np.ndarray  # (draw, row, asset): the asset that is seen instead
     shared: np.ndarray  # (channel,): whether it is the same for all assets
-    values: Array  # (row, asset, channel): what is seen instead, on all rows of the table
+    own: Array  # (row, asset, channel): the channels on all rows of the table
+    others: Array  # likewise: what is seen instead
 
     @staticmethod
     def drawn(stretches: Sequence[Stretch], count: int, block: int, seed: int) -> "Shuffles":
@@ -96,13 +97,14 @@ class Shuffles(NamedTuple):
         # The last fold is followed beyond its end, as long as the longest.
         pad = ((0, 0), (0, longest))
         rows, shown = np.pad(rows, pad, "edge"), np.pad(shown, (*pad, (0, 0)), "edge")
-        values, shared = channels(task), _shared(stretches)
+        shared = _shared(stretches)
+        own = others = channels(task)
         if task.tradable is not None:
             # Where an asset is not tradable its signals are 0, those that all share as well. It
             # may be tradable in the row that sees them, so it gets another's.
-            common = values[jnp.arange(len(values)), task.tradable.argmax(1)]
-            values = jnp.where(jnp.asarray(shared), common[:, None], values)
-        return Shuffles(begin, rows, shown, shared, values)
+            common = own[jnp.arange(len(own)), task.tradable.argmax(1)]
+            others = jnp.where(jnp.asarray(shared), common[:, None], own)
+        return Shuffles(begin, rows, shown, shared, own, others)
 
 
 class Replays(NamedTuple):
@@ -135,9 +137,10 @@ def open_to(stretches: Sequence[Stretch]) -> np.ndarray:
 def _shared(stretches: Sequence[Stretch]) -> np.ndarray:
     """Whether a channel is the same for all assets that may be bought on the days of the test."""
     begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
-    shown, there = np.asarray(channels(stretches[0].task))[begin:end], open_to(stretches)[..., None]
-    least, most = np.where(there, shown, np.inf).min(1), np.where(there, shown, -np.inf).max(1)
-    return np.asarray((most <= least).all(0))
+    shown, there = np.asarray(channels(stretches[0].task))[begin:end], open_to(stretches)
+    least = (np.where(there, each, np.inf).min(1) for each in np.moveaxis(shown, -1, 0))
+    most = (np.where(there, each, -np.inf).max(1) for each in np.moveaxis(shown, -1, 0))
+    return np.array([bool((x <= y).all()) for x, y in zip(most, least, strict=True)])
 
 
 def replay(
@@ -159,10 +162,9 @@ def replay(
 def _replay(
     agent: Agent, stretches: Sequence[Stretch], shuffles: Shuffles, wanted: Sequence[Shuffle]
 ) -> Replays:
-    raw = channels(stretches[0].task)
     masks, rows, assets = (jnp.asarray(np.array(x)) for x in zip(*wanted, strict=True))
     counts = [fold.decisions.stop - fold.decisions.start for *_, fold in stretches]
-    cash = np.eye(raw.shape[1] + 1)[:1]
+    cash = np.eye(shuffles.own.shape[1] + 1)[:1]
     held = begin(stretches[0].task, np.repeat(cash, len(wanted), 0))
     targets, before = [], []
     for (task, members, fold), count in zip(stretches, counts, strict=True):
@@ -174,7 +176,7 @@ def _replay(
         first = jnp.array(start, jnp.int32)
         ends = _paths(
             task,
-            (raw, shuffles.values),
+            (shuffles.own, shuffles.others),
             agent,
             together,
             first,
