@@ -1,5 +1,8 @@
 """Mandates that allow short sales and loans: actions, tilts, and what agents learn."""
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ import pytest
 from qfolio.agents.tilts import tilted
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Box, Simplex
+from qfolio.core.training import begin
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.policy import Policy
@@ -68,6 +72,14 @@ def test_a_policy_of_weights_says_what_it_is_for() -> None:
     ppo = preset("fast", "portfolio", "ppo").build()
     with pytest.raises(QfolioError, match="which Portfolio has not; set network=mlp"):
         ppo.init(task, jnp.zeros(2, jnp.uint32))
+
+
+@pytest.mark.parametrize("agent", ["tilts", "pathwise"])
+def test_actions_may_give_cash_or_leave_it_to_the_rest(agent: str) -> None:
+    """What is checked before the first step accepts both."""
+    chosen = preset("fast", "portfolio", agent)
+    task = Portfolio.of(planted(900), mandate=MANDATE, **chosen.task)
+    jax.eval_shape(partial(begin, task, chosen.build()), jnp.uint32(0))
 
 
 @pytest.mark.slow

@@ -55,9 +55,11 @@ def require_agent(
     """
     require_whole(f"{type(agent).__name__}.warm_up()", agent.warm_up(), 0, 2**31 - 1)
     state = jax.eval_shape(lambda: _arrays(agent, "init", state))
+    seen = _repeated(step.observation, agent.num_envs)
+    acts = _shapes(agent, "act", state, seen, key)
+    step = step._replace(action=_chosen(task, acts))
     batch = _repeated(step, agent.num_envs)
     rollout = _repeated(batch, agent.rollout_steps)
-    acts = _shapes(agent, "act", state, batch.observation, key)
     _require_like(agent, "act", acts, batch.action)
     stored = _shapes(agent, "observe", state, rollout)
     _require_like(agent, "observe", stored, state, like="init")
@@ -88,6 +90,16 @@ def _form(actions: Actions) -> Any:
         return jax.ShapeDtypeStruct((), jnp.int32)
     length = actions.n if isinstance(actions, Box) else 1 + actions.assets
     return jax.ShapeDtypeStruct((length,), jnp.float32)
+
+
+def _chosen(task: Task, acts: PyTree) -> Any:
+    """The form of an agent's actions: the task's; in a market with debts, cash may come first."""
+    form = _form(task.actions)
+    if isinstance(task, ExogenousTask) and isinstance(task.actions, Box):
+        with_cash = jax.ShapeDtypeStruct((task.actions.n + 1,), form.dtype)
+        if getattr(acts, "shape", ())[1:] == with_cash.shape:
+            return with_cash
+    return form
 
 
 def _repeated(tree: PyTree, count: int) -> Any:

@@ -117,7 +117,10 @@ def _falling(
 
 
 PRESETS: Presets = {
-    ("gym:CartPole-v1", "dqn"): _dqn("CartPole-v1", 120_000, discount=0.98, epsilon_end=0.05),
+    # Near the ends of the track an agent is early in training only: the replay forgets nothing.
+    ("gym:CartPole-v1", "dqn"): _dqn(
+        "CartPole-v1", 120_000, discount=0.98, epsilon_end=0.1, replay_capacity=131_072
+    ),
     ("gym:CartPole-v1", "ppo"): {"fast": _preset("CartPole-v1", "ppo", 100_000, **_PPO)},
     ("gym:Acrobot-v1", "dqn"): _dqn("Acrobot-v1", 60_000),
     ("gym:Acrobot-v1", "ppo"): _ppo("Acrobot-v1", 3_000_000),
