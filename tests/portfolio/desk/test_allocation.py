@@ -210,3 +210,25 @@ def test_prices_of_another_day():
     for day in ("NaT", "today", "2025", ""):  # numpy reads these
         with pytest.raises(QfolioError, match=f"--as-of is '{day}'; it must be a date"):
             require_fresh(PRICES, day)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_what_keeps_its_weight_is_no_order_and_pays_no_fee(whole):
+    """Of 1,000, half in each; 100 of A are sold at a fee of 5, and B stays as it is."""
+    policy = Fixed([0.1, 0.4, 0.5], 0)
+    policy.task = dataclasses.replace(TASK, cost=0.0, cost_model="itemized(fixed=5,capital=1000)")
+    shares = np.array([25.0, 12.5])
+    allocation = Allocation.of(policy, PRICES, shares, 0.0, whole_shares=whole)
+    sold = 5 if whole else 25 - 495 * 0.8 / 20  # of the 500 that pay, a fifth becomes cash
+    np.testing.assert_allclose(allocation.trades, [-sold, 0], atol=1e-9)
+    assert allocation.costs["fixed"] == pytest.approx(5)
+    assert allocation.cash_after == pytest.approx(20 * sold - 5)
+    assert len(list(order_rows(allocation, "generic", "USD")[1])) == 1
+
+
+def test_an_order_that_costs_more_than_it_moves_is_left_out():
+    policy = Fixed([0.002, 0.0, 0.998], 0)
+    policy.task = dataclasses.replace(TASK, cost=0.0, cost_model="itemized(fixed=5,capital=1000)")
+    allocation = Allocation.of(policy, PRICES, np.array([0.1, 998 / 40]), 0.0)
+    assert not allocation.trades.any()
+    assert (allocation.cost, allocation.cash_after) == (0, 0)

@@ -112,13 +112,15 @@ class Allocation:
         context = context_of(policy.costs, prices, wealth)
         after = partial(settled, policy.costs, context, held, wealth, shares, known)
         if not np.array_equal(weights, held):
-            remainder = float(policy.costs.trade(held, weights, context)[0])
-            money = remainder * weights[1:] * wealth
+            kept = abs(weights - held)[1:] <= NOISE
+            reached = _paid(policy.costs, context, held, weights, kept)
+            money = wealth * reached[1:]
             trades = np.divide(money, known, out=np.zeros_like(money), where=known > 0) - shares
             lot = lots(policy.mandate)
-            if whole_shares or lot is not None:
-                trades[abs(weights - held)[1:] <= NOISE] = 0.0
-                ideal = remainder * weights[0] * wealth
+            whole = whole_shares or lot is not None
+            trades[kept & (whole | (reached == held)[1:])] = 0.0
+            if whole:
+                ideal = wealth * reached[0]
                 trades = rounded(trades, shares, known, ideal, lambda trades: after(trades)[0], lot)
         cash_after, costs = after(trades) if trades.any() else (cash, {})
         return Allocation(
@@ -198,6 +200,32 @@ def _ordered(targets: np.ndarray, held: np.ndarray) -> np.ndarray:
     return np.asarray(weights / weights.sum())
 
 
+def _paid(
+    model: CostModel, context: Context, held: np.ndarray, weights: np.ndarray, kept: np.ndarray
+) -> np.ndarray:
+    """Cash and each asset after the costs of an order, as shares of the wealth before it.
+
+    What is kept pays nothing: a sale of the share of wealth that costs take away, so that its
+    weight stays the same, would be an order of its own, with a fee. If the rest is worth less than
+    the costs, nothing is traded. Where there are debts, all pay.
+
+    kept: whether an asset's weight is to stay, of shape (N,).
+    """
+
+    def cost(before: np.ndarray, after: np.ndarray, share: float) -> float:
+        of_it = context._replace(wealth=share * context.wealth)
+        return float(model.trade(before / before.sum(), after / after.sum(), of_it)[0])
+
+    apart = np.append(False, kept)
+    before, after = (np.where(apart, 0.0, each) for each in (held, weights))
+    rest = float(before.sum())
+    if min(held[1:].min(), weights.min()) < 0:
+        return cost(held, weights, 1.0) * weights
+    if min(rest, after.sum()) <= NOISE or (remainder := cost(before, after, rest)) <= 0:
+        return held
+    return np.where(apart, held, remainder * rest * after / after.sum())
+
+
 def context_of(model: CostModel, prices: Prices, wealth: float) -> Context:
     """The circumstances of a trade at the table's last row."""
     known = Conditions.of(prices, model.columns)
@@ -217,14 +245,17 @@ def settled(
     """The cash that is left after trades, and their costs in money, by kind.
 
     The cost model asks for the weights after the trade, which depend on the cash that it leaves;
-    that cash is a fixed point, found in a few steps because costs are small.
+    that cash is a fixed point, found in a few steps because costs are small. What is not traded
+    counts as cash: its weight changes because costs change the wealth, which is no order.
     """
-    values = (shares + trades) * prices
-    invested = float(values.sum())
+    values, kept = (shares + trades) * prices, trades == 0
+    invested, apart = float(values.sum()), float(values[kept].sum())
+    held = np.append(held[0] + held[1:][kept].sum(), np.where(kept, 0.0, held[1:]))
+    values = np.where(kept, 0.0, values)
     cash = wealth - invested
     costs: dict[str, Any] = {}
     for _ in range(100):
-        after = np.append(cash, values) / (cash + invested)
+        after = np.append(cash + apart, values) / (cash + invested)
         remainder, costs = model.trade(held, after, context)
         found = wealth * float(remainder) - invested
         if abs(found - cash) <= 1e-14 * wealth:
