@@ -49,14 +49,20 @@ class Promise:
     least: float
 
     @staticmethod
-    def of(tested: ArrayLike, rng: np.random.Generator, resamples: int = RESAMPLES) -> "Promise":
-        """The promise of a backtest's net returns, shape (T,); its limit is bootstrapped."""
+    def of(
+        tested: ArrayLike, rng: np.random.Generator, promises: int = 1, resamples: int = RESAMPLES
+    ) -> "Promise":
+        """The promise of a backtest's net returns, shape (T,); its limit is bootstrapped.
+
+        promises: how many are tested together, of which none may be wrong.
+        """
         returns = np.asarray(tested, dtype=float)
         low, high = np.quantile(returns, (TAIL, 1 - TAIL))
         cut = np.clip(returns, low, high)
         block = block_length(cut)
         days = stationary_bootstrap_indices(len(cut), block, resamples, rng)
-        return Promise(float(low), float(high), float(np.quantile(cut[days].mean(1), ALPHA / 2)))
+        least = np.quantile(cut[days].mean(1), ALPHA / 2 / promises)
+        return Promise(float(low), float(high), float(least))
 
 
 def evidence(promise: Promise, live: ArrayLike) -> Floats:

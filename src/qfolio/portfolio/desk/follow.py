@@ -220,7 +220,7 @@ def follow(desk: Desk, prices: Path | None = None, benchmark: Path | None = None
             pairs.append((tested - before, live.returns - theirs))
         evidence = consistency.together(
             [
-                consistency.evidence(consistency.Promise.of(promised, rng), now)
+                consistency.evidence(consistency.Promise.of(promised, rng, len(pairs)), now)
                 for promised, now in pairs
             ]
         )
