@@ -207,7 +207,8 @@ def test_a_network_finds_what_linear_scores_cannot(network):
 
 def test_a_network_changes_nothing_in_what_is_learned_without_it():
     tables = [walk(1500, 8, seed) for seed in range(3)]
-    deep, linear = (trained(*tables, network=name) for name in ("hidden", "linear"))
+    # Few rounds: the two programs round differently, which training amplifies.
+    deep, linear = (trained(*tables, rounds=10, network=name) for name in ("hidden", "linear"))
     np.testing.assert_allclose(deep.evidence.total, linear.evidence.total, rtol=1e-2, atol=1e-5)
     for name in ("linear", "interaction"):
         one, other = (getattr(state.policy.members, name) for state in (deep, linear))
