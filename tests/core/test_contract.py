@@ -10,9 +10,11 @@ import pytest
 from qfolio.agents.dqn import DQN
 from qfolio.core.errors import QfolioError, one_line
 from qfolio.core.fields import static
-from qfolio.core.mdp import Agent, Discrete, Step, Task
+from qfolio.core.mdp import Discrete, Step, Task
 from qfolio.core.population import Population
 from qfolio.core.training import begin
+
+from planted import Known
 
 
 class Walk(Task):
@@ -30,29 +32,14 @@ class Walk(Task):
         return Step(state + action, -state[0], jnp.array(False))
 
 
-class Learner(Agent):
+class Learner(Known):
     num_envs: int = static(2)
-    episode_steps: int = static(0)
-
-    discount = None
 
     def init(self, task, key):
         return jnp.zeros(2)
 
-    def warm_up(self):
-        return 0
-
-    def act(self, state, observation, key):
-        return self.policy(state, observation)
-
-    def observe(self, state, rollout):
-        return state
-
     def learn(self, task, state, rollout, key):
         return state + rollout.reward.mean(), {"reward": rollout.reward.mean()}
-
-    def weights(self, state):
-        return state
 
     def policy(self, weights, observation):
         return jnp.full(len(observation), weights.argmax())
@@ -86,6 +73,10 @@ NO = jnp.array(False)
          r"Own.step returns int32\[3\] as state; it must be float32\[3\], like that of Own.reset."),
         ("step", lambda self, s, a, k: Step(s, -s, NO),
          r"Own.step returns float32\[3\] as reward; it must be float32\[\]."),
+        ("step", lambda self, s, a, k: Step(s, (s[0],), NO),  # type: ignore[arg-type]
+         r"Own.step returns \(float32\[\],\) as reward; it must be float32\[\]."),
+        ("step", lambda self, s, a, k: Step(s, s[0] * 1j, NO),
+         r"Own.step returns complex64\[\] as reward; it must be float32\[\]."),
         ("step", lambda self, s, a, k: Step(s, s[0], s[0]),
          r"returns float32\[\] as terminated; it must be bool\[\]."),
         ("measure", lambda self, step: {"held": step.observation},

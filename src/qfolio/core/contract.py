@@ -35,7 +35,7 @@ def require_task(task: Task, key: PRNGKeyArray) -> Any:
         if not isinstance(after, Step):
             raise _refused(task, "step", after, "Step(state, reward, terminated)")
         _require_like(task, "step", after.state, start, " as state", "reset")
-        if after.reward.shape or jnp.issubdtype(after.reward.dtype, jnp.complexfloating):
+        if not _is_number(after.reward):
             raise _refused(task, "step", after.reward, _shown(NUMBER), " as reward")
         _require_like(task, "step", after.terminated, TRUTH, " as terminated")
     step = Transition(start, seen, action, NUMBER, start, seen, TRUTH, TRUTH)
@@ -122,6 +122,13 @@ def _arrays(owner: Task | Agent, name: str, found: Any) -> Any:
                 "arrays, perhaps in tuples, dicts or modules of equinox."
             )
     return found
+
+
+def _is_number(found: PyTree) -> bool:
+    """Whether a result is one real number, of any type."""
+    kinds = (jnp.bool_, jnp.integer, jnp.floating)
+    alone = jax.tree.leaves(found) == [found] and not found.shape
+    return alone and any(jnp.issubdtype(found.dtype, kind) for kind in kinds)
 
 
 def _require_observation(task: Task, seen: PyTree) -> None:

@@ -85,13 +85,18 @@ def cores() -> list[int]:
 
 
 def describe() -> str:
-    """The number, kind and platform of the devices. Raises QfolioError if jax finds none."""
+    """The number, kind and platform of the devices.
+
+    Raises QfolioError if the platform that the user chose has none.
+    """
     try:
         devices = jax.devices()
     except (AssertionError, RuntimeError):  # the first without the plugin of a platform
+        if not (platforms := os.environ.get("JAX_PLATFORMS")):
+            raise
         raise QfolioError(
-            f"jax finds no device of JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}; unset "
-            "it, or install jax for this platform."
+            f"jax finds no device of JAX_PLATFORMS={platforms}; unset it, or install jax for this "
+            "platform."
         ) from None
     return f"{len(devices)} × {devices[0].device_kind} ({devices[0].platform})"
 

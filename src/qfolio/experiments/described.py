@@ -5,7 +5,7 @@ from typing import Any
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.mdp import Agent, Task
-from qfolio.core.registry import build, name_of
+from qfolio.core.registry import Kind, build, name_of
 from qfolio.core.text import quote
 
 
@@ -24,26 +24,22 @@ def task_of(name: str, described: dict[str, Any], given: Task | None = None) -> 
 
     given: the task itself, if it cannot be restored. Raises QfolioError if it is another one.
     """
-    if given is None:
-        task: Task = build("task", name, described)
-        return task
-    require_type("task", given, Task, "a task, such as qfolio.Pendulum()")
-    _require_same("task", given, name, described)
-    return given
+    task: Task = _part("task", Task, "a task, such as qfolio.Pendulum()", name, described, given)
+    return task
 
 
 def agent_of(name: str, described: dict[str, Any], given: Agent | None = None) -> Agent:
     """The agent of a configuration; see ``task_of``."""
+    agent: Agent = _part("agent", Agent, "an agent, such as qfolio.DQN()", name, described, given)
+    return agent
+
+
+def _part(
+    kind: Kind, base: type, wanted: str, name: str, described: dict[str, Any], given: Any
+) -> Any:
     if given is None:
-        agent: Agent = build("agent", name, described)
-        return agent
-    require_type("agent", given, Agent, "an agent, such as qfolio.DQN()")
-    _require_same("agent", given, name, described)
-    return given
-
-
-def _require_same(kind: str, given: Any, name: str, described: dict[str, Any]) -> None:
-    """Raises QfolioError unless an agent or task is the one of a configuration."""
+        return build(kind, name, described)
+    require_type(kind, given, base, wanted)
     for key, found, stored in (
         (kind, name_of(given), name),
         (f"{kind}_settings", settings.describe(given), described),
@@ -53,3 +49,4 @@ def _require_same(kind: str, given: Any, name: str, described: dict[str, Any]) -
                 f"{key} is {quote(found)}, but what the folder holds was trained with "
                 f"{quote(stored)}; give that {kind}."
             )
+    return given

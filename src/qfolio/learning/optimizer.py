@@ -56,8 +56,8 @@ class Optimizer(eqx.Module):
         if kind == "adam":
             mu = jax.tree.map(partial(_mean, FIRST_DECAY), mu, gradient)
             nu = jax.tree.map(partial(_mean, SECOND_DECAY), nu, _squares(gradient))
-            # The correction of means that start at 0 is a factor of all weights (Adam, section 2):
-            # a division of each mean would cost more than all other passes over the weights.
+            # The correction of means that start at 0 is a factor of all weights (Adam, section 2);
+            # to divide each mean by it takes longer.
             root = jnp.sqrt(1 - SECOND_DECAY**count)
             factor = root / (1 - FIRST_DECAY**count)
             direction = jax.tree.map(

@@ -135,7 +135,7 @@ def require_sound(model: CostModel, trade: Context, relatives: Any, holding: Con
     require("trade", ((left > 0) & (left <= 1)).all(), "shares of wealth above 0 and at most 1")
     require("trade", (left[[0, 3]] == 1).all(), "exactly 1 where nothing is traded")
     gap = abs(sum(paid) - (1 - left)).max()
-    require("trade", gap < 1e-9, "costs that sum to 1 minus the share of wealth that remains")
+    require("trade", gap < 1e-6, "costs that sum to 1 minus the share of wealth that remains")
     for method in ("carry", "owe"):
         found = getattr(model, method)(relatives, holding)
         if method == "carry" or found is not None:

@@ -226,9 +226,13 @@ def test_what_keeps_its_weight_is_no_order_and_pays_no_fee(whole):
     assert len(list(order_rows(allocation, "generic", "USD")[1])) == 1
 
 
-def test_an_order_that_costs_more_than_it_moves_is_left_out():
-    policy = Fixed([0.002, 0.0, 0.998], 0)
+@pytest.mark.parametrize("shares", [[0.1, 24.95], [0.1, 24.9], [0.11, 24.9]])
+def test_an_order_that_costs_more_than_it_moves_is_left_out(shares):
+    """Weights times wealth are not always the money held, to the last digit."""
+    held = np.array(shares) * [20, 40]
+    sold = held[0] / held.sum()
+    policy = Fixed([sold, 0.0, 1 - sold], 0)
     policy.task = dataclasses.replace(TASK, cost=0.0, cost_model="itemized(fixed=5,capital=1000)")
-    allocation = Allocation.of(policy, PRICES, np.array([0.1, 998 / 40]), 0.0)
+    allocation = Allocation.of(policy, PRICES, np.array(shares), 0.0)
     assert not allocation.trades.any()
     assert (allocation.cost, allocation.cash_after) == (0, 0)

@@ -118,7 +118,7 @@ class Allocation:
             trades = np.divide(money, known, out=np.zeros_like(money), where=known > 0) - shares
             lot = lots(policy.mandate)
             whole = whole_shares or lot is not None
-            trades[kept & (whole | (reached == held)[1:])] = 0.0
+            trades[(kept & whole) | (reached == held)[1:]] = 0.0
             if whole:
                 ideal = wealth * reached[0]
                 trades = rounded(trades, shares, known, ideal, lambda trades: after(trades)[0], lot)
@@ -212,7 +212,7 @@ def _paid(
     kept: whether an asset's weight is to stay, of shape (N,).
     """
 
-    def cost(before: np.ndarray, after: np.ndarray, share: float) -> float:
+    def remains(before: np.ndarray, after: np.ndarray, share: float) -> float:
         of_it = context._replace(wealth=share * context.wealth)
         return float(model.trade(before / before.sum(), after / after.sum(), of_it)[0])
 
@@ -220,8 +220,8 @@ def _paid(
     before, after = (np.where(apart, 0.0, each) for each in (held, weights))
     rest = float(before.sum())
     if min(held[1:].min(), weights.min()) < 0:
-        return cost(held, weights, 1.0) * weights
-    if min(rest, after.sum()) <= NOISE or (remainder := cost(before, after, rest)) <= 0:
+        return remains(held, weights, 1.0) * weights
+    if min(rest, after.sum()) <= NOISE or (remainder := remains(before, after, rest)) <= 0:
         return held
     return np.where(apart, held, remainder * rest * after / after.sum())
 

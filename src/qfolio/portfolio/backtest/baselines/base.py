@@ -12,6 +12,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.registry import imported
 
 Calendar = Literal["fold", "month", "row"]
+"""When a baseline decides; see ``Baseline``."""
 
 
 class History(NamedTuple):
