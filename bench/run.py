@@ -285,7 +285,8 @@ def trained(population: Population) -> Contestant:
         steps = population.steps - before
         return steps * population.agent.num_envs * len(population.seeds)
 
-    advance()  # may observe only
+    while population.steps <= population.agent.warm_up():
+        advance()
     advance()
     return timed(advance)
 

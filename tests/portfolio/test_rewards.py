@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Position
 from qfolio.portfolio.market import Market
 from qfolio.portfolio.rewards import (
@@ -110,3 +111,30 @@ def test_a_reward_of_ones_own():
     paid = 1 - 1 / (1 + 0.1 / 0.9 * 0.75)  # buying w costs c/(1−c) of it, out of what is left
     fine = paid + 0.5 * (0.25**2 + 0.75**2)
     np.testing.assert_allclose(first.reward - second.reward, fine, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda state, paid: paid,
+         r"Own.__call__ returns float32\[\]; it must be a number, and the next state."),
+        (lambda state, paid: (paid * jnp.ones(2), state),
+         r"Own.__call__ returns .float32\[2\], float32\[\].; it must be a number, and the next st"),
+        (lambda state, paid: (paid, {"last": state}),
+         r"Own.__call__ returns {last: float32\[\]} as state; it must be float32\[\], like that of "
+         r"Own.init."),
+    ],
+    ids=["number", "vector", "state"],
+)  # fmt: skip
+def test_what_a_reward_of_ones_own_must_return(monkeypatch, answer, message):
+    class Own(Diversified):
+        def __call__(self, state, outcome):
+            return answer(state, outcome.cost)
+
+    monkeypatch.setitem(globals(), "Own", Own)
+
+    class Rewarded(Ar1):
+        reward: str = eqx.field(static=True, default=f"{__name__}:Own")
+
+    with pytest.raises(QfolioError, match=message):
+        Rewarded()

@@ -1,4 +1,4 @@
-"""What the methods of a task and an agent must return, checked on shapes before the first step."""
+"""What the methods of a task, an agent and a reward must return, checked on shapes before use."""
 
 from functools import wraps
 from numbers import Integral
@@ -41,6 +41,15 @@ def require_task(task: Task, key: PRNGKeyArray) -> Any:
     step = Transition(start, seen, action, NUMBER, start, seen, TRUTH, TRUTH)
     _require_metrics(task, "measure", _shapes(task, "measure", step))
     return step
+
+
+def require_reward(reward: Any, outcome: PyTree) -> None:
+    """Raises QfolioError unless ``reward(state, outcome)`` returns a number and the next state."""
+    start = _shapes(reward, "init")
+    found = _shapes(reward, "__call__", start, outcome)
+    if not (isinstance(found, tuple) and len(found) == 2 and _is_number(found[0])):
+        raise _refused(reward, "__call__", found, "a number, and the next state")
+    _require_like(reward, "__call__", found[1], start, " as state", "init")
 
 
 def require_agent(
@@ -106,14 +115,14 @@ def _repeated(tree: PyTree, count: int) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), tree)
 
 
-def _shapes(owner: Task | Agent, name: str, *args: Any, of: tuple[Task, ...] = ()) -> Any:
+def _shapes(owner: object, name: str, *args: Any, of: tuple[Task, ...] = ()) -> Any:
     """The shapes of what a method returns; of: its first arguments, if it takes a task."""
     method = getattr(owner, name)
     checked = wraps(method)(lambda *args: _arrays(owner, name, method(*of, *args)))
     return jax.eval_shape(checked, *args)
 
 
-def _arrays(owner: Task | Agent, name: str, found: Any) -> Any:
+def _arrays(owner: object, name: str, found: Any) -> Any:
     """What a method returns; raises QfolioError unless it consists of arrays and numbers."""
     for leaf in jax.tree.leaves(found):
         if not eqx.is_array_like(leaf):
@@ -144,7 +153,7 @@ def _require_observation(task: Task, seen: PyTree) -> None:
 
 
 def _require_like(
-    owner: Task | Agent, name: str, found: PyTree, wanted: PyTree, place: str = "", like: str = ""
+    owner: object, name: str, found: PyTree, wanted: PyTree, place: str = "", like: str = ""
 ) -> None:
     """Raises QfolioError unless a result has the structure, shapes and types that are wanted.
 
@@ -161,15 +170,13 @@ def _require_like(
             raise _refused(owner, name, leaf, _shown(want) + like, place)
 
 
-def _require_metrics(owner: Task | Agent, name: str, found: Any) -> None:
+def _require_metrics(owner: object, name: str, found: Any) -> None:
     """Raises QfolioError unless metrics are named scalars."""
     if not isinstance(found, dict) or any(getattr(x, "shape", 1) for x in found.values()):
         raise _refused(owner, name, found, "a dict of names and scalars", " as metrics")
 
 
-def _refused(
-    owner: Task | Agent, name: str, found: PyTree, wanted: str, place: str = ""
-) -> QfolioError:
+def _refused(owner: object, name: str, found: PyTree, wanted: str, place: str = "") -> QfolioError:
     return QfolioError(
         f"{type(owner).__name__}.{name} returns {_shown(found)}{place}; it must be {wanted}."
     )

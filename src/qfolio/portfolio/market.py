@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.core import settings, simplex
+from qfolio.core.contract import require_reward
 from qfolio.core.errors import QfolioError
 from qfolio.core.market import MenuActions, View
 from qfolio.core.mdp import (
@@ -28,7 +29,7 @@ from qfolio.core.mdp import (
     Simplex,
     Transition,
 )
-from qfolio.core.registry import Kind, build
+from qfolio.core.registry import Kind, build, own_modules
 from qfolio.portfolio.costs import Context, CostModel, grown, traded
 from qfolio.portfolio.execution import Plan
 from qfolio.portfolio.mandate.feasible import CappedSimplex, Feasible
@@ -234,6 +235,11 @@ class Market(ExogenousTask):
     @property
     def costs(self) -> CostModel:
         return _part(self, "cost", self.cost_model)
+
+    def __check_init__(self) -> None:
+        if own_modules(self.reward_function):
+            account = jnp.zeros(1 + self.limits.shape[0])
+            require_reward(self.reward_function, Outcome(jnp.ones(()), jnp.zeros(()), account))
 
     @property
     def reward_function(self) -> Reward:

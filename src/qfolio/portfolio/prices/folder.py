@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,14 +11,12 @@ from qfolio.core.text import quote
 from qfolio.portfolio.prices.reading import PARQUET_FILES, TEXT_FILES
 from qfolio.portfolio.prices.vocabulary import kind
 
-if TYPE_CHECKING:
-    from qfolio.portfolio.prices.table import Prices
 
+def join(folder: Path, load: Callable[[Path], Any]) -> Any:
+    """A long data frame of all tables in a folder.
 
-def join(folder: Path, load: Callable[[Path], "Prices"]) -> Any:
-    """A long data frame of all tables in a folder; load: function that reads one of them.
-
-    An asset that its file does not name takes the name of the file.
+    load: function that reads the Prices in one of them. An asset that its file does not name takes
+    the name of the file.
 
     Raises:
         QfolioError: A table has errors, or the folder has none.
