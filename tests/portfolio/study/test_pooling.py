@@ -15,6 +15,7 @@ from qfolio.portfolio.study.pooling import (
     z_of,
 )
 
+from backtests import weekdays
 from studies import made_up
 
 
@@ -55,6 +56,15 @@ def test_a_z_is_as_likely_as_its_t():
     assert z_of(estimate(ours, ours, 252)["growth"]) == 0
 
 
+def test_a_loss_beyond_doubt_has_a_z():
+    """An agent that pays costs at every minute; its t of −80 has no tail in double precision."""
+    market, noise = 2e-4 * np.random.default_rng(0).standard_normal((2, 1, 100_000))
+    difference = estimate(market + noise - 5e-5, market, 98_280)["growth"]
+    assert difference.value / difference.error < -75
+    assert -38 < z_of(difference) < -30
+    assert z_of(difference.negated()) == -z_of(difference)
+
+
 def test_the_information_ratio_by_hand():
     found = evidence(constant([0.002, -0.001]), "a").to_reference
     spread = math.sqrt(252) * 0.0015 * math.sqrt(40 / 39)
@@ -62,6 +72,7 @@ def test_the_information_ratio_by_hand():
     assert found.tracking_error == pytest.approx(spread)
     assert found.information_ratio == pytest.approx(252 * 0.0005 / spread)
     copied = evidence(constant([1e-9, -1e-10]), "a").to_reference
+    assert pool({"t": constant([1e-9, -1e-10])}, ["a"])["a"].to_reference.positive == 0
     assert (copied.information_ratio, copied.t, copied.z) == (0, 0, 0)
     assert evidence(constant([0.002]), "a").years == pytest.approx(40 / 252)
 
@@ -128,6 +139,61 @@ def test_correlations_come_from_common_days():
     assert correlations([same, days(100, 100)], [x, x])[0, 1] == 0
 
 
+def by_period(dates, x, unit):
+    """The last day of each week or month, and the sum of the numbers in it."""
+    shift = np.timedelta64(3 if unit == "W" else 0, "D")
+    _, places = np.unique((dates + shift).astype(f"M8[{unit}]"), return_inverse=True)
+    return dates[np.flatnonzero(np.append(np.diff(places) > 0, True))], np.bincount(places, x)
+
+
+def text(dates):
+    return tuple(map(str, dates))
+
+
+def test_rows_of_any_length_share_shocks():
+    x = np.random.default_rng(5).standard_normal(1200)
+    dates = weekdays("2001-01-01", 1200).astype("M8[D]")
+    weeks, weekly = by_period(dates, x, "W")
+    months, monthly = by_period(dates, x, "M")
+    first, calendar = months.astype("M8[M]"), months.astype("M8[M]") + 1
+    tables = [
+        (text(dates), x),
+        (text(weeks), weekly),
+        (text(weeks - 2), weekly),
+        (text(months), monthly),
+        (text(first.astype("M8[D]")), monthly),
+        (text(calendar.astype("M8[D]") - 1), monthly),
+        (tuple(f"{day}-{time}" for day in text(dates) for time in ("103000", "160000")),
+         np.repeat(x / 2, 2)),
+    ]  # fmt: skip
+    found = correlations(*zip(*tables, strict=True))
+    # A week may belong to two months.
+    assert found == pytest.approx(np.ones((7, 7)), abs=0.15)
+    assert np.delete(np.delete(found, [1, 2], 0), [1, 2], 1) == pytest.approx(1)
+    assert found[:3, :3] == pytest.approx(1)
+    other = np.random.default_rng(6).standard_normal(len(monthly))
+    assert correlations([text(dates), text(months)], [x, other])[0, 1] < 0.3
+
+
+def test_one_market_with_two_frequencies_counts_once():
+    """Were its rows independent, its z would be √2 times as large."""
+    rng = np.random.default_rng(7)
+    dates = weekdays("2001-01-01", 1500).astype("M8[D]")
+
+    def table(days, active, year):
+        flat = np.zeros(len(days))
+        ours = {"a": np.expm1(active)}
+        return TableReturns(text(days), year, ours, {"ew": flat}, {"ew": flat})
+
+    active = 3e-4 + 0.002 * rng.standard_normal(1500)
+    weeks, sums = by_period(dates, active, "W")
+    daily, weekly = table(dates, active, 252), table(weeks, sums, 52)
+    z = [number(pool({"t": each}, ["a"])["a"].to_reference.z) for each in (daily, weekly)]
+    both = pool({"daily": daily, "weekly": weekly}, ["a"])["a"].to_reference.z
+    assert min(z) > 1
+    assert number(both) == pytest.approx(np.mean(z), rel=0.01)
+
+
 def test_the_bootstrap_draws_tables():
     tables = [np.zeros((1, 30)), np.ones((1, 50))]
     drawn = hierarchical_bootstrap(tables, 4000, np.random.default_rng(0))[:, 0]
@@ -174,6 +240,8 @@ def test_tables_are_pooled():
 def test_a_total_loss_is_the_worst_and_has_no_numbers():
     lost = constant([0.001])
     lost.agents["a"][7] = -1.0
+    found = evidence(lost, "a").to_reference
+    assert (found.growth, found.information_ratio, found.t, found.z) == (None, None, None, None)
     pooled = pool({"good": constant([0.002, 0.0]), "lost": lost}, ["a"])["a"].to_reference
     assert pooled.worst == "lost"
     assert (pooled.growth, pooled.low, pooled.z, pooled.p) == (None, None, None, None)

@@ -10,10 +10,10 @@ from qfolio.experiments.executor import Here
 from qfolio.portfolio.backtest.folds import require_fold
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.study.folder import Variant
-from qfolio.portfolio.study.run import Study, corrected
+from qfolio.portfolio.study.run import Study, corrected, summarize
 
 from listeners import Interrupt
-from studies import study
+from studies import made_up, study
 from tiny import PATHWISE
 
 AGENTS = {"pathwise": PATHWISE}
@@ -182,6 +182,48 @@ def test_the_correction_counts_all_agents_and_references():
     once = corrected({"tilts": worse}, False)["tilts"]
     assert once.to_reference.p_holm == pytest.approx(1e-9)
     assert once.to_rebalanced == once.to_reference
+
+
+def test_luck_of_many_looks_is_not_better():
+    _, result = study(3)
+    pools = result.variants[0].agents["tilts"]
+    z = msgspec.structs.replace(pools.to_reference, z=2.5, p=0.0124)
+    pools = msgspec.structs.replace(pools, to_reference=z, to_rebalanced=z)
+
+    def finding(threshold, z):
+        one = msgspec.structs.replace(pools.to_reference, z=z)
+        decided = corrected(
+            {"tilts": msgspec.structs.replace(pools, to_reference=one)}, False, threshold
+        )
+        return decided["tilts"].to_reference.finding
+
+    assert finding(2.4, 2.5) == "better"
+    assert finding(2.8, 2.5) == "none"
+    assert finding(2.8, -2.5) == "worse"
+
+
+def test_a_verdict_counts_earlier_looks():
+    """The same returns, which 213 earlier looks at a table make those of luck."""
+    config, _ = study(2)
+    rng = np.random.default_rng(0)
+    tested = {
+        name: made_up(rng, 2520, 1e-4, f"{1960 + 20 * i}-01-04")
+        for i, name in enumerate(config.tables)
+    }
+
+    def said(trials):
+        tables = {
+            name: msgspec.structs.replace(table, trials=trials)
+            for name, table in config.tables.items()
+        }
+        changed = msgspec.structs.replace(config, tables=tables, agents=["tilts"])
+        return summarize(changed, [tested]).verdicts["tilts"][0]
+
+    assert said(0).startswith("tilts beats equal-weight, however it is rebalanced,")
+    assert said(213).startswith("No evidence that tilts beats the best rebalancing of equal-weight")
+    assert said(213).endswith(
+        "corrected p = 0.012, but luck is expected to reach a z of +2.79 after all looks."
+    )
 
 
 def test_short_tables_are_left_out_with_a_reason(tmp_path):

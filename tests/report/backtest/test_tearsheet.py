@@ -36,6 +36,16 @@ def test_figures_are_means_over_seeds() -> None:
     assert len(rows) == 34  # without net exposure, as nothing is sold short
 
 
+def test_interest_on_cash_is_no_alpha() -> None:
+    data, rate = usual(300), np.full(300, 0.05 / 252)
+    market = data.strategies["equal weight"]
+    half = replace(market, returns=(market.returns + rate) / 2)
+    data = replace(data, strategies={**data.strategies, "third": half}, risk_free=rate)
+    sheet = tear_sheet(["third"], data)
+    rows = {name: cells for _, group in sheet["groups"] for name, cells in group}
+    assert rows["Alpha a year, beside equal weight"] == ["0.00%"]
+
+
 def test_net_exposure_of_short_positions() -> None:
     data = usual(300)
     series = data.strategies["DQN"]

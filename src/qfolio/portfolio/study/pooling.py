@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from qfolio.core.arrays import Floats
 from qfolio.core.text import finite
@@ -26,9 +26,13 @@ from qfolio.portfolio.backtest.statistics.measures import (
     paired_difference,
     ratio_or_zero,
 )
+from qfolio.portfolio.prices.frequency import spacing
 
 RESAMPLES = 2000
 """Number of histories that the hierarchical bootstrap draws."""
+
+SPANS = ((1.5, "D"), (11.0, "W"), (46.0, "M"), (137.0, "3M"), (math.inf, "Y"))
+"""Spans of the calendar, and the most days between the rows of a table that they suit."""
 
 _CHUNK = 2_000_000  # resampled days held at a time
 
@@ -91,8 +95,8 @@ class Pooled(msgspec.Struct, frozen=True, kw_only=True):
     high: float | None
     z: float | None  # Stouffer's
     p: float | None  # two-sided; against rebalancings only the claim "better" is tested
-    p_holm: float | None = None  # corrected for all comparisons of the main variant; sets finding
-    finding: Finding | None = None  # none for other variants
+    p_holm: float | None = None  # corrected for all comparisons of the main variant
+    finding: Finding | None = None  # by p_holm and what luck reaches; none for other variants
     positive: int  # tables on which the agent grew more
     worst: str  # the table with the least active growth
 
@@ -214,7 +218,7 @@ def _pooled_sharpe(
     return PooledSharpe(
         difference=finite(float(np.mean(found))),
         z=finite(z),
-        positive=sum(value > 0 for value in found),
+        positive=int((clear(found) > 0).sum()),
     )
 
 
@@ -232,7 +236,7 @@ def _pooled(
         high=finite(float(high)),
         z=finite(z),
         p=finite(p_value(z, both=both)),
-        positive=sum(value > 0 for value in growth.values()),
+        positive=int((clear(list(growth.values())) > 0).sum()),
         # A growth that is not finite is that of a total loss.
         worst=min(growth, key=lambda name: (math.isfinite(growth[name]), growth[name])),
     )
@@ -247,7 +251,8 @@ def z_of(difference: Estimate) -> float:
 
     if not difference.known:
         return math.nan
-    tail = float(stdtr(difference.freedom, -abs(_t(difference))))
+    # The smallest number, where the tail is none: an infinite z would leave nothing to pool.
+    tail = max(float(stdtr(difference.freedom, -abs(_t(difference)))), np.finfo(float).tiny)
     return math.copysign(float(ndtri(tail)), difference.value)
 
 
@@ -269,25 +274,42 @@ def stouffer(z: ArrayLike, weights: ArrayLike, correlation: ArrayLike | None = N
 
 
 def correlations(days: Sequence[Sequence[str]], active: Sequence[Floats]) -> Floats:
-    """Estimate the correlations of the tables' mean active returns from their common days.
+    """Estimate the correlations of the tables' mean active returns from their common time.
 
     The correlation of two means is ρ · n / √(n₁n₂), where ρ is that of the n common days. Negative
     ones count as 0, so that the pooled z is never larger than that of independent tables.
 
+    Rows of different length have no common days to speak of, and two monthly tables may give a
+    month its first or its last day. So the days are those of the calendar for daily and intraday
+    rows only; otherwise they are its weeks, months, quarters or years, whichever are as long as the
+    rows of both tables, with the sums of the differences.
+
     Args:
-        days: Days of each table.
-        active: Daily differences of each table, of shape (days,).
+        days: Days of each table, with a time of day if there are several rows a day.
+        active: Differences of each table, of shape (days,).
     """
+    dates = [np.array([day[:10] for day in each], "datetime64[D]") for each in days]
+    lengths = [spacing(each.astype("datetime64[s]"))[1] if len(each) > 1 else 1 for each in dates]
     shared = np.eye(len(days))
     for i in range(len(days)):
         for j in range(i):
-            _, here, there = np.intersect1d(days[i], days[j], return_indices=True)
-            first, second = active[i][here], active[j][there]
+            longest = max(lengths[i], lengths[j])
+            unit = next(unit for most, unit in SPANS if longest <= most)
+            (own, x), (other, y) = (_sums(dates[k], active[k], unit) for k in (i, j))
+            _, here, there = np.intersect1d(own, other, return_indices=True)
+            first, second = x[here], y[there]
             if len(here) > 2 and first.std() > 0 and second.std() > 0:
                 rho = float(np.corrcoef(first, second)[0, 1])
-                part = len(here) / math.sqrt(len(days[i]) * len(days[j]))
+                part = len(here) / math.sqrt(len(own) * len(other))
                 shared[i, j] = shared[j, i] = max(0.0, rho * part)
     return shared
+
+
+def _sums(dates: NDArray, values: Floats, unit: str) -> tuple[NDArray, Floats]:
+    """The days, weeks, months, … of some dates, and the sum of the values in each."""
+    monday = np.timedelta64(3 if unit == "W" else 0, "D")  # numpy's weeks begin on Thursdays
+    spans, places = np.unique((dates + monday).astype(f"datetime64[{unit}]"), return_inverse=True)
+    return spans, np.asarray(np.bincount(places, values), float)
 
 
 def hierarchical_bootstrap(
@@ -381,7 +403,7 @@ def _standardized(returns: Floats) -> Floats:
 
 def _t(difference: Estimate) -> float:
     if not difference.known:
-        return 0.0
+        return math.nan
     return float(ratio_or_zero(clear(difference.value), difference.error))
 
 

@@ -332,9 +332,10 @@ def summarize(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]])
     """
     pooled = [pool(tables, config.agents) for tables in tested]
     rebalanced = any(len(table.rebalancings) > 1 for table in tested[0].values())
-    pooled[0] = corrected(pooled[0], rebalanced)
     before = [table.trials + trials_on(table.source) for table in config.tables.values()]
     trials = max(before) + len(config.variants) * len(config.agents)
+    threshold = expected_maximum_sharpe(trials, 1.0)
+    pooled[0] = corrected(pooled[0], rebalanced, threshold)
     return Result(
         variants=[
             VariantResult(variant=variant, agents=agents)
@@ -343,8 +344,8 @@ def summarize(config: StudyConfig, tested: Sequence[Mapping[str, TableReturns]])
         looks=sum(len(look.agents) for look in config.looks),
         earlier=sum(before),
         trials=trials,
-        threshold=expected_maximum_sharpe(trials, 1.0),
-        verdicts=verdicts(pooled[0]),
+        threshold=threshold,
+        verdicts=verdicts(pooled[0], threshold),
     )
 
 
@@ -354,15 +355,18 @@ def looks_of(folder: Path | str) -> list[Look]:
     return [*config.earlier, *config.looks]
 
 
-def corrected(agents: Mapping[str, Pools], rebalanced: bool) -> dict[str, Pools]:
+def corrected(
+    agents: Mapping[str, Pools], rebalanced: bool, threshold: float = 0.0
+) -> dict[str, Pools]:
     """The pooled evidence with findings, by Holm's correction over all agents and references.
 
     rebalanced: whether the reference has rebalancings; if not, there is one comparison per agent.
+    threshold: the z that luck is expected to reach after all looks; nothing below it is better.
     """
     against = AGAINST if rebalanced else AGAINST[:1]
     pooled: list[Pooled] = [getattr(agents[name], key) for name in agents for key in against]
     p_holm = holm([1.0 if each.p is None else each.p for each in pooled]).tolist()
-    found = iter([_found(each, p) for each, p in zip(pooled, p_holm, strict=True)])
+    found = iter([_found(each, p, threshold) for each, p in zip(pooled, p_holm, strict=True)])
     decided = {}
     for name, pools in agents.items():
         first = next(found)
@@ -371,9 +375,9 @@ def corrected(agents: Mapping[str, Pools], rebalanced: bool) -> dict[str, Pools]
     return decided
 
 
-def _found(pooled: Pooled, p: float) -> Pooled:
+def _found(pooled: Pooled, p: float, threshold: float) -> Pooled:
     finding: Finding = "none"
-    if p <= 1 - LEVEL and pooled.z is not None:
+    if p <= 1 - LEVEL and pooled.z is not None and not 0 < pooled.z < threshold:
         finding = "better" if pooled.z > 0 else "worse"
     return msgspec.structs.replace(pooled, p_holm=p, finding=finding)
 

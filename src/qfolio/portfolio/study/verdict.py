@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT
+from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
 from qfolio.portfolio.backtest.statistics.verdict import p_text
 from qfolio.portfolio.study.folder import Result
 from qfolio.portfolio.study.pooling import Pooled, Pools
@@ -11,25 +12,29 @@ from qfolio.portfolio.study.pooling import Pooled, Pools
 _VERBS = {"better": "{} beats", "worse": "{} falls short of", "none": "No evidence that {} beats"}
 
 
-def verdicts(agents: Mapping[str, Pools]) -> dict[str, list[str]]:
-    """Sentences on each agent: growth, the same against another speed, by table, Sharpe ratio."""
+def verdicts(agents: Mapping[str, Pools], threshold: float = 0.0) -> dict[str, list[str]]:
+    """Sentences on each agent: growth, the same against another speed, by table, Sharpe ratio.
+
+    threshold: the z that luck is expected to reach after all looks.
+    """
     return {
-        name: [*_findings(name, pools), _tables(pools), _sharpe(pools)]
+        name: [*_findings(name, pools, threshold), _tables(pools), _sharpe(pools)]
         for name, pools in agents.items()
     }
 
 
-def _findings(name: str, pools: Pools) -> list[str]:
+def _findings(name: str, pools: Pools, threshold: float) -> list[str]:
     """The claim about an agent with its numbers; equal weights have a second sentence.
 
     Equal weights that are rebalanced at every row pay for trades that earn nothing. To beat them
     alone is therefore no claim: an agent that merely trades less does so on random walks.
     """
     reference, alone, best = _reference(pools), pools.to_reference, pools.to_rebalanced
+    of_alone, of_best = _numbers(alone, threshold), _numbers(best, threshold)
     where = f"in growth after costs over {amount(len(pools.evidence), 'table')}"
     found = f"{_VERBS[alone.finding or 'none'].format(name)} {reference} {where}"
     if reference != EQUAL_WEIGHT:
-        return [f"{found}: {_numbers(alone)}."]
+        return [f"{found}: {of_alone}."]
     at_best = f"the best rebalancing of {reference}"
     if best.finding == "better":
         found = f"{name} beats {reference}, however it is rebalanced, {where}"
@@ -38,17 +43,19 @@ def _findings(name: str, pools: Pools) -> list[str]:
         found = f"No evidence that {name} beats {at_best} {where}"
         also = f"It beats {reference} itself, as trading less may do without any skill"
     else:
-        return [f"{found}: {_numbers(alone)}.", f"Against {at_best}: {_numbers(best)}."]
-    return [f"{found}: {_numbers(best)}.", f"{also}: {_numbers(alone)}."]
+        return [f"{found}: {of_alone}.", f"Against {at_best}: {of_best}."]
+    return [f"{found}: {of_best}.", f"{also}: {of_alone}."]
 
 
 def _reference(pools: Pools) -> str:
     return next(iter(pools.evidence.values())).to_reference.reference
 
 
-def _numbers(pooled: Pooled) -> str:
+def _numbers(pooled: Pooled, threshold: float) -> str:
     interval = f"95% interval {percent(pooled.low)} to {percent(pooled.high)}"
     chance = "" if pooled.p_holm is None else f", corrected p {p_text(pooled.p_holm)}"
+    if pooled.finding == "none" and pooled.p_holm is not None and pooled.p_holm <= 1 - LEVEL:
+        chance += f", but luck is expected to reach a z of {decimal(threshold)} after all looks"
     return (
         f"the mean difference in annual growth is {percent(pooled.growth)} ({interval}); "
         f"Stouffer’s z is {decimal(pooled.z)}{chance}"
@@ -85,7 +92,7 @@ def looks_sentence(result: Result) -> str:
     if result.trials > 1:
         sentence += (
             f" The best of {result.trials:,} configurations without skill is expected to reach a "
-            f"pooled z of {decimal(result.threshold)}."
+            f"pooled z of {decimal(result.threshold)}; a lower z is no evidence."
         )
     return sentence
 

@@ -61,9 +61,10 @@ def tear_sheet(names: list[str], data: BacktestData) -> dict[str, Any]:
 def _means(name: str, data: BacktestData, year: float) -> dict[str, float]:
     """Figures of a strategy; ratios over what cash earns are those of its assessment."""
     series, test = data.strategies[name], data.assessment
-    reference = data.strategies[test.reference].returns.mean(axis=0)
+    cash = 0.0 if data.risk_free is None else data.risk_free
+    reference = data.strategies[test.reference].returns.mean(axis=0) - cash
     each = [
-        {**figures(row, data.dates, year), "alpha": alpha(row, reference, year)}
+        {**figures(row, data.dates, year), "alpha": alpha(row - cash, reference, year)}
         for row in series.returns
     ]
     gross, net = leverage(series.weights)

@@ -51,6 +51,19 @@ def test_components_are_of_training_rows():
     np.testing.assert_allclose(got, np.sign(got @ expected) * expected, atol=1e-12)
 
 
+def test_interest_on_cash_is_no_alpha(prices, stretches):
+    """An agent that holds half of its wealth in cash, which earns 5% a year."""
+    folds, rate = [fold for *_, fold in stretches], np.full(600, 0.05 / 252)
+    market = factor_returns(prices.values, folds, 1, 252)["market"]
+    found = factor_returns(prices.values, folds, 1, 252, cash=rate)
+    np.testing.assert_allclose(found["market"], market - rate)
+    noise = np.random.default_rng(0).normal(0, 1e-5, 600)
+    left = exposures((market + rate) / 2 + noise - market, {"market": found["market"]}, 252)
+    assert left is not None
+    assert left.factors[0].beta == pytest.approx(-0.5, abs=1e-3)
+    assert left.alpha == pytest.approx(0, abs=1e-3)  # and not 2.5%
+
+
 @pytest.mark.parametrize(("per_year", "names"), [
     (12, ["market", "momentum 12−1", "reversal 1", "low volatility"]),
     (1, ["market"]),

@@ -43,6 +43,8 @@ def test_limits() -> None:
     rounded = relative(OTHER + np.array([1e-9, 1e-10, 0, 1e-10]), OTHER, 252)
     assert rounded["tracking_error"] > 0
     assert rounded["information_ratio"] == 0
+    dearer = relative(OTHER - 1e-4, OTHER, 252)  # by the same fee in each period
+    assert (dearer["tracking_error"], dearer["information_ratio"]) == (0, -math.inf)
     assert itself["beta"] == itself["up_capture"] == itself["down_capture"] == pytest.approx(1)
     rising = relative(RETURNS, [0.01, 0.011, 0.01, 0.01], 252)
     assert np.isnan(rising["down_capture"])

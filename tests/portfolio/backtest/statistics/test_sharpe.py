@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from qfolio.portfolio.backtest.statistics.sharpe import (
+    SharpeTest,
     deflated_sharpe,
     expected_maximum_sharpe,
     minimum_track_record,
     probabilistic_sharpe,
+    sharpe_tests,
 )
 
 
@@ -64,3 +66,27 @@ def test_deflated_sharpe_of_the_paper() -> None:
     assert deflated_sharpe(sharpe, 1250, -3, 10, 100, variance) == pytest.approx(0.9004, abs=5e-5)
     assert deflated_sharpe(sharpe, 1250, -3, 10, 46, variance) == pytest.approx(0.9505, abs=5e-5)
     assert deflated_sharpe(sharpe, 1250, 0, 3, 88, variance) == pytest.approx(0.9505, abs=5e-5)
+
+
+def test_a_bad_trial_is_no_sign_of_luck() -> None:
+    rng = np.random.default_rng(1)
+    noise = rng.standard_normal((3, 1000))
+    noise = (noise - noise.mean(1, keepdims=True)) / noise.std(1, keepdims=True)
+
+    def tests(**means: list[float]) -> dict[str, SharpeTest]:
+        returns = {
+            name: np.array(mean)[:, None] + noise[: len(mean)] for name, mean in means.items()
+        }
+        year = math.sqrt(252)
+        ratios = {name: year * each.mean(1) / each.std(1) for name, each in returns.items()}
+        return sharpe_tests(returns, ratios, list(means), 10, 252)
+
+    alone = tests(good=[0.1, 0.1, 0.1])["good"]
+    luck = math.sqrt(252) * expected_maximum_sharpe(10, 1 / 999)
+    assert alone.threshold == pytest.approx(luck)
+    beside = tests(good=[0.1, 0.1, 0.1], bad=[-2.0, -2.0, -2.0], fund=[-3.0])["good"]
+    assert beside.threshold == pytest.approx(luck)
+    spread = tests(good=[0.1, 0.1, 0.1], wild=[-0.1, 0.0, 0.1])["good"]
+    # Variances by hand: 0 and 0.01 with two degrees of freedom each, a period.
+    wide = math.sqrt(252) * expected_maximum_sharpe(10, 0.005)
+    assert spread.threshold == pytest.approx(wide)

@@ -171,18 +171,36 @@ UNKNOWN = Contrast(-math.inf, (-math.inf, math.inf), 1.0, 1.0, "none")
 def test_a_total_loss_is_said_without_numbers(assessment: Assessment) -> None:
     entry, lost = assessment.strategies["dqn"], about(growth=UNKNOWN)
 
-    def said_of(*growth: float) -> list[str]:
-        measure = dataclasses.replace(entry.measures["growth"], per_seed=growth)
+    def said_of(*deepest: float) -> list[str]:
+        measure = dataclasses.replace(entry.measures["drawdown"], per_seed=deepest)
         strategies = {
             **assessment.strategies,
-            "dqn": dataclasses.replace(entry, measures={**entry.measures, "growth": measure}),
+            "dqn": dataclasses.replace(entry, measures={**entry.measures, "drawdown": measure}),
         }
         return said(dataclasses.replace(assessment, strategies=strategies), lost, lost)
 
-    assert said_of(-1.0) == ["dqn was wiped out: it lost everything."]
-    assert said_of(0.1, -1.0, -1.0) == ["dqn was wiped out with 2 of 3 seeds: it lost everything."]
+    assert said_of(1.0) == ["dqn was wiped out: it lost everything."]
+    assert said_of(0.1, 1.0, 1.0) == ["dqn was wiped out with 2 of 3 seeds: it lost everything."]
     other = about("equal weight", growth=dataclasses.replace(UNKNOWN, value=math.inf))
     assert said(assessment, None, other) == ["equal weight was wiped out, and dqn was not."]
+
+
+def test_what_a_year_would_take_is_not_lost() -> None:
+    """An agent that trades too much on minutes, and loses half of its money in three days."""
+    market = 2e-4 * np.random.default_rng(0).standard_normal((1, 1200))
+    zeros = np.zeros_like(market)
+    minutes = np.datetime64("2024-01-02T09:31") + np.arange(1200, dtype="m8[m]")
+    found = assess(
+        {
+            "equal weight": ("baseline", market, zeros, zeros),
+            "dqn": ("agent", market - 5e-4, zeros, zeros),
+        },
+        minutes,
+        periods_per_year=252 * 390,
+    )
+    assert found.strategies["dqn"].measures["growth"].mean == -1  # to the last digit
+    (sentence,) = verdicts(found)["dqn"]
+    assert sentence.startswith("dqn falls short of equal weight in growth and Sharpe ratio after")
 
 
 def test_nothing_is_times_as_volatile_as_cash(assessment: Assessment) -> None:

@@ -1,8 +1,9 @@
 """Factors made from the price table itself, and a strategy's exposures to them.
 
 Except for the market, each factor is long one unit of assets and short one unit, with weights that
-are known at the close before the return; no factor pays costs. Momentum, reversal and low
-volatility weight assets by the rank of a signal. The components are the largest principal
+are known at the close before the return; no factor pays costs. The market is held with borrowed
+cash: otherwise the interest of an agent that holds cash would be its alpha. Momentum, reversal and
+low volatility weight assets by the rank of a signal. The components are the largest principal
 components of returns minus the market's, fitted on the rows that the fold's agents were trained on
 (Connor & Korajczyk 1988).
 """
@@ -79,6 +80,7 @@ def factor_returns(
     lag: int,
     periods_per_year: float,
     tradable: Bools | None = None,
+    cash: Floats | float = 0.0,
 ) -> dict[str, Floats]:
     """The returns of every factor on the days of a test.
 
@@ -89,6 +91,7 @@ def factor_returns(
         periods_per_year: Sets the number of rows in a year, a month and a week.
         tradable: Whether a factor may hold an asset from a row to the next, of the same shape as
             the prices (default: from its first price on).
+        cash: What cash earns on the days of the test, shape (D,) (default: nothing).
 
     Returns:
         Series of shape (D,), by the name of the factor.
@@ -101,7 +104,7 @@ def factor_returns(
     shift = lag + 1
     days = slice(folds[0].decisions.start + shift, folds[-1].decisions.stop + shift)
     market = moves.sum(1) / np.maximum(held.sum(1), 1)
-    found = {"market": market[days]}
+    found = {"market": market[days] - cash}
     for name, signal in _signals(periods_per_year).items():
         ranks = signals.compute([signal], values, tradable=there)[..., 0]
         weights = _long_short(-ranks if name == "low volatility" else ranks)

@@ -17,6 +17,10 @@ RELATIVE = (
 
 _WORST = -1 + 1e-12  # a total loss, whose logarithm would not be finite
 
+_STILL = 1e-24
+"""Variance of a period's active return up to which it is constant: what is left is rounding, and a
+ratio to it would be a number of seventeen digits."""
+
 
 def relative(
     returns: ArrayLike,
@@ -109,7 +113,8 @@ def _from_moments(
 ) -> dict[str, Floats]:
     mean, spread, square, mine, theirs, product, variance, *captured, held = moments
     bessel = periods / (periods - 1) if periods > 1 else math.nan
-    error = np.sqrt(periods_per_year * bessel * np.maximum(square - spread**2, 0))
+    moves = square - spread**2
+    error = np.sqrt(periods_per_year * bessel * np.where(moves > _STILL, moves, 0))
     active = periods_per_year * (mean + spread)
     with np.errstate(divide="ignore", invalid="ignore"):
         up, down = (

@@ -49,8 +49,7 @@ def sharpe_tests(
     """
     year = math.sqrt(periods_per_year)
     periods = next(iter(returns.values())).shape[1]
-    found = [float(ratio) for name in judged for ratio in ratios[name]]
-    variance = _trial_variance(found, periods, periods_per_year)
+    variance = _trial_variance([ratios[name] for name in judged], periods, periods_per_year)
 
     def test(name: str) -> SharpeTest:
         annual, moments = mean_over_seeds(ratios[name]), skewness_and_kurtosis(returns[name])
@@ -144,17 +143,20 @@ def deflated_sharpe(
     return probabilistic_sharpe(sharpe, periods, skewness, kurtosis, benchmark)
 
 
-def _trial_variance(annual: list[float], periods: int, periods_per_year: float) -> float:
-    """The variance of the trials' Sharpe ratios per period.
+def _trial_variance(annual: Sequence[Floats], periods: int, periods_per_year: float) -> float:
+    """The variance of the trials' Sharpe ratios per period; annual: those of each agent's seeds.
 
     At least that of an estimate from normal returns without skill: seeds of one agent are similar,
-    and their spread understates what other trials could have found by luck.
+    and their spread understates what other trials could have found by luck. Differences between
+    agents do not count: one that does badly for a reason is no sign that another was lucky.
     """
-    known = np.sort(annual)  # so that the order of the seeds cannot move the last digit
+    known = [np.sort(each) for each in annual if np.isfinite(each).all()]  # in a canonical order
+    freedom = sum(len(each) - 1 for each in known)
     luck = 1 / (periods - 1)
-    if len(known) < 2 or not np.isfinite(known).all():
+    if not freedom:
         return luck
-    return max(luck, float(np.var(known, ddof=1) / periods_per_year))
+    spread = sum(float(((each - each.mean()) ** 2).sum()) for each in known)
+    return max(luck, spread / freedom / periods_per_year)
 
 
 def _sharpe_variance(sharpe: float, skewness: float, kurtosis: float) -> float:

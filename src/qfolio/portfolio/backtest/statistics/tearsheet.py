@@ -126,7 +126,8 @@ def leverage(weights: ArrayLike) -> tuple[float, float]:
 def alpha(returns: ArrayLike, reference: ArrayLike, periods_per_year: float) -> float:
     """Return the annual mean return that the regression on a reference leaves.
 
-    NaN if the returns fluctuate ``STEADY`` times as much as the reference.
+    NaN if the returns fluctuate ``STEADY`` times as much as the reference. Where cash earns
+    interest, both are to be in excess of it: otherwise holding cash has an alpha.
 
     Args:
         returns: Simple returns of shape (periods,).

@@ -72,17 +72,21 @@ def claims(name: str, assessment: Assessment) -> list[tuple[str, Difference]]:
 
 
 def wiped_out(strategy: StrategyAssessment) -> bool:
-    """Whether a strategy lost everything, with any of its seeds."""
-    return -1 in strategy.measures["growth"].per_seed
+    """Whether a strategy lost everything, with any of its seeds.
+
+    The drawdown tells; annual growth is also −1, to the last digit, where a short test of intraday
+    rows would lose all but 1e-16 in a year.
+    """
+    return 1 in strategy.measures["drawdown"].per_seed
 
 
 def _ruin(name: str, strategy: StrategyAssessment, difference: Difference) -> str:
     """That a strategy, or the one it is compared with, lost everything."""
     if not wiped_out(strategy):
         return f"{difference.reference} was wiped out, and {name} was not"
-    growth = strategy.measures["growth"].per_seed
-    lost = growth.count(-1)
-    seeds = "" if lost == len(growth) else f" with {lost} of {len(growth)} seeds"
+    deepest = strategy.measures["drawdown"].per_seed
+    lost = deepest.count(1)
+    seeds = "" if lost == len(deepest) else f" with {lost} of {len(deepest)} seeds"
     return f"{name} was wiped out{seeds}: it lost everything"
 
 
