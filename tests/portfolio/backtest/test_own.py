@@ -160,6 +160,18 @@ def test_later_rows_change_nothing_earlier():
     np.testing.assert_array_equal(elsewhere, before)
 
 
+@pytest.mark.parametrize("quantity", ["weight", "shares"])
+def test_orders_after_the_last_price_wait_for_it(quantity):
+    """A month's order may be dated on the Sunday after the table's last Friday."""
+    dates, asset = [days()[100], "2020-06-09", "2020-06-14"], ["A", "A", "B"]
+    source = pd.DataFrame({"date": dates, "asset": asset, quantity: [0.5, 0.5, 0.5]})
+    if quantity == "shares":
+        cash = pd.DataFrame({"date": dates[:1], "asset": ["cash"], "shares": [100.0]})
+        source = pd.concat([cash, source])
+    decisions, _ = placed(source)
+    assert np.flatnonzero(~np.isnan(decisions[:, 0])).tolist() == [100 - FIRST]
+
+
 def test_a_holding_from_before_the_test_has_earned_interest():
     prices, cost = table(), "itemized(cash_rate=0.2)"
     task = Portfolio.of(prices, window=5, horizon=20, cost_model=cost)

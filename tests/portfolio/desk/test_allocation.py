@@ -7,7 +7,9 @@ import pytest
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.desk.allocation import Allocation, require_fresh
+from qfolio.portfolio.desk.ledger import Ledger, holdings_digest
 from qfolio.portfolio.desk.orders_csv import order_rows
+from qfolio.portfolio.mandate.limits import mandate_text
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.task import Portfolio
@@ -131,20 +133,43 @@ def test_noise_of_float32_is_no_loan():
 def test_orders_through_zero_are_two_where_brokers_tell_short_sales():
     allocation = plan([0.9, -0.2, 0.3], [5, -1], 1000, cost=0.0)  # wealth of 1060
     np.testing.assert_allclose(allocation.trades, [-10.6 - 5, 7.95 + 1])
-    rows = order_rows(allocation, "alpaca", "USD")[1]
-    assert [row[:3] for row in rows] == [
-        ["A", 5, "sell"], ["A", 10.6, "sell"], ["B", 1, "buy"], ["B", 7.95, "buy"],
-    ]  # fmt: skip
-    with pytest.raises(QfolioError, match="An order at Schwab takes whole shares only"):
-        order_rows(allocation, "schwab", "USD")
+    for layout, said in (("alpaca", "sells whole shares short"), ("schwab", "takes whole shares")):
+        with pytest.raises(QfolioError, match=f"{said} only; add --whole-shares"):
+            order_rows(allocation, layout, "USD")
     whole = plan([0.9, -0.2, 0.3], [5, -1], 1000, cost=0.0, whole_shares=True)
-    assert [str(row[1]) for row in order_rows(whole, "alpaca", "USD")[1]] == ["5", "10", "1", "8"]
+    rows = order_rows(whole, "alpaca", "USD")[1]
+    assert [row[:3] for row in rows] == [
+        ["A", 5, "sell"], ["A", 10, "sell"], ["B", 1, "buy"], ["B", 8, "buy"],
+    ]  # fmt: skip
+    assert [str(row[1]) for row in rows] == ["5", "10", "1", "8"]
+    long = plan([0.5, 0.3, 0.2], [20, 10], 0, cost=0.0)  # fractions of what is owned may be sold
+    assert [row[:3] for row in order_rows(long, "alpaca", "USD")[1]] == [
+        ["A", 8, "sell"], ["B", 6, "sell"],
+    ]  # fmt: skip
     header, rows = order_rows(whole, "schwab", "USD")
     assert header[2:4] == ["instruction", "quantity"]
     assert [row[:4] for row in rows] == [
         ["A", "EQUITY", "SELL", 5], ["A", "EQUITY", "SELL_SHORT", 10],
         ["B", "EQUITY", "BUY_TO_COVER", 1], ["B", "EQUITY", "BUY", 8],
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("layout", "place", "symbols"),
+    [
+        ("generic", 1, ["BRK-B", "VTI"]), ("ib", 2, ["BRK B", "VTI"]),
+        ("alpaca", 0, ["BRK.B", "VTI"]), ("schwab", 0, ["BRK/B", "VTI"]),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("spelled", ["BRK-B", "BRK.B", "BRK/B", "BRK B"])
+def test_classes_of_shares_are_spelled_as_the_broker_does(layout, place, symbols, spelled):
+    bought = plan([0, 0.5, 0.5], [0, 0], 400, cost=0.0, whole_shares=True)
+    allocation = dataclasses.replace(bought, assets=("VTI", spelled))
+    rows = order_rows(allocation, layout, "USD")[1]
+    wanted = [spelled if layout == "generic" and each != "VTI" else each for each in symbols]
+    assert sorted(row[place] for row in rows) == wanted
+    abroad = dataclasses.replace(bought, assets=("VTI", "TSCO.L"))  # in London
+    assert "TSCO.L" in [row[place] for row in order_rows(abroad, layout, "USD")[1]]
 
 
 def test_whole_shares_by_hand():
@@ -178,6 +203,8 @@ def test_fractions_that_are_held_stay_where_whole_shares_are_sold():
 def test_nothing_to_allocate():
     with pytest.raises(QfolioError, match="nothing to allocate"):
         plan([1, 0, 0], [0, 0], 0)
+    with pytest.raises(QfolioError, match=r"The account is worth -900\.00, since its debts exceed"):
+        plan([1, 0, 0], [-50, 0], 100)
 
 
 def test_costs_by_kind():
@@ -236,3 +263,46 @@ def test_an_order_that_costs_more_than_it_moves_is_left_out(shares):
     allocation = Allocation.of(policy, PRICES, np.array(shares), 0.0)
     assert not allocation.trades.any()
     assert (allocation.cost, allocation.cash_after) == (0, 0)
+
+
+def test_what_keeps_its_weight_beside_debts_is_no_order_either():
+    """Of 1,000, A falls from 120% to 110%; the 20% of B that are owed stay as they are."""
+    policy = Fixed([0.1, 1.1, -0.2], 0)
+    policy.task = dataclasses.replace(TASK, cost=0.0, cost_model="itemized(fixed=5,capital=1000)")
+    allocation = Allocation.of(policy, PRICES, np.array([60.0, -5.0]), 0.0)
+    left = 0.995  # of the wealth; A is scaled to it, and cash takes the rest
+    np.testing.assert_allclose(allocation.trades, [1100 * left / 20 - 60, 0], atol=1e-9)
+    assert allocation.costs["fixed"] == pytest.approx(5)
+    assert allocation.cash_after == pytest.approx(1200 - 1100 * left - 5)
+    assert len(order_rows(allocation, "generic", "USD")[1]) == 1
+    few = Allocation.of(policy, PRICES, np.array([0.3, -0.025]), 0.0)  # 5 in all, as the fee
+    assert not few.trades.any()
+
+
+def test_an_overdraft_that_no_order_repays_is_said():
+    """50 shares are less than a lot."""
+    policy = Fixed([0, 1, 0], 0.01)
+    mandate = mandate_text({"trading": {"lot": 100}}, ("A", "B"))
+    policy.task = dataclasses.replace(TASK, mandate=mandate)
+    allocation = Allocation.of(policy, PRICES, np.array([50.0, 0.0]), -40.0, debts=False)
+    assert not allocation.trades.any()
+    assert allocation.cash_after == -40
+    np.testing.assert_allclose(allocation.reached, [-40 / 960, 1000 / 960, 0])
+
+
+def test_only_what_is_traded_counts_as_turnover(tmp_path):
+    """All are due to fall by 1% of the wealth, and a lot is more than all."""
+    policy = Fixed([0.02, 0.49, 0.49], 0)
+    mandate = mandate_text({"trading": {"lot": 1000}}, ("A", "B"))
+    ledger = Ledger(tmp_path)
+    for lots, turnover in ((True, 0.0), (False, 0.02)):
+        policy.task = dataclasses.replace(TASK, cost=0.0, mandate=mandate if lots else "")
+        allocation = Allocation.of(policy, PRICES, np.array([250.0, 125.0]), 0.0)
+        assert allocation.trades.any() != lots
+        assert allocation.turnover == pytest.approx(turnover)
+        held = holdings_digest(allocation.assets, allocation.shares, allocation.cash)
+        ledger.append(
+            allocation, PRICES, keep_prices=False, agent="x", policy=None, made="", version="",
+            digests={"prices": str(lots), "settings": "", "holdings": held}, whole_shares=lots,
+        )  # fmt: skip
+        assert ledger.spent(np.datetime64("2024-12-31T01")) == pytest.approx(turnover)

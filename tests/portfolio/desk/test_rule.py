@@ -103,6 +103,15 @@ def test_an_unknown_name_gets_the_near_ones(desk, name, said):
     assert str(error.value) == f"The backtest has no agent, baseline or strategy '{name}'; {said}"
 
 
+@pytest.mark.parametrize("name", ["momentum", "60/40", "C"])
+def test_prices_of_another_frequency_are_refused(desk, name):
+    """Their returns would be compared with those of the backtest's days."""
+    months = np.arange("2020-01", "2022-01", dtype="datetime64[M]").astype("datetime64[D]")
+    prices = Prices(months, NAMES[1:], np.ones((len(months), 3)))
+    with pytest.raises(QfolioError, match="about 12 rows a year, and the backtest has 365; give"):
+        desk.followed(name).weights(prices)
+
+
 def test_an_asset_without_a_price_is_refused(desk):
     values = table().values.copy()
     values[:, 2] = np.nan

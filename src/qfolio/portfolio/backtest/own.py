@@ -123,8 +123,10 @@ def _placed_weights(
         )
     unpriced = np.isnan(prices.known)
     for row, weights in zip(rows, own.values, strict=True):
+        if row >= days.stop:  # after the test, and perhaps after the last price
+            break
         wrong = (weights[1:] != 0) & unpriced[row]
-        if row < days.stop and wrong.any():
+        if wrong.any():
             asset = int(wrong.argmax())
             early = prices.first_rows[asset] > row
             when, until = (
@@ -134,7 +136,7 @@ def _placed_weights(
                 f"{name} orders {prices.assets[asset]} on {_day(prices, row)}, {when} price; give "
                 f"it weight 0 {until}."
             )
-        if days.start <= row < days.stop:
+        if row >= days.start:
             decisions[row - days.start] = weights
     before = np.flatnonzero(rows < days.start)
     if before.size and np.isnan(decisions[0, 0]):

@@ -91,6 +91,11 @@ class Allocation:
         last = prices.values[-1]
         known = np.where(np.isnan(last), 0.0, last)  # without a price there are no shares
         wealth = float(shares @ known + cash)
+        if wealth < 0:
+            raise QfolioError(
+                f"The account is worth {wealth:,.2f}, since its debts exceed what it owns, and has "
+                "nothing to allocate; pay in money, or close it with the broker."
+            )
         if not 0 < wealth < math.inf:
             raise QfolioError(
                 "There is nothing to allocate: give --capital, or --holdings with shares or cash."
@@ -123,6 +128,7 @@ class Allocation:
                 ideal = wealth * reached[0]
                 trades = rounded(trades, shares, known, ideal, lambda trades: after(trades)[0], lot)
         cash_after, costs = after(trades) if trades.any() else (cash, {})
+        rounding = weights[0] >= 0 and cash_after > -1e-9 * wealth
         return Allocation(
             date=day(prices.dates[-1]),
             assets=prices.assets,
@@ -132,7 +138,7 @@ class Allocation:
             weights=weights,
             trades=trades,
             costs=costs,
-            cash_after=max(cash_after, 0.0) if weights[0] >= 0 else cash_after,  # rounding errors
+            cash_after=max(cash_after, 0.0) if rounding else cash_after,
         )
 
     @property
@@ -151,8 +157,8 @@ class Allocation:
 
     @property
     def turnover(self) -> float:
-        """Sum of the absolute changes in the assets' weights, bought and sold."""
-        return float(abs(self.weights - self.held)[1:].sum())
+        """Sum of the absolute changes in the weights of the assets bought and sold."""
+        return turnover(self.held, self.reached, self.trades)
 
     @cached_property
     def reached(self) -> np.ndarray:
@@ -207,7 +213,8 @@ def _paid(
 
     What is kept pays nothing: a sale of the share of wealth that costs take away, so that its
     weight stays the same, would be an order of its own, with a fee. If the rest is worth less than
-    the costs, nothing is traded. Where there are debts, all pay.
+    the costs, nothing is traded. Where there are debts, the rest may be worth little, or nothing,
+    and cash pays for what is kept.
 
     kept: whether an asset's weight is to stay, of shape (N,).
     """
@@ -220,10 +227,17 @@ def _paid(
     before, after = (np.where(apart, 0.0, each) for each in (held, weights))
     rest = float(before.sum())
     if min(held[1:].min(), weights.min()) < 0:
-        return remains(held, weights, 1.0) * weights
+        left = remains(held, weights, 1.0)
+        return np.where(apart, held, left * weights) if left > 0 else held
     if min(rest, after.sum()) <= NOISE or (remainder := remains(before, after, rest)) <= 0:
         return held
     return np.where(apart, held, remainder * rest * after / after.sum())
+
+
+def turnover(held: Any, reached: Any, trades: Any) -> float:
+    """Sum of the absolute changes of weights, cash first, of the assets that are traded."""
+    changes = abs(np.subtract(reached, held))[1:]
+    return float(changes[np.asarray(trades) != 0].sum())
 
 
 def context_of(model: CostModel, prices: Prices, wealth: float) -> Context:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import near, quote
+from qfolio.core.text import amount, near, quote
 from qfolio.core.version import __version__
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.own import Own
@@ -22,7 +22,11 @@ from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_d
 from qfolio.portfolio.desk.rule import Kind, Ordered, Rule, Untrained
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.findings import Finding, day
+from qfolio.portfolio.prices.frequency import spacing
 from qfolio.portfolio.prices.table import Prices, accepted, inspect
+
+SLOW = 6.0
+"""Days between the rows of a table from which on a lag of one is no longer the next day."""
 
 SAME = 1e-6
 """How far reproduced weights may be off: policies decide in float32, which differs by machine."""
@@ -147,6 +151,8 @@ class Desk:
         """Sentences on when and how the backtest and its mandate would trade an allocation."""
         trading = followed.task.written.trading
         said = self._timing(followed, table, allocation)
+        if allocation.trades.any():
+            said += waiting(table, self.run.config.lag)
         if trading.fill > 1:
             said.append(
                 f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
@@ -170,7 +176,7 @@ class Desk:
         terms, calendar = followed.task.terms, self.run.config.calendar
         days, within = table.dates, band(calendar)
         if not allocation.trades.any():
-            if allocation.turnover > NOISE:
+            if abs(allocation.weights - allocation.held)[1:].max() > NOISE:
                 return ["Nothing is ordered: the trades come to no whole share or lot."]
             if within:
                 far = f"no weight is more than {within:g} from what is wanted"
@@ -278,3 +284,14 @@ class Desk:
                 raise QfolioError(f"{path} is missing; restore it.")
             found["policy"] = file_digest(path)
         return found
+
+
+def waiting(prices: Prices, lag: int) -> list[str]:
+    """Says so if orders wait for long, because the rows of a table are far apart."""
+    usual = spacing(prices.dates)[1] if len(prices) > 1 else 0.0
+    if not lag or usual < SLOW:
+        return []
+    return [
+        f"The backtest and follow fill these orders {amount(lag, 'row')} later, after about "
+        f"{lag * usual:.0f} days; if you trade at once, follow a backtest with --lag 0."
+    ]

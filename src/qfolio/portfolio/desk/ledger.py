@@ -17,7 +17,7 @@ import numpy as np
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, read_arrays, read_json, write_arrays, write_json
 from qfolio.core.text import listed, quote
-from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.allocation import Allocation, turnover
 from qfolio.portfolio.prices.table import Prices
 
 FORMAT = 1
@@ -94,7 +94,7 @@ class Ledger:
         last = {record.moment: record for record in known}
         year = moment.astype("datetime64[Y]")
         return sum(
-            float(abs(np.subtract(record.target, record.weights_before))[1:].sum())
+            turnover(record.weights_before, record.weights_after, record.trades)
             for record in last.values()
             if record.moment < moment and record.moment.astype("datetime64[Y]") == year
         )

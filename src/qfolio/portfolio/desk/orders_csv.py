@@ -1,6 +1,7 @@
 """Orders as CSV, in columns that brokers read."""
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -76,7 +77,7 @@ def _interactive_brokers(allocation: Allocation, currency: str) -> tuple[list[st
             raise QfolioError(
                 "A basket of Interactive Brokers takes whole shares only; add --whole-shares."
             )
-        symbol = allocation.assets[i]
+        symbol = _symbol(allocation.assets[i], " ")
         rows.append([side, int(quantity), symbol, "STK", "SMART", currency, "DAY", "MKT", tag])
     return header, rows
 
@@ -84,14 +85,17 @@ def _interactive_brokers(allocation: Allocation, currency: str) -> tuple[list[st
 def _alpaca(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
     """Market orders for the day, in the fields of POST /v2/orders; Alpaca does not import files.
 
-    Source: Alpaca, "Working with /orders".
+    Source: Alpaca, "Working with /orders". It answers others with "fractional orders are not
+    allowed to short".
     """
     header = ["symbol", "qty", "side", "type", "time_in_force"]
-    return header, [
-        [allocation.assets[i], quantity, "buy" if side.startswith("BUY") else "sell", "market",
-         "day"]
-        for i, side, quantity in _legs(allocation)
-    ]  # fmt: skip
+    rows: Rows = []
+    for i, instruction, quantity in _legs(allocation):
+        if instruction == "SELL_SHORT" and quantity != int(quantity):
+            raise QfolioError("Alpaca sells whole shares short only; add --whole-shares.")
+        side = "buy" if instruction.startswith("BUY") else "sell"
+        rows.append([_symbol(allocation.assets[i], "."), quantity, side, "market", "day"])
+    return header, rows
 
 
 def _schwab(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
@@ -107,9 +111,8 @@ def _schwab(allocation: Allocation, currency: str) -> tuple[list[str], Rows]:
     for i, instruction, quantity in _legs(allocation):
         if quantity != int(quantity):
             raise QfolioError("An order at Schwab takes whole shares only; add --whole-shares.")
-        rows.append(
-            [allocation.assets[i], "EQUITY", instruction, int(quantity), "MARKET", "NORMAL", "DAY"]
-        )
+        symbol = _symbol(allocation.assets[i], "/")
+        rows.append([symbol, "EQUITY", instruction, int(quantity), "MARKET", "NORMAL", "DAY"])
     return header, rows
 
 
@@ -149,6 +152,14 @@ def _legs(allocation: Allocation) -> list[tuple[int, str, float]]:
         sizes = ((first, closed), (then, round(quantity - closed, DIGITS)))
         found += [(i, name, _number(size)) for name, size in sizes if size]
     return found
+
+
+def _symbol(name: str, mark: str) -> str:
+    """An asset's name with a broker's mark before the class of a share: BRK-B, BRK.B, BRK/B.
+
+    Other letters after a dot stand for an exchange, as in TSCO.L.
+    """
+    return re.sub(r"(?<=[A-Z])[-./ ](?=[ABC]$)", mark, name)
 
 
 def _number(shares: float) -> float:

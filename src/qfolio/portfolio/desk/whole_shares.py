@@ -19,10 +19,10 @@ def whole_shares(
     """The trades in whole shares that track the ideal ones best.
 
     Each trade is rounded down or up. The distance to the target is the sum of squared deviations of
-    each asset and of the cash, in money. Starting with all trades rounded down, the best change of
-    one or two trades is made until none reduces the distance. This local search does not prove the
-    optimum; the tests compare it with every rounding. Fractions of a share, or of a lot, that are
-    held are never sold.
+    each asset and of the cash, in money. Starting once with all trades rounded down and once with
+    the nearest whole numbers, the best change of one or two trades is made until none reduces the
+    distance; the nearer result counts. This local search does not prove the optimum; the tests
+    compare it with every rounding. Fractions of a share, or of a lot, that are held are never sold.
 
     Args:
         ideal: Shares to buy, negative to sell, of shape (assets,).
@@ -42,11 +42,22 @@ def whole_shares(
     least = np.minimum(shares + ideal, 0.0)  # a holding is not sold short by rounding
     low = np.where(shares + low < least - EXACT, np.minimum(high, low + 1), low)
     least_cash = min(cash, 0.0)
-    trades = _affordable(low, prices, lambda trades: cash_after(trades) - least_cash)
-    low = np.minimum(low, trades)
-    while (better := _improved(trades, low, high, ideal, prices, cash, cash_after)) is not None:
-        trades = better
-    return trades + 0.0  # no -0
+
+    def searched(start: np.ndarray) -> np.ndarray:
+        trades = _affordable(start, prices, lambda trades: cash_after(trades) - least_cash)
+        limits = np.minimum(low, trades), high
+        while (better := _improved(trades, *limits, ideal, prices, cash, cash_after)) is not None:
+            trades = better
+        return trades
+
+    def distance(trades: np.ndarray) -> tuple[bool, float]:
+        left = cash_after(trades)
+        off = np.append((trades - ideal) * prices, left - cash)
+        overdrawn = left < least_cash - EXACT * float(abs(shares) @ prices)
+        return overdrawn, float(off @ off)  # no trade leaves an overdraft as it is
+
+    found = map(searched, (low, np.clip(np.round(ideal), low, high)))
+    return min(found, key=distance) + 0.0  # no -0
 
 
 def _affordable(
@@ -80,11 +91,14 @@ def _improved(
         moved = off + change
         return float(moved @ moved + (after - cash) ** 2 - off @ off - error**2)
 
-    # The costs of one share more or less are ignored here, and counted when a change is made.
+    # The costs of one share more or less are ignored here, and counted when a change is made. That
+    # must not rule out a sale less because what it saves in costs is missing: without any costs,
+    # there is at least as much cash.
+    free = cash_after(np.zeros_like(trades)) - trades @ prices
     own = 2 * off * money + money**2
     gains = own + own[:, None] + (error - money - money[:, None]) ** 2 - error**2
     np.fill_diagonal(gains, own + (error - money) ** 2 - error**2)
-    gains[left - money - np.where(np.eye(len(some)), 0, money[:, None]) < min(cash, 0.0)] = np.inf
+    gains[free - money - np.where(np.eye(len(some)), 0, money[:, None]) < min(cash, 0.0)] = np.inf
     while len(some):
         i, j = divmod(int(gains.argmin()), len(some))
         if not gains[i, j] < 0:
