@@ -47,10 +47,21 @@ class Fail:
     """Raises an error."""
 
     name: str
-    error: Exception = field(default_factory=lambda: QfolioError("the loss is not finite."))
+    error: BaseException = field(default_factory=lambda: QfolioError("the loss is not finite."))
 
     def run(self, listeners):
         raise self.error
+
+
+@dataclass(frozen=True)
+class Print:
+    """Prints its name."""
+
+    name: str
+
+    def run(self, listeners):
+        print(self.name)
+        return self.name
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,6 @@ from typing import Any, NoReturn
 from qfolio.core.text import near, printable
 from qfolio.experiments.interrupts import EXIT_CODE, exit_on_ctrl_c
 
-OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
-
 SHELLS = ("bash", "zsh", "fish")
 """Shells whose completion can be installed."""
 
@@ -57,7 +55,7 @@ def commands() -> dict[str, Callable[..., Any]]:
 
 def run() -> NoReturn:
     """Runs the command line; an error of the user becomes one sentence and exit code 2."""
-    from qfolio.core.errors import QfolioError, one_line, own_frame
+    from qfolio.core.errors import QfolioError, sentence_on
 
     try:
         try:
@@ -71,14 +69,10 @@ def run() -> NoReturn:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _refuse(f"{where}{error.strerror or error}.")
-    except MemoryError:
-        _refuse(OUT_OF_MEMORY)
     except Exception as error:
-        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error):  # jax's own
-            _refuse(OUT_OF_MEMORY)
-        if (own := own_frame(error)) is None:
+        if (sentence := sentence_on(error)) is None:
             raise
-        _refuse(f"{own.name} failed: {one_line(error)}.")
+        _refuse(sentence)
     except KeyboardInterrupt:
         print("qfolio: interrupted", file=sys.stderr)
         sys.exit(EXIT_CODE)

@@ -1,10 +1,19 @@
 """qfolio report: pages written again, and printed."""
 
+import shlex
 import shutil
 
 import pytest
 
+from qfolio.agents.dqn import DQN
+from qfolio.experiments import continual
+from qfolio.experiments.budget import Budget
+from qfolio.experiments.comparison.run import Comparison, Entrant
+from qfolio.experiments.continual import Plan
+from qfolio.experiments.tuning import search
+from qfolio.experiments.tuning.run import Tuning
 from qfolio.report import printing
+from qfolio.tasks.pendulum import Pendulum
 
 from shell import TINY, TINY_BACKTEST, qfolio
 from tables import write_table
@@ -104,3 +113,46 @@ def test_other_folders_are_refused(tmp_path, monkeypatch, capsys, content):
     printed = capsys.readouterr().err
     assert "Traceback" not in printed
     assert str(tmp_path) in printed.replace("\n", "")
+
+
+class Mine(DQN):
+    """An agent of this module, which is no part of qfolio."""
+
+
+MINE = Mine(hidden=(8,), num_envs=2, batch_size=8, replay_capacity=100, learning_starts=10)
+OLD, NEW = Pendulum(horizon=20), Pendulum(horizon=20, mass=2.0)
+
+
+def begin_comparison(folder):
+    entrants = {name: Entrant(OLD, MINE, None, Budget(2)) for name in ("one", "other")}
+    Comparison.create(entrants, seeds=1, out=folder)
+
+
+def begin_search(folder):
+    space = search.parse(["discount=0.9..0.99"], Mine)
+    Tuning.create(
+        OLD, MINE, space, trials=1, seeds=1, budget=Budget(2), batch=1, fresh_seeds=1,
+        preset="fast", out=folder,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("begin", "command"),
+    [
+        (begin_comparison, ["compare", "--resume"]),
+        (begin_search, ["tune", "--join"]),
+        (
+            lambda folder: continual.create(Plan(OLD, NEW, MINE, 2), folder),
+            ["continual", "--resume"],
+        ),
+    ],
+)
+def test_what_is_not_finished_names_the_command_that_goes_on(
+    begin, command, monkeypatch, capsys, tmp_path
+):
+    """As a shell takes it, with the module to trust."""
+    folder = tmp_path / "my run"
+    begin(folder)
+    assert qfolio(monkeypatch, "report", folder) == 2
+    said = capsys.readouterr().err.strip().removesuffix(".").partition("; continue with ")[2]
+    assert shlex.split(said) == ["qfolio", *command, str(folder), "--trust", __name__]

@@ -248,3 +248,43 @@ def test_faults_of_own_code_are_one_sentence(name, says, tmp_path, monkeypatch, 
     assert says in capsys.readouterr().err.replace("\n", " ")
     assert not (tmp_path / "x").exists()
     sys.modules.pop("failing_parts", None)
+
+
+PRICED = """
+from qfolio.core.fields import static
+from qfolio.core.mdp import Task
+from qfolio.tasks.finite import Cliff
+
+class Priced(Task):
+    price: float
+    horizon: int = static(9)
+    cliff = Cliff()
+    states, actions = cliff.states, cliff.actions
+
+    def reset(self, key):
+        return self.cliff.reset(key)
+
+    def observe(self, state):
+        return self.cliff.observe(state)
+
+    def step(self, state, action, key):
+        after = self.cliff.step(state, action, key)
+        return after._replace(reward=self.price * after.reward)
+"""
+
+
+def test_a_setting_without_a_default_is_in_the_commands_that_repeat_the_training(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "priced_parts.py").write_text(PRICED)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    words = ["priced_parts:Priced", "--agent", "q-learning", "--steps", 90, "--set", "price=2"]
+    assert qfolio(monkeypatch, "train", *words, "--seeds", 1, "--out", "run") == 0
+    assert "--set price=2.0\n" in (tmp_path / "run" / "report.html").read_text()
+    assert qfolio(monkeypatch, "tune", *words, "--search", "discount=0.5|0.9", "--trials", 2,
+                  "--seeds", 1, "--out", "search") == 0  # fmt: skip
+    assert re.search(r"^qfolio train .* --set .*price=2\.0$", capsys.readouterr().out, re.MULTILINE)
+    assert qfolio(monkeypatch, "train", *words[:-2], "--out", "x") == 2
+    assert "Priced needs price; give price a default" in capsys.readouterr().err
+    sys.modules.pop("priced_parts", None)

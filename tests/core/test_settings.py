@@ -7,9 +7,9 @@ import pytest
 from qfolio.agents.dqn import DQN
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
-from qfolio.core.fields import number
+from qfolio.core.fields import number, static
 
-from probes import OneState
+from probes import OneState, Probe
 
 
 def test_text_becomes_the_fields_type():
@@ -124,3 +124,25 @@ def test_a_default_that_would_change_nothing_is_refused():
         learning_rate: float = number(1e-5)
 
     assert Slow().learning_rate == 1e-5
+
+
+class Priced(Probe):
+    """Its price has no default."""
+
+    price: float
+    horizon: int = static(1)
+    reset, observe, step = OneState.reset, OneState.observe, OneState.step
+
+
+def test_a_setting_without_a_default_has_to_be_set():
+    assert settings.build(Priced, {"price": "2"}).price == 2.0
+    with pytest.raises(
+        QfolioError, match=r"^Priced needs price; give price a default in its class"
+    ):
+        settings.build(Priced, {})
+
+
+def test_defaults_leave_out_what_has_none():
+    whole = settings.describe(settings.build(Priced, {"price": 2.0}))
+    assert settings.defaults(Priced, {"price": 2.0}) == whole
+    assert settings.defaults(Priced, {}) == {k: x for k, x in whole.items() if k != "price"}

@@ -3,9 +3,12 @@ import dataclasses
 import json
 import math
 import re
+import sys
+import types
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -31,6 +34,7 @@ from qfolio.portfolio.synthetic.kelly import Kelly
 from qfolio.portfolio.synthetic.regime import Regime
 from qfolio.report.comparison import comparison_data, render_comparison, tidy
 from qfolio.report.figures.style import percent_tick
+from qfolio.tasks.catch import Catch
 from qfolio.tasks.pendulum import Pendulum
 
 from jobs import Elsewhere
@@ -333,10 +337,30 @@ def test_an_agent_that_diverges_does_not_stop_the_others(tmp_path):
     assert content["ranking"]["order"] in (["slow", "quick"], ["quick", "slow"])
     assert list(content["failures"]) == ["wild"]
     assert re.match(r"wild could not be trained. The loss of seed", content["notes"][0])
+    assert Comparison.open(tmp_path / "run").finish() == content  # as qfolio report does
     alone = Comparison.create(tiny(wild=1e29, wilder=1e30), seeds=3, out=tmp_path / "alone")
     alone.run()
     with pytest.raises(QfolioError, match=r"fewer than two agents to compare\. wild: The loss"):
         alone.finish()
+
+
+class Unpaid(Catch):
+    """Its rewards are no numbers."""
+
+    def step(self, state, action, key):
+        return super().step(state, action, key)._replace(reward=jnp.array(jnp.nan))
+
+
+@pytest.mark.parametrize("executor", [None, Elsewhere()])
+def test_agents_that_cannot_be_graded_are_left_out(executor, tmp_path):
+    """They never begin to learn, so their losses are finite."""
+    agent, budget = DQN(**TINY | {"learning_starts": 190}), Budget(6)
+    entrants = {name: Entrant(Unpaid(), agent, None, budget) for name in ("one", "other")}
+    run = Comparison.create(entrants, seeds=2, out=tmp_path / "run")
+    run.run(executor=executor)
+    fault = "The reward of Unpaid is not finite at step 1 of an episode; check its step."
+    assert run.failures == {"one": fault, "other": fault}
+    assert run.finished
 
 
 def noted(tmp_path, first, second, steps=1000):
@@ -451,6 +475,7 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
         (["--agents", "dqn,dqx"], "no agent 'dqx'"), (["--agents", "dqn:fst,dqn"], "preset 'fst'"),
         (["--agents", "dqn"], "two or more agents"), ([], "two or more agents"),
         (["--agents", "dqn,dqn:fast"], "the preset fast twice: dqn, dqn:fast"),
+        (["--agents", "dqn,one:Mine,two:Mine", "--steps", 9], "two agents that are called Mine"),
         (["--agents", "dqn,pathwise"], "pathwise has no preset for pendulum"),
         (["pendulm", "--agents", "dqn,dqn:bold"], "no task 'pendulm'"),
         (["--agents", "dqn,dqn:bold", "--seeds", 0], "seeds is 0"),
@@ -461,6 +486,10 @@ def test_a_comparison_that_is_stopped_says_how_to_go_on(presets, monkeypatch, ca
     ],
 )  # fmt: skip
 def test_comparisons_that_are_refused(presets, monkeypatch, capsys, tmp_path, options, message):
+    for name in ("one", "two"):
+        module = types.ModuleType(name)
+        vars(module)["Mine"] = type("Mine", (DQN,), {"__module__": name})
+        monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.chdir(tmp_path)
     out = [] if "--resume" in options else ["--out", tmp_path / "run"]
     assert qfolio(monkeypatch, "compare", *options, *out) == 2

@@ -8,6 +8,7 @@ import sys
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from qfolio.agents.pathwise import Pathwise
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
+from qfolio.core.fields import constant, require
 from qfolio.core.population import Population
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.executor import Here
@@ -30,6 +32,7 @@ from qfolio.experiments.tuning.trials import trials_jobs
 from qfolio.report.figures.tuning import draw_progress
 from qfolio.report.sweep import Sweep
 from qfolio.report.tuning import render_page, write_tuning_report
+from qfolio.tasks.catch import Catch
 
 from jobs import Elsewhere
 from shell import TINY, qfolio
@@ -282,6 +285,40 @@ def test_a_search_where_all_diverge_says_so(tmp_path, task, agent):
     work = start(tmp_path / "s", task, agent, f"learning_rate=1e29|{BOOM}", trials=2)
     work.run()
     with pytest.raises(QfolioError, match="None of the 2 configurations kept a finite loss"):
+        work.conclude()
+
+
+class Ordered(DQN):
+    """Explores less at the end than at the start."""
+
+    def __check_init__(self):
+        require(self, "epsilon_end", lambda x: x <= self.epsilon_start, "at most epsilon_start")
+
+
+def test_settings_that_the_agent_refuses_together_do_not_end_a_search(tmp_path, task, agent):
+    ranges = ["epsilon_start=0.2|0.8", "epsilon_end=0.1|0.5"]
+    ordered = settings.build(Ordered, settings.describe(agent) | {"epsilon_end": 0.1})
+    work = start(tmp_path / "s", task, ordered, *ranges, trials=6, batch=1)
+    work.run()
+    trials = work.journal.trials()
+    refused = [
+        trial for trial in trials if trial.values == {"epsilon_start": "0.2", "epsilon_end": "0.5"}
+    ]
+    assert len(trials) == 6
+    assert refused == [trial for trial in trials if math.isnan(trial.value)] != []
+
+
+class Unpaid(Catch):
+    """Its rewards are no numbers."""
+
+    def step(self, state, action, key):
+        return super().step(state, action, key)._replace(reward=jnp.array(jnp.nan))
+
+
+def test_a_search_where_the_task_is_at_fault_says_so(tmp_path, agent):
+    work = start(tmp_path / "s", Unpaid(), agent, trials=1, batch=1, seeds=1)
+    work.run()
+    with pytest.raises(QfolioError, match="The reward of Unpaid is not finite at step 1"):
         work.conclude()
 
 
@@ -630,6 +667,9 @@ def test_tune_from_the_command_line(tmp_path, monkeypatch, capsys):
     chosen = settings.parse(words[words.index("--set") + 1 :])
     assert chosen.pop("horizon") == "20"
     assert preset("fast").build(**chosen) == work.configured(best.values)
+    taken = ["tune", "--out", folder, "--search", "learning_rate=1e-4..1e-2"]
+    assert qfolio(monkeypatch, *taken) == 2
+    assert f"continue with --join {folder}." in capsys.readouterr().err
     # Joining what is done only writes the report again.
     assert qfolio(monkeypatch, "tune", "--join", folder) == 0
     assert (folder / "summary.json").stat().st_mtime_ns == before
@@ -665,6 +705,21 @@ def test_wrong_commands(arguments, says, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert qfolio(monkeypatch, "tune", *arguments) == 2
     assert says in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+class Discounted(Catch):
+    """It has a setting that agents have, too."""
+
+    discount: float = constant(0.9)
+
+
+def test_a_setting_of_agent_and_task_is_not_searched(monkeypatch, capsys, tmp_path):
+    """The command that trains the best configuration could not set it."""
+    monkeypatch.chdir(tmp_path)
+    words = ["tune", f"{__name__}:Discounted", "--agent", "dqn", "--trials", 1, "--steps", 9]
+    assert qfolio(monkeypatch, *words) == 2
+    assert "both have a setting discount" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

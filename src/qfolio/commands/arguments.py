@@ -70,5 +70,5 @@ def again(command: str, folder: Path, *parts: object, on: str = "here") -> str:
     parts: the tasks and agents; modules of a user's own must be trusted again. on: where it ran.
     """
     modules = own_modules(*parts)
-    words = [command, str(folder), *(["--trust", *modules] if modules else [])]
-    return " ".join([*words, *(["--on", on] if on != "here" else [])])
+    words = [*command.split(), str(folder), *(["--trust", *modules] if modules else [])]
+    return shlex.join([*words, *(["--on", on] if on != "here" else [])])

@@ -1,5 +1,6 @@
 """The command that trains several agents on one task and compares them."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
@@ -103,14 +104,29 @@ def compare(
         f"{len(run.entrants)} agents on {run.config.task} · {amount(seeds, 'seed')} "
         f"each · {run.config.device}"
     )
-    parts = [part for one in run.entrants.values() for part in (one.task, one.agent)]
-    command = again("qfolio compare --resume", run.folder, *parts, on=on)
+    command = _resume(run, on)
     with resumable(command):
         with tracked(*following):
             _train(run, executor)
         if run.interrupted:
             stop(command)
         return outcome(run.folder, _finish(run))
+
+
+def write_again(folder: Path) -> None:
+    """Writes the report of a finished comparison."""
+    from qfolio.experiments.comparison.run import Comparison
+    from qfolio.report.comparison import write_comparison_report
+
+    run = Comparison.open(folder)
+    if not run.finished:
+        raise QfolioError(f"The comparison is not finished; continue with {_resume(run)}.")
+    write_comparison_report(folder, run.finish())
+
+
+def _resume(run: "Comparison", on: str = "here") -> str:
+    parts = [part for one in run.entrants.values() for part in (one.task, one.agent)]
+    return again("qfolio compare --resume", run.folder, *parts, on=on)
 
 
 def _entrants(
@@ -136,7 +152,12 @@ def _entrants(
             )
         chosen[agent, name] = entry
         settled = presets.preset(name, task, agent)
-        entrants[registry.entrant(entry)] = Entrant(
+        called = registry.entrant(entry)
+        if called in entrants:  # classes of the same name, in different modules
+            raise QfolioError(
+                f"--agents names two agents that are called {called}; rename one of the classes."
+            )
+        entrants[called] = Entrant(
             settings.build(task_class, settled.task),
             settled.build(),
             name,

@@ -1,5 +1,6 @@
 """The command that changes a task after training, and compares ways to adapt."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
@@ -109,6 +110,21 @@ def continual(
     console.tell(verdict(content))
     console.say(f"Report: {folder / PAGE}")
     return outcome(folder, content)
+
+
+def write_again(folder: Path) -> None:
+    """Writes the report of a finished experiment."""
+    import msgspec
+
+    from qfolio.experiments import continual
+    from qfolio.report.continual import write_continual_report
+
+    state = continual.read(folder)
+    if set(continual.WAYS) - set(state.courses):
+        plan = state.plan()
+        resume = again("qfolio continual --resume", folder, plan.task, plan.agent)
+        raise QfolioError(f"The experiment is not finished; continue with {resume}.")
+    write_continual_report(folder, msgspec.to_builtins(state))
 
 
 def _plan(

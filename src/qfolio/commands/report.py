@@ -89,10 +89,9 @@ def _training(folder: Path) -> None:
 
 
 def _comparison(folder: Path) -> None:
-    from qfolio.experiments.comparison.run import Comparison
-    from qfolio.report.comparison import write_comparison_report
+    from qfolio.commands.comparison import write_again
 
-    write_comparison_report(folder, Comparison.open(folder).finish())
+    write_again(folder)
 
 
 def _search(folder: Path) -> None:
@@ -102,18 +101,9 @@ def _search(folder: Path) -> None:
 
 
 def _continual(folder: Path) -> None:
-    import msgspec
+    from qfolio.commands.continual import write_again
 
-    from qfolio.core.config import read_config
-    from qfolio.experiments.continual import FILE, WAYS, ContinualConfig
-    from qfolio.report.continual import write_continual_report
-
-    state = read_config(folder / FILE, ContinualConfig)
-    if set(WAYS) - set(state.courses):
-        raise QfolioError(
-            f"The experiment is not finished; continue with qfolio continual --resume {folder}."
-        )
-    write_continual_report(folder, msgspec.to_builtins(state))
+    write_again(folder)
 
 
 WRITERS: dict[str, Callable[[Path], None]] = {

@@ -134,11 +134,11 @@ def write_again(folder: Path) -> None:
     from qfolio.report.tuning import write_tuning_report
 
     tuning = _tuning()
-    if not (folder / "summary.json").is_file():
-        raise QfolioError(f"The search is not finished; continue with qfolio tune --join {folder}.")
     work = tuning.Tuning.open(folder)
-    summary = work.conclude()
     resume = again("qfolio tune --join", folder, work.task, work.agent)
+    if not (folder / "summary.json").is_file():
+        raise QfolioError(f"The search is not finished; continue with {resume}.")
+    summary = work.conclude()
     write_tuning_report(folder, sweep(work, summary, f"{command(work, summary['best'])}\n{resume}"))
 
 
@@ -184,10 +184,16 @@ def _new(
         schedules = {"learning_rate_steps", "importance_steps"} & preset.settings.keys()
         scheduled = {name: round(preset.settings[name] * share, 1) for name in schedules}
     agent = preset.build(**{**scheduled, **chosen})
+    space = space or [dim for dim in search.usual(agent) if dim.name not in chosen]
+    if both := [dim.name for dim in space if dim.name in settings.names(task_class)]:
+        raise QfolioError(  # no command line could train what was found
+            f"{agent_name} and {task_name} both have a setting {both[0]}, and --set gives it to "
+            "the task; rename that of the task, or name others with --search."
+        )
     return Tuning.create(
         settings.build(task_class, {**preset.task, **task_settings}),
         agent,
-        space or [dim for dim in search.usual(agent) if dim.name not in chosen],
+        space,
         trials=64 if trials is None else trials,
         seeds=2 if seeds is None else seeds,
         budget=budget,
@@ -223,9 +229,9 @@ def command(work: "Tuning", values: dict[str, Any]) -> str:
 
     config = work.config
     base = preset(config.preset, config.task, config.agent)
-    default = settings.describe(base.build()) | settings.describe(type(work.task)(**base.task))
+    default = base.described(type(work.task))
     chosen = settings.describe(work.configured(values)) | config.task_settings
-    changed = {name: value for name, value in chosen.items() if value != default[name]}
+    changed = {name: value for name, value in chosen.items() if value != default.get(name)}
     words = ["qfolio train", config.task, "--agent", config.agent, "--preset"]
     words += [config.preset, f"--{config.budget.unit}", str(config.budget.amount)]
     words += ["--set", *map(shlex.quote, written(changed))] if changed else []

@@ -12,12 +12,25 @@ from typing import Any
 
 from qfolio.core.text import listed
 
+OUT_OF_MEMORY = "There is too little memory for these settings; lower batch_size, hidden or seeds."
+
 
 class QfolioError(Exception):
     """An error that a user can fix: one sentence that says what is wrong, where, and what to do.
 
     The command line prints it without a traceback and exits with code 2.
     """
+
+
+class WorkerError(RuntimeError):
+    """An error that a job raised on a worker, with its traceback there.
+
+    sentence: as of ``sentence_on``, by the worker.
+    """
+
+    def __init__(self, message: str, sentence: str | None) -> None:
+        super().__init__(message)
+        self.sentence = sentence
 
 
 def require_type(
@@ -83,6 +96,17 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, SyntaxError) or not frame:  # a SyntaxError's message names the place
         return text
     return f"{text} ({PurePath(frame.filename).name}, line {frame.lineno})"
+
+
+def sentence_on(error: BaseException) -> str | None:
+    """What to tell of an error of a user's own code, or of too little memory; None of another."""
+    if isinstance(error, WorkerError):
+        return error.sentence
+    exhausted = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)  # jax's own
+    if isinstance(error, MemoryError) or exhausted:
+        return OUT_OF_MEMORY
+    own = own_frame(error)
+    return None if own is None else f"{own.name} failed: {one_line(error)}."
 
 
 def own_frame(error: BaseException) -> traceback.FrameSummary | None:

@@ -21,7 +21,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from qfolio.core.errors import QfolioError, require_type
-from qfolio.core.text import csv_cell
+from qfolio.core.text import csv_cell, shell
 
 _JSON = msgspec.json.Encoder()
 _NUMBERS, _LARGE = (float, int), 2.0**63  # msgspec takes no larger integers
@@ -73,21 +73,21 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
-def require_new(folder: Path) -> None:
-    """Raises QfolioError if ``folder`` is not empty."""
+def require_new(folder: Path, option: str = "--resume") -> None:
+    """Raises QfolioError if ``folder`` is not empty; option: continues the work in it."""
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise QfolioError(
-            f"{folder} is not empty; name a new folder, or continue with --resume {folder}."
+            f"{folder} is not empty; name a new folder, or continue with {option} {shell(folder)}."
         )
 
 
 @contextlib.contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
+def new_folder(folder: Path, option: str = "--resume") -> Iterator[Path]:
     """A temporary folder that is renamed to ``folder`` at the end: it is complete or absent.
 
-    Raises QfolioError if ``folder`` is not empty.
+    option: as for ``require_new``, which raises QfolioError if ``folder`` is not empty.
     """
-    require_new(folder)
+    require_new(folder, option)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:

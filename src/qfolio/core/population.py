@@ -150,7 +150,7 @@ class Population:
     def _require_healthy(self) -> None:
         healthy = self.healthy
         if not all(healthy):
-            if fault := self._task_fault():
+            if fault := self.task_fault():
                 raise QfolioError(fault)
             bad = {str(s): None for s, ok in zip(self.seeds, healthy, strict=True) if not ok}
             raise QfolioError(
@@ -159,7 +159,7 @@ class Population:
                 "whichever the agent has)."
             )
 
-    def _task_fault(self) -> str | None:
+    def task_fault(self) -> str | None:
         """What is wrong with the task, if the fault is not in the learning."""
         return faults.find(self.task, self.agent, self.seeds[0])
 

@@ -21,6 +21,32 @@ def describe(instance: Any) -> dict[str, Any]:
     return {name: _described(getattr(instance, name)) for name in _types(type(instance))}
 
 
+def defaults(kind: type, chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of an object of which only some are chosen, as ``describe`` gives them.
+
+    Those without a default are left out unless they are chosen.
+    """
+    lacking = _lacking(kind, chosen)
+    if not lacking:
+        return describe(build(kind, chosen))
+    values = {field.name: field.default for field in dataclasses.fields(kind)}
+    values |= convert(kind, chosen)
+    return {name: _described(values[name]) for name in _types(kind) if name not in lacking}
+
+
+def _lacking(kind: type, chosen: Mapping[str, Any]) -> list[str]:
+    """Settings without a default that are not chosen."""
+    types = _types(kind)
+    return [
+        field.name
+        for field in dataclasses.fields(kind)
+        if field.name in types
+        and field.name not in chosen
+        and field.default is dataclasses.MISSING
+        and field.default_factory is dataclasses.MISSING
+    ]
+
+
 def _described(value: Any) -> Any:
     """A setting as a JSON value; JSON has no infinity."""
     if isinstance(value, tuple):
@@ -43,8 +69,14 @@ def _types(kind: type) -> dict[str, Any]:
 def build(kind: type[T], settings: Mapping[str, Any]) -> T:
     """An agent or task with these fields set; the rest keep their defaults.
 
-    Values are JSON values or text. Raises QfolioError for names and values that do not fit.
+    Values are JSON values or text. Raises QfolioError for names and values that do not fit, and if
+    a setting without a default is not set.
     """
+    if lacking := _lacking(kind, settings):
+        raise QfolioError(
+            f"{kind.__name__} needs {listed(lacking)}; give {lacking[0]} a default in its class, "
+            f"or set it, as in --set {lacking[0]}=1."
+        )
     return kind(**convert(kind, settings))
 
 

@@ -3,8 +3,10 @@
 import difflib
 import math
 import re
+import shlex
 import unicodedata
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 UNSAFE = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
@@ -28,6 +30,11 @@ def quote(value: object, limit: int = 60) -> str:
     """Any value in quotation marks, on one line and cut to ``limit`` characters."""
     text = str(value)
     return f"'{printable(text if len(text) <= limit else text[: limit - 1] + '…')}'"
+
+
+def shell(path: Path) -> str:
+    """A path as a shell takes it, for commands that can be pasted."""
+    return shlex.quote(str(path))
 
 
 def amount(count: int, noun: str) -> str:

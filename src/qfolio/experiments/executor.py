@@ -167,5 +167,7 @@ def persistent(executor: Executor) -> Iterator[Executor]:
         yield executor
         return
     workers = _Persistent(executor)
-    with contextlib.closing(workers.results):
+    # One event for all maps: the executor's generator, which goes on from one to the next, would
+    # keep that of the first.
+    with interruptible(), contextlib.closing(workers.results):
         yield workers

@@ -6,11 +6,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from qfolio.core.errors import require_whole
+from qfolio.core.errors import QfolioError, require_whole
 from qfolio.core.evaluation import greedy, start_keys
 from qfolio.core.mdp import Optimum
 from qfolio.core.population import Population
 from qfolio.core.statistics import mean_interval, regret
+from qfolio.core.text import listed
 from qfolio.experiments.budget import MOST_STARTS
 from qfolio.solvers.followed import FollowedOptimum
 
@@ -18,13 +19,22 @@ from qfolio.solvers.followed import FollowedOptimum
 def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
     """Returns, optimum and regret of each member's greedy policy, as JSON values.
 
-    starts: how many of the fixed start states (default: those of the population's kind).
+    starts: how many of the fixed start states (default: those of the population's kind). Raises
+    QfolioError if a return is not finite.
     """
     if starts is not None:
         require_whole("starts", starts, 1, MOST_STARTS)
     task, keys = population.task, start_keys(starts or population.starts)
     played = population.evaluate(keys)
     returns = played.returns.mean(1)
+    if not np.isfinite(returns).all():  # although all losses were: no file could hold it
+        bad = listed(
+            [str(s) for s, x in zip(population.seeds, returns, strict=True) if not np.isfinite(x)]
+        )
+        raise QfolioError(
+            population.task_fault()
+            or f"The return of seed {bad} is not finite; check the step of {task.name}."
+        )
     solution = task.optimum()
     optimum, regrets = None, None
     if solution is not None:

@@ -118,10 +118,13 @@ def setting_groups(config: dict[str, Any]) -> list[tuple[str, list[tuple[str, st
 
 
 def changed_settings(changes: dict[str, tuple[Any, Any]]) -> list[tuple[str, str]]:
-    """Return changed settings as pairs: the name, and the text "value instead of old value"."""
+    """Return changed settings as pairs: the name, and the text "value instead of old value".
+
+    The old value is None if there is none.
+    """
     now, other = (_flat({name: pair[i] for name, pair in changes.items()}) for i in (0, 1))
     return [
-        (name, f"{text} instead of {before}")
+        (name, text if before == "null" else f"{text} instead of {before}")
         for (name, text), (_, before) in zip(now, other, strict=True)
     ]
 

@@ -1,10 +1,15 @@
 """Jobs as bytes: what travels with them."""
 
 import numpy as np
+import pytest
 
 from qfolio.core import registry
+from qfolio.core.errors import QfolioError
 from qfolio.core.population import LARGE
 from qfolio.experiments.machines.parcels import Packer, Unpacker
+
+import jobs
+from jobs import Add
 
 
 def test_only_modules_that_a_job_names_travel_with_it(monkeypatch):
@@ -27,3 +32,10 @@ def test_a_large_array_travels_beside_its_jobs_once():
     assert (one, two) == (1, 2)
     assert mine is same
     np.testing.assert_array_equal(mine, large)
+
+
+def test_a_class_that_a_worker_does_not_have(monkeypatch):
+    parcel = Packer().pack(Add("a", 1.0))
+    monkeypatch.delattr(jobs, "Add")
+    with pytest.raises(QfolioError, match=r"cannot make what it is to train \(.*'Add'.*\); define"):
+        Unpacker().unpack(parcel)

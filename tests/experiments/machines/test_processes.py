@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import OUT_OF_MEMORY, QfolioError, WorkerError, sentence_on
 from qfolio.experiments.executor import Executor, Here, Job, persistent
 from qfolio.experiments.fit import Listener
+from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.machines.processes import Processes
 
 import jobs
-from jobs import Add, Die, Fail, Sleep, Tell, alive
+from jobs import Add, Die, Fail, Print, Sleep, Tell, alive
 
 
 def silent(job):
@@ -82,6 +83,25 @@ def test_workers_are_kept_between_maps():
     assert not alive(place)
 
 
+def test_ctrl_c_ends_workers_that_are_kept_between_maps(tmp_path):
+    """In a later map as in the first."""
+
+    def press():
+        wait_for(tmp_path / "a")
+        os.kill(os.getpid(), signal.SIGINT)
+
+    begun = time.perf_counter()
+    with persistent(Processes(1)) as executor:
+        for work in ([Add("first", 1.0)], [Sleep("a", tmp_path)]):
+            with interruptible() as stop:
+                if work[0].name == "a":
+                    threading.Thread(target=press).start()
+                done = [job.name for job, _ in executor.map(work, silent)]
+    assert stop.is_set()
+    assert done == []
+    assert time.perf_counter() - begun < 45
+
+
 def test_listeners_hear_of_trainings_on_workers():
     heard: list[Any] = []
 
@@ -119,12 +139,32 @@ def test_a_job_that_kills_every_worker(tmp_path):
     ("error", "kind", "message"),
     [
         (QfolioError("the loss is not finite."), QfolioError, r"^the loss is not finite\.$"),
-        (ZeroDivisionError("by zero"), RuntimeError, r"(?s)^a failed on a worker:\nTraceback.*by"),
+        (ZeroDivisionError("by zero"), WorkerError, r"(?s)^a failed on a worker:\nTraceback.*by"),
+        (
+            SystemExit("no license"),
+            WorkerError,
+            r"(?s)^a failed on a worker:\nTraceback.*no license",
+        ),
     ],
 )
 def test_the_error_of_a_job(error, kind, message):
-    with pytest.raises(kind, match=message):
+    with pytest.raises(kind, match=message) as raised:
         list(Processes(1).map([Fail("a", error)], silent))
+    if kind is WorkerError:  # the command line tells it as it would here
+        said = f"run failed: {type(error).__name__}: {error} (jobs.py, line "
+        assert str(sentence_on(raised.value)).startswith(said)
+
+
+def test_workers_print_nothing_to_the_standard_output(capfd):
+    list(Processes(1).map([Print("a")], silent))
+    printed = capfd.readouterr()
+    assert (printed.out, printed.err) == ("", "a\n")
+
+
+def test_too_little_memory_on_a_worker():
+    with pytest.raises(WorkerError) as raised:
+        list(Processes(1).map([Fail("a", MemoryError())], silent))
+    assert sentence_on(raised.value) == OUT_OF_MEMORY
 
 
 def test_ctrl_c_ends_all_workers_and_keeps_what_is_done(tmp_path):

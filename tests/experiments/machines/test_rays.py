@@ -17,7 +17,7 @@ import jax
 import numpy as np
 import pytest
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, WorkerError
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.executor import Executor, Job
 from qfolio.experiments.machines import dispatch, rays
@@ -233,6 +233,8 @@ class TestRay:
     def test_the_error_of_a_job(self, nodes):
         with pytest.raises(QfolioError, match="the loss is not finite"):
             list(on("ray").map([Fail("a")], silent))
+        with pytest.raises(WorkerError, match=r"SystemExit: no license"):
+            list(on("ray").map([Fail("a", SystemExit("no license"))], silent))
 
     def test_ctrl_c(self, nodes, tmp_path):
         names = ("a", "b")

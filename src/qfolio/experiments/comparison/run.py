@@ -33,7 +33,7 @@ from qfolio.experiments.comparison.conclusion import conclusion
 from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.ranking import Result, rank
 from qfolio.experiments.described import agent_of, describe, task_of
-from qfolio.experiments.executor import Executor, Here, Job, ListenToJob, carry_out
+from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.log import JobLog, Log, add_result, seed_names
 from qfolio.experiments.machines.choice import on
@@ -126,7 +126,7 @@ class Comparison:
 
     def __init__(self, config: ComparisonConfig, folder: Path) -> None:
         self.config, self.results, self.folder = config, dict(config.results), folder
-        self.failures: dict[str, str] = {}
+        self.failures = dict(config.failures)
         self.interrupted = False
         self.entrants = {
             name: _entrant(config.task, entry) for name, entry in config.agents.items()
@@ -229,6 +229,7 @@ class Comparison:
         self.interrupted = False
         if not missing:
             return
+        self.failures = {}  # they are tried again
         with locked(self.folder), Log(self.folder).opened(**self._about) as log:
             run = self._run_here if isinstance(executor, Here) else self._run_groups
             self.interrupted = run(missing, executor, listen, log)
@@ -253,9 +254,9 @@ class Comparison:
 
         def store(job: _AgentJob, trained: Run | QfolioError) -> None:
             if isinstance(trained, QfolioError):
-                self._fail(job, job.name, trained, log)
+                self._fail(job.name, job.name, trained, log)
             else:
-                self._keep(job.name, trained, executor)
+                self._keep(job.name, trained, executor, log)
 
         return carry_out(executor, jobs, listen, store, log)
 
@@ -269,12 +270,12 @@ class Comparison:
             try:
                 runs[job.label].groups.store(job, trained, log)
             except QfolioError as error:
-                self._fail(job, job.label, error, log)
+                self._fail(job.name, job.label, error, log)
             keep_if_finished(job.label)
 
         def keep_if_finished(name: str) -> None:
             if not runs[name].budget.left(runs[name].population):
-                self._keep(name, runs.pop(name), executor)
+                self._keep(name, runs.pop(name), executor, log)
 
         with contextlib.ExitStack() as stack:
             for name in missing:
@@ -284,13 +285,21 @@ class Comparison:
                 keep_if_finished(name)  # all seeds may be trained, with only the result missing
             return carry_out(executor, jobs, listen, store, log)
 
-    def _fail(self, job: Job, name: str, error: QfolioError, log: Log) -> None:
+    def _fail(self, job: str, name: str, error: QfolioError, log: Log) -> None:
         self.failures[name] = str(error)
-        log.write("failed", job=job.name, error=str(error))
+        log.write("failed", job=job, error=str(error))
 
-    def _keep(self, name: str, run: Run, executor: Executor) -> None:
-        self.results[name] = measure(run, executor.devices)
+    def _keep(self, name: str, run: Run, executor: Executor, log: Log) -> None:
+        try:
+            self.results[name] = measure(run, executor.devices)
+        except QfolioError as error:  # it cannot be graded
+            self._fail(name, name, error, log)
         self._write()
+
+    @property
+    def finished(self) -> bool:
+        """Whether every agent has a result, or could not be trained."""
+        return self.entrants.keys() == self.results.keys() | self.failures.keys()
 
     def finish(self) -> dict[str, Any]:
         """The content of comparison.json, with the ranking of all finished agents."""
@@ -367,7 +376,7 @@ class Comparison:
     def _write(self) -> None:
         results = {name: self.results[name] for name in self.entrants if name in self.results}
         content: dict[str, Any] = {"results": results, "failures": self.failures}
-        if len(results) > 1 and len(results) + len(self.failures) == len(self.entrants):
+        if len(results) > 1 and self.finished:
             ranking = rank(results)
             content |= {
                 "ranking": ranking,

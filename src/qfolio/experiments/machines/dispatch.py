@@ -11,7 +11,7 @@ from itertools import chain, islice, takewhile
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, WorkerError
 from qfolio.experiments.executor import Job
 from qfolio.experiments.fit import Listener
 from qfolio.experiments.interrupts import interruptible
@@ -182,4 +182,4 @@ def _require_same(ready: Ready, wanted: dict[str, str]) -> None:
 def _failure(job: Job, failed: Failed) -> Exception:
     if failed.plain:
         return QfolioError(failed.error)
-    return RuntimeError(f"{job.name} failed on a worker:\n{failed.error}")
+    return WorkerError(f"{job.name} failed on a worker:\n{failed.error}", failed.sentence)

@@ -45,11 +45,13 @@ class Done(NamedTuple):
 class Failed(NamedTuple):
     """A job raised an error, which would recur on any worker.
 
-    plain: whether it is a QfolioError; otherwise ``error`` is a traceback.
+    plain: whether it is a QfolioError; otherwise ``error`` is a traceback, and ``sentence`` what
+    ``sentence_on`` says of it.
     """
 
     error: str
     plain: bool
+    sentence: str | None = None
 
 
 class Lost(NamedTuple):

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from qfolio.core.errors import QfolioError
 from qfolio.core.population import LARGE
 from qfolio.core.registry import trust, trusted
 
@@ -85,7 +86,10 @@ class Unpacker:
         return [digest for digest in parcel.arrays if digest not in self._arrays]
 
     def unpack(self, parcel: Parcel) -> Any:
-        """The job; imports the modules that the driver has imported."""
+        """The job; imports the modules that the driver has imported.
+
+        Raises QfolioError if a class is not found here, such as one of a notebook.
+        """
         trust(parcel.modules)
         arrays = self._arrays
 
@@ -93,4 +97,10 @@ class Unpacker:
             def persistent_load(_, digest: str) -> Any:  # noqa: N805
                 return arrays[digest]
 
-        return Unpickler(io.BytesIO(parcel.job)).load()
+        try:
+            return Unpickler(io.BytesIO(parcel.job)).load()
+        except (AttributeError, ImportError) as error:
+            raise QfolioError(
+                f"A worker cannot make what it is to train ({error}); define parts of your own in "
+                "a module that every worker can import, not in a notebook or in the script itself."
+            ) from None

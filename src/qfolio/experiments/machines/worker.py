@@ -7,6 +7,7 @@ import contextlib
 import multiprocessing
 import os
 import pickle
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Mapping
@@ -14,7 +15,7 @@ from multiprocessing import connection
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, sentence_on
 from qfolio.experiments.machines.messages import Done, Failed, Message, Ready, place, versions
 
 if TYPE_CHECKING:
@@ -49,13 +50,14 @@ def work(unpacker: "Unpacker", parcel: "Parcel", send: Callable[[Message], None]
         send(Done(unpacker.unpack(parcel).run([Reporter(send)])))
     except QfolioError as error:
         send(Failed(str(error), plain=True))
-    except Exception:
-        send(Failed(traceback.format_exc(), plain=False))
+    except (Exception, SystemExit) as error:  # sys.exit would end the worker, or its thread in Ray
+        send(Failed(traceback.format_exc(), plain=False, sentence=sentence_on(error)))
 
 
 def serve(pipe: connection.Connection, cores: list[int], environment: dict[str, str]) -> None:
     """The main function of a process: runs jobs from the pipe until it is closed."""
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
+    sys.stdout = sys.stderr  # what a user's own code prints; --json has the driver's for itself
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, cores)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from qfolio.core import settings
 from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.registry import AGENTS, GYM, TASKS
 from qfolio.core.text import listed, near
@@ -90,7 +89,8 @@ def changes(config: RunConfig, task: type[Task]) -> tuple[str, dict[str, tuple[A
     if not known:
         return None
     name = config.preset if config.preset in known else next(iter(known))
-    own = settings.describe(preset(name, config.task, config.agent).build())
-    own |= settings.describe(task(**known[name].task))
+    own = known[name].described(task)
     chosen = config.agent_settings | config.task_settings
-    return name, {key: (value, own[key]) for key, value in chosen.items() if value != own[key]}
+    return name, {
+        key: (value, own.get(key)) for key, value in chosen.items() if value != own.get(key)
+    }

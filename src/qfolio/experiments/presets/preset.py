@@ -9,7 +9,7 @@ from qfolio.core.registry import find
 from qfolio.experiments.budget import Budget
 
 if TYPE_CHECKING:
-    from qfolio.core.mdp import Agent
+    from qfolio.core.mdp import Agent, Task
 
 
 class Preset(NamedTuple):
@@ -28,6 +28,11 @@ class Preset(NamedTuple):
     def build(self, **changes: Any) -> "Agent":
         """The agent, with some settings changed."""
         return settings.build(find("agent", self.agent), {**self.settings, **changes})
+
+    def described(self, task: "type[Task]") -> dict[str, Any]:
+        """The settings of agent and task, except those that have no default."""
+        agent = settings.defaults(find("agent", self.agent), self.settings)
+        return agent | settings.defaults(task, self.task)
 
     @property
     def budget(self) -> Budget:

@@ -25,6 +25,7 @@ from qfolio.core.config import Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.files import new_folder, read_json, write_json
+from qfolio.core.host import population_of
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.text import finite
 from qfolio.core.training import begin
@@ -184,7 +185,7 @@ class Tuning:
         search.require_buildable(type(agent), settings.describe(agent), space)
         jax.eval_shape(lambda: begin(task, agent, jnp.array(0, jnp.uint32)))  # fits the task?
         folder = Path(out)
-        with new_folder(folder) as unfinished:
+        with new_folder(folder, "--join") as unfinished:
             write_config(unfinished / STUDY, config)
         return cls(config, folder)
 
@@ -285,7 +286,8 @@ class Tuning:
         self.interrupted |= carry_out(executor, jobs, listen, store, log or Log(None))
         if len(found) < len(agents):
             raise KeyboardInterrupt
-        return np.array([found[name] for name in agents]), seconds_compile
+        returns = np.array([found[name] for name in agents]).reshape(len(agents), len(seeds))
+        return returns, seconds_compile
 
     def conclude(self, executor: Executor | str | None = None) -> dict[str, Any]:
         """Trains the best configuration and the preset with fresh seeds, and grades both.
@@ -297,7 +299,8 @@ class Tuning:
         found = best_of(trials)
         if found is None:
             raise QfolioError(
-                f"None of the {len(trials)} configurations kept a finite loss; search lower "
+                population_of(self.task, self.agent, [0]).task_fault()
+                or f"None of the {len(trials)} configurations kept a finite loss; search lower "
                 "learning rates, or bound the gradient (huber_delta or max_grad_norm, whichever "
                 "the agent has)."
             )
@@ -333,10 +336,14 @@ class Tuning:
         listener: Callable[[float], None] | None = None,
         executor: Executor | str | None = None,
     ) -> Progress:
-        """Trains a batch and records its returns."""
+        """Trains a batch and records its returns: NaN for settings that the agent refuses."""
         start = perf_counter()
         try:
-            agents = {f"trial {one.trial.number}": self.configured(one.values) for one in asked}
+            agents = dict[str, Agent]()
+            for one in asked:
+                # It may refuse two values that it takes one by one; the search goes on without it.
+                with contextlib.suppress(QfolioError):
+                    agents[_name(one)] = self.configured(one.values)
             seeds = range(self.config.seeds)
             returns, seconds_compile = self.trained(
                 agents, seeds, tuning_keys(), log, listener, executor
@@ -346,8 +353,10 @@ class Tuning:
                 self.journal.give_up(one)
             raise
         seconds = perf_counter() - start
-        for one, row in zip(asked, returns, strict=True):
-            self.journal.tell(one, row.tolist(), seconds / len(asked))
+        found = dict(zip(agents, returns.tolist(), strict=True))
+        for one in asked:
+            returns_of_one = found.get(_name(one), [math.nan] * len(seeds))
+            self.journal.tell(one, returns_of_one, seconds / len(asked))
         trials = self.journal.trials()
         return Progress(
             done=len(trials),
@@ -359,6 +368,10 @@ class Tuning:
             seconds_compile=seconds_compile,
             trials=len(asked),
         )
+
+
+def _name(asked: Asked) -> str:
+    return f"trial {asked.trial.number}"
 
 
 def _require_counts(**counts: int) -> None:

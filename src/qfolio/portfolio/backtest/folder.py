@@ -40,7 +40,7 @@ from qfolio.core.files import (
 )
 from qfolio.core.mdp import Agent
 from qfolio.core.registry import BASELINES, name_of
-from qfolio.core.text import quote
+from qfolio.core.text import quote, shell
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.presets import Preset
 from qfolio.experiments.records import Records
@@ -330,7 +330,8 @@ class BacktestFolder:
             }
         except (AttributeError, KeyError, TypeError, ValueError):
             raise QfolioError(
-                f"{path} is damaged; write it again with qfolio backtest --resume {self.path}."
+                f"{path} is damaged; write it again with qfolio backtest --resume "
+                f"{shell(self.path)}."
             ) from None
 
     def write_why(self, content: dict[str, Any]) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.text import shell
 from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest.folder import BacktestFolder
 
@@ -49,7 +50,9 @@ class Kept:
     def policy(self, agent: str, fold: str, template: Any) -> Any:
         """A policy, in the structure of the template; raises QfolioError if it is not trained."""
         if not self.has(agent, fold):
-            where = f"qfolio backtest --resume {self.folder.path}" if self.folder else "run()"
+            where = (
+                f"qfolio backtest --resume {shell(self.folder.path)}" if self.folder else "run()"
+            )
             raise QfolioError(f"The backtest is not finished; continue with {where} first.")
         if self.folder is None:
             return self._policies[agent, fold]

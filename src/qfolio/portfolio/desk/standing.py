@@ -5,7 +5,7 @@ from pathlib import Path
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json
-from qfolio.core.text import figure
+from qfolio.core.text import figure, shell
 from qfolio.portfolio.backtest.folder import followed
 from qfolio.portfolio.desk.rule import Kind
 
@@ -52,7 +52,7 @@ class Standing:
             return Standing(agent, str(summary["verdicts"][name][0]), lost or worse)
         except (AttributeError, IndexError, KeyError, TypeError, ValueError):
             raise QfolioError(
-                f"{path} is damaged; write it again with qfolio backtest --resume {folder}."
+                f"{path} is damaged; write it again with qfolio backtest --resume {shell(folder)}."
             ) from None
 
     def require_sound(self, folder: Path, named: bool) -> None:
@@ -67,8 +67,8 @@ class Standing:
         if not self.verdict:
             raise QfolioError(
                 f"The backtest in {folder} is not finished, so it does not say how {self.agent} "
-                f"compares with its benchmark; finish it with qfolio backtest --resume {folder}, "
-                "or allocate with --anyway."
+                "compares with its benchmark; finish it with qfolio backtest --resume "
+                f"{shell(folder)}, or allocate with --anyway."
             )
         if self.worse and not named:
             raise QfolioError(

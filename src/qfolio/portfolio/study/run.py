@@ -22,7 +22,7 @@ from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
 from qfolio.core.statistics import holm
-from qfolio.core.text import amount, near
+from qfolio.core.text import amount, near, shell
 from qfolio.experiments.executor import Executor
 from qfolio.experiments.interrupts import interruptible
 from qfolio.experiments.log import Log
@@ -284,7 +284,8 @@ class Study:
         config = self.config
         if not self._complete:
             raise QfolioError(
-                f"The study is not finished; continue with qfolio study --resume {self.folder}."
+                "The study is not finished; continue with qfolio study --resume "
+                f"{shell(self.folder)}."
             )
         result = summarize(
             config,
