@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from qfolio.commands import comparison, continual, training, tuning
 from qfolio.commands.arguments import Modules
 from qfolio.commands.parsing import PAGE, Document
 from qfolio.core import registry
@@ -82,36 +83,12 @@ def _study(folder: Path) -> None:
     write_study_report(Study.open(folder))
 
 
-def _training(folder: Path) -> None:
-    from qfolio.commands.training import write_again
-
-    write_again(folder)
-
-
-def _comparison(folder: Path) -> None:
-    from qfolio.commands.comparison import write_again
-
-    write_again(folder)
-
-
-def _search(folder: Path) -> None:
-    from qfolio.commands.tuning import write_again
-
-    write_again(folder)
-
-
-def _continual(folder: Path) -> None:
-    from qfolio.commands.continual import write_again
-
-    write_again(folder)
-
-
 WRITERS: dict[str, Callable[[Path], None]] = {
     "backtest": _backtest,
     "study": _study,
-    "run": _training,
-    "comparison": _comparison,
-    "search": _search,
-    "continual": _continual,
+    "run": training.write_again,
+    "comparison": comparison.write_again,
+    "search": tuning.write_again,
+    "continual": continual.write_again,
 }
 """The function that writes the report, by kind of folder."""

@@ -183,6 +183,11 @@ class Market(ExogenousTask):
     cost_model = "proportional"
     lag = 0  # rows from a decision to its execution
 
+    def __check_init__(self) -> None:
+        if own_modules(self.reward_function):
+            account = jnp.zeros(1 + self.limits.shape[0])
+            require_reward(self.reward_function, Outcome(jnp.ones(()), jnp.zeros(()), account))
+
     @abc.abstractmethod
     def features(self, market: PyTree) -> Float[Array, "asset time channel"]:
         """The features of each asset, without knowledge of the future."""
@@ -235,11 +240,6 @@ class Market(ExogenousTask):
     @property
     def costs(self) -> CostModel:
         return _part(self, "cost", self.cost_model)
-
-    def __check_init__(self) -> None:
-        if own_modules(self.reward_function):
-            account = jnp.zeros(1 + self.limits.shape[0])
-            require_reward(self.reward_function, Outcome(jnp.ones(()), jnp.zeros(()), account))
 
     @property
     def reward_function(self) -> Reward:

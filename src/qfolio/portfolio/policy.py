@@ -29,7 +29,7 @@ from qfolio.portfolio import policy_folder, signals
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.prices.findings import day, listing
-from qfolio.portfolio.prices.frequency import alike
+from qfolio.portfolio.prices.frequency import require_alike
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 
@@ -38,9 +38,6 @@ UPDATE_RATE = 0.1
 
 MOST = 100.0
 """Largest weight that may be held, long or short, where debts are allowed."""
-
-SEVERAL = 10
-"""Rows from which on a table shows its frequency."""
 
 UNKNOWN = np.datetime64("NaT", "s")
 
@@ -249,19 +246,14 @@ class Policy:
                 f"The price table has {listing(table.feature_names) or 'none'} as further "
                 f"features; the policy was trained with {listing(self.features) or 'none'}."
             )
-        usual, found = float(self.task.year), table.periods_per_year
-        if usual and len(table) >= SEVERAL and not alike(usual, found):
-            raise QfolioError(
-                f"The price table has about {found:.0f} rows a year, and the policy learned from "
-                f"prices with {usual:.0f}; give prices of the same frequency."
-            )
+        require_alike(table.dates, float(self.task.year), "the policy learned from prices with")
         if len(table) <= self.task.window:
             raise QfolioError(
                 f"The price table has {amount(len(table), 'row')}; the policy's window "
                 f"needs at least {self.task.window + 1}."
             )
         # A policy that learned from a shorter table has never known its longest signals.
-        chosen = signals.parse(self.task.signals, found)
+        chosen = signals.parse(self.task.signals, table.periods_per_year)
         looked = min(signals.lookback(chosen), self.rows - 1)
         if len(table) <= looked:
             raise QfolioError(

@@ -18,9 +18,8 @@ from qfolio.portfolio.backtest.own import Own, rows_at
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.mandate.limits import feasible, largest_weight
-from qfolio.portfolio.policy import SEVERAL
 from qfolio.portfolio.prices.findings import day
-from qfolio.portfolio.prices.frequency import alike
+from qfolio.portfolio.prices.frequency import require_alike
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 
@@ -53,12 +52,7 @@ class Untrained(abc.ABC):
                 f"The price table must have the {len(self.assets)} assets of the backtest, and no "
                 f"others; {off[0]!r} is in only one of the two."
             )
-        usual, found = float(self.task.year), table.periods_per_year
-        if len(table) >= SEVERAL and not alike(usual, found):
-            raise QfolioError(
-                f"The price table has about {found:.0f} rows a year, and the backtest has "
-                f"{usual:.0f}; give prices of the same frequency."
-            )
+        require_alike(table.dates, float(self.task.year), "the backtest has")
         return table.select(self.assets)
 
     @abc.abstractmethod

@@ -2,6 +2,11 @@
 
 import numpy as np
 
+from qfolio.core.errors import QfolioError
+
+SEVERAL = 10
+"""Rows from which on a table shows its frequency."""
+
 TRADING_DAYS = 252.0  # a year
 INTRADAY = 366.0  # rows a year beyond which there are several a day
 YEARLY = ((6, 8, 52.0), (27, 32, 12.0), (88, 93, 4.0), (360, 370, 1.0))
@@ -62,6 +67,19 @@ def alike(one: float, other: float) -> bool:
     if max(one, other) > INTRADAY:
         return min(one, other) > INTRADAY
     return max(one, other) <= 2 * min(one, other)
+
+
+def require_alike(dates: np.ndarray, usual: float, known: str) -> None:
+    """Raises QfolioError if a table's rows are of another frequency than usual, if it shows one.
+
+    usual: rows a year; 0 if unknown. known: what is known to have them, for the message.
+    """
+    found = periods_per_year(dates)
+    if usual and len(dates) >= SEVERAL and not alike(usual, found):
+        raise QfolioError(
+            f"The price table has about {found:.0f} rows a year, and {known} {usual:.0f}; give "
+            "prices of the same frequency."
+        )
 
 
 def _a_year(dates: np.ndarray) -> float:

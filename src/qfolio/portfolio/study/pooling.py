@@ -6,6 +6,7 @@ of rebalancing and with the best baseline; ``pool`` combines what several tables
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Literal, NamedTuple
 
 import msgspec
@@ -290,12 +291,13 @@ def correlations(days: Sequence[Sequence[str]], active: Sequence[Floats]) -> Flo
     """
     dates = [np.array([day[:10] for day in each], "datetime64[D]") for each in days]
     lengths = [spacing(each.astype("datetime64[s]"))[1] if len(each) > 1 else 1 for each in dates]
+    sums = cache(lambda table, unit: _sums(dates[table], active[table], unit))
     shared = np.eye(len(days))
     for i in range(len(days)):
         for j in range(i):
             longest = max(lengths[i], lengths[j])
             unit = next(unit for most, unit in SPANS if longest <= most)
-            (own, x), (other, y) = (_sums(dates[k], active[k], unit) for k in (i, j))
+            (own, x), (other, y) = sums(i, unit), sums(j, unit)
             _, here, there = np.intersect1d(own, other, return_indices=True)
             first, second = x[here], y[there]
             if len(here) > 2 and first.std() > 0 and second.std() > 0:
