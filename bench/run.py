@@ -21,7 +21,7 @@ from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter, sleep
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 ENVIRONMENT = dict(os.environ)
 """For other processes: without the flags that `configure` sets for this one."""
@@ -35,6 +35,7 @@ import jax.numpy as jnp  # noqa: E402
 import tyro  # noqa: E402
 from jax import lax  # noqa: E402
 
+import assets  # noqa: E402
 import replay  # noqa: E402
 from qfolio.core.host import HostPopulation  # noqa: E402
 from qfolio.core.population import Population  # noqa: E402
@@ -211,7 +212,8 @@ def of_one_run(effort: Effort) -> Outcome:
             first_chunk(train(episodes=3, out=Path(folder, name)), Path(folder, name), environment)
             for name in ("first", "second")
         )
-        memory = peak_memory(train(episodes=episodes, out=Path(folder, "run")), environment)
+        run = train(episodes=episodes, out=Path(folder, "run"))
+        memory = watched(run, environment).megabytes
     most = partial(Figure, at_least=False)
     return [
         most(f"Peak memory of the report's {episodes} episodes", memory, "{:.0f} MB", target=1000),
@@ -264,6 +266,57 @@ def of_replays(effort: Effort) -> Outcome:
         middle = statistics.median(ordered)
         figures.append(Figure(what, middle, "{:.0f}", ordered[0], ordered[-1], target=10.0))
     return figures, rates
+
+
+def of_many_assets(effort: Effort) -> Outcome:
+    """Tables of many assets against tables of few: training, a backtest, and reading."""
+    few, many = 20, 100 if effort.quick else 1000
+    figures: list[Figure] = []
+    rates: Rates = {}
+    for name in assets.AGENTS:
+        of_few, of_many = (f"{name}, {size:,} assets" for size in (few, many))
+        contestants = {
+            of_few: assets.decisions(trained(assets.population(name, few)), few),
+            of_many: assets.decisions(trained(assets.population(name, many)), many),
+        }
+        speeds = race(contestants, effort.rounds, effort.seconds)
+        what = f"Decisions on an asset a second, {name}: {many:,} assets ÷ {few}"
+        figures.append(times(what, ratio(speeds, of_many, of_few), 1.0))
+        rates |= speeds
+    train = ("--train", "7y", "--agents", "dqn", "--seeds", "2")
+    small, large = (needs(assets.backtest(size, 2520, *train)).seconds for size in (few, 100))
+    read = needs(assets.prices(1000, 500 if effort.quick else 5040)).seconds
+    most = partial(Figure, at_least=False)
+    return [
+        *figures,
+        most("Time of a backtest, dqn: 100 assets ÷ 20", large / small, "{:.2f} ×", target=3.0),
+        most("qfolio prices, 1,000 assets × 20 years", read, "{:.1f} s", target=5.0),
+    ], rates
+
+
+def of_large_tables(effort: Effort) -> Outcome:
+    """Whole backtests of large tables."""
+    part = 25 if effort.quick else 1
+    one = ("--test", "3y", "--agents", "tilts", "--seeds", "1")
+    minutes = ("--train", "120000d", "--test", "40000d")
+    most = partial(Figure, at_least=False)
+    figures = []
+    for what, command, longest, largest in (
+        ("default agents, 500 assets × 20 years",
+         assets.backtest(500 // part, 5040, "--train", "7y"), 20.0, 6.0),
+        ("tilts, 1 seed, 1 fold, 3,000 assets × 10 years",
+         assets.backtest(3000 // part, 2520, "--train", "7y", *one), None, None),
+        ("default agents, 10 assets × 200,000 minutes",
+         assets.backtest(10, 200_000, *minutes, daily=False), None, None),
+    ):  # fmt: skip
+        found = needs(command)
+        time, memory = found.seconds / 60, found.megabytes / 1e3
+        figures += [
+            most(f"Backtest, {what}", time, "{:.1f} min", target=longest),
+            most("… its memory", memory, "{:.1f} GB", target=largest),
+            most("… its report", found.report, "{:.1f} MB", target=10.0),
+        ]
+    return figures, {}
 
 
 def spelled(library: str, threads: int) -> str:
@@ -395,22 +448,41 @@ def first_chunk(run: list[str], out: Path, environment: dict[str, str]) -> float
         return perf_counter() - start
 
 
-def peak_memory(run: list[str], environment: dict[str, str]) -> float:
-    """The most memory that a command held, in MB.
+class Needs(NamedTuple):
+    """What a command needed, and what it wrote."""
+
+    seconds: float
+    megabytes: float  # the most memory that it held
+    report: float = 0.0  # megabytes of its page, if it wrote one
+
+
+def needs(command: assets.Command) -> Needs:
+    """Runs a command of qfolio that writes to a folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = watched([str(QFOLIO), *command(Path(folder))], ENVIRONMENT)
+        page = Path(folder, "out", "report.html")
+        return found._replace(report=page.stat().st_size / 1e6) if page.exists() else found
+
+
+def watched(run: list[str], environment: dict[str, str]) -> Needs:
+    """Runs a command.
 
     A process inherits the peak of the one that starts it, so a small one starts it here.
     """
     starter = (
-        "import resource, subprocess, sys;"
+        "import resource, subprocess, sys, time;"
+        "begun = time.perf_counter();"
         "subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL);"
-        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+        "used = resource.getrusage(resource.RUSAGE_CHILDREN);"
+        "print(time.perf_counter() - begun, used.ru_maxrss)"
     )
     result = subprocess.run(
         [sys.executable, "-S", "-c", starter, *run],
         check=True, env=environment, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kibibytes elsewhere
-    return int(result.stdout) * unit / 1e6
+    seconds, peak = result.stdout.split()
+    return Needs(float(seconds), int(peak) * unit / 1e6)
 
 
 def times(what: str, measured: Ratio, target: float) -> Figure:
@@ -453,7 +525,12 @@ def tables(results: dict[str, Any]) -> str:
     ]
     if rates:
         text += "\n" + table(
-            ["environment steps (replay: asset-days) a second", "median", "range"], rates
+            [
+                "environment steps (replay: asset-days; assets: decisions) a second",
+                "median",
+                "range",
+            ],
+            rates,
         )
     machines = dict.fromkeys(part["machine"] for part in results.values())
     loads = ", ".join(f"{part['load']} ({name})" for name, part in results.items())
@@ -483,16 +560,18 @@ PARTS: dict[str, Callable[[Effort], Outcome]] = {
     "families": of_families,
     "host": of_host_loop,
     "replay": of_replays,
+    "assets": of_many_assets,
     "best": partial(of_preset, "best"),
+    "tables": of_large_tables,
 }
+
+LONG = ("best", "tables")
+USUAL = tuple(name for name in PARTS if name not in LONG)
 
 
 def main(
-    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART …")] = (
-        *("a", "b", "c", "d", "e"),
-        *("families", "host", "replay"),
-    ),
-    best: bool = False,
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART …")] = USUAL,
+    long: bool = False,
     quick: bool = False,
 ) -> None:
     """Measure qfolio against its peers and its own limits.
@@ -500,11 +579,11 @@ def main(
     Args:
         only: Parts to run: a (peers), b (matrix products), c (cores), d (memory and start),
             e (preset fast), families (PPO, SAC, TD3 and DDPG), host (environments of Gymnasium),
-            replay (the backtest's engine).
-        best: Measure the preset best, too.
+            replay (the backtest's engine), assets (many against few).
+        long: Run best (preset best) and tables (backtests of large tables), too.
         quick: Short rounds and short runs, to see that all works; leaves the files as they are.
     """
-    chosen = [part for part in PARTS if part in only or (best and part == "best")]
+    chosen = [part for part in PARTS if part in only or (long and part in LONG)]
     results: dict[str, Any] = {}
     for part in chosen:
         busy = load()

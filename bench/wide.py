@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from made_up import table
+from made_up import table, written
 from qfolio.core.registry import BASELINES, short
 from qfolio.portfolio.backtest.attribution.factors import factor_returns
 from qfolio.portfolio.backtest.baselines import baseline
@@ -35,11 +35,7 @@ found: dict[str, list[float]] = {}
 
 def read(assets: int, place: Path) -> Prices:
     """A made-up table, written as CSV and read from it."""
-    made, path = table(assets, ROWS), place / f"{assets}.csv"
-    with path.open("w") as file:
-        file.write(",".join(["date", *made.assets]) + "\n")
-        for day, row in zip(made.dates.astype("datetime64[D]"), made.values, strict=True):
-            file.write(f"{day}," + ",".join(f"{value:.6f}" for value in row) + "\n")
+    path = written(table(assets, ROWS), place / f"{assets}.csv")
     return timed("reading", lambda: load(path))
 
 
