@@ -407,13 +407,14 @@ class Portfolio(Market):
         start = market - self.window + 1
         returns = lax.dynamic_slice_in_dim(self.log_relatives, start, self.window)
         others = lax.dynamic_slice_in_dim(self.extra, start, self.window)
-        # Scaled before they are joined: an agent that reads only signals then computes only them.
+        # Scaled and transposed before they are joined: an agent that reads only signals then
+        # computes only them, and XLA copies nothing to leave the returns out.
         # Multiplied, because XLA divides or multiplies by the reciprocal, depending on how many
         # folds share a program, and these round differently.
         factor = 1 / self.scale
         returns = (returns - self.center[0]) * factor[0]
         others = (others - self.center[1:]) * factor[1:]
-        return jnp.swapaxes(jnp.concatenate([returns[..., None], others], -1), 0, 1)
+        return jnp.concatenate([returns.T[..., None], jnp.swapaxes(others, 0, 1)], -1)
 
     def anchor_weights(self, market: Row) -> Float[Array, " asset"] | None:
         """The anchor's weights; those of assets that cannot be traded go to the others.
