@@ -98,13 +98,13 @@ def backtest(
     for note in mandated(run.replay):
         console.tell(note)
     resume = again("qfolio backtest --resume", folder, *run.parts, on=options.on)
-    status = "Replaying all strategies, drawing histories, writing the report"
+    status = "Replaying all strategies, explaining the agents and writing the report"
     with resumable(resume):
         with console.bar("compiling") as update, tracked(*following):
             run.run(JobsProgress(update), executor)
         if run.interrupted:
             stop(resume)
-        with console.console.status(status):
+        with console.working(status):
             found = finish(run)
     print_assessment(found.assessment)
     for sentences in found.why.diagnosis.values():

@@ -39,11 +39,11 @@ def report(folder: Positional[Path], *, pdf: bool = False, trust: Modules = ()) 
 
     devices.configure()
     registry.trust(trust)
-    with console.console.status("Writing the report"):
+    with console.working("Writing the report"):
         WRITERS[kind](folder)
     console.say(f"Report: {folder / PAGE}")
     if pdf:
-        with console.console.status("Printing"):
+        with console.working("Printing"):
             print_pdf(folder / PAGE, folder / PDF)
         console.say(f"PDF: {folder / PDF}")
     return {"folder": folder, "report": folder / PAGE, "pdf": folder / PDF if pdf else None}

@@ -94,7 +94,7 @@ def study(
         run.run(listen, write_page, executor)
     if run.interrupted:
         stop(resume)
-    with resumable(resume), console.console.status("Pooling the evidence, writing the report"):
+    with resumable(resume), console.working("Pooling the evidence and writing the report"):
         result = run.result()
         write_study_report(run)
     print_study(result)

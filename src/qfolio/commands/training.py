@@ -266,7 +266,7 @@ def _train(
 
     solution, optimum = run.task.optimum(), None
     if solution is not None:
-        with console.console.status("Solving for the exact optimum (once; then it is cached)"):
+        with console.working("Solving for the exact optimum (once; then it is cached)"):
             on_curve = solution.returns(start_keys())[: run.population.curve_starts]
             optimum = float(on_curve.mean())
     run.train(budget, [RunProgress(run, optimum, show)])
@@ -318,13 +318,13 @@ def write_again(folder: Path) -> None:
 
 
 def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
-    from qfolio.commands.console import console, say
+    from qfolio.commands.console import say, working
     from qfolio.commands.console.training import print_result, print_rule
     from qfolio.report.collect import report_data
     from qfolio.report.training import write_report
 
     starts = run.population.starts
-    with console.status(f"Grading on {starts:,} start states and writing the report"):
+    with working(f"Grading on {starts:,} start states and writing the report"):
         summary = run.summary()
         write_report(folder, report_data(run, summary, contrast, _command(run)))
     print_result(run.population.seeds, summary)

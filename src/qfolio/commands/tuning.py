@@ -205,15 +205,15 @@ def _new(
 
 
 def _conclude(work: "Tuning", resume: str, executor: "Executor") -> Document:
-    from qfolio.commands.console import console, say
+    from qfolio.commands.console import say, working
     from qfolio.commands.console.tuning import print_search
     from qfolio.report.sweep import sweep
     from qfolio.report.tuning import write_tuning_report
 
-    with console.status("Training the best configuration and the preset with fresh seeds"):
+    with working("Training the best configuration and the preset with fresh seeds"):
         summary = work.conclude(executor=executor)
     train = command(work, summary["best"])
-    with console.status("Writing the report"):
+    with working("Writing the report"):
         data = sweep(work, summary, f"{train}\n{resume}")
         write_tuning_report(work.folder, data)
     print_search(summary, data.verdicts)

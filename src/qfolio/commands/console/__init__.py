@@ -31,6 +31,15 @@ def tell(sentences: str) -> None:
 
 
 @contextlib.contextmanager
+def working(text: str) -> Iterator[None]:
+    """Says what is being done: in a terminal until it is, in a file or pipe once."""
+    if not console.is_terminal:
+        say(f"{text}.")
+    with console.status(text):
+        yield
+
+
+@contextlib.contextmanager
 def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., None]]:
     """A bar with text beside it, on terminals only, removed at the end.
 
