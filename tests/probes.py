@@ -117,3 +117,10 @@ class AimWeights(Aim):
     def step(self, state, action, key):
         error = action - jnp.array([0.2, 0.5, 0.3])
         return Step(state, 1.0 - 10 * (error**2).sum(), TERMINATED)
+
+
+class AimPlainWeights(AimWeights):
+    """The same, with an observation that is no view of a market."""
+
+    def observe(self, state):
+        return state[None]

@@ -26,7 +26,7 @@ from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
-from probes import Aim, AimWeights, OneState
+from probes import Aim, AimPlainWeights, AimWeights, OneState
 
 DISCOUNT = 0.8
 ANY = [-jnp.inf, jnp.inf]  # rewards that allow every value
@@ -158,11 +158,18 @@ def test_a_soft_choice_among_numbered_actions(rescale):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("agent", [DDPG(**SMALL, exploration_noise=0.1), SAC(**SMALL, spread=0.02)])
-def test_weights_on_a_simplex(agent):
-    end = learned(AimWeights(), agent)
+@pytest.mark.parametrize(
+    ("agent", "task"),
+    [
+        (DDPG(**SMALL, exploration_noise=0.1), AimWeights()),
+        (SAC(**SMALL, spread=0.02), AimWeights()),
+        (SAC(**SMALL, spread=0.02), AimPlainWeights()),
+    ],
+)
+def test_weights_on_a_simplex(agent, task):
+    end = learned(task, agent)
     weights = sac.Policy(end.actor, None) if isinstance(agent, SAC) else end.actor
-    view = jax.vmap(AimWeights().observe)(STATES[:, 0])
+    view = jax.vmap(task.observe)(STATES[:, 0])
     np.testing.assert_allclose(agent.policy(weights, view), [[0.2, 0.5, 0.3]] * 2, atol=0.03)
 
 

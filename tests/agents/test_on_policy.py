@@ -24,7 +24,7 @@ from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
-from probes import Aim, AimWeights, Endless, OneState, RewardDelay, TwoStates
+from probes import Aim, AimPlainWeights, AimWeights, Endless, OneState, RewardDelay, TwoStates
 
 DISCOUNT = 0.9
 SLOW = pytest.mark.slow
@@ -377,10 +377,12 @@ def test_numbers(agent):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("agent", [A2C, PPO])
-def test_weights(agent):
-    weights = learned(agent, AimWeights(), steps=8000)
-    views = jax.vmap(AimWeights().observe)(jnp.array([0.5, -0.5]))
+@pytest.mark.parametrize(
+    ("agent", "task"), [(A2C, AimWeights()), (PPO, AimWeights()), (PPO, AimPlainWeights())]
+)
+def test_weights(agent, task):
+    weights = learned(agent, task, steps=8000)
+    views = jax.vmap(task.observe)(jnp.array([0.5, -0.5]))
     np.testing.assert_allclose(weights.policy(views).mode(), [[0.2, 0.5, 0.3]] * 2, atol=0.02)
 
 

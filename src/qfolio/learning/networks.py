@@ -222,6 +222,13 @@ class Outputs(NamedTuple):
     each: int = 0
     atoms: int = 1  # how many of these numbers belong to one action
 
+    def count(self, task: Task, observation: PyTree) -> int:
+        """All of them; a task that is no market may have weights of assets as actions, too."""
+        if isinstance(task.actions, Simplex):
+            return self.pooled + task.actions.assets * self.each
+        assets = observation.holding.shape[-1] if isinstance(observation, View) else 0
+        return self.pooled + assets * self.each
+
 
 def outputs_of(actions: Actions) -> Outputs:
     """One output for each action, weight or coordinate."""
@@ -282,10 +289,8 @@ def build(
     # Small weights on a bounded observation make a function too smooth for some tasks.
     gain = jnp.where(input_gain > 0, input_gain / jnp.array(task.observation_scale), 1.0)
     if kind == "flat":
-        assets = observation.holding.shape[-1] if isinstance(observation, View) else 0
-        count = outputs.pooled + assets * outputs.each
         return Flat(
-            observation, hidden, count, key, gain, task.states,
+            observation, hidden, outputs.count(task, observation), key, gain, task.states,
             activation=activation, initialization=initialization,
         )  # fmt: skip
     if kind == "positions":
@@ -299,7 +304,8 @@ def build(
         gain = jnp.broadcast_to(gain, (math.prod(shape),))[: shape[-1]]
         width, *rest = hidden
         encoder = _ENCODERS[kind](shape, width, encoder_key, gain)
-        return Flat(observation, tuple(rest), outputs.pooled, key, encoder=encoder)
+        count = outputs.count(task, observation)
+        return Flat(observation, tuple(rest), count, key, encoder=encoder)
     if isinstance(task.actions, Discrete) and not isinstance(task.actions, MenuActions):
         raise QfolioError(
             f"network={kind} is shared by assets and needs a menu with choices for each, such as "
