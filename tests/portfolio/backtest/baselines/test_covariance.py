@@ -30,6 +30,30 @@ def test_nonlinear_shrinkage_is_nearer_to_the_truth(rows: int, assets: int) -> N
     assert errors[2] < errors[1] < errors[0]
 
 
+@pytest.mark.parametrize("assets", [20, 240, 251, 252, 253, 600])
+def test_nonlinear_shrinkage_keeps_a_common_factor(assets: int) -> None:
+    """With as many assets as rows, eigenvalues spread over many orders of magnitude."""
+    rng = np.random.default_rng(3)
+    factor, own = rng.normal(size=(252, 1)), rng.normal(size=(252, assets))
+    direction = np.full(assets, assets**-0.5)
+    found = nonlinear(0.01 * (factor + own))
+    sample = 1e-4 * ((factor + own) @ direction).var()
+    np.testing.assert_allclose(direction @ found @ direction, sample, rtol=0.1)
+    assert np.linalg.eigvalsh(found)[0] > 0
+
+
+def test_nonlinear_shrinkage_of_more_assets_than_rows_equals_that_of_the_whole_spectrum() -> None:
+    """Where the published formula needs all eigenvectors, the ones that are left out are alike."""
+    returns = np.random.default_rng(4).normal(size=(30, 70)) * np.linspace(1, 3, 70)
+    found = nonlinear(returns)
+    values, vectors = np.linalg.eigh(np.cov(returns.T))
+    turned = vectors.T @ found @ vectors
+    np.testing.assert_allclose(turned, np.diag(np.diag(turned)), atol=1e-9)
+    none = np.diag(turned)[: 70 - 29]
+    np.testing.assert_allclose(none, none[0])
+    assert np.diag(turned)[-1] > none[0] > values[0]
+
+
 def test_nonlinear_shrinkage_vanishes_with_many_rows() -> None:
     returns = np.random.default_rng(2).normal(size=(100_000, 4)) * [1, 2, 3, 4]
     np.testing.assert_allclose(nonlinear(returns), np.cov(returns.T), rtol=2e-3, atol=2e-2)

@@ -32,28 +32,43 @@ def nonlinear(returns: Floats) -> Floats:
     """
     rows, assets = len(returns) - 1, returns.shape[1]  # a row less, for the mean
     centered = returns - returns.mean(axis=0)
-    eigenvalues, vectors = np.linalg.eigh(centered.T @ centered / rows)
-    kept = np.maximum(eigenvalues[max(0, assets - rows) :], 1e-12 * eigenvalues[-1])
+    if assets <= rows:
+        eigenvalues, vectors = np.linalg.eigh(centered.T @ centered / rows)
+    else:  # without the eigenvalues that are 0, which would take most of the time for many assets
+        vectors, singular, _ = np.linalg.svd(centered.T, full_matrices=False)
+        eigenvalues, vectors = singular[rows - 1 :: -1] ** 2 / rows, vectors[:, rows - 1 :: -1]
+    kept = np.maximum(eigenvalues, 1e-12 * eigenvalues[-1])
     width = rows ** (-1 / 3)
     scale = width * kept  # of each eigenvalue's kernel
     x = (kept[:, None] - kept) / scale
     root = np.sqrt(5)
     density = (3 / (4 * root) * np.maximum(1 - x**2 / 5, 0) / scale).mean(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        curve = (1 - x**2 / 5) * np.log(np.abs((root - x) / (root + x)))
-    curve = np.where(np.isclose(np.abs(x), root, rtol=1e-12), 0, curve)
-    hilbert = ((-3 / 10 * x + 3 / (4 * root) * curve) / np.pi / scale).mean(axis=1)
+    hilbert = (_hilbert(x) / scale).mean(axis=1)
     ratio = assets / rows
     if assets <= rows:
         real = 1 - ratio - np.pi * ratio * kept * hilbert
         shrunk = kept / ((np.pi * ratio * kept * density) ** 2 + real**2)
-    else:
-        edge = np.log((1 + root * width) / abs(1 - root * width))
-        level = 3 / 10 / width**2 + 3 / (4 * root) / width * (1 - 1 / (5 * width**2)) * edge
-        none = np.pi * (assets - rows) / rows * level / np.pi * (1 / kept).mean()
-        positive = 1 / (np.pi**2 * kept * (density**2 + hilbert**2))
-        shrunk = np.concatenate([np.full(assets - rows, 1 / none), positive])
-    return np.asarray((vectors * shrunk) @ vectors.T)
+        return np.asarray((vectors * shrunk) @ vectors.T)
+    edge = np.log((1 + root * width) / abs(1 - root * width))
+    level = 3 / 10 / width**2 + 3 / (4 * root) / width * (1 - 1 / (5 * width**2)) * edge
+    none = 1 / (np.pi * (assets - rows) / rows * level / np.pi * (1 / kept).mean())
+    positive = 1 / (np.pi**2 * kept * (density**2 + hilbert**2))
+    return np.asarray(none * np.eye(assets) + (vectors * (positive - none)) @ vectors.T)
+
+
+def _hilbert(x: Floats) -> Floats:
+    """The Hilbert transform of Epanechnikov's kernel.
+
+    Far from the kernel its terms cancel each other, all but about −1 / πx, and a series takes their
+    place: eigenvalues of about as many assets as rows spread over many orders of magnitude.
+    """
+    root, far = np.sqrt(5), np.abs(x) > 100
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curve = (1 - x**2 / 5) * np.log(np.abs((root - x) / (root + x)))
+        square = 5 / x**2
+        series = -(1 + square / 5 + 3 * square**2 / 35) / x
+    curve = np.where(np.isclose(np.abs(x), root, rtol=1e-12), 0, curve)
+    return np.asarray(np.where(far, series, -3 / 10 * x + 3 / (4 * root) * curve) / np.pi)
 
 
 def exponential(returns: Floats, decay: float = 0.97) -> Floats:
