@@ -222,7 +222,7 @@ class Outputs(NamedTuple):
     each: int = 0
     atoms: int = 1  # how many of these numbers belong to one action
 
-    def count(self, task: Task, observation: PyTree) -> int:
+    def size(self, task: Task, observation: PyTree) -> int:
         """All of them; a task that is no market may have weights of assets as actions, too."""
         if isinstance(task.actions, Simplex):
             return self.pooled + task.actions.assets * self.each
@@ -290,7 +290,7 @@ def build(
     gain = jnp.where(input_gain > 0, input_gain / jnp.array(task.observation_scale), 1.0)
     if kind == "flat":
         return Flat(
-            observation, hidden, outputs.count(task, observation), key, gain, task.states,
+            observation, hidden, outputs.size(task, observation), key, gain, task.states,
             activation=activation, initialization=initialization,
         )  # fmt: skip
     if kind == "positions":
@@ -304,7 +304,7 @@ def build(
         gain = jnp.broadcast_to(gain, (math.prod(shape),))[: shape[-1]]
         width, *rest = hidden
         encoder = _ENCODERS[kind](shape, width, encoder_key, gain)
-        count = outputs.count(task, observation)
+        count = outputs.size(task, observation)
         return Flat(observation, tuple(rest), count, key, encoder=encoder)
     if isinstance(task.actions, Discrete) and not isinstance(task.actions, MenuActions):
         raise QfolioError(
