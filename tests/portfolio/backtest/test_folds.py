@@ -73,9 +73,14 @@ def test_lengths_that_are_none(length):
         parse_length(length)
 
 
-def test_a_table_that_is_too_short():
+def test_rows_of_a_length_may_be_minutes():
+    assert parse_length("120000d") == (120_000, "d")
+
+
+@pytest.mark.parametrize("length", ["10y", "999999999y", "999999999w", "999999999d"])
+def test_a_table_that_is_too_short(length):
     with pytest.raises(QfolioError, match="nothing to test"):
-        walk_forward(DAYS, "10y", "1y", 1)
+        walk_forward(DAYS, length, "1y", 1)
 
 
 def test_all_dates_of_a_long_table_are_spelled_at_once() -> None:

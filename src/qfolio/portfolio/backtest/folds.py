@@ -121,7 +121,7 @@ def spell_all(some: np.ndarray, dates: np.ndarray) -> list[str]:
 def parse_length(text: str) -> tuple[int, str]:
     """Number and unit (y, m, w or d) of a length such as "5y"; raises QfolioError for others."""
     known = isinstance(text, str)  # a call from Python may give a number
-    match = re.fullmatch(r"\s*([0-9]{1,5})\s*([ymwd])\s*", text) if known else None
+    match = re.fullmatch(r"\s*([0-9]{1,9})\s*([ymwd])\s*", text) if known else None
     if match is None or int(match[1]) == 0:
         raise QfolioError(f"A length is {text!r}; it must be like 5y, 6m, 8w or 500d (rows).")
     return int(match[1]), match[2]
