@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
+from textwrap import fill
 from time import perf_counter, sleep
 from typing import Annotated, Any, NamedTuple
 
@@ -294,29 +295,27 @@ def of_many_assets(effort: Effort) -> Outcome:
     ], rates
 
 
-def of_large_tables(effort: Effort) -> Outcome:
-    """Whole backtests of large tables."""
-    part = 25 if effort.quick else 1
-    one = ("--test", "3y", "--agents", "tilts", "--seeds", "1")
-    minutes = ("--train", "120000d", "--test", "40000d")
+def of_backtest(
+    what: str,
+    assets_and_rows: tuple[int, int],
+    options: str,
+    effort: Effort,
+    *,
+    daily: bool = True,
+    longest: float | None = None,
+    largest: float | None = None,
+) -> Outcome:
+    """A whole backtest of a large table; at most so many minutes and gigabytes are the targets."""
+    count, rows = assets_and_rows
+    size = max(count // 25, 5) if effort.quick else count
+    found = needs(assets.backtest(size, rows, *options.split(), daily=daily))
+    minutes, memory = found.seconds / 60, found.megabytes / 1e3
     most = partial(Figure, at_least=False)
-    figures = []
-    for what, command, longest, largest in (
-        ("default agents, 500 assets × 20 years",
-         assets.backtest(500 // part, 5040, "--train", "7y"), 20.0, 6.0),
-        ("tilts, 1 seed, 1 fold, 3,000 assets × 10 years",
-         assets.backtest(3000 // part, 2520, "--train", "7y", *one), None, None),
-        ("default agents, 10 assets × 200,000 minutes",
-         assets.backtest(10, 200_000, *minutes, daily=False), None, None),
-    ):  # fmt: skip
-        found = needs(command)
-        time, memory = found.seconds / 60, found.megabytes / 1e3
-        figures += [
-            most(f"Backtest, {what}", time, "{:.1f} min", target=longest),
-            most("… its memory", memory, "{:.1f} GB", target=largest),
-            most("… its report", found.report, "{:.1f} MB", target=10.0),
-        ]
-    return figures, {}
+    return [
+        most(f"Backtest of {what}", minutes, "{:.1f} min", target=longest),
+        most("… its memory", memory, "{:.1f} GB", target=largest),
+        most("… its report", found.report, "{:.1f} MB", target=10.0),
+    ], {}
 
 
 def spelled(library: str, threads: int) -> str:
@@ -534,7 +533,8 @@ def tables(results: dict[str, Any]) -> str:
         )
     machines = dict.fromkeys(part["machine"] for part in results.values())
     loads = ", ".join(f"{part['load']} ({name})" for name, part in results.items())
-    return f"{text}\n{'; '.join(machines)}; load average before each part: {loads}.\n"
+    measured_on = f"{'; '.join(machines)}; load average before each part: {loads}."
+    return f"{text}\n{fill(measured_on, 120)}\n"
 
 
 def write(results: dict[str, Any]) -> None:
@@ -562,10 +562,21 @@ PARTS: dict[str, Callable[[Effort], Outcome]] = {
     "replay": of_replays,
     "assets": of_many_assets,
     "best": partial(of_preset, "best"),
-    "tables": of_large_tables,
-}
+    "universe": partial(
+        of_backtest, "500 assets × 20 years, default agents", (500, 5040), "--train 7y",
+        longest=20.0, largest=6.0,
+    ),
+    "market": partial(
+        of_backtest, "3,000 assets × 10 years, tilts, 1 seed, 1 fold", (3000, 2520),
+        "--train 7y --test 3y --agents tilts --seeds 1",
+    ),
+    "minutes": partial(
+        of_backtest, "10 assets × 200,000 minutes, default agents", (10, 200_000),
+        "--train 120000d --test 40000d", daily=False,
+    ),
+}  # fmt: skip
 
-LONG = ("best", "tables")
+LONG = ("best", "universe", "market", "minutes")
 USUAL = tuple(name for name in PARTS if name not in LONG)
 
 
@@ -580,7 +591,7 @@ def main(
         only: Parts to run: a (peers), b (matrix products), c (cores), d (memory and start),
             e (preset fast), families (PPO, SAC, TD3 and DDPG), host (environments of Gymnasium),
             replay (the backtest's engine), assets (many against few).
-        long: Run best (preset best) and tables (backtests of large tables), too.
+        long: Run best (preset best) and backtests of large tables (universe, market, minutes), too.
         quick: Short rounds and short runs, to see that all works; leaves the files as they are.
     """
     chosen = [part for part in PARTS if part in only or (long and part in LONG)]
@@ -595,8 +606,8 @@ def main(
             "rates": rates,
         }
         print(tables({part: results[part]}), flush=True)
-    if not quick:
-        write(results)
+        if not quick:
+            write(results)
 
 
 if __name__ == "__main__":
