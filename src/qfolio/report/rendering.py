@@ -58,6 +58,11 @@ def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
     return text.replace("-", "\N{MINUS SIGN}")
 
 
+def years(first: str, last: str) -> str:
+    """The calendar years between two dates, such as "1990 to 2022", or the one year of both."""
+    return first[:4] if first[:4] == last[:4] else f"{first[:4]} to {last[:4]}"
+
+
 def percent(fraction: float, digits: int = 1, *, sign: bool = False) -> str:
     """Return a fraction as a percentage."""
     if math.isnan(fraction):

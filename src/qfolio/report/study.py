@@ -154,7 +154,7 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
         Row(
             name=name,
             link=links.get(name),
-            period=_period(known := pools.evidence[name]),
+            period=rendering.years((known := pools.evidence[name]).first, known.last),
             years=number(known.years),
             bar=bar(one.growth, one.low, one.high),
             side=_side(one.low, one.high),
@@ -254,10 +254,6 @@ def _chance(p: float | None) -> str:
 def _spread(active: Active) -> str:
     spread = active.tracking_error
     return "undefined" if spread is None else rendering.percent(spread)
-
-
-def _period(known: Evidence) -> str:
-    return f"{known.first[:4]} to {known.last[:4]}"
 
 
 def _spelled(variant: Variant) -> str:

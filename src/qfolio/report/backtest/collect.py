@@ -15,6 +15,7 @@ from qfolio.portfolio.backtest.simulation import Simulation
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
+from qfolio.report import rendering
 from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.backtest.data import BacktestData, StrategySeries
 
@@ -30,9 +31,9 @@ def backtest_data(
     config, dates = backtest.config, backtest.prices.dates
     shift = config.lag + 1
     date = lambda row: day(dates[row])  # noqa: E731
-    first, last = (str(backtest.dates[i])[:4] for i in (0, -1))
+    tested = rendering.years(*(str(backtest.dates[i]) for i in (0, -1)))
     table = str(config.prices["source"]).rpartition(": ")[2]  # without its vendor
-    named = f"{listed(list(backtest.agents))} on {table}, {first} to {last}"
+    named = f"{listed(list(backtest.agents))} on {table}, {tested}"
     return BacktestData(
         title=config.title or named,
         command=config.command,
