@@ -266,7 +266,7 @@ def _train(
 
     solution, optimum = run.task.optimum(), None
     if solution is not None:
-        with console.working("Solving for the exact optimum (once; then it is cached)"):
+        with console.working("Finding the exact optimum (solved once, then cached)"):
             on_curve = solution.returns(start_keys())[: run.population.curve_starts]
             optimum = float(on_curve.mean())
     run.train(budget, [RunProgress(run, optimum, show)])

@@ -225,8 +225,9 @@ class Outputs(NamedTuple):
     def size(self, task: Task, observation: PyTree) -> int:
         """All of them; a task that is no market may have weights of assets as actions, too."""
         if isinstance(task.actions, Simplex):
-            return self.pooled + task.actions.assets * self.each
-        assets = observation.holding.shape[-1] if isinstance(observation, View) else 0
+            assets = task.actions.assets
+        else:
+            assets = observation.holding.shape[-1] if isinstance(observation, View) else 0
         return self.pooled + assets * self.each
 
 
