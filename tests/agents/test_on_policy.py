@@ -12,7 +12,7 @@ from scipy import stats
 
 from qfolio.agents.a2c import A2C
 from qfolio.agents.on_policy import Batch, explained_variance, standardized
-from qfolio.agents.ppo import PPO, clipped, minibatches, shuffled
+from qfolio.agents.ppo import PPO, clipped, shuffled
 from qfolio.agents.reinforce import REINFORCE
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Transition
@@ -154,16 +154,30 @@ def test_normalized_by_hand():
     np.testing.assert_allclose(some, [-root, 0, root], rtol=1e-6)
 
 
+class Looking(PPO):
+    """Learns nothing; reports of which rows its minibatches are."""
+
+    def judge(self, weights, rollout, gae_lambda):
+        row = jnp.arange(8.0)
+        return Batch(row[:, None], row, row, row, row)
+
+    def descend(self, state, batch):
+        row = batch.target
+        parts = (batch.observation[:, 0], batch.action, batch.log_prob, batch.advantage)
+        whole = jnp.stack([(part == row).all() for part in parts]).all()
+        first = jnp.where((row == 0).any(), row.sum(), 0.0)
+        return state, {"rows": (4**row).sum(), "whole": 1.0 * whole, "first": first}
+
+
 def test_minibatches_hold_every_row_once_and_whole():
-    row = jnp.arange(12.0)
-    batch = Batch(row[:, None], row, row, row, row)
-    first, second = (minibatches(jax.random.key(i), batch, 4) for i in range(2))
-    assert first.target.shape == (3, 4)
-    np.testing.assert_array_equal(np.sort(first.target, axis=None), row)
-    assert (np.asarray(first.target).ravel() != row).any()
-    assert (first.target != second.target).any()
-    for part in (first.observation[..., 0], first.action, first.log_prob, first.advantage):
-        np.testing.assert_array_equal(part, first.target)
+    agent, task = Looking(num_envs=2, rollout_length=4, batch_size=4, epochs=1), Pendulum()
+    state = agent.init(task, jax.random.key(0))
+    unread = Transition(*[jnp.zeros(())] * len(Transition._fields))
+    draws = [agent.improve(state, unread, jax.random.key(i))[1] for i in range(8)]
+    for found in draws:
+        assert 2 * found["rows"] == sum(4**row for row in range(8))
+        assert found["whole"] == 1
+    assert len({float(found["first"]) for found in draws}) > 1
 
 
 @pytest.mark.parametrize("n", [1, 5, 8])

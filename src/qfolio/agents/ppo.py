@@ -57,18 +57,16 @@ class PPO(OnPolicy):
         batch = self.judge(state.weights, rollout, self.gae_lambda)
 
         def epoch(state: OnPolicyState, key: PRNGKeyArray) -> tuple[OnPolicyState, Metrics]:
-            descend = lambda state, batch: self.descend(state, batch)  # noqa: E731
-            return lax.scan(descend, state, minibatches(key, batch, self.batch_size))
+            # A scan over minibatches would copy each of them once more than one over their rows.
+            def descend(state: OnPolicyState, rows: Array) -> tuple[OnPolicyState, Metrics]:
+                return self.descend(state, jax.tree.map(lambda x: x[rows], batch))
+
+            order = shuffled(key, batch.target.shape[0])
+            return lax.scan(descend, state, order.reshape(-1, self.batch_size))
 
         state, metrics = lax.scan(epoch, state, jax.random.split(key, self.epochs))
         metrics = jax.tree.map(jnp.mean, metrics)
         return state, metrics | {"explained_variance": explained_variance(batch)}
-
-
-def minibatches(key: PRNGKeyArray, batch: Batch, size: int) -> Batch:
-    """The batch's rows in random order, as (minibatch, row, ...)."""
-    order = shuffled(key, batch.target.shape[0]).reshape(-1, size)
-    return jax.tree.map(lambda x: x[order], batch)
 
 
 def shuffled(key: PRNGKeyArray, n: int) -> Int[Array, " n"]:
