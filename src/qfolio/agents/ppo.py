@@ -57,7 +57,7 @@ class PPO(OnPolicy):
         batch = self.judge(state.weights, rollout, self.gae_lambda)
 
         def epoch(state: OnPolicyState, key: PRNGKeyArray) -> tuple[OnPolicyState, Metrics]:
-            # A scan over minibatches would copy each of them once more than one over their rows.
+            # Minibatches are gathered one at a time; gathered beforehand, each is copied twice.
             def descend(state: OnPolicyState, rows: Array) -> tuple[OnPolicyState, Metrics]:
                 return self.descend(state, jax.tree.map(lambda x: x[rows], batch))
 

@@ -154,7 +154,7 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
         Row(
             name=name,
             link=links.get(name),
-            period=rendering.years((known := pools.evidence[name]).first, known.last),
+            period=rendering.years(known.first, known.last),
             years=number(known.years),
             bar=bar(one.growth, one.low, one.high),
             side=_side(one.low, one.high),
@@ -164,7 +164,7 @@ def _forest(pools: Pools, links: dict[str, str]) -> dict[str, Any]:
             label=_label(one.growth, one.low, one.high),
         )
         for name in order
-        for one in [actives[name]]
+        for one, known in [(actives[name], pools.evidence[name])]
     ]
     rest = pools.to_rebalanced
     return {
