@@ -164,7 +164,10 @@ def test_units_do_not_matter():
 @pytest.mark.optimized
 @pytest.mark.parametrize("agent", [PPO, A2C])
 def test_policies_are_learned_in_any_units(agent):
-    """Without the statistics neither learns from observations around 300 and rewards of 50."""
+    """Without the statistics neither learns from observations around 300 and rewards of 50.
+
+    One seed's actions end about 0.1 from the best ones; the mean error of 16 hardly varies.
+    """
     settings: dict[str, Any] = {
                 "hidden": (16,), "num_envs": 8, "rollout_length": 8, "learning_rate": 1e-2,
                 "learning_rate_final": 0.0, "learning_rate_steps": 2000.0, "discount": 0.5,
@@ -174,9 +177,10 @@ def test_policies_are_learned_in_any_units(agent):
     states = 300 + 20 * jnp.array([[0.5], [-0.5]])
     for chosen, reached in ((BOTH, True), ({}, False)):
         learner = agent(**settings, **chosen)
-        weights = trained(Foreign(), learner, 8 * 250).weights()
-        actions = learner.policy(jax.tree.map(lambda x: jnp.asarray(x[0]), weights), states)
-        assert np.allclose(actions, [[1], [-1]], atol=0.1) == reached
+        weights = trained(Foreign(), learner, 8 * 250, range(16)).weights()
+        actions = jax.vmap(learner.policy, in_axes=(0, None))(weights, states)
+        error = jnp.abs(actions - jnp.array([[1.0], [-1.0]])).mean()
+        assert error < 0.15 if reached else error > 0.8
 
 
 @pytest.mark.parametrize(
