@@ -83,6 +83,11 @@ NO = jnp.array(False)
          r"Own.measure returns {held: float32\[3\]} as metrics; it must be a dict of names and "),
         ("states", 2, r"Own.observe returns float32\[3\]; it must be a whole number below its "),
         ("states", 2.0, "states of Own is 2.0; it must be a whole number."),
+        ("observation_scale", (1.0, 2.0),
+         r"observation_scale of Own is \(1.0, 2.0\); it must be a positive number, or one for each "
+         "of the 3 numbers of an observation."),
+        ("observation_scale", (1.0, 0.0, 2.0), "must be a positive number, or one for each of the"),
+        ("observation_scale", "wide", "observation_scale of Own returns 'wide'; it must"),
         ("actions", 2, "actions of Own is 2; it must be Discrete, Simplex or Box."),
     ],
 )  # fmt: skip

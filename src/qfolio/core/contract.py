@@ -7,9 +7,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.tree_util import keystr
 from jaxtyping import PRNGKeyArray, PyTree
 
+from qfolio.core.arrays import numbers
 from qfolio.core.errors import QfolioError, require_methods, require_type, require_whole
 from qfolio.core.mdp import Actions, Agent, Box, Discrete, ExogenousTask, Step, Task, Transition
 
@@ -141,15 +143,25 @@ def _is_number(found: PyTree) -> bool:
 
 
 def _require_observation(task: Task, seen: PyTree) -> None:
-    """Raises QfolioError unless an observation is of numbers, or one of a task's states."""
+    """Raises QfolioError unless an observation is of numbers, or one of a task's states.
+
+    Its scale has to fit it.
+    """
     leaves = jax.tree.leaves(seen)
-    numbers = [jnp.issubdtype(x.dtype, jnp.number) or x.dtype == bool for x in leaves]
-    if not (numbers and all(numbers)):
+    kinds = [jnp.issubdtype(x.dtype, jnp.number) or x.dtype == bool for x in leaves]
+    if not (kinds and all(kinds)):
         raise _refused(task, "observe", seen, "an array of numbers, or several")
     if task.states is not None:
         require_type(f"states of {type(task).__name__}", task.states, Integral, "a whole number")
         if leaves != [seen] or seen.shape or not jnp.issubdtype(seen.dtype, jnp.integer):
             raise _refused(task, "observe", seen, f"a whole number below its states, {task.states}")
+    scale = numbers(f"observation_scale of {type(task).__name__}", task.observation_scale)
+    size = sum(x.size for x in leaves)
+    if scale.shape not in ((), (size,)) or not (np.isfinite(scale) & (scale > 0)).all():
+        raise QfolioError(
+            f"observation_scale of {type(task).__name__} is {task.observation_scale}; it must be a "
+            f"positive number, or one for each of the {size} numbers of an observation."
+        )
 
 
 def _require_like(
