@@ -74,6 +74,7 @@ def test_a_mandate_names_costs_calendar_and_benchmark(tmp_path):
     other = create(path, calendar="monthly", cost_model="itemized(fixed=2)", benchmark="B").config
     assert (other.benchmark, other.calendar) == ("B", "monthly")
     assert other.cost_model == "itemized(fixed=2)"
+    assert create(path, cost_model="itemized").config.cost_model == config.cost_model
     path.write_text("[costs]\nfee = 1.0\n")
     with pytest.raises(QfolioError, match="Itemized has no setting 'fee'"):
         create(path)

@@ -25,13 +25,15 @@ class TradingTerms(NamedTuple):
     ) -> "TradingTerms":
         """A mandate's cost always applies, its other terms where an argument has its default.
 
+        A cost model that is only named, as the mandate's own is, has the mandate's settings.
         A cost that is written into a cost model precedes both. Raises QfolioError if the mandate
         or the type of the cost model is invalid.
         """
         if mandate is not None:
             mandate = Mandate.of(mandate)
             cost = _number(mandate.costs.get("cost"), cost)
-            cost_model = (cost_model == PROPORTIONAL and mandate.cost_model) or cost_model
+            unset = PROPORTIONAL, mandate.costs.get("model", "itemized")  # without any settings
+            cost_model = (cost_model in unset and mandate.cost_model) or cost_model
             calendar = calendar or mandate.trading.calendar
             benchmark = mandate.benchmark if benchmark is None else benchmark
         require_type("cost_model", cost_model, str, 'text, such as "itemized(fixed=5)"')
