@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from qfolio.core.arrays import Bools, Floats
 from qfolio.core.errors import QfolioError
 
-PERIODS = ("weekly", "monthly", "quarterly", "yearly")
-"""Calendars that are named after their periods."""
+PERIODS = {"weekly": "week", "monthly": "month", "quarterly": "quarter", "yearly": "year"}
+"""Calendars that are named after their periods, and the periods."""
 
 DRIFT = "drift:"
 """Prefix of a calendar that trades only when a weight has drifted beyond a band: drift:0.05."""

@@ -89,6 +89,43 @@ def test_short_sales_are_not_called_impossible(data: BacktestData) -> None:
     assert not said({"cash": {"min": -1.0}})
 
 
+@pytest.mark.parametrize(
+    ("calendar", "said"),
+    [
+        ("drift:0.03", "every day, but trade only if a weight wanted, that of cash included, is "
+         "more than 3% of the wealth from the weight held; otherwise, holdings drift."),
+        ("3", "the first day of the test and, after it, once in 3 days, counted from the table’s "
+         "first row; between, holdings drift."),
+        ("quarterly", "the first day of the test and, after it, on the first day of each quarter; "
+         "between, holdings drift."),
+    ],
+)  # fmt: skip
+def test_says_when_strategies_decide(data: BacktestData, calendar: str, said: str) -> None:
+    config = {**data.config, "calendar": calendar}
+    text = Page(render_backtest(replace(data, config=config))).text
+    assert f"All strategies decide on {said}" in text
+
+
+def test_the_terms_are_those_of_the_figures(data: BacktestData) -> None:
+    assert "Annualized mean return over volatility." in Page(render_backtest(data)).text
+    rate = np.full(len(data.dates), 1e-4)
+    text = Page(render_backtest(replace(data, risk_free=rate))).text
+    assert "Annualized mean return less what cash earns, over volatility." in text
+    assert "less what cash earns, over downside deviation, which counts shortfalls alone." in text
+
+
+def test_calls_nothing_a_limit_that_the_backtest_may_replace(data: BacktestData) -> None:
+    mandate = {
+        "benchmark": "SPY",
+        "costs": {"fixed": 2.0},
+        "trading": {"calendar": "weekly", "turnover": 0.4},
+        "risk": {"tracking_error": 0.05, "benchmark": "SPY"},
+    }
+    page = Page(render_backtest(replace(data, config={**data.config, "mandate": mandate})))
+    limits = "trading.turnover = 0.4; risk.tracking_error = 0.05; risk.benchmark = SPY"
+    assert f"Every order obeys these limits: {limits}." in page.text
+
+
 def test_the_haircut_is_found_from_the_payout() -> None:
     frame = pd.DataFrame(
         {"date": ["2020-01-01", "2020-01-02", "2020-01-03", "2020-01-06"], "A": [1, 2, 3, 4.0],

@@ -8,6 +8,7 @@ from typing import Any
 from qfolio.core.statistics import FEWEST_SEEDS
 from qfolio.core.text import plural
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
+from qfolio.portfolio.calendars import PERIODS, band
 from qfolio.report.backtest.data import BacktestData
 from qfolio.report.rendering import THIN_SPACE, number
 
@@ -112,7 +113,7 @@ def account(data: BacktestData) -> dict[str, Any]:
         **{key: settings.get(key) for key in ("lag", "train", "test", "expanding", "cap")},
         "mandate": "; ".join(_limits(settings.get("mandate") or {})),
         "model": None if settings.get("cost_model") in PLAIN else settings["cost_model"],
-        "calendar": settings.get("calendar") or None,
+        "calendar": _calendar(settings.get("calendar") or "", unit_of(test.periods_per_year)),
         "long_only": _long_only(data),
         "universe": " ".join(universe(data.prices)),
         "trials": _counts(test),
@@ -130,10 +131,36 @@ def _long_only(data: BacktestData) -> bool:
     return all((each or 0) >= 0 for each in least) and all(w.min() > -1e-6 for w in held)
 
 
+def _calendar(calendar: str, unit: str) -> str:
+    """When strategies decide, in a sentence; empty if there is no calendar."""
+    if not calendar:
+        return ""
+    if width := band(calendar):
+        return (
+            f"All strategies decide on every {unit}, but trade only if a weight wanted, that of "
+            f"cash included, is more than {100 * width:.4g}% of the wealth from the weight held; "
+            "otherwise, holdings drift."
+        )
+    if calendar.isdecimal():
+        when = f"once in {_counted(int(calendar), unit)}, counted from the table’s first row"
+    else:
+        when = f"on the first {unit} of each {PERIODS[calendar]}"
+    return (
+        f"All strategies decide on the first {unit} of the test and, after it, {when}; between, "
+        "holdings drift."
+    )
+
+
+_TERMS = ("benchmark", "costs", "trading.calendar")
+"""Entries of a mandate that are no limits; the page says elsewhere what holds of them."""
+
+
 def _limits(mandate: dict[str, Any], place: str = "") -> list[str]:
-    """A mandate's entries as its file writes them, without the assets of groups."""
+    """A mandate's limits as its file writes them, without the assets of groups."""
     said = []
     for key, value in mandate.items():
+        if f"{place}{key}" in _TERMS:
+            continue
         if isinstance(value, dict):
             said += _limits(value, f"{place}{key}.")
         elif not (place.startswith("groups.") and key == "assets"):
