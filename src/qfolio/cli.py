@@ -25,6 +25,9 @@ Examples:
 
 def main() -> NoReturn:
     """Runs the program; Ctrl-C ends it at once, or after the current chunk of a training."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed, as by ">&-": no other file may get its number
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
     exit_on_ctrl_c()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

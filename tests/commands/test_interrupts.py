@@ -105,6 +105,21 @@ def test_a_reader_that_leaves(tmp_path):
         assert process.stderr.read() == ""
 
 
+def test_closed_streams_are_no_error(tmp_path):
+    """As ``<&- >&- 2>&-`` leaves them; nothing that is printed lands in another file."""
+    prices = write_table(tmp_path / "prices.csv", rows=700)
+    command = [sys.executable, "-m", "qfolio", "prices", str(prices)]
+    for closed in ((1,), (0, 1, 2)):
+        done = subprocess.run(
+            [sys.executable, "-c", "import os, sys; [os.close(int(n)) for n in sys.argv[1]]; "
+             "os.execv(sys.argv[2], sys.argv[2:])", "".join(map(str, closed)), *command],
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+        )  # fmt: skip
+        assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 def test_ctrl_c_with_workers(tmp_path, count):

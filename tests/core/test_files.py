@@ -7,11 +7,13 @@ import math
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import platformdirs
 import pytest
+from filelock import FileLock
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import (
@@ -104,6 +106,26 @@ def test_a_full_disk_is_named_where_only_the_folder_is_known(tmp_path):
     with pytest.raises(OSError, match="No space left") as error, new_folder(tmp_path / "run"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert error.value.filename == str(tmp_path / "run")
+
+
+def test_a_read_only_disk_names_what_was_to_be_written(tmp_path, monkeypatch):
+    """And not a temporary file, or one that is never there, such as the lock."""
+
+    def refused(path, *_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    def error_of(write):
+        with pytest.raises(OSError, match="Read-only") as error:
+            write()
+        return error.value.filename
+
+    monkeypatch.setattr(tempfile, "mkdtemp", lambda *, prefix, dir: refused(dir / prefix))
+    monkeypatch.setattr(FileLock, "acquire", lambda lock: refused(lock.lock_file))
+    monkeypatch.setattr(Path, "open", refused)
+    monkeypatch.setattr(Path, "unlink", refused)
+    assert error_of(lambda: write_bytes(tmp_path / "policy", b"")) == str(tmp_path / "policy")
+    assert error_of(new_folder(tmp_path / "run").__enter__) == str(tmp_path / "run")
+    assert error_of(locked(tmp_path).__enter__) == str(tmp_path)
 
 
 def test_a_lock_says_who_holds_it(tmp_path):

@@ -295,14 +295,13 @@ def test_one_seed_one_evaluation_and_no_extras(tmp_path: Path) -> None:
 
 def test_value_needs_maps() -> None:
     with pytest.raises(ValueError, match="maps"):
-        value(io.BytesIO(), replace(make_data(steps=1), maps=None))
+        value(Path("value.png"), replace(make_data(steps=1), maps=None))
 
 
 def test_gif_has_every_step_and_repeats() -> None:
     episode = make_episode(25)
-    buffer = io.BytesIO()
-    pendulum_gif(buffer, episode.states, episode.torques, episode.rewards)
-    with Image.open(buffer) as gif:
+    content = pendulum_gif(episode.states, episode.torques, episode.rewards)
+    with Image.open(io.BytesIO(content)) as gif:
         assert gif.n_frames == 26 + FADE_FRAMES  # type: ignore[attr-defined]
         assert gif.info["loop"] == 0
         assert gif.info["duration"] == 50
@@ -556,7 +555,7 @@ def test_weights_are_drawn_beside_the_exact_ones() -> None:
 
 def test_policy_needs_a_market() -> None:
     with pytest.raises(ValueError, match="policies of a market"):
-        policy(io.BytesIO(), replace(make_market(), market=None))
+        policy(Path("policy.png"), replace(make_market(), market=None))
 
 
 def test_a_beginner_far_off_does_not_hide_the_curve() -> None:

@@ -194,6 +194,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
     devices.configure()
     registry.trust(trust)
     from qfolio.core.evaluation import STARTS
+    from qfolio.core.files import write_bytes
     from qfolio.experiments.run import Run
     from qfolio.report.animation import pendulum_gif
     from qfolio.report.collect import EPISODE_START, greedy_episode
@@ -214,7 +215,7 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
         return
     episode = greedy_episode(run, run.task)
     path = folder / "episode.gif"
-    pendulum_gif(path, episode.states, episode.torques, episode.rewards)
+    write_bytes(path, pendulum_gif(episode.states, episode.torques, episode.rewards))
     say(f"There is no display here; the episode is in {path}")
 
 

@@ -59,7 +59,8 @@ def write_bytes(path: Path, content: bytes) -> None:
                 os.fsync(file.fileno())
             temporary.replace(path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # on a disk that has become read-only
+            temporary.unlink(missing_ok=True)
         raise
 
 
@@ -88,8 +89,9 @@ def new_folder(folder: Path, option: str = "--resume") -> Iterator[Path]:
     option: as for ``require_new``, which raises QfolioError if ``folder`` is not empty.
     """
     require_new(folder, option)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    with naming(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         yield temporary
         mask = os.umask(0)
@@ -114,7 +116,8 @@ def locked(folder: Path) -> Iterator[None]:
     holder = folder / ".holder"
     lock = FileLock(folder / ".lock", timeout=0)
     try:
-        lock.acquire()
+        with naming(folder):
+            lock.acquire()
     except Timeout:
         raise QfolioError(
             f"{folder} is in use by {_holder(holder)}; wait until it has finished, or stop it."
@@ -124,8 +127,8 @@ def locked(folder: Path) -> Iterator[None]:
         write_json(holder, {"pid": os.getpid(), "host": platform.node(), "since": since})
         yield
     finally:
-        holder.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # Windows cannot delete open files
+        with contextlib.suppress(OSError):  # read-only by now, or Windows: no open file is deleted
+            holder.unlink(missing_ok=True)
             (folder / ".lock").unlink(missing_ok=True)
         lock.release()
 

@@ -1,10 +1,9 @@
 """An episode of the pendulum as an animation that loops smoothly."""
 
+import io
 from collections.abc import Sequence
 from itertools import pairwise
 from math import cos, degrees, pi, sin
-from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,19 +25,13 @@ _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 _RGB = tuple[int, int, int]
 
 
-def pendulum_gif(
-    path: str | Path | IO[bytes],
-    states: ArrayLike,
-    torques: ArrayLike,
-    rewards: ArrayLike,
-) -> None:
-    """Save an episode of T steps as a GIF that plays in real time and repeats forever.
+def pendulum_gif(states: ArrayLike, torques: ArrayLike, rewards: ArrayLike) -> bytes:
+    """Return an episode of T steps as a GIF that plays in real time and repeats forever.
 
     The last frame is held for a moment and then fades into the first one: T + 1 + FADE_FRAMES
     frames in all.
 
     Args:
-        path: File name or binary stream.
         states: Angle (radians, 0 = upright, counter-clockwise positive) and angular speed,
             shape (T + 1, 2).
         torques: Torques in N m, counter-clockwise positive, shape (T,).
@@ -53,8 +46,9 @@ def pendulum_gif(
     frames += _fade(frames[-1], frames[0])
     table = _color_table()
     indexed = [frame.quantize(palette=table, dither=Image.Dither.NONE) for frame in frames]
+    gif = io.BytesIO()
     indexed[0].save(
-        path,
+        gif,
         format="GIF",
         save_all=True,
         append_images=indexed[1:],
@@ -62,6 +56,7 @@ def pendulum_gif(
         loop=0,
         optimize=False,
     )
+    return gif.getvalue()
 
 
 def pendulum_frames(states: ArrayLike, torques: ArrayLike, rewards: ArrayLike) -> list[Image.Image]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qfolio.core.arrays import AnyFloats
+from qfolio.core.files import write_bytes
 from qfolio.core.statistics import FEWEST_SEEDS, band, interquartile_mean
 from qfolio.core.text import plural
 from qfolio.experiments.comparison.conclusion import amount, share, span
@@ -118,7 +119,7 @@ def write_comparison_report(folder: Path, content: dict[str, Any]) -> None:
     data = comparison_data(content)
     folder.mkdir(parents=True, exist_ok=True)
     save_png(folder / "learning_curves.png", draw_curves, data, LEAD)
-    (folder / "report.html").write_text(render_comparison(data), encoding="utf-8")
+    write_bytes(folder / "report.html", render_comparison(data).encode("utf-8"))
 
 
 def render_comparison(data: ComparisonData) -> str:

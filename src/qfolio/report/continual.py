@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qfolio.core.files import write_bytes
 from qfolio.core.statistics import band, interquartile_mean
 from qfolio.experiments.continual import WAYS
 from qfolio.report import palette
@@ -42,7 +43,7 @@ def write_continual_report(folder: Path, content: Content) -> None:
     """Write report.html and recovery.png into a folder, which is created if missing."""
     folder.mkdir(parents=True, exist_ok=True)
     save_png(folder / "recovery.png", draw_recovery, content, LEAD)
-    (folder / "report.html").write_text(render_page(content), encoding="utf-8")
+    write_bytes(folder / "report.html", render_page(content).encode("utf-8"))
 
 
 def render_page(content: Content) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from qfolio.core.files import write_bytes
 from qfolio.core.statistics import interquartile_mean
 from qfolio.report.animation import pendulum_gif
 from qfolio.report.data import MarketData, ReportData, decimals
@@ -53,14 +54,14 @@ def write_report(folder: Path, data: ReportData) -> None:
             draw(folder / name, data)
         else:
             (folder / name).unlink(missing_ok=True)
-    animation = folder / "episode.gif"
+    animation, gif = folder / "episode.gif", None
     if data.episode is None:
         animation.unlink(missing_ok=True)
     else:
         episode = data.episode
-        pendulum_gif(animation, episode.states, episode.torques, episode.rewards)
-    gif = animation.read_bytes() if data.episode is not None else None
-    (folder / "report.html").write_text(render_page(data, gif), encoding="utf-8")
+        gif = pendulum_gif(episode.states, episode.torques, episode.rewards)
+        write_bytes(animation, gif)
+    write_bytes(folder / "report.html", render_page(data, gif).encode("utf-8"))
 
 
 def render_page(data: ReportData, gif: bytes | None = None) -> str:

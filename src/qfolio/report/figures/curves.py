@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 from qfolio.report.figures.style import (
     LEAD,
     NARROW,
-    Target,
     new_figure,
     percent_axis,
     percent_tick,
@@ -34,9 +34,9 @@ DECADES = 5
 """Maximum number of decades on a scale of regrets; larger regrets are off the scale."""
 
 
-def learning_curve(target: Target, data: ReportData) -> None:
+def learning_curve(path: Path, data: ReportData) -> None:
     """Save the greedy return over training, and its regret if the optimum is known, as PNG."""
-    save_png(target, draw_learning_curve, data, LEAD)
+    save_png(path, draw_learning_curve, data, LEAD)
 
 
 def draw_learning_curve(data: ReportData, width: float) -> Figure:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,16 +17,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-from qfolio.report.figures.style import NARROW, WIDE, Panels, Target, colors, new_figure, save_png
+from qfolio.report.figures.style import NARROW, WIDE, Panels, colors, new_figure, save_png
 
 
-def value(target: Target, data: ReportData) -> None:
+def value(path: Path, data: ReportData) -> None:
     """Save maps of the learned and the exact value and policy as PNG.
 
     Raises:
         ValueError: The data has no maps.
     """
-    save_png(target, draw_value, data, WIDE)
+    save_png(path, draw_value, data, WIDE)
 
 
 def draw_value(data: ReportData, width: float) -> Figure:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 from qfolio.report.figures.style import (
     NARROW,
     WIDE,
-    Target,
     end_label,
     legend_above,
     new_figure,
@@ -28,13 +28,13 @@ from qfolio.report.figures.style import (
 )
 
 
-def policy(target: Target, data: ReportData) -> None:
+def policy(path: Path, data: ReportData) -> None:
     """Save the targets of the learned policies and the best one as PNG.
 
     Raises:
         ValueError: The data has no policy of a market.
     """
-    save_png(target, draw_policy, data, WIDE)
+    save_png(path, draw_policy, data, WIDE)
 
 
 def draw_policy(data: ReportData, width: float) -> Figure:

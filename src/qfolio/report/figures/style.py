@@ -14,6 +14,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from qfolio.core.files import write_bytes
 from qfolio.report import palette
 from qfolio.report.data import ReportData
 from qfolio.report.rendering import percent
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Draw = Callable[[ReportData, float], "Figure"]
 Panels = NDArray[np.object_]
-Target = str | Path | IO[bytes]
 
 LEAD = 10.5
 WIDE = 7.2
@@ -109,16 +109,18 @@ def svgs(draw: Callable[[T, float], Figure], data: T, width: float) -> dict[str,
     return {kind: Markup(inline_svg(draw, data, size)) for kind, size in sizes.items()}
 
 
-def save_png(target: Target, draw: Callable[[T, float], Figure], data: T, width: float) -> None:
+def save_png(path: Path, draw: Callable[[T, float], Figure], data: T, width: float) -> None:
     """Save a function's figure of some data in the style of all figures."""
-    _save(draw, data, width, target, format="png", dpi=160, facecolor=palette.PAPER)
+    png = io.BytesIO()
+    _save(draw, data, width, png, format="png", dpi=160, facecolor=palette.PAPER)
+    write_bytes(path, png.getvalue())
 
 
 def _save(
     draw: Callable[[T, float], Figure],
     data: T,
     width: float,
-    target: Target | IO[str],
+    target: IO[bytes] | IO[str],
     **options: Any,
 ) -> None:
     import matplotlib as mpl
