@@ -171,9 +171,10 @@ def test_a_policy_that_was_found_worse_is_traded_on_demand_only(copy, monkeypatc
 
 
 def test_a_backtest_without_a_verdict(copy, monkeypatch, capsys):
-    (copy / "summary.json").write_text('{"strategies": {"pathwise": 1}}')
-    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 2
-    assert "summary.json is damaged; write it again" in capsys.readouterr().err
+    for damaged in ('{"strategies": {"pathwise": 1}}', '{"strategies": {'):
+        (copy / "summary.json").write_text(damaged)
+        assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1) == 2
+        assert "summary.json is damaged; write it again" in capsys.readouterr().err
     (copy / "summary.json").unlink()
     for consent in ([], ["--agent", "pathwise"]):
         assert qfolio(monkeypatch, "allocate", copy, *AS_OF, "--capital", 1, *consent) == 2

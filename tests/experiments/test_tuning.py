@@ -673,6 +673,10 @@ def test_tune_from_the_command_line(tmp_path, monkeypatch, capsys):
     # Joining what is done only writes the report again.
     assert qfolio(monkeypatch, "tune", "--join", folder) == 0
     assert (folder / "summary.json").stat().st_mtime_ns == before
+    # What follows from the trials is made again if it is damaged.
+    (folder / "summary.json").write_text('{"best": {')
+    assert qfolio(monkeypatch, "tune", "--join", folder) == 0
+    assert json.loads((folder / "summary.json").read_text()) == summary
 
 
 def test_the_learning_rate_ends_with_the_training(tmp_path, monkeypatch, capsys):

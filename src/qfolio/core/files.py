@@ -89,8 +89,8 @@ def new_folder(folder: Path, option: str = "--resume") -> Iterator[Path]:
     option: as for ``require_new``, which raises QfolioError if ``folder`` is not empty.
     """
     require_new(folder, option)
+    folder.parent.mkdir(parents=True, exist_ok=True)
     with naming(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         yield temporary
@@ -174,9 +174,11 @@ def read_json(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
     except (ValueError, RecursionError) as error:
-        raise QfolioError(f"{path} is damaged: it holds no valid JSON ({error}).") from None
+        raise QfolioError(
+            f"{path} is damaged: it holds no valid JSON ({error}); restore it."
+        ) from None
     if not isinstance(content, dict):
-        raise QfolioError(f"{path} is damaged: it holds no JSON object.")
+        raise QfolioError(f"{path} is damaged: it holds no JSON object; restore it.")
     return content
 
 

@@ -305,8 +305,9 @@ class Tuning:
                 "the agent has)."
             )
         path = self.folder / "summary.json"
-        if path.exists() and (summary := read_json(path)).get("best") == found.values:
-            return summary
+        with contextlib.suppress(QfolioError):  # missing or damaged: it is made again
+            if (summary := read_json(path)).get("best") == found.values:
+                return summary
         seeds = range(FRESH, FRESH + self.config.fresh_seeds)
         agents = {"best": self.configured(found.values), "preset": self.agent}
         with self._log() as log:

@@ -328,7 +328,7 @@ class BacktestFolder:
                 for name, strategy in read_json(path)["strategies"].items()
                 if strategy["kind"] != "rebalancing"
             }
-        except (AttributeError, KeyError, TypeError, ValueError):
+        except (AttributeError, KeyError, QfolioError, TypeError, ValueError):
             raise QfolioError(
                 f"{path} is damaged; write it again with qfolio backtest --resume "
                 f"{shell(self.path)}."

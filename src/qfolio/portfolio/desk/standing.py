@@ -36,9 +36,9 @@ class Standing:
         path = folder / "summary.json"
         if not path.exists():
             return Standing(agent, "", False, kind)
-        summary = read_json(path)
-        strategies = summary.get("strategies", {})
         try:
+            summary = read_json(path)
+            strategies = summary.get("strategies", {})
             if kind != "agent":
                 measured = _measured(kind, strategies[agent]["measures"])
                 return Standing(agent, measured, False, kind)
@@ -50,7 +50,7 @@ class Standing:
                 for key in ("to_rebalanced", "to_reference")
             )
             return Standing(agent, str(summary["verdicts"][name][0]), lost or worse)
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        except (AttributeError, IndexError, KeyError, QfolioError, TypeError, ValueError):
             raise QfolioError(
                 f"{path} is damaged; write it again with qfolio backtest --resume {shell(folder)}."
             ) from None
