@@ -24,7 +24,7 @@ from qfolio.portfolio.backtest.training import FoldsJob
 from qfolio.portfolio.following import begin, follow
 from qfolio.portfolio.prices.table import DEFAULT_SOURCE, DEFAULT_TRIALS, Prices, load
 
-from listeners import Interrupt
+from listeners import Interrupt, Tell
 from tables import write_table
 
 AGENTS = {
@@ -259,6 +259,18 @@ def test_what_was_trained_stays(finished, tmp_path):
     one, other = ((members(b), b.policy("pathwise").learner) for b in (resumed, finished))
     for x, y in zip(*(jax.tree.leaves(tree) for tree in (one, other)), strict=True):
         np.testing.assert_array_equal(x, y)
+
+
+def test_a_folder_that_is_moved_while_it_trains_is_resumed_there(tmp_path):
+    place, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    backtest = create(place, agents={"pathwise": AGENTS["pathwise"]})
+    move = lambda *_: place.exists() and place.rename(elsewhere)  # noqa: E731
+    with pytest.raises(QfolioError, match="run is gone; if it was moved, resume it there"):
+        backtest.run(lambda job, done, share: [Tell(move)])
+    assert not place.exists()
+    resumed = Backtest.open(elsewhere)
+    resumed.run()
+    assert resumed.policy()
 
 
 def test_further_agents_are_prepared_while_the_first_trains(monkeypatch):

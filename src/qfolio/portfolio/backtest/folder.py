@@ -268,6 +268,11 @@ class BacktestFolder:
         return read_tree(self.policy_file(agent, fold), template)
 
     def write_records(self, agent: str, fold: str, rows: Records) -> None:
+        """Writes the training episodes of a fold; raises QfolioError if the folder is gone."""
+        if not self.path.exists():  # or a new one would get only the folds that are still to come
+            raise QfolioError(
+                f"{self.path} is gone; if it was moved, resume it there: what was finished is kept."
+            )
         write_bytes(self._records(agent, fold), rows.csv(header=True))
 
     def read_records(self, agent: str, fold: str) -> Records:
