@@ -1,8 +1,10 @@
 """Reports from synthetic data: a real, coarse solution of the pendulum with noise put on top, and a
 market whose exact policy stays within a region."""
 
+import errno
 import io
 import math
+import os
 import re
 from dataclasses import replace
 from functools import lru_cache
@@ -296,6 +298,19 @@ def test_one_seed_one_evaluation_and_no_extras(tmp_path: Path) -> None:
 def test_value_needs_maps() -> None:
     with pytest.raises(ValueError, match="maps"):
         value(Path("value.png"), replace(make_data(steps=1), maps=None))
+
+
+def test_a_full_disk_leaves_the_earlier_report(tmp_path, monkeypatch):
+    def full(file):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    write_report(tmp_path, make_data(steps=1))
+    earlier = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space") as error:
+        write_report(tmp_path, make_data(steps=2))
+    assert error.value.filename == str(tmp_path / "learning_curve.png")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == earlier
 
 
 def test_gif_has_every_step_and_repeats() -> None:
