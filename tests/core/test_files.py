@@ -102,6 +102,16 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_for_results_is_new_or_empty(tmp_path):
+    used, file = tmp_path / "used", tmp_path / "prices.csv"
+    write_bytes(used / "results", b"")
+    write_bytes(file, b"")
+    with pytest.raises(QfolioError, match="is not empty; name a new folder"), new_folder(used):
+        pass
+    with pytest.raises(QfolioError, match="is a file; name a new folder"), new_folder(file):
+        pass
+
+
 def test_a_full_disk_is_named_where_only_the_folder_is_known(tmp_path):
     with pytest.raises(OSError, match="No space left") as error, new_folder(tmp_path / "run"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -75,8 +75,10 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def require_new(folder: Path, option: str = "--resume") -> None:
-    """Raises QfolioError if ``folder`` is not empty; option: continues the work in it."""
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+    """Raises QfolioError unless ``folder`` is new or empty; option: continues the work in it."""
+    if folder.exists() and not folder.is_dir():
+        raise QfolioError(f"{folder} is a file; name a new folder.")
+    if folder.exists() and any(folder.iterdir()):
         raise QfolioError(
             f"{folder} is not empty; name a new folder, or continue with {option} {shell(folder)}."
         )
