@@ -103,7 +103,7 @@ def test_short_sales_are_not_called_impossible(data: BacktestData) -> None:
 def test_says_when_strategies_decide(data: BacktestData, calendar: str, said: str) -> None:
     config = {**data.config, "calendar": calendar}
     text = Page(render_backtest(replace(data, config=config))).text
-    assert f"All strategies decide on {said}" in text
+    assert f"Agents and baselines decide on {said}" in text
 
 
 def test_the_terms_are_those_of_the_figures(data: BacktestData) -> None:

@@ -137,17 +137,17 @@ def _calendar(calendar: str, unit: str) -> str:
         return ""
     if width := band(calendar):
         return (
-            f"All strategies decide on every {unit}, but trade only if a weight wanted, that of "
-            f"cash included, is more than {100 * width:.4g}% of the wealth from the weight held; "
-            "otherwise, holdings drift."
+            f"Agents and baselines decide on every {unit}, but trade only if a weight wanted, that "
+            f"of cash included, is more than {100 * width:.4g}% of the wealth from the weight "
+            "held; otherwise, holdings drift."
         )
     if calendar.isdecimal():
         when = f"once in {_counted(int(calendar), unit)}, counted from the table’s first row"
     else:
         when = f"on the first {unit} of each {PERIODS[calendar]}"
     return (
-        f"All strategies decide on the first {unit} of the test and, after it, {when}; between, "
-        "holdings drift."
+        f"Agents and baselines decide on the first {unit} of the test and, after it, {when}; "
+        "between, holdings drift."
     )
 
 
