@@ -84,9 +84,11 @@ class OnPaths(Agent):
         """Raises QfolioError if a rollout would span two episodes."""
         episode = episode_steps(task, self)
         if episode % self.rollout_length:
+            most = min(episode, self.rollout_length)
+            fits = next(steps for steps in range(most, 0, -1) if episode % steps == 0)
             raise QfolioError(
                 f"rollout_length is {self.rollout_length}; it must divide the {episode} steps of "
-                "an episode (episode_steps, or the task's horizon)."
+                f"an episode (episode_steps, or the task's horizon), such as {fits}."
             )
 
     def _followed(
