@@ -172,7 +172,7 @@ def test_backtest_obeys_a_mandate(monkeypatch, capsys, tmp_path):
     for said in (
         "groups.sector.Metals.cap = 0.3",
         "itemized(minimum=1.0, cash_rate=0.02)",
-        "weekly, on the first day of each period",
+        "on the first day of each week",
         "Table of growth by capital",
     ):
         assert said in page
