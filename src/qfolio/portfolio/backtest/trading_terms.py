@@ -32,7 +32,7 @@ class TradingTerms(NamedTuple):
         if mandate is not None:
             mandate = Mandate.of(mandate)
             cost = _number(mandate.costs.get("cost"), cost)
-            unset = PROPORTIONAL, mandate.costs.get("model", "itemized")  # without any settings
+            unset = PROPORTIONAL, mandate.bare_cost_model
             cost_model = (cost_model in unset and mandate.cost_model) or cost_model
             calendar = calendar or mandate.trading.calendar
             benchmark = mandate.benchmark if benchmark is None else benchmark

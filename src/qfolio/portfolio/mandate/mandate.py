@@ -195,7 +195,12 @@ class Mandate(Section, frozen=True):
         if not self.costs:
             return ""
         chosen = ", ".join(f"{k}={v}" for k, v in self.costs.items() if k != "model")
-        return f"{self.costs.get('model', 'itemized')}({chosen})"
+        return f"{self.bare_cost_model}({chosen})"
+
+    @property
+    def bare_cost_model(self) -> str:
+        """The name of the cost model, without settings."""
+        return str(self.costs.get("model", "itemized"))
 
     def text(self, assets: Sequence[str]) -> str:
         """The limits for a table's assets, in order, as JSON; ``limits.feasible`` takes it.
