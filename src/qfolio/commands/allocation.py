@@ -218,7 +218,7 @@ def follow(
     from qfolio.commands import console
     from qfolio.commands.console.desk import print_following
     from qfolio.commands.console.tables import print_warnings
-    from qfolio.core.files import write_bytes
+    from qfolio.core.files import write_text
     from qfolio.portfolio.desk.consistency import ALARM
     from qfolio.portfolio.desk.desk import Desk
     from qfolio.portfolio.desk.follow import follow as marked
@@ -243,7 +243,7 @@ def follow(
         )
         title = f"{following.agent}, live and in the backtest"
         text = render_following(title, following.sentences(), rows, following.rows())
-        write_bytes(page, text.encode())
+        write_text(page, text)
     print_following(following)
     console.say(f"Rows: {path}" + (f", page: {page}" if len(live.returns) else ""))
     return following.to_json()

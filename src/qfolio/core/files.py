@@ -143,9 +143,14 @@ def _holder(path: Path) -> str:
         return "another process"
 
 
+def write_text(path: Path, text: str) -> None:
+    """Writes text in UTF-8, its line ends as they are: a page holds hashes of its scripts."""
+    write_bytes(path, text.encode())
+
+
 def write_json(path: Path, content: Any) -> None:
     """Writes JSON; raises ValueError for NaN and infinity."""
-    write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def write_csv(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qfolio.core.arrays import AnyFloats
-from qfolio.core.files import write_bytes
+from qfolio.core.files import write_text
 from qfolio.core.statistics import FEWEST_SEEDS, band, interquartile_mean
 from qfolio.core.text import plural
 from qfolio.experiments.comparison.conclusion import amount, share, span
@@ -117,9 +117,8 @@ def write_comparison_report(folder: Path, content: dict[str, Any]) -> None:
         OSError: A file cannot be written.
     """
     data = comparison_data(content)
-    folder.mkdir(parents=True, exist_ok=True)
     save_png(folder / "learning_curves.png", draw_curves, data, LEAD)
-    write_bytes(folder / "report.html", render_comparison(data).encode("utf-8"))
+    write_text(folder / "report.html", render_comparison(data))
 
 
 def render_comparison(data: ComparisonData) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qfolio.core.files import write_bytes
+from qfolio.core.files import write_text
 from qfolio.core.statistics import band, interquartile_mean
 from qfolio.experiments.continual import WAYS
 from qfolio.report import palette
@@ -41,9 +41,8 @@ FLOOR = 1e-3
 
 def write_continual_report(folder: Path, content: Content) -> None:
     """Write report.html and recovery.png into a folder, which is created if missing."""
-    folder.mkdir(parents=True, exist_ok=True)
     save_png(folder / "recovery.png", draw_recovery, content, LEAD)
-    write_bytes(folder / "report.html", render_page(content).encode("utf-8"))
+    write_text(folder / "report.html", render_page(content))
 
 
 def render_page(content: Content) -> str:

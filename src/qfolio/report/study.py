@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from qfolio.core.files import write_bytes
+from qfolio.core.files import write_text
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.statistics.verdict import p_text
 from qfolio.portfolio.study.folder import Result, StudyConfig, Variant
@@ -71,7 +71,7 @@ def write_study_report(study: Study) -> None:
         if (study.folder / (folder := _place(name, study.config.variants[0]))).exists()
     }
     page = render_study(study.config, result, settings, links)
-    write_bytes(study.folder / "report.html", page.encode("utf-8"))
+    write_text(study.folder / "report.html", page)
 
 
 def render_study(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from qfolio.core.files import write_bytes
+from qfolio.core.files import write_bytes, write_text
 from qfolio.core.statistics import interquartile_mean
 from qfolio.report.animation import pendulum_gif
 from qfolio.report.data import MarketData, ReportData, decimals
@@ -44,7 +44,6 @@ def write_report(folder: Path, data: ReportData) -> None:
         OSError: A file cannot be written.
         ValueError: The shapes of the episode do not match.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     curves.learning_curve(folder / "learning_curve.png", data)
     for name, draw, applies in (
         ("value.png", pendulum.value, data.maps is not None),
@@ -61,7 +60,7 @@ def write_report(folder: Path, data: ReportData) -> None:
         episode = data.episode
         gif = pendulum_gif(episode.states, episode.torques, episode.rewards)
         write_bytes(animation, gif)
-    write_bytes(folder / "report.html", render_page(data, gif).encode("utf-8"))
+    write_text(folder / "report.html", render_page(data, gif))
 
 
 def render_page(data: ReportData, gif: bytes | None = None) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from qfolio.core.files import write_bytes
+from qfolio.core.files import write_text
 from qfolio.core.statistics import mean_interval, regret
 from qfolio.core.text import plural
 from qfolio.experiments.tuning.journal import best_of
@@ -33,7 +33,7 @@ def write_tuning_report(folder: Path, data: Sweep) -> None:
             (folder / name).unlink(missing_ok=True)
         else:
             save_png(folder / name, draw, data, width)
-    write_bytes(folder / "report.html", render_page(data).encode("utf-8"))
+    write_text(folder / "report.html", render_page(data))
 
 
 def render_page(data: Sweep) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
-from qfolio.core.files import write_bytes
+from qfolio.core.files import write_text
 from qfolio.portfolio.backtest.statistics.assessment import JUDGED
 from qfolio.portfolio.backtest.statistics.verdict import bound_sentence
 from qfolio.report import palette
@@ -78,10 +78,8 @@ def write_backtest_report(folder: Path, data: BacktestData) -> None:
         QfolioError: Strategies, assessment, dates and assets do not fit together.
     """
     page = render_backtest(data)
-    folder.mkdir(parents=True, exist_ok=True)
     save_png(folder / "wealth.png", draw_wealth, data, LEAD)
-    # Bytes, because changed line ends would change the scripts' hashes.
-    write_bytes(folder / "report.html", page.encode("utf-8"))
+    write_text(folder / "report.html", page)
 
 
 def render_backtest(data: BacktestData) -> str:
