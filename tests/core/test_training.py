@@ -1,3 +1,4 @@
+import dataclasses
 import os
 
 import equinox as eqx
@@ -64,6 +65,19 @@ def test_a_rehearsal_compiles_what_a_population_runs(task, agent):
     assert population._programs is rehearsal._programs
     assert population.seconds_compile == 0
     same(population.fetch(), expected.fetch())
+
+
+def test_learning_is_traced_once(task, agent, monkeypatch):
+    """It takes most of the time before the first step."""
+    traced, learn = [], DQN.learn
+
+    def counted(*args):
+        traced.append(args)
+        return learn(*args)
+
+    monkeypatch.setattr(DQN, "learn", counted)
+    trained(task, dataclasses.replace(agent, hidden=(17,)), [0], [50])
+    assert len(traced) == 1
 
 
 def test_different_seeds_differ(task, agent):

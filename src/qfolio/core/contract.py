@@ -1,6 +1,7 @@
 """What the methods of a task, an agent and a reward must return, checked on shapes before use."""
 
-from functools import wraps
+from collections.abc import Callable, Hashable
+from functools import lru_cache, wraps
 from numbers import Integral
 from typing import Any
 
@@ -8,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 from jax.tree_util import keystr
 from jaxtyping import PRNGKeyArray, PyTree
 
@@ -74,7 +76,7 @@ def require_agent(
     _require_like(agent, "act", acts, batch.action)
     stored = _shapes(agent, "observe", state, rollout)
     _require_like(agent, "observe", stored, state, like="init")
-    learned = _shapes(agent, "learn", state, rollout, key, of=(task,))
+    learned = jax.eval_shape(learning_of(task, agent), task, agent, *_here((state, rollout)), key)
     if not (isinstance(learned, tuple) and len(learned) == 2):
         raise _refused(agent, "learn", learned, "the next state, and a dict of metrics")
     _require_like(agent, "learn", learned[0], state, " as state", "init")
@@ -93,6 +95,30 @@ def require_agent(
         each = jax.ShapeDtypeStruct((agent.num_envs + 1, task.actions.n), jnp.float32)
         _require_like(agent, "action_values", values, each)
     return learned[1], measured
+
+
+def learning_of(task: Task, agent: Agent) -> Callable[..., Any]:
+    """``agent.learn`` as a function of task, agent, state, rollout and key.
+
+    Tracing it takes most of the time that a program takes to trace. This check and the program that
+    trains share one trace.
+    """
+    return _learning_of(jax.tree.structure((task, agent)))
+
+
+@lru_cache(maxsize=8)
+def _learning_of(_structure: Hashable) -> Callable[..., Any]:
+    def learn(task: Task, agent: Agent, state: Any, rollout: Any, key: PRNGKeyArray) -> Any:
+        return _arrays(agent, "learn", agent.learn(task, state, rollout, key))
+
+    return jax.jit(learn, inline=True)
+
+
+def _here(tree: PyTree) -> Any:
+    """Shapes and types as an array of the program that is being traced would have them."""
+    mesh = jax.sharding.get_abstract_mesh()
+    place = None if mesh.empty else NamedSharding(mesh, PartitionSpec())
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), tree)
 
 
 def _form(actions: Actions) -> Any:

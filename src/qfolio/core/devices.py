@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable
 from importlib.metadata import version
 from platform import python_version
+from threading import Lock
 from typing import Any
 
 import jax
@@ -38,6 +39,9 @@ UNROLLED = 16
 looks for vector instructions, and then finds none: without this limit, an operation on a row of 20
 numbers takes longer than on one of 64, and programs take longer to compile."""
 
+TRACING = Lock()
+"""Held while a program is traced. Tracing is done in Python, where two threads slow each other. In
+turn, the second traces while the first compiles."""
 
 PRODUCTS_ONLY: dict[str, str | bool] = {
     "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"
@@ -76,6 +80,12 @@ def configure() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache_directory() / "programs"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def effort(*, once: bool) -> dict[str, str | bool]:
+    """Options of the compiler: half the effort for a program that runs once, with equal results."""
+    level = "xla_backend_optimization_level"
+    return {level: "1"} if once and level not in os.environ.get("XLA_FLAGS", "") else {}
 
 
 def cores() -> list[int]:
@@ -172,7 +182,12 @@ class Members:
         return jax.tree.map(lambda x: np.asarray(x)[self._slots], tree)
 
     def compile(
-        self, function: Callable[..., Any], *example: Any, split: int = 1, donate: bool = False
+        self,
+        function: Callable[..., Any],
+        *example: Any,
+        split: int = 1,
+        donate: bool = False,
+        once: bool = False,
     ) -> Any:
         """Compiles ``function(*members, *shared)`` into a program of ``taken`` and these arguments.
 
@@ -180,6 +195,7 @@ class Members:
 
         example: arguments of the shapes to compile for; the first ``split`` of them have an axis of
         slots, the others are the same for all members. donate: reuses the first one's memory.
+        once: whether it is to run only once, so that optimizing it would take longer than it saves.
         """
 
         def on_device(taken: Array, *args: Any) -> Any:
@@ -198,9 +214,10 @@ class Members:
             )(taken, *args)
 
         program = jax.jit(on_all, donate_argnums=1 if donate else ())
-        lowered = program.lower(self.taken, *example)
+        with TRACING:
+            lowered = program.lower(self.taken, *example)
         try:
-            return lowered.compile(compiler_options=PRODUCTS_ONLY)
+            return lowered.compile(compiler_options=PRODUCTS_ONLY | effort(once=once))
         except jax.errors.JaxRuntimeError:  # this version of XLA has no such option
             return lowered.compile()
 

@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from qfolio.core.devices import effort
 from qfolio.core.errors import QfolioError, one_line
 from qfolio.core.evaluation import Greedy
 from qfolio.core.mdp import Agent, Task, Transition
@@ -180,7 +181,9 @@ class HostPopulation(Population):
         self._require_memory()
         self._own = [jax.device_put([x[i] for x in own]) for i in range(len(self.seeds))]
         self._states = [
-            self._start("begin", lambda task, agent, seed: begin(task, agent, seed), seed, own)
+            self._start(
+                "begin", lambda task, agent, seed: begin(task, agent, seed), seed, own, once=True
+            )
             for seed, own in zip(np.array(self.seeds, np.uint32), self._own, strict=True)
         ]
         self._environments: list[Environments] = []
@@ -311,8 +314,11 @@ class HostPopulation(Population):
     def _fetch(self, where: Callable[[TrainingState], PyTree]) -> PyTree:
         return _stack([where(state) for state in self._states])
 
-    def _compile(self, one: Callable[..., Any], *args: Any, donate: bool) -> Any:
-        return jax.jit(one, donate_argnums=0 if donate else ()).lower(*args).compile()
+    def _compile(
+        self, one: Callable[..., Any], *args: Any, donate: bool = False, once: bool = False
+    ) -> Any:
+        program = jax.jit(one, donate_argnums=0 if donate else ())
+        return program.lower(*args).compile(compiler_options=effort(once=once))
 
     def _call(self, program: Any, *args: Any) -> Any:
         return program(*args)

@@ -74,7 +74,7 @@ class Population:
         self._require_memory()
         seeds = self._members.place(np.array(self.seeds, np.uint32))
         self.state: TrainingState = self._run(
-            "begin", lambda task, agent, seed: begin(task, agent, seed), seeds
+            "begin", lambda task, agent, seed: begin(task, agent, seed), seeds, once=True
         )
 
     @property
@@ -200,11 +200,14 @@ class Population:
         function: Callable[..., Any],
         members: Any,
         *args: Any,
-        donate: bool = False,
+        **how: bool,
     ) -> Any:
-        """Runs ``function(task, agent, member, *args)`` for all members as one program."""
+        """Runs ``function(task, agent, member, *args)`` for all members as one program.
+
+        how: to compile it, see ``Members.compile``.
+        """
         start = partial(self._start, name, function, members, self._own)
-        return jax.block_until_ready(start(*args, donate=donate))
+        return jax.block_until_ready(start(*args, **how))
 
     def _start(
         self,
@@ -213,7 +216,7 @@ class Population:
         member: Any,
         own: Any,
         *args: Any,
-        donate: bool = False,
+        **how: bool,
     ) -> Any:
         """``_run`` without waiting for the result; compiles at the first use of the name.
 
@@ -228,13 +231,15 @@ class Population:
             start = perf_counter()
             with self._programs.compiling:
                 if name not in self._programs:
-                    self._programs[name] = self._compile(one, *args, donate=donate)
+                    self._programs[name] = self._compile(one, *args, **how)
             self.seconds_compile += perf_counter() - start
         return self._call(self._programs[name], *args)
 
-    def _compile(self, one: Callable[..., Any], *args: Any, donate: bool) -> Any:
-        """Compiles for arguments shaped like these; ``donate`` reuses the first one's memory."""
-        return self._members.compile(one, *args, split=2, donate=donate)
+    def _compile(
+        self, one: Callable[..., Any], *args: Any, donate: bool = False, once: bool = False
+    ) -> Any:
+        """Compiles for arguments shaped like these."""
+        return self._members.compile(one, *args, split=2, donate=donate, once=once)
 
     def _call(self, program: Any, *args: Any) -> Any:
         """Calls what ``_compile`` returned, for this or another population of the same form."""

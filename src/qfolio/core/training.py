@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
-from qfolio.core.contract import require_agent, require_task
+from qfolio.core.contract import learning_of, require_agent, require_task
 from qfolio.core.errors import require_methods
 from qfolio.core.mdp import Agent, Metrics, Task, Transition
 
@@ -142,7 +142,7 @@ def _rollout(
             reward=after.reward.astype(jnp.float32),
             next_state=after.state,
             next_observation=jax.vmap(task.observe)(after.state),
-            terminated=after.terminated,
+            terminated=finished & ~truncated,  # not a constant, see learning_of
             truncated=truncated,
         )
 
@@ -172,7 +172,8 @@ def absorb(
     """Learns from a rollout, or only stores it, and updates the counts."""
     if learning:
         last = state.steps + agent.rollout_steps - 1
-        learner, metrics = agent.learn(task, state.agent, rollout, step_keys(state.key, last)[3])
+        learn, learn_key = learning_of(task, agent), step_keys(state.key, last)[3]
+        learner, metrics = learn(task, agent, state.agent, rollout, learn_key)
     else:
         learner, metrics = agent.observe(state.agent, rollout), {}
     monitored = agent.monitor(state.agent)
