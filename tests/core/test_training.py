@@ -1,4 +1,3 @@
-import dataclasses
 import os
 
 import equinox as eqx
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
+from qfolio.agents.ppo import PPO
 from qfolio.core.devices import Members, configure
 from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population, Rehearsal, programs_of
@@ -67,16 +67,24 @@ def test_a_rehearsal_compiles_what_a_population_runs(task, agent):
     same(population.fetch(), expected.fetch())
 
 
-def test_learning_is_traced_once(task, agent, monkeypatch):
+@pytest.mark.parametrize(
+    "agent",
+    [
+        DQN(hidden=(17,), num_envs=2, batch_size=8, replay_capacity=200, learning_starts=20),
+        PPO(hidden=(17,), num_envs=2, rollout_length=5, batch_size=5),
+    ],
+    ids=["DQN", "PPO"],
+)
+def test_learning_is_traced_once(agent, monkeypatch):
     """It takes most of the time before the first step."""
-    traced, learn = [], DQN.learn
+    traced, learn = [], type(agent).learn
 
     def counted(*args):
         traced.append(args)
         return learn(*args)
 
-    monkeypatch.setattr(DQN, "learn", counted)
-    trained(task, dataclasses.replace(agent, hidden=(17,)), [0], [50])
+    monkeypatch.setattr(type(agent), "learn", counted)
+    trained(Endless(), agent, [0, 1], [50])
     assert len(traced) == 1
 
 

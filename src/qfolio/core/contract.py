@@ -100,8 +100,9 @@ def require_agent(
 def learning_of(task: Task, agent: Agent) -> Callable[..., Any]:
     """``agent.learn`` as a function of task, agent, state, rollout and key.
 
-    Tracing it takes most of the time that a program takes to trace. This check and the program that
-    trains share one trace.
+    Tracing it takes most of the time that a program takes to trace. ``require_agent`` and the
+    program that trains share one trace, if the types of the arguments agree. A constant has another
+    type there than what is computed from arguments, see ``_here``.
     """
     return _learning_of(jax.tree.structure((task, agent)))
 
@@ -115,7 +116,10 @@ def _learning_of(_structure: Hashable) -> Callable[..., Any]:
 
 
 def _here(tree: PyTree) -> Any:
-    """Shapes and types as an array of the program that is being traced would have them."""
+    """Shapes and types as arrays have them that the program being traced computes.
+
+    In a program for several devices, the types of such arrays also say where they are.
+    """
     mesh = jax.sharding.get_abstract_mesh()
     place = None if mesh.empty else NamedSharding(mesh, PartitionSpec())
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), tree)

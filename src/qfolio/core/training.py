@@ -142,7 +142,7 @@ def _rollout(
             reward=after.reward.astype(jnp.float32),
             next_state=after.state,
             next_observation=jax.vmap(task.observe)(after.state),
-            terminated=finished & ~truncated,  # not a constant, see learning_of
+            terminated=finished & ~truncated,  # often a constant by itself, see learning_of
             truncated=truncated,
         )
 
