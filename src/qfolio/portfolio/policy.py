@@ -31,6 +31,7 @@ from qfolio.portfolio.following import begin, follow, on_table
 from qfolio.portfolio.prices.findings import day, listing
 from qfolio.portfolio.prices.frequency import require_alike
 from qfolio.portfolio.prices.table import Prices, load
+from qfolio.portfolio.short import fitted
 from qfolio.portfolio.task import Portfolio
 
 UPDATE_RATE = 0.1
@@ -61,7 +62,8 @@ def train(
         seeds, seed: Number of agents (default: the preset's, or 5), with the seeds ``seed``,
             ``seed + 1``, ….
         episodes: Training episodes of each agent (default: the preset's).
-        task: Settings of the portfolio task (cost, lag, window, …) that replace the preset's.
+        task: Settings of the portfolio task (cost, lag, window, …) that replace the preset's. With
+            a preset, horizon is halved if the table has too few rows for it.
 
     Raises:
         QfolioError: Table, settings and agent do not fit together, or a loss is not finite.
@@ -70,7 +72,8 @@ def train(
     if isinstance(agent, str):
         agent = preset("fast", "portfolio", agent)
     if isinstance(agent, Preset):
-        task = {**agent.task, **task}
+        agent = fitted(agent._replace(task={**agent.task, **task}), len(table))
+        task = dict(agent.task)
         episodes = agent.episodes if episodes is None else episodes
         seeds = agent.seeds if seeds is None else seeds
         agent = agent.build()

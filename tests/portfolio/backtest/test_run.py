@@ -423,6 +423,24 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
         np.testing.assert_array_equal(x, y)
 
 
+def test_episodes_are_halved_where_the_first_fold_is_short(tmp_path):
+    run = create(tmp_path / "run", train="30d", test="100d", agents=AGENTS, seeds=1)
+    for backtest in (run, Backtest.open(tmp_path / "run")):
+        assert {name: task.horizon for name, task in backtest.tasks.items()} == dict.fromkeys(
+            AGENTS, 10
+        )
+        assert backtest.config.agents["pathwise"].settings["rollout_length"] == 10
+    run.run()
+    said = [note for note in Backtest.open(tmp_path / "run").entries()[1] if "episodes" in note]
+    assert said == [
+        f"{name} learns from episodes of 10 rows instead of 20, because the first fold trains on "
+        "29 rows only."
+        for name in AGENTS
+    ]
+    longer = create(train="40d", test="100d")
+    assert not any(entry.halved for entry in longer.config.agents.values())
+
+
 def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):
     create(tmp_path / "run", agents={"pathwise:fast": AGENTS["pathwise"]})
     assert list(Backtest.open(tmp_path / "run").agents) == ["pathwise:fast"]
@@ -448,7 +466,8 @@ def test_a_wrong_baseline_of_ones_own_is_found_before_the_training(tmp_path, mon
     ("settings", "message"),
     [
         ({"train": "300d"}, "nothing to test"), ({"test": "1 year"}, "like 5y"),
-        ({"train": "25d"}, "rows are too few"), ({"cost": 0.5}, "cost is 0.5"),
+        ({"train": "20d"}, "rows are too few: .* 10 need at least 22"),
+        ({"cost": 0.5}, "cost is 0.5"),
         ({"trials": -1}, "trials is -1; it must be from 0"),
         ({"lag": -1}, "lag is -1"), ({"agents": {}}, "at least one agent"),
         ({"cap": 1.5}, "The cap is 1.5; it must be above 0"), ({"cap": np.nan}, "The cap is nan"),

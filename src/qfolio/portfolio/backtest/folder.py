@@ -47,6 +47,7 @@ from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest.own import KINDS, Own
 from qfolio.portfolio.mandate.mandate import Mandate
 from qfolio.portfolio.prices.table import Prices
+from qfolio.portfolio.short import fitted
 
 EQUAL_WEIGHT = "equal-weight"
 """The benchmark, unless another is named."""
@@ -90,12 +91,20 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
     settings: dict[str, Any]
     task: dict[str, Any]
     episodes: int
+    halved: bool = False  # whether its preset's horizon was too long for the first fold
 
     @staticmethod
     def of(
-        name: str, agent: Preset | Agent, episodes: int | None, task: Mapping[str, Any]
+        name: str,
+        agent: Preset | Agent,
+        episodes: int | None,
+        task: Mapping[str, Any],
+        learned: slice,
+        lag: int,
     ) -> "AgentConfig":
         """The configuration of an agent; episodes and task are those of one without a preset.
+
+        learned: the rows that the first fold trains on.
 
         Raises QfolioError if the name cannot be that of a folder, or there are no episodes.
         """
@@ -105,12 +114,13 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
                 "colon within, as in tilts:low-risk."
             )
         if isinstance(agent, Preset):
-            described = settings.describe(agent.build())
+            chosen = fitted(agent, learned.stop - learned.start, lag)
             return AgentConfig(
-                agent=agent.agent,
-                settings=described,
-                task=dict(agent.task),
-                episodes=agent.episodes,
+                agent=chosen.agent,
+                settings=settings.describe(chosen.build()),
+                task=dict(chosen.task),
+                episodes=chosen.episodes,
+                halved=chosen is not agent,
             )
         if episodes is None:
             raise QfolioError(

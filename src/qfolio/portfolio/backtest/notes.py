@@ -8,6 +8,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from qfolio.portfolio.backtest.folder import AgentConfig
+from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.replay import Entry, Replay
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.prices.findings import first_of, listing
@@ -15,6 +17,17 @@ from qfolio.portfolio.task import Portfolio
 
 BARELY = 1e-3
 """Risk that exceeds a limit by a smaller share of it is a rounding error."""
+
+
+def halved(agents: Mapping[str, AgentConfig], first: Fold) -> list[str]:
+    """A note on each agent whose episodes are shorter than its preset's; first: the first fold."""
+    rows = first.train.stop - first.train.start
+    horizons = {name: agent.task["horizon"] for name, agent in agents.items() if agent.halved}
+    return [
+        f"{name} learns from episodes of {half} rows instead of {2 * half}, because the first fold "
+        f"trains on {rows} rows only."
+        for name, half in horizons.items()
+    ]
 
 
 def left_out(replay: Replay) -> list[str]:
