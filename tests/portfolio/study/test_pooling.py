@@ -155,15 +155,16 @@ def test_rows_of_any_length_share_shocks():
     dates = weekdays("2001-01-01", 1200).astype("M8[D]")
     weeks, weekly = by_period(dates, x, "W")
     months, monthly = by_period(dates, x, "M")
-    first, calendar = months.astype("M8[M]"), months.astype("M8[M]") + 1
+    day, first = np.timedelta64(1, "D"), months.astype("M8[M]")
+    following = (first + np.timedelta64(1, "M")).astype("M8[D]")
     tables = [
         (text(dates), x),
         (text(weeks), weekly),
-        (text(weeks - 2), weekly),
+        (text(weeks - 2 * day), weekly),
         (text(months), monthly),
         (text(first.astype("M8[D]")), monthly),
-        (text(calendar.astype("M8[D]") - 1), monthly),
-        (tuple(f"{day}-{time}" for day in text(dates) for time in ("103000", "160000")),
+        (text(following - day), monthly),
+        (tuple(f"{date}-{time}" for date in text(dates) for time in ("103000", "160000")),
          np.repeat(x / 2, 2)),
     ]  # fmt: skip
     found = correlations(*zip(*tables, strict=True))
