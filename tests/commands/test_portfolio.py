@@ -268,7 +268,7 @@ def test_the_check_of_prices_guesses_at_splits_and_escapes_names(monkeypatch, ca
         (["--preset", "quick"], "no preset"), (["--set", "lag=2"], "options of their own"),
         (["--set", "dqn.windw=2"], "has this setting"), (["--train", "90y"], "nothing to test"),
         (["--set", "dqm.window=2"], "no agent is named dqm; did you mean"),
-        (["--train", "40d"], "a longer --train in a backtest), or lower window or horizon"),
+        (["--train", "20d"], "a longer --train in a backtest), or lower window or horizon"),
         (["--seeds", "0"], "seeds is 0"), (["--cost-bps", "-5"], "--cost-bps is -5"),
         (["--on", "procesess:4"], "--on is 'procesess:4'; it must be here, processes:4"),
         (["--on", "processes:0"], "--on is 'processes:0'; give a number of processes"),

@@ -162,6 +162,25 @@ def test_it_goes_on_from_where_it_was(policy):
     assert not same(again.learner, updated.learner)
 
 
+@pytest.mark.parametrize("episodes", [None, 6])
+def test_an_update_of_an_agent_that_weighs_evidence_learns_anew(episodes):
+    """Its members would count as evidence what they had learned from before the table moved."""
+    agent = Tilts(network="linear", members=2, blocks=4, num_envs=2, rollout_length=10, head=2)
+    make = lambda seed: train(  # noqa: E731
+        table().between(0, 60), agent, seeds=2, seed=seed, episodes=12, window=1, horizon=20,
+        signals="momentum:8-2", anchor="equal-weight",
+    )  # fmt: skip
+    one, other = make(0), make(7)
+    assert any(
+        (x != y).any() for x, y in zip(leaves(one.learner), leaves(other.learner), strict=True)
+    )
+    assert (one.learner.optimizer.count == 12).all()
+    updated = [each.update(table(), episodes) for each in (one, other)]
+    assert (updated[0].learner.optimizer.count == (episodes or 12)).all()
+    for x, y in zip(*(leaves(each.learner) for each in updated), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
 def test_no_update_without_learning_state(policy):
     bare = Policy(policy.task, policy.agent, policy.members, policy.assets, policy.features)
     with pytest.raises(QfolioError, match="cannot be updated"):

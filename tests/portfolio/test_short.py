@@ -10,33 +10,46 @@ from qfolio.portfolio.task import Portfolio
 
 def months(rows):
     values = 50 * np.exp(np.cumsum(np.random.default_rng(0).normal(0, 0.04, (rows, 3)), axis=0))
-    return Prices(np.datetime64("2000-01") + np.arange(rows), ("A", "B", "C"), values, note="")
+    dates = np.arange(rows).astype("datetime64[M]")
+    return Prices(dates, ("A", "B", "C"), values, note="")
 
 
-@pytest.mark.parametrize("name", ["tilts", "dqn", "reinforce", "pathwise"])
+def changed(given, **task):
+    return given._replace(task={**given.task, **task})
+
+
+@pytest.mark.parametrize("name", ["tilts", "dqn", "reinforce", "ppo"])
 @pytest.mark.parametrize("lag", [1, 3])
-def test_a_horizon_is_halved_where_it_does_not_fit(name, lag):
-    given = preset("fast", "portfolio", name)
-    horizon, fewest = given.task["horizon"], given.task["window"] + given.task["horizon"] + lag + 1
-    Portfolio.of(months(fewest), **given.task, lag=lag)
-    assert fitted(given, fewest, lag) is given
+def test_a_horizon_that_does_not_fit_is_halved(name, lag):
+    given = changed(preset("fast", "portfolio", name), window=2)
+    horizon = given.task["horizon"]
+    enough = 2 + horizon + lag + 1
+    Portfolio.of(months(enough), **given.task, lag=lag)
+    assert fitted(given, enough, lag) == given
     with pytest.raises(QfolioError, match="rows are too few"):
-        Portfolio.of(months(fewest - 1), **given.task, lag=lag)
-    short = fitted(given, fewest - 1, lag)
+        Portfolio.of(months(enough - 1), **given.task, lag=lag)
+    short = fitted(given, enough - 1, lag)
     assert short.task == {**given.task, "horizon": horizon // 2}
-    Portfolio.of(months(fewest - 1), **short.task, lag=lag)
-    with_lag = given._replace(task={**given.task, "lag": lag})
-    assert fitted(with_lag, fewest - 1).settings == short.settings
+    Portfolio.of(months(enough - 1), **short.task, lag=lag)
+    assert fitted(changed(given, lag=lag), enough - 1).settings == short.settings
+    assert fitted(given, 12, lag) == given  # nothing fits, so the error names the preset's
 
 
 def test_a_path_is_at_most_an_episode():
-    paths = {
-        name: preset("fast", "portfolio", name) for name in ("tilts", "pathwise", "dqn", "ppo")
-    }
-    short = {name: fitted(given, 60, 1) for name, given in paths.items()}
+    given = {name: preset("fast", "portfolio", name) for name in ("tilts", "pathwise", "ppo")}
+    short = {name: fitted(changed(each, window=1), 59) for name, each in given.items()}
     assert short["tilts"].settings["rollout_length"] == 42
-    for name in ("pathwise", "dqn", "ppo"):  # these paths fit, or may span several episodes
-        assert short[name].settings == paths[name].settings
-    odd = preset("fast", "portfolio", "minimum-variance-learned")
-    assert fitted(odd, 60, 1) is odd
-    assert fitted(Preset("dqn", {}), 60).task == {"horizon": 25}  # of the task's defaults
+    for name in ("pathwise", "ppo"):  # these paths fit, or may span several episodes
+        assert short[name].settings == given[name].settings
+    assert fitted(changed(given["tilts"], horizon=40), 59).settings["rollout_length"] == 40
+    assert fitted(given["tilts"], 32).task["horizon"] == 28
+    learned = preset("fast", "portfolio", "minimum-variance-learned")
+    assert fitted(learned, 560) == learned  # 21 of its steps do not count
+
+
+def test_what_the_user_has_chosen_is_kept():
+    given = preset("fast", "portfolio", "tilts")
+    assert fitted(changed(given, horizon=80), 59).task["horizon"] == 80
+    chosen = given._replace(settings={"rollout_length": 28})
+    assert fitted(chosen, 59) == chosen
+    assert fitted(Preset("dqn", {}, task={"horizon": 63}), 59).task["horizon"] == 63

@@ -20,6 +20,7 @@ from qfolio.experiments import presets
 from qfolio.portfolio.backtest.simulation import Simulation, simulate
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import drift, grown
+from qfolio.portfolio.prices.frequency import dated, periods_per_year
 from qfolio.portfolio.prices.table import Prices
 
 OWN = ("cost", "lag", "max_weight", "window")
@@ -168,6 +169,7 @@ class PortfolioPolicy(BaseOptimization):
         chosen, task = self._chosen()
         self._held()  # rejects invalid holdings before training
         self.returns_, self.observations_ = returns, _dates(X)
+        self.periods_per_year_ = _frequency(self.observations_)
         self.n_samples_seen_ = len(returns)
         self.policy_ = train(
             self._learned(),
@@ -248,7 +250,7 @@ class PortfolioPolicy(BaseOptimization):
         """Prices of the rows to learn from: those up to the first decision of a prediction."""
         learned = self.returns_[: len(self.returns_) - self.lag]
         dropped = self.n_samples_seen_ - len(self.returns_)
-        return _prices(learned, self._assets(), first=dropped)
+        return _prices(learned, self._assets(), self.periods_per_year_, first=dropped)
 
     def _assets(self) -> tuple[str, ...]:
         named = getattr(self, "feature_names_in_", None)
@@ -271,7 +273,7 @@ class PortfolioPolicy(BaseOptimization):
         return np.asarray(held / held.sum())
 
     def _next_weights(self) -> np.ndarray:
-        prices = _prices(self.returns_, self._assets())
+        prices = _prices(self.returns_, self._assets(), self.periods_per_year_)
         targets, _ = self.policy_.decide(prices, len(prices) - 1, self._held(), 1)
         return np.asarray(targets[0, 1:])
 
@@ -291,7 +293,8 @@ class PortfolioPolicy(BaseOptimization):
         # Rows missing before the first decision's window; their returns are zero.
         missing = max(0, window + lag - len(before))
         still = np.zeros((missing, returns.shape[1]))
-        prices = _prices(np.concatenate([still, before, returns]), self._assets())
+        rows = np.concatenate([still, before, returns])
+        prices = _prices(rows, self._assets(), self.periods_per_year_)
         values, last = prices.values, missing + len(before)  # the last row before X
         known = Conditions.of(prices, task.costs.columns)
 
@@ -373,8 +376,19 @@ def _dates(X: Any) -> Any:
     return index if index.is_monotonic_increasing and index.is_unique and not counted else None
 
 
-def _prices(returns: np.ndarray, assets: tuple[str, ...], first: int = 0) -> Prices:
-    """Prices that start at 1 and have these simple returns; days are counted from ``first``."""
+def _frequency(labels: Any) -> float:
+    """Rows per year by the dates of the rows (default: 252, if they have no dates)."""
+    known = getattr(getattr(labels, "dtype", None), "kind", "") == "M"
+    return periods_per_year(labels.to_numpy("datetime64[s]") if known else np.zeros(0, "M8[s]"))
+
+
+def _prices(
+    returns: np.ndarray, assets: tuple[str, ...], per_year: float, first: int = 0
+) -> Prices:
+    """Prices that start at 1 and have these simple returns.
+
+    Their rows are counted from ``first``, and dated so that there are ``per_year`` a year.
+    """
     if not (returns > -1).all():
         row, asset = np.argwhere(~(returns > -1))[0]
         raise ValueError(
@@ -382,5 +396,5 @@ def _prices(returns: np.ndarray, assets: tuple[str, ...], first: int = 0) -> Pri
             "return must be above -1."
         )
     values = np.cumprod(np.concatenate([np.ones((1, len(assets))), 1 + returns]), axis=0)
-    days = np.arange(first, first + len(values)).astype("datetime64[D]")
-    return Prices(days, assets, values)
+    rows = np.arange(first, first + len(values))
+    return Prices(dated(rows, per_year), assets, values)

@@ -181,6 +181,9 @@ class MeanVariance(Onlooker):
             **found,
         }
 
+    def relearned(self, state: MeanVarianceState) -> int:
+        return int(state.optimizer.count.max()) if self.returns else 0
+
     def weights(self, state: MeanVarianceState) -> Efficient:
         return state.policy
 

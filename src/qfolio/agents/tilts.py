@@ -238,6 +238,9 @@ class Tilts(Onlooker):
             found |= {"evidence_of_depth": state.evidence_of_depth.t, "depth": state.policy.depth}
         return found | state.policy.trading.described
 
+    def relearned(self, state: TiltsState) -> int:
+        return int(state.optimizer.count.max())
+
     def weights(self, state: TiltsState) -> TiltPolicy:
         return state.policy
 

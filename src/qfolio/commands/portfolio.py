@@ -69,7 +69,7 @@ def backtest(
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
-    from qfolio.portfolio.backtest.notes import halved, mandated
+    from qfolio.portfolio.backtest.notes import mandated, shortened
     from qfolio.portfolio.backtest.run import Backtest
     from qfolio.report.backtest.finish import finish
 
@@ -95,7 +95,7 @@ def backtest(
             "with more rows."
         )
     console.say(describe_backtest(run))
-    for note in (*halved(run.config.agents, run.folds[0]), *mandated(run.replay)):
+    for note in (*shortened(run.config.agents, run.folds), *mandated(run.replay)):
         console.tell(note)
     resume = again("qfolio backtest --resume", folder, *run.parts, on=options.on)
     status = "Replaying all strategies, explaining the agents and writing the report"

@@ -58,6 +58,7 @@ def study(
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on
+    from qfolio.portfolio.backtest.notes import shortened
     from qfolio.portfolio.study.run import Study
     from qfolio.report.backtest.finish import write_page
     from qfolio.report.study import write_study_report
@@ -89,6 +90,8 @@ def study(
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1
             console.say(f"{place} of {len(run.places)}: {table}, {spell(variant)}")
+            for note in shortened(backtest.config.agents, backtest.folds):
+                console.tell(note)
             return JobsProgress(update)
 
         run.run(listen, write_page, executor)

@@ -343,6 +343,14 @@ class Agent(eqx.Module):
         """
         return state
 
+    def relearned(self, state: Any) -> int:
+        """From how many rollouts it learns anew on newer data; 0 if it goes on (default).
+
+        Evidence must come from data that a member has not learned from. When the data move, so do
+        the blocks that members leave out, and members have learned from what they now leave out.
+        """
+        return 0
+
     @abc.abstractmethod
     def policy(self, weights: PyTree, observation: PyTree) -> Array:
         """Actions for a batch of observations, without exploration."""

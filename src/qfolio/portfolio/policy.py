@@ -154,11 +154,13 @@ class Policy:
 
         It learns from as many rows as in its first training, and keeps the scale of its
         observations. Networks and optimizer continue from their states, at a constant tenth of the
-        learning rate; experience from the old table is dropped.
+        learning rate; experience from the old table is dropped. Agents that weigh evidence, such as
+        tilts, learn anew, for as long as before.
 
         Args:
             prices: As for ``weights``.
-            episodes: Learning episodes of each agent (default: one for each of its environments).
+            episodes: Learning episodes of each agent (default: one for each of its environments; as
+                many as before if it learns anew).
 
         Raises:
             QfolioError: The learning state was not saved, the table does not fit, or it has no row
@@ -169,8 +171,8 @@ class Policy:
                 "This policy was saved without its learning state and cannot be updated; train it "
                 "again."
             )
-        wanted = self.agent.num_envs if episodes is None else episodes
-        _ = Budget(wanted)
+        if episodes is not None:
+            _ = Budget(episodes)
         table = self.table(prices, **options)
         if table.dates[-1] <= self.learned:
             raise QfolioError(
@@ -179,22 +181,19 @@ class Policy:
             )
         table = table.between(max(0, len(table) - self.rows), None)
         task = self._moved(table)
-        of_now: Any = self.agent
-        rates = {}
-        known = {field.name for field in dataclasses.fields(of_now)}  # a user's may have no rate
-        if "learning_rate" in known:
-            rates["learning_rate"] = of_now.learning_rate * UPDATE_RATE
-        if "learning_rate_final" in known:
-            rates["learning_rate_final"] = 1.0  # the schedule may have ended
-        agent: Agent = dataclasses.replace(of_now, **rates)
+        rollouts = self.agent.relearned(self.learner)
+        agent = self.agent if rollouts else _slowed(self.agent)
         draws = [np.random.SeedSequence((i, self.updates + 1)) for i in range(self.seeds)]
         seeds = [int(draw.generate_state(1)[0]) for draw in draws]
-        unlearned = -(-agent.warm_up() // episode_steps(task, agent)) * agent.num_envs
+        lasting = lambda steps: -(-steps // episode_steps(task, agent)) * agent.num_envs  # noqa: E731
+        unlearned = lasting(agent.warm_up())
+        wanted = lasting(rollouts * agent.rollout_steps) or agent.num_envs
         population = Population(task, agent, seeds)
-        state = population.fetch()
-        learner = agent.carry_over(self.learner, state.agent)
-        population.restore(eqx.tree_at(lambda s: s.agent, state, learner))
-        _learn(population, unlearned + wanted, listeners)
+        if not rollouts:
+            state = population.fetch()
+            learner = agent.carry_over(self.learner, state.agent)
+            population.restore(eqx.tree_at(lambda s: s.agent, state, learner))
+        _learn(population, unlearned + (wanted if episodes is None else episodes), listeners)
         learner = population.fetch().agent
         return Policy(
             task,
@@ -359,6 +358,19 @@ class Policy:
         part = task.part(0, len(table) - 1, tradable)
         where = lambda t: (t.center, t.scale)  # noqa: E731
         return eqx.tree_at(where, part, where(self.task))
+
+
+def _slowed(agent: Agent) -> Agent:
+    """An agent at a constant share of its learning rate; a user's may have none."""
+    of_now: Any = agent
+    rates = {}
+    known = {field.name for field in dataclasses.fields(of_now)}
+    if "learning_rate" in known:
+        rates["learning_rate"] = of_now.learning_rate * UPDATE_RATE
+    if "learning_rate_final" in known:
+        rates["learning_rate_final"] = 1.0  # the schedule may have ended
+    slowed: Agent = dataclasses.replace(of_now, **rates)
+    return slowed
 
 
 def _learn(population: Population, episodes: int, listeners: Sequence[Listener]) -> None:

@@ -2,24 +2,43 @@
 
 from qfolio.agents.paths import OnPaths
 from qfolio.core import settings
-from qfolio.experiments.presets import Preset
+from qfolio.experiments.presets import Preset, presets_of
 from qfolio.portfolio.task import Portfolio
 
 
 def fitted(preset: Preset, rows: int, lag: int | None = None) -> Preset:
-    """The preset with half its ``horizon``, if so many rows are too few for an episode.
+    """The preset with a shorter ``horizon``, if so many rows are too few for an episode.
 
-    Paths that an agent differentiates through are at most an episode. Half instead of all that
-    fits, so that episodes can begin at different rows. lag: default, that of the preset's task.
+    It is a half or a third, and not all that fits, so that episodes can begin at different rows.
+    Paths that an agent differentiates through become at most an episode. Whoever
+    has chosen one of the two lengths otherwise than qfolio's presets keeps it.
+
+    lag: default, that of the preset's task.
     """
+    usual = presets_of("portfolio", preset.agent).values()
+    path, head = _path(preset)
+    if path not in (length for length, _ in map(_path, usual)):
+        return preset
     task = settings.convert(Portfolio, preset.task)
     horizon, window, kept = (
         task.get(name, getattr(Portfolio, name)) for name in ("horizon", "window", "lag")
     )
-    half, odd = divmod(horizon, 2)
-    if odd or horizon < rows - window - (kept if lag is None else lag):
-        return preset
-    agent, chosen = preset.build(), dict(preset.settings)
-    if isinstance(agent, OnPaths) and agent.rollout_length > half:
-        chosen["rollout_length"] = half
-    return preset._replace(settings=chosen, task={**preset.task, "horizon": half})
+    most = rows - window - (kept if lag is None else lag) - 1
+    lengths = (horizon // parts for parts in (1, 2, 3) if horizon % parts == 0)
+    if any(each.task.get("horizon") == horizon for each in usual):
+        horizon = next((length for length in lengths if head < length <= most), horizon)
+    shorter = {"rollout_length": horizon} if path > horizon else {}
+    return preset._replace(
+        settings={**preset.settings, **shorter}, task={**preset.task, "horizon": horizon}
+    )
+
+
+def _path(preset: Preset) -> tuple[int, int]:
+    """Steps of the paths that its agent differentiates through, and how many do not count.
+
+    Both are 0 if it differentiates through none.
+    """
+    agent = preset.build()
+    if not isinstance(agent, OnPaths):
+        return 0, 0
+    return agent.rollout_length, getattr(agent, "head", 0)

@@ -47,6 +47,16 @@ def test_calendar_lengths():
     assert latest("x", DAYS, "1m", expanding=True).train == slice(0, len(DAYS))
 
 
+@pytest.mark.parametrize(("months", "rows"), [(1, 12), (3, 4)])
+def test_a_year_of_last_trading_days_has_all_its_months(months, rows):
+    following = np.datetime64("1983-02") + np.arange(0, 480, months).astype("m8[M]")
+    dates = np.busday_offset(following.astype("M8[D]"), -1, roll="forward")
+    folds = walk_forward(dates, "5y", "1y", 1, expanding=False)
+    lengths = [fold.decisions.stop - fold.decisions.start for fold in folds]
+    assert lengths == [rows] * 35
+    assert {fold.train.stop - fold.train.start for fold in folds[1:]} == {5 * rows + 1}
+
+
 def test_folds_within_a_day_have_names_of_their_own():
     hours = np.arange("2020-01-01T00", "2020-02-01T00", dtype="datetime64[h]")
     folds = walk_forward(hours, "300d", "9d", 1)

@@ -13,7 +13,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES, find
 from qfolio.experiments.events import read
 from qfolio.experiments.executor import Here
-from qfolio.experiments.presets import Preset
+from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio.backtest.folder import MOST_WEIGHTS, rows_written
 from qfolio.portfolio.backtest.kept import LATEST
 from qfolio.portfolio.backtest.replay import Stretch, decide
@@ -423,22 +423,30 @@ def test_an_update_goes_on_learning_and_is_kept(finished, agent, tmp_path):
         np.testing.assert_array_equal(x, y)
 
 
-def test_episodes_are_halved_where_the_first_fold_is_short(tmp_path):
-    run = create(tmp_path / "run", train="30d", test="100d", agents=AGENTS, seeds=1)
+def test_episodes_are_shorter_where_a_fold_is_short(tmp_path):
+    quick = {"blocks": 4, "num_envs": 2, "network": "linear"}
+    given = preset("fast", "portfolio", "tilts")
+    agents = {
+        "tilts": given._replace(
+            settings=quick, episodes=8, task={**given.task, "signals": "momentum:5"}
+        ),
+        "pathwise": AGENTS["pathwise"],
+    }
+    run = create(tmp_path / "run", train="60d", test="100d", agents=agents, seeds=1)
     for backtest in (run, Backtest.open(tmp_path / "run")):
-        assert {name: task.horizon for name, task in backtest.tasks.items()} == dict.fromkeys(
-            AGENTS, 10
-        )
-        assert backtest.config.agents["pathwise"].settings["rollout_length"] == 10
+        assert {name: task.horizon for name, task in backtest.tasks.items()} == {
+            "tilts": 42,
+            "pathwise": 20,
+        }
+        assert backtest.config.agents["tilts"].settings["rollout_length"] == 42
     run.run()
     said = [note for note in Backtest.open(tmp_path / "run").entries()[1] if "episodes" in note]
     assert said == [
-        f"{name} learns from episodes of 10 rows instead of 20, because the first fold trains on "
-        "29 rows only."
-        for name in AGENTS
+        "tilts learns from episodes of 42 rows instead of 84, because a fold trains on 59 rows "
+        "only."
     ]
-    longer = create(train="40d", test="100d")
-    assert not any(entry.halved for entry in longer.config.agents.values())
+    longer = create(train="100d", test="100d", agents=agents)
+    assert not any(entry.shortened for entry in longer.config.agents.values())
 
 
 def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):
@@ -466,7 +474,8 @@ def test_a_wrong_baseline_of_ones_own_is_found_before_the_training(tmp_path, mon
     ("settings", "message"),
     [
         ({"train": "300d"}, "nothing to test"), ({"test": "1 year"}, "like 5y"),
-        ({"train": "20d"}, "rows are too few: .* 10 need at least 22"),
+        ({"train": "25d"}, "dqn, fold .*: 24 rows are too few: .* of 20 need at least 32"),
+        ({"train": "10d"}, r"rows are too few: .* or lower window \(--set window=…\)"),
         ({"cost": 0.5}, "cost is 0.5"),
         ({"trials": -1}, "trials is -1; it must be from 0"),
         ({"lag": -1}, "lag is -1"), ({"agents": {}}, "at least one agent"),

@@ -91,7 +91,7 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
     settings: dict[str, Any]
     task: dict[str, Any]
     episodes: int
-    halved: bool = False  # whether its preset's horizon was too long for the first fold
+    shortened: int = 0  # its preset's horizon, if that was too long for a fold
 
     @staticmethod
     def of(
@@ -99,12 +99,12 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
         agent: Preset | Agent,
         episodes: int | None,
         task: Mapping[str, Any],
-        learned: slice,
+        rows: int,
         lag: int,
     ) -> "AgentConfig":
         """The configuration of an agent; episodes and task are those of one without a preset.
 
-        learned: the rows that the first fold trains on.
+        rows: the fewest that a fold trains on.
 
         Raises QfolioError if the name cannot be that of a folder, or there are no episodes.
         """
@@ -114,13 +114,14 @@ class AgentConfig(msgspec.Struct, kw_only=True, frozen=True):
                 "colon within, as in tilts:low-risk."
             )
         if isinstance(agent, Preset):
-            chosen = fitted(agent, learned.stop - learned.start, lag)
+            chosen = fitted(agent, rows, lag)
+            horizons = [each.task.get("horizon", 0) for each in (agent, chosen)]
             return AgentConfig(
                 agent=chosen.agent,
                 settings=settings.describe(chosen.build()),
                 task=dict(chosen.task),
                 episodes=chosen.episodes,
-                halved=chosen is not agent,
+                shortened=horizons[0] if horizons[1] < horizons[0] else 0,
             )
         if episodes is None:
             raise QfolioError(

@@ -1,12 +1,14 @@
 """Walk-forward folds: train on a window, test on the rows after it, move on."""
 
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.prices.findings import day
+from qfolio.portfolio.prices.table import Prices
 
 
 class Fold(NamedTuple):
@@ -64,9 +66,16 @@ def walk_forward(
     if not folds:
         raise QfolioError(
             f"{len(dates)} rows, {day(dates[0])} to {day(dates[-1])}, leave nothing to "
-            f"test after train={train}; shorten it, or give more rows."
+            f"test after train={train}; shorten it (--train), or give more rows."
         )
     return folds
+
+
+def fewest(folds: Sequence[Fold], prices: Prices) -> int:
+    """The smallest number of rows that agents learn from in a fold."""
+    if prices.tradable is None:
+        folds = [fold.complete(prices.values) for fold in folds]
+    return min(fold.train.stop - fold.train.start for fold in folds)
 
 
 def require_fold(dates: np.ndarray, train: str, test: str, lag: int) -> None:
@@ -132,6 +141,7 @@ def _after(dates: np.ndarray, row: int, length: str) -> int:
     count, unit = parse_length(length)
     if unit == "d":
         return min(row + count, len(dates))
+    dates = _counted(dates, unit)
     return int(np.searchsorted(dates, _shift(dates[row], count, unit)))
 
 
@@ -140,7 +150,18 @@ def _before(dates: np.ndarray, row: int, length: str) -> int:
     count, unit = parse_length(length)
     if unit == "d":
         return max(row - count, 0)
+    dates = _counted(dates, unit)
     return int(np.searchsorted(dates, _shift(dates[row], -count, unit)))
+
+
+def _counted(dates: np.ndarray, unit: str) -> np.ndarray:
+    """Dates from which lengths are counted: the months, if each has at most one row.
+
+    So a year has twelve rows of months that are dated by their last day of trading.
+    """
+    months = dates.astype("datetime64[M]")
+    monthly = unit in "ym" and bool((months[1:] > months[:-1]).all())
+    return months.astype(dates.dtype) if monthly else dates
 
 
 def _shift(date: np.datetime64, count: int, unit: str) -> np.datetime64:

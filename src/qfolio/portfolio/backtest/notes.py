@@ -1,6 +1,6 @@
 """What a backtest has to say of its strategies besides their figures, in sentences."""
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,14 +19,14 @@ BARELY = 1e-3
 """Risk that exceeds a limit by a smaller share of it is a rounding error."""
 
 
-def halved(agents: Mapping[str, AgentConfig], first: Fold) -> list[str]:
-    """A note on each agent whose episodes are shorter than its preset's; first: the first fold."""
-    rows = first.train.stop - first.train.start
-    horizons = {name: agent.task["horizon"] for name, agent in agents.items() if agent.halved}
+def shortened(agents: Mapping[str, AgentConfig], folds: Sequence[Fold]) -> list[str]:
+    """A note on each agent whose episodes are shorter than its preset's."""
+    rows = min(fold.train.stop - fold.train.start for fold in folds)
     return [
-        f"{name} learns from episodes of {half} rows instead of {2 * half}, because the first fold "
-        f"trains on {rows} rows only."
-        for name, half in horizons.items()
+        f"{name} learns from episodes of {agent.task['horizon']} rows instead of "
+        f"{agent.shortened}, because a fold trains on {rows} rows only."
+        for name, agent in agents.items()
+        if agent.shortened
     ]
 
 

@@ -59,7 +59,7 @@ class Plan:
         }
         self.tasks = {name: self._task(name) for name in self.agents}
         self._parts = {
-            (name, fold.name): self._part(task, fold)
+            (name, fold.name): self._part(name, task, fold)
             for name, task in self.tasks.items()
             for fold in every
         }
@@ -168,10 +168,13 @@ class Plan:
         task = Portfolio.of(self._prices, **settings.convert(Portfolio, {**entry, **own}))
         return task.deciding_at(self.folds[0].decisions.start)
 
-    def _part(self, task: Portfolio, fold: Fold) -> Portfolio:
+    def _part(self, name: str, task: Portfolio, fold: Fold) -> Portfolio:
         still = self._prices.tradable is None
         usable = fold.tradable(self._prices.values) if still else None
-        return task.part(fold.train.start, fold.train.stop - 1, usable)
+        try:
+            return task.part(fold.train.start, fold.train.stop - 1, usable)
+        except QfolioError as error:
+            raise QfolioError(f"{name}, fold {fold.name}: {error}") from None
 
     def _missing(self, name: str, kept: Kept, executor: Executor) -> list[FoldsJob]:
         """The folds that are still to be trained, in groups that fill a worker's devices."""

@@ -39,7 +39,7 @@ from qfolio.portfolio.backtest.folder import (
     BacktestConfig,
     BacktestFolder,
 )
-from qfolio.portfolio.backtest.folds import walk_forward
+from qfolio.portfolio.backtest.folds import fewest, walk_forward
 from qfolio.portfolio.backtest.hindsight import constant_bound
 from qfolio.portfolio.backtest.kept import Kept, learning, tomorrow
 from qfolio.portfolio.backtest.own import Own, place
@@ -201,8 +201,7 @@ class Backtest:
         limits = terms.mandate
         if limits is not None:
             limits = tracked(limits, terms.benchmark, field, prices)
-        first = walk_forward(prices.dates, train, test, int(lag), expanding)[0]
-        learned = (first.complete(prices.values) if prices.tradable is None else first).train
+        rows = fewest(walk_forward(prices.dates, train, test, int(lag), expanding), prices)
         config = BacktestConfig(
             prices=describe(prices),
             assets=list(prices.assets),
@@ -225,7 +224,7 @@ class Backtest:
             command=command,
             title=title,
             agents={
-                name: AgentConfig.of(name, agent, episodes, task or {}, learned, int(lag))
+                name: AgentConfig.of(name, agent, episodes, task or {}, rows, int(lag))
                 for name, agent in agents.items()
             },
             **devices.circumstances("python", "jax", "equinox", "numpy", "skfolio"),
@@ -425,7 +424,7 @@ class Backtest:
         others, said = replay.others(self.baselines, self._own, self.config.benchmark)
         entries = {name: entry for each in (*found, others) for name, entry in each.items()}
         return entries, [
-            *notes.halved(self.config.agents, self.folds[0]),
+            *notes.shortened(self.config.agents, self.folds),
             *notes.left_out(replay),
             *notes.mandated(replay),
             *said,

@@ -59,6 +59,17 @@ def periods_per_year(dates: np.ndarray) -> float:
     return _a_year(dates)
 
 
+def dated(rows: np.ndarray, per_year: float) -> np.ndarray:
+    """Made-up dates for numbered rows, of which ``periods_per_year`` finds about so many a year."""
+    if per_year == TRADING_DAYS:
+        weeks, day = np.divmod(rows, 5)
+        return (7 * weeks + day + 4).astype("datetime64[D]").astype("datetime64[s]")  # a Monday
+    if per_year in (12.0, 4.0, 1.0):
+        return rows.astype(f"datetime64[{round(12 / per_year)}M]").astype("datetime64[s]")
+    days = 7 if per_year == 52.0 else 365 / per_year
+    return (rows * round(86400 * days)).astype("datetime64[s]")
+
+
 def alike(one: float, other: float) -> bool:
     """Whether two numbers of rows a year are of one frequency.
 
