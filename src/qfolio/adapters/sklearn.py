@@ -54,7 +54,7 @@ class PortfolioPolicy(BaseOptimization):
 
     update_episodes : int, default=None
         Training episodes of each later ``partial_fit``; one for each of the agent's environments if
-        None.
+        None. Agents that weigh evidence, such as "tilts", learn anew; None means as long as before.
 
     seeds : int, default=None
         Number of agents trained; the policy follows their mean decision. The preset's if None.
