@@ -316,7 +316,8 @@ def test_menus_that_are_none(menu):
         ({"reward": "crra", "risk_aversion": -1.0}, "risk_aversion is -1.0"),
         ({"risk_aversion": float("inf")}, "risk_aversion is inf; it must be finite"),
         ({"sharpe_rate": float("-inf")}, "sharpe_rate is -inf; it must be finite"),
-        ({"window": 58}, r"60 rows are too few: .*lower window or horizon \(--set horizon=…\)"),
+        ({"window": 50}, r"60 rows are too few: .*lower window or horizon \(--set horizon=…\)"),
+        ({"window": 58}, r"60 rows are too few: .*lower window \(--set window=…\)"),
     ],
 )  # fmt: skip
 def test_settings_that_do_not_fit(settings, message):
