@@ -95,7 +95,7 @@ def backtest(
             "with more rows."
         )
     console.say(describe_backtest(run))
-    for note in (*shortened(run.config.agents, run.folds), *mandated(run.replay)):
+    for note in (*shortened(run.config.agents, run.replay), *mandated(run.replay)):
         console.tell(note)
     resume = again("qfolio backtest --resume", folder, *run.parts, on=options.on)
     status = "Replaying all strategies, explaining the agents and writing the report"

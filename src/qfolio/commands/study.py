@@ -90,7 +90,7 @@ def study(
         def listen(table: str, variant: "Variant", backtest: "Backtest") -> Any:
             place = run.places.index((table, variant)) + 1
             console.say(f"{place} of {len(run.places)}: {table}, {spell(variant)}")
-            for note in shortened(backtest.config.agents, backtest.folds):
+            for note in shortened(backtest.config.agents, backtest.replay):
                 console.tell(note)
             return JobsProgress(update)
 

@@ -62,8 +62,8 @@ def train(
         seeds, seed: Number of agents (default: the preset's, or 5), with the seeds ``seed``,
             ``seed + 1``, ….
         episodes: Training episodes of each agent (default: the preset's).
-        task: Settings of the portfolio task (cost, lag, window, …) that replace the preset's. With
-            a preset, horizon is halved if the table has too few rows for it.
+        task: Settings of the portfolio task (cost, lag, window, …) that replace the preset's. A
+            preset's horizon is shortened if the table has too few rows for it, see ``short.py``.
 
     Raises:
         QfolioError: Table, settings and agent do not fit together, or a loss is not finite.

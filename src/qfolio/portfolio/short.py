@@ -10,8 +10,8 @@ def fitted(preset: Preset, rows: int, lag: int | None = None) -> Preset:
     """The preset with a shorter ``horizon``, if so many rows are too few for an episode.
 
     It is a half or a third, and not all that fits, so that episodes can begin at different rows.
-    Paths that an agent differentiates through become at most an episode. Whoever
-    has chosen one of the two lengths otherwise than qfolio's presets keeps it.
+    Paths that an agent differentiates through become at most an episode. Lengths that the user has
+    chosen, so that they are in none of qfolio's presets, are kept.
 
     lag: default, that of the preset's task.
     """

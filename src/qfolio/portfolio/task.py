@@ -210,13 +210,12 @@ class Portfolio(Market):
         """
         decisions = last - self.lag - 1 - (first + self.window) + 1
         if decisions < self.horizon:
-            seen = "window (--set window=…)"
-            lower = "window or horizon (--set horizon=…)" if decisions > 0 else seen
+            both, alone = "window or horizon (--set horizon=…)", "window (--set window=…)"
             raise QfolioError(
                 f"{last - first + 1} rows are too few: a window of {self.window}, a lag of "
                 f"{self.lag} and an episode of {self.horizon} need at least "
                 f"{self.window + self.lag + self.horizon + 1}; give more rows (a longer --train in "
-                f"a backtest), or lower {lower}."
+                f"a backtest), or lower {both if decisions > 0 else alone}."
             )
         rows = slice(first + 1, last + 1)
         usable = np.ones(self.limits.shape[0], bool) if tradable is None else tradable

@@ -1,6 +1,6 @@
 """What a backtest has to say of its strategies besides their figures, in sentences."""
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from qfolio.portfolio.backtest.folder import AgentConfig
-from qfolio.portfolio.backtest.folds import Fold
+from qfolio.portfolio.backtest.folds import fewest
 from qfolio.portfolio.backtest.replay import Entry, Replay
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.prices.findings import first_of, listing
@@ -19,9 +19,9 @@ BARELY = 1e-3
 """Risk that exceeds a limit by a smaller share of it is a rounding error."""
 
 
-def shortened(agents: Mapping[str, AgentConfig], folds: Sequence[Fold]) -> list[str]:
+def shortened(agents: Mapping[str, AgentConfig], replay: Replay) -> list[str]:
     """A note on each agent whose episodes are shorter than its preset's."""
-    rows = min(fold.train.stop - fold.train.start for fold in folds)
+    rows = fewest(replay.folds, replay.prices)
     return [
         f"{name} learns from episodes of {agent.task['horizon']} rows instead of "
         f"{agent.shortened}, because a fold trains on {rows} rows only."

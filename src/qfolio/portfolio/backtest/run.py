@@ -424,7 +424,7 @@ class Backtest:
         others, said = replay.others(self.baselines, self._own, self.config.benchmark)
         entries = {name: entry for each in (*found, others) for name, entry in each.items()}
         return entries, [
-            *notes.shortened(self.config.agents, self.folds),
+            *notes.shortened(self.config.agents, replay),
             *notes.left_out(replay),
             *notes.mandated(replay),
             *said,
