@@ -83,27 +83,6 @@ def test_without_tilts_and_at_the_anchor_nothing_is_traded():
     np.testing.assert_array_equal(policy(seen), held)
 
 
-def test_part_of_the_way_is_traded_beyond_the_band():
-    policy = tilt([0.0], rate=0.0, band=np.log(0.2))  # half of it
-    seen = view([0.40, 0.10, 0.50])  # off by 0.15 and -0.15, with a band of 0.2/3
-    found = policy(seen)
-    np.testing.assert_allclose(found, [0, 0.4 - 0.25 / 6, 0.1 + 0.25 / 6, 0.5], atol=1e-6)
-
-
-def test_purchases_are_scaled_to_sales():
-    policy = tilt([0.0], rate=20.0, band=np.log(0.2))
-    seen = view([0.34, 0.20, 0.46])  # off by 0.09, -0.05, -0.04: one asset beyond its band
-    found = policy(seen)
-    np.testing.assert_allclose(found, [0, 0.34, 0.20, 0.46], atol=1e-6)
-
-
-def test_cash_is_invested_at_once_in_proportion_to_the_target():
-    policy = tilt([0.0], rate=-20.0)
-    seen = view([0.0, 0.0, 0.0])
-    found = policy(seen)
-    np.testing.assert_allclose(found, [0, 0.25, 0.25, 0.5], atol=1e-6)
-
-
 def test_a_weight_of_zero_can_grow():
     seen = view([0, 0, 0], [[3.0], [0.0], [0.0]], anchor=(1e-6, 0.5, 0.5 - 1e-6))
     assert tilt([1.0]).target(seen)[1] > 0.3

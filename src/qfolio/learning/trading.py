@@ -43,21 +43,22 @@ class Trading(eqx.Module):
     ) -> Float[Array, "*batch entry"]:
         """The order, cash first: part of the way from the weights held to the target.
 
-        An asset's deviation from its target beyond the band is traded at the rate, as far as
-        purchases and sales pay for each other. Cash above the target's is invested at once, in
-        proportion to the target; missing cash is raised at once, in proportion to the holdings.
+        Cash above the target's is invested at once, in proportion to the target; missing cash is
+        raised at once, in proportion to the holdings. Then an asset's deviation beyond the band is
+        traded at the rate. Where this would buy more than it sells, what pays for the rest is sold
+        within the band, in proportion to deviations there, and likewise the other way around: one
+        asset that outgrows its band is sold even if none of the others has fallen below theirs.
         """
-        gap = target[..., 1:] - held
-        band = jnp.exp(self.band) * equal(anchor)
-        bought, sold = jnp.maximum(gap - band, 0.0), jnp.maximum(-gap - band, 0.0)
-        buying, selling = bought.sum(-1, keepdims=True), sold.sum(-1, keepdims=True)
-        matched = jnp.where(buying < selling, buying, selling)
-        trade = bought * ratio(matched, buying) - sold * ratio(matched, selling)
         idle = 1 - held.sum(-1, keepdims=True) - target[..., :1]
         source = jnp.where(idle > 0, target[..., 1:], held)
-        invested = idle * source * ratio(1.0, source.sum(-1, keepdims=True))
-        assets = held + jax.nn.sigmoid(self.rate) * trade + invested
-        return simplex.with_rest(assets)
+        held = held + idle * source * ratio(1.0, source.sum(-1, keepdims=True))
+        gap = target[..., 1:] - held
+        band = jnp.exp(self.band) * equal(anchor)
+        beyond = gap - jnp.clip(gap, -band, band)
+        excess = beyond.sum(-1, keepdims=True)  # of purchases over sales
+        within = jnp.maximum(jnp.where(excess > 0, beyond - gap, gap - beyond), 0.0)
+        trade = beyond - excess * within * ratio(1.0, within.sum(-1, keepdims=True))
+        return simplex.with_rest(held + jax.nn.sigmoid(self.rate) * trade)
 
 
 def equal(anchor: Float[Array, "*batch asset"]) -> Float[Array, "*batch asset"]:
