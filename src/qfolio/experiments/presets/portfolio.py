@@ -18,14 +18,21 @@ SHORT_SIGNALS = "momentum:1,momentum:2,momentum:5,momentum:10,momentum:21,moving
 """Signals that pay off within days; for slower ones, values of single trades are too noisy."""
 
 
-_ON_ANCHOR = {"window": 1, "horizon": 84, "signals": SIGNALS, "anchor": "equal-weight"}
+# As averse to risk as the investor of Brandt, Santa-Clara & Valkanov (2009).
+_ON_ANCHOR = {
+    "window": 1,
+    "horizon": 84,
+    "reward": "crra",
+    "risk_aversion": 5.0,
+    "signals": SIGNALS,
+    "anchor": "equal-weight",
+}
 
 
-# Averse to risk. The anchor is not minimum variance alone, which holds so few assets that there is
+# More averse. The anchor is not minimum variance alone, which holds so few assets that there is
 # little evidence for tilts.
 _ON_LOW_RISK = {
     **_ON_ANCHOR,
-    "reward": "crra",
     "risk_aversion": 20.0,
     "anchor": "equal-weight+minimum-variance-nonlinear",
 }
