@@ -147,13 +147,19 @@ def test_signals_look_back_further_than_the_window(decided):
 
 @pytest.mark.parametrize(
     ("index", "year"),
-    [("B", 252), ("D", 365), ("W-FRI", 52), ("ME", 12), ("BQE", 4), (None, 252)],
+    [
+        (pd.date_range("2000", periods=60, freq="B"), 252),
+        (pd.date_range("2000", periods=60, freq="D"), 365),
+        (pd.date_range("2000", periods=60, freq="W-FRI"), 52),
+        (pd.date_range("2000", periods=60, freq="ME"), 12),
+        (pd.date_range("2000", periods=60, freq="BQE"), 4),
+        (pd.period_range("2000", periods=60, freq="M"), 12),
+        (pd.RangeIndex(60), 252),
+    ],
 )
 def test_signals_look_back_on_a_year_of_the_rows(index, year):
     given = returns(60)
-    given.index = (
-        pd.RangeIndex(60) if index is None else pd.date_range("2000", periods=60, freq=index)
-    )
+    given.index = index
     fitted = model(episodes=8, seeds=1, settings={**TINY, "signals": "momentum:1m"}).fit(given)
     assert fitted.periods_per_year_ == float(fitted.policy_.task.year) == year
     assert len(fitted.predict(given.iloc[-5:]).returns) == 5

@@ -378,6 +378,7 @@ def _dates(X: Any) -> Any:
 
 def _frequency(labels: Any) -> float:
     """Rows per year by the dates of the rows (default: 252, if they have no dates)."""
+    labels = labels.to_timestamp() if hasattr(labels, "to_timestamp") else labels  # of periods
     known = getattr(getattr(labels, "dtype", None), "kind", "") == "M"
     return periods_per_year(labels.to_numpy("datetime64[s]") if known else np.zeros(0, "M8[s]"))
 
