@@ -46,7 +46,9 @@ def test_the_sentence(seeds, expected):
 
 def test_an_agent_that_ignores_what_it_observes():
     (sentence,) = diagnose("dqn", entry(LIVELY), FOLDS, "ABC", ignored=True)
-    assert sentence.startswith("dqn ignored what it observed")
+    assert sentence.startswith("dqn ignored what it observed: its targets did not change")
+    (sentence,) = diagnose("tilts", entry(LIVELY), FOLDS, "ABC", ignored=True, anchor="momentum")
+    assert sentence.startswith("tilts found no reason to leave momentum: its targets did not")
 
 
 def test_a_reference_with_idle_cash():

@@ -24,7 +24,12 @@ IDLE = 0.02
 
 
 def diagnose(
-    name: str, entry: Entry, folds: Sequence[slice], assets: Sequence[str], ignored: bool
+    name: str,
+    entry: Entry,
+    folds: Sequence[slice],
+    assets: Sequence[str],
+    ignored: bool,
+    anchor: str = "",
 ) -> list[str]:
     """Sentences about a strategy that does nothing with what it observes; usually none.
 
@@ -34,6 +39,7 @@ def diagnose(
         folds: The days of each fold.
         assets: Names of the assets.
         ignored: Whether its targets stay the same when all that it observes is shuffled.
+        anchor: What its targets depart from (default: nothing).
     """
     seeds = len(entry.decisions)
     found = [_dead(entry, seed, folds, assets) for seed in range(seeds)]
@@ -43,9 +49,9 @@ def diagnose(
         who = name if count == seeds else f"{count} of {seeds} seeds of {name}"
         sentences.append(f"{who} {what}.")
     if ignored:
+        what = f"found no reason to leave {anchor}" if anchor else "ignored what it observed"
         sentences.append(
-            f"{name} ignored what it observed: its targets did not change when all of it was "
-            "shuffled."
+            f"{name} {what}: its targets did not change when all that it observed was shuffled."
         )
     return sentences
 

@@ -83,6 +83,7 @@ def _explained(
             list(folds.values()),
             prices.assets,
             worth.ignored and each == traded,
+            backtest.tasks[name].anchor,
         )
         for each in dict.fromkeys((name, traded))
     }
