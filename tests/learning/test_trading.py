@@ -64,8 +64,8 @@ def test_an_asset_that_left_the_anchor_is_sold():
 
 
 def test_orders_are_weights_and_have_derivatives():
-    keys = jax.random.split(jax.random.key(0), 3)
-    held, target = (jax.random.dirichlet(key, jnp.full(6, 0.3), (200,)) for key in keys[:2])
+    keys = jax.random.split(jax.random.key(0))
+    held, target = (jax.random.dirichlet(key, jnp.full(6, 0.3), (200,)) for key in keys)
     anchor = jnp.full((200, 5), 0.2)
 
     def first(trade: Trading, held, target) -> jax.Array:

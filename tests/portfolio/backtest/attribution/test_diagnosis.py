@@ -49,6 +49,10 @@ def test_an_agent_that_ignores_what_it_observes():
     assert sentence.startswith("dqn ignored what it observed: its targets did not change")
     (sentence,) = diagnose("tilts", entry(LIVELY), FOLDS, "ABC", ignored=True, anchor="momentum")
     assert sentence.startswith("tilts found no reason to leave momentum: its targets did not")
+    dead = entry(always(1, 0, 0, 0))
+    never, sentence = diagnose("dqn", dead, FOLDS, "ABC", ignored=True, anchor="momentum")
+    assert never == "dqn never traded and stayed in cash."
+    assert sentence.startswith("dqn ignored what it observed")
 
 
 def test_a_reference_with_idle_cash():

@@ -49,7 +49,9 @@ def diagnose(
         who = name if count == seeds else f"{count} of {seeds} seeds of {name}"
         sentences.append(f"{who} {what}.")
     if ignored:
-        what = f"found no reason to leave {anchor}" if anchor else "ignored what it observed"
+        # An agent that is dead in another way did not weigh whether to leave its anchor.
+        stays = anchor and not sentences
+        what = f"found no reason to leave {anchor}" if stays else "ignored what it observed"
         sentences.append(
             f"{name} {what}: its targets did not change when all that it observed was shuffled."
         )
