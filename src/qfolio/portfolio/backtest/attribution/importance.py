@@ -93,6 +93,8 @@ def importance(
     wanted += [Shuffle(np.ones(len(names), int), draw, draw) for draw in each_draw]
 
     task, first = stretches[0].task, stretches[0].fold.decisions.start
+    # Those of the task are float32, which the exact replay would take over.
+    conditions = jax.tree.map(lambda x: np.asarray(x, float), task.conditions)
     logs: list[Floats] = []
     moved: list[float] = []
     for group in replay(agent, stretches, shuffles, wanted):
@@ -108,7 +110,7 @@ def importance(
                 first=first,
                 cost=task.costs,
                 lag=task.lag,
-                conditions=task.conditions,
+                conditions=conditions,
                 long_only=task.feasible.long_only,
             )
             # Growth after ruin is not finite; use the floor of training.
