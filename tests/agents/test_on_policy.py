@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,8 +23,10 @@ from qfolio.experiments.run import train
 from qfolio.learning.targets import advantages
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.merton import Merton
+from qfolio.portfolio.task import Portfolio
 from qfolio.tasks.pendulum import Pendulum
 
+from planted import planted
 from probes import Aim, AimPlainWeights, AimWeights, Endless, OneState, RewardDelay, TwoStates
 
 DISCOUNT = 0.9
@@ -157,11 +160,11 @@ def test_normalized_by_hand():
 class Looking(PPO):
     """Learns nothing; reports of which rows its minibatches are."""
 
-    def judge(self, weights, rollout, gae_lambda):
+    def judge(self, task, weights, rollout, gae_lambda):
         row = jnp.arange(8.0)
         return Batch(row[:, None], row, row, row, row)
 
-    def descend(self, state, batch):
+    def descend(self, task, state, batch):
         row = batch.target
         parts = (batch.observation[:, 0], batch.action, batch.log_prob, batch.advantage)
         whole = jnp.stack([(part == row).all() for part in parts]).all()
@@ -173,7 +176,7 @@ def test_minibatches_hold_every_row_once_and_whole():
     agent, task = Looking(num_envs=2, rollout_length=4, batch_size=4, epochs=1), Pendulum()
     state = agent.init(task, jax.random.key(0))
     unread = Transition(*[jnp.zeros(())] * len(Transition._fields))
-    draws = [agent.improve(state, unread, jax.random.key(i))[1] for i in range(8)]
+    draws = [agent.improve(task, state, unread, jax.random.key(i))[1] for i in range(8)]
     for found in draws:
         assert 2 * found["rows"] == sum(4**row for row in range(8))
         assert found["whole"] == 1
@@ -246,7 +249,7 @@ def test_loss_and_gradient(name, kind, changes):
         task = TASKS[kind]
         state = jit(agent.init)(task, jax.random.key(0))
         rollout = a_rollout(agent, task, state, jax.random.key(1))
-        batch = jit(agent.judge)(state.weights, rollout, 0.8)
+        batch = jit(agent.judge)(task, state.weights, rollout, 0.8)
         # Some way from the policy that drew the actions, so that some ratios are clipped.
         leaves, structure = jax.tree.flatten(state.weights)
         noise = [
@@ -277,10 +280,35 @@ def test_the_critic_is_no_part_of_the_policys_gradient():
     task = TASKS["numbers"]
     state = jit(agent.init)(task, jax.random.key(0))
     rollout = a_rollout(agent, task, state, jax.random.key(1))
-    loss = lambda weights: agent.loss(weights, agent.judge(state.weights, rollout, 1.0))[0]  # noqa: E731
+    loss = lambda weights: agent.loss(weights, agent.judge(task, state.weights, rollout, 1.0))[0]  # noqa: E731
     gradient = jax.tree.map(np.asarray, jax.jit(jax.grad(loss))(state.weights))
     assert all((x == 0).all() for x in jax.tree.leaves(gradient.critic))
     assert all((x != 0).any() for x in (gradient.actor.mlp.weights[-1], gradient.log_std))
+
+
+@pytest.mark.parametrize("agent", AGENTS.values(), ids=AGENTS)
+def test_learning_from_positions_is_learning_from_the_views_that_were_seen(agent):
+    task = Portfolio.of(planted(200), window=5, horizon=4, anchor="equal-weight", signals="high:20")
+    agent = dataclasses.replace(agent, network="positions", learning_rate=0.1)
+    state = jit(agent.init)(task, jax.random.key(0))
+    shape = (agent.rollout_length, agent.num_envs)
+
+    @jit
+    def a_step(key):
+        position = task.reset(key)
+        seen = task.observe(position)
+        action = agent.act(state, jax.tree.map(lambda x: x[None], seen), key)[0]
+        after = task.step(position, action, key)
+        return Transition(
+            position, seen, action, after.reward, after.state, task.observe(after.state),
+            terminated=jnp.array(False), truncated=jax.random.bernoulli(key),
+        )  # fmt: skip
+
+    rollout = jax.vmap(jax.vmap(a_step))(jax.random.split(jax.random.key(1), shape))
+    learn = jit(lambda rollout: agent.learn(task, state, rollout, jax.random.key(2))[0].weights)
+    found, expected = learn(rollout), learn(rollout._replace(state=None, next_state=None))
+    assert not eqx.tree_equal(found, state.weights, rtol=0.01)
+    assert eqx.tree_equal(found, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_judging_is_what_the_formulas_say():
@@ -288,7 +316,7 @@ def test_judging_is_what_the_formulas_say():
     agent = dataclasses.replace(agent, reward_scale=0.5)
     state = jit(agent.init)(task, jax.random.key(0))
     rollout = a_rollout(agent, task, state, jax.random.key(1))
-    batch = jit(agent.judge)(state.weights, rollout, 0.8)
+    batch = jit(agent.judge)(task, state.weights, rollout, 0.8)
     values = jit(lambda x: jax.vmap(state.weights.value)(x))
     value = np.asarray(values(rollout.observation))
     following = np.asarray(values(rollout.next_observation))

@@ -9,7 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from qfolio.agents.on_policy import OnPolicy, OnPolicyState, explained_variance
 from qfolio.core.fields import number, require, static
-from qfolio.core.mdp import Metrics, Transition
+from qfolio.core.mdp import Metrics, Task, Transition
 
 
 class A2C(OnPolicy):
@@ -24,8 +24,8 @@ class A2C(OnPolicy):
         require(self, "gae_lambda", lambda x: 0 <= x <= 1, "between 0 and 1")
 
     def improve(
-        self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        batch = self.judge(state.weights, rollout, self.gae_lambda)
-        state, metrics = self.descend(state, batch)
+        batch = self.judge(task, state.weights, rollout, self.gae_lambda)
+        state, metrics = self.descend(task, state, batch)
         return state, metrics | {"explained_variance": explained_variance(batch)}

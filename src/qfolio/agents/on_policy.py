@@ -14,15 +14,17 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.fields import constant, number, require, require_counts, sizes, static
-from qfolio.core.mdp import Actions, Agent, Box, Metrics, Simplex, Task, Transition
+from qfolio.core.mdp import Actions, Agent, Box, Metrics, Position, Simplex, Task, Transition
 from qfolio.learning import networks, optimizer
 from qfolio.learning.distributions import Distribution, policy_of
 from qfolio.learning.networks import Network, NetworkConfig, Outputs, outputs_of, saturation
 from qfolio.learning.normalization import Moments, NormalizationConfig, Normalizer, normalized
 from qfolio.learning.optimizer import CosineSchedule, OptimizerConfig
+from qfolio.learning.recall import recalled, stored
 from qfolio.learning.targets import Scalar, advantages
 
 LARGEST = 1e18
@@ -62,7 +64,7 @@ class OnPolicyState(eqx.Module):
 class Batch(NamedTuple):
     """Steps of a rollout as rows, by time and then environment, with advantages and targets."""
 
-    observation: PyTree
+    observation: PyTree  # as stored
     action: Array
     log_prob: Float[Array, " batch"]  # of the action, when it was drawn
     advantage: Float[Array, " batch"]
@@ -176,45 +178,52 @@ class OnPolicy(Agent):
         # Observations are normalized as they were when the policy acted on them.
         before, after = state.normalizer, state.normalizer.update(rollout, self.discount)
         rollout = rollout._replace(
-            observation=before.observation(rollout.observation),
-            next_observation=before.observation(rollout.next_observation),
+            observation=stored(rollout.state, before.observation(rollout.observation)),
+            next_observation=stored(
+                rollout.next_state, before.observation(rollout.next_observation)
+            ),
             reward=after.reward(rollout.reward),
         )
-        state, metrics = self.improve(state, rollout, key)
+        state, metrics = self.improve(task, state, rollout, key)
         return dataclasses.replace(state, normalizer=after), metrics
 
     @abc.abstractmethod
     def improve(
-        self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        """Learns from a rollout of normalized observations and rewards."""
+        """Learns from a rollout of normalized observations, as stored, and rewards."""
 
-    def judge(self, weights: PolicyAndValue, rollout: Transition, gae_lambda: Scalar) -> Batch:
+    def judge(
+        self, task: Task, weights: PolicyAndValue, rollout: Transition, gae_lambda: Scalar
+    ) -> Batch:
         """The steps of a rollout that these weights made, with advantages and targets.
 
         gae_lambda: λ of the advantages, from 0 (trust the critic) to 1 (trust the rewards).
         """
+
+        def look(step: Transition) -> tuple[Array, Array, Array]:
+            seen = recalled(task, step.observation)
+            following = weights.value(recalled(task, step.next_observation))
+            return weights.value(seen), following, weights.policy(seen).log_prob(step.action)
+
         step = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout)
-        value = weights.value(step.observation)
-        by_time = lambda x: x.reshape(rollout.reward.shape)  # noqa: E731
+        # Views of a market are recalled one time at a time: all together, they exceed the caches.
+        by_time = isinstance(rollout.observation, Position)
+        found = lax.map(look, rollout) if by_time else look(step)
+        value, following, log_prob = (x.reshape(rollout.reward.shape) for x in found)
         terminated, truncated = rollout.terminated, rollout.truncated
         if self.time_limit_terminal:
             terminated = terminated | truncated
         advantage = advantages(
-            self.reward_scale * rollout.reward,
-            by_time(value),
-            by_time(weights.value(step.next_observation)),
-            terminated,
-            truncated,
-            self.discount,
-            gae_lambda,
-        ).reshape(-1)
+            self.reward_scale * rollout.reward, value, following, terminated, truncated,
+            self.discount, gae_lambda,
+        )  # fmt: skip
         return Batch(
             observation=step.observation,
             action=step.action,
-            log_prob=weights.policy(step.observation).log_prob(step.action),
-            advantage=advantage,
-            target=advantage + value,
+            log_prob=log_prob.reshape(-1),
+            advantage=advantage.reshape(-1),
+            target=(advantage + value).reshape(-1),
         )
 
     def objective(self, log_prob: Float[Array, " batch"], batch: Batch) -> Float[Array, " batch"]:
@@ -248,8 +257,11 @@ class OnPolicy(Agent):
         """Further metrics, given the log ratio of new to old probabilities of the actions."""
         return {}
 
-    def descend(self, state: OnPolicyState, batch: Batch) -> tuple[OnPolicyState, Metrics]:
+    def descend(
+        self, task: Task, state: OnPolicyState, batch: Batch
+    ) -> tuple[OnPolicyState, Metrics]:
         """One gradient step."""
+        batch = batch._replace(observation=recalled(task, batch.observation))
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.weights, batch)
         metrics["gradient_norm"] = jnp.minimum(optimizer.norm(gradient), LARGEST)
         gradient = optimizer.clip(gradient, self.max_grad_norm)

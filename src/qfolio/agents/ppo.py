@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from qfolio.agents.on_policy import Batch, OnPolicy, OnPolicyState, explained_variance
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, require_counts, static
-from qfolio.core.mdp import Metrics, Transition
+from qfolio.core.mdp import Metrics, Task, Transition
 from qfolio.learning.targets import Scalar
 
 
@@ -52,14 +52,14 @@ class PPO(OnPolicy):
         return {"kl": (ratio - 1 - log_ratio).mean(), "clip_fraction": clipped.mean()}
 
     def improve(
-        self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        batch = self.judge(state.weights, rollout, self.gae_lambda)
+        batch = self.judge(task, state.weights, rollout, self.gae_lambda)
 
         def epoch(state: OnPolicyState, key: PRNGKeyArray) -> tuple[OnPolicyState, Metrics]:
             # Minibatches are gathered one at a time; gathered beforehand, each is copied twice.
             def descend(state: OnPolicyState, rows: Array) -> tuple[OnPolicyState, Metrics]:
-                return self.descend(state, jax.tree.map(lambda x: x[rows], batch))
+                return self.descend(task, state, jax.tree.map(lambda x: x[rows], batch))
 
             order = shuffled(key, batch.target.shape[0])
             return lax.scan(descend, state, order.reshape(-1, self.batch_size))

@@ -33,11 +33,11 @@ class REINFORCE(OnPolicy):
         return super().init(task, key)
 
     def improve(
-        self, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
+        self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray
     ) -> tuple[OnPolicyState, Metrics]:
-        batch = self.judge(state.weights, rollout, gae_lambda=1.0)
+        batch = self.judge(task, state.weights, rollout, gae_lambda=1.0)
         batch = batch._replace(counted=finished(rollout).reshape(-1))
-        state, metrics = self.descend(state, batch)
+        state, metrics = self.descend(task, state, batch)
         return state, metrics | {"explained_variance": explained_variance(batch)}
 
 

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require, require_counts
-from qfolio.core.market import View
-from qfolio.core.mdp import Position, Task, Transition
+from qfolio.core.mdp import Task, Transition
 from qfolio.learning.priorities import Priorities
+from qfolio.learning.recall import recalled, stored
 from qfolio.learning.targets import Scalar, n_step
 
 Discount = Float[Array, "*#batch"] | float
@@ -24,8 +24,7 @@ Discount = Float[Array, "*#batch"] | float
 class Experience(NamedTuple):
     """A transition as the buffer stores it; nothing is bootstrapped after ``terminal``.
 
-    The view of a position in a market is many times larger than the position, so the buffer stores
-    positions, and ``recalled`` computes the views of those that are drawn.
+    The observations are as ``stored`` keeps them.
     """
 
     observation: PyTree
@@ -40,7 +39,7 @@ class Experience(NamedTuple):
         state: PyTree, observation: PyTree, action: Array, *, with_last: bool = False
     ) -> "Experience":
         """An example row, for its shapes and types."""
-        no, seen = jnp.array(False), _stored(state, observation)
+        no, seen = jnp.array(False), stored(state, observation)
         last = no if with_last else None
         return Experience(seen, action, jnp.array(0.0), seen, no, last)
 
@@ -54,22 +53,14 @@ class Experience(NamedTuple):
         if time_limit_terminal:
             terminal = last
         return Experience(
-            _stored(step.state, step.observation), step.action, step.reward,
-            _stored(step.next_state, step.next_observation), terminal, last if with_last else None,
+            stored(step.state, step.observation), step.action, step.reward,
+            stored(step.next_state, step.next_observation), terminal, last if with_last else None,
         )  # fmt: skip
 
     def recalled(self, task: Task) -> "Experience":
         """The batch with observations as the agent saw them."""
-        if not isinstance(self.observation, Position):
-            return self
-        seen, then = map(jax.vmap(task.observe), (self.observation, self.next_observation))
+        seen, then = recalled(task, self.observation), recalled(task, self.next_observation)
         return self._replace(observation=seen, next_observation=then)
-
-
-def _stored(state: PyTree, observation: PyTree) -> PyTree:
-    """What the buffer stores of an observation."""
-    kept = isinstance(state, Position) and isinstance(observation, View)
-    return state if kept else observation
 
 
 class ReplayConfig(NamedTuple):
