@@ -531,10 +531,14 @@ def tables(results: dict[str, Any]) -> str:
             ],
             rates,
         )
-    machines = dict.fromkeys(part["machine"] for part in results.values())
-    loads = ", ".join(f"{part['load']} ({name})" for name, part in results.items())
-    measured_on = f"{'; '.join(machines)}; load average before each part: {loads}."
-    return f"{text}\n{fill(measured_on, 120)}\n"
+    loads: dict[str, list[str]] = {}
+    for name, part in results.items():
+        loads.setdefault(part["machine"], []).append(f"{part['load']} ({name})")
+    measured_on = "\n\n".join(
+        fill(f"{machine}; load average before each part: {', '.join(parts)}.", 120)
+        for machine, parts in loads.items()
+    )
+    return f"{text}\n{measured_on}\n"
 
 
 def write(results: dict[str, Any]) -> None:

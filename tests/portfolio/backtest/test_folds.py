@@ -7,6 +7,7 @@ import pytest
 from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.folds import (
     latest,
+    overdue,
     parse_length,
     spell,
     spell_all,
@@ -55,6 +56,28 @@ def test_a_year_of_last_trading_days_has_all_its_months(months, rows):
     lengths = [fold.decisions.stop - fold.decisions.start for fold in folds]
     assert lengths == [rows] * 35
     assert {fold.train.stop - fold.train.start for fold in folds[1:]} == {5 * rows + 1}
+
+
+@pytest.mark.parametrize(
+    ("learned", "test", "last", "due"),
+    [
+        ("2024-01-31", "1y", "2025-01-30", False),
+        ("2024-01-31", "1y", "2025-01-31", True),
+        ("2024-01-31", "5d", "2024-02-04", False),
+        ("2024-01-31", "5d", "2024-02-05", True),
+        ("2019-12-31", "1y", "2020-12-30", False),  # before the table begins
+    ],
+)
+def test_a_policy_is_overdue_after_a_whole_test(learned, test, last, due):
+    dates = np.arange("2020-01-01", np.datetime64(last) + 1, dtype="datetime64[D]")
+    assert overdue(np.datetime64(learned), test, dates) == due
+
+
+def test_months_are_due_though_their_last_trading_days_come_early():
+    """November's is the 28th, less than a month after the 31st of October."""
+    dates = np.array(["2025-08-29", "2025-09-30", "2025-10-31", "2025-11-28"], "datetime64[D]")
+    assert overdue(dates[-2], "1m", dates)
+    assert not overdue(dates[-1], "1m", dates)
 
 
 def test_folds_within_a_day_have_names_of_their_own():

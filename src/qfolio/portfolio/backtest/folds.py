@@ -107,10 +107,8 @@ def latest(name: str, dates: np.ndarray, train: str, expanding: bool = False) ->
 
 def overdue(learned: np.datetime64, test: str, dates: np.ndarray) -> bool:
     """Whether a table has rows for a whole test, or longer, after the last row learned."""
-    count, unit = parse_length(test)
-    if unit == "d":
-        return int((dates > learned).sum()) >= count
-    return bool(dates[-1] >= _shift(learned, count, unit))
+    row = max(int(np.searchsorted(dates, learned, side="right")) - 1, 0)
+    return _after(dates, row, test) < len(dates)
 
 
 def spell(date: np.datetime64, dates: np.ndarray) -> str:
