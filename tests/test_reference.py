@@ -1,5 +1,6 @@
 """What docs/reference/ must have: every public name, and what each setting means."""
 
+import ast
 import dataclasses
 import importlib.util
 import inspect
@@ -47,6 +48,35 @@ def resolve(path: str) -> Any:
 WRITTEN = {
     path: resolve(path) for path in re.findall(r"auto(?:class|function|exception):: (\S+)", PAGES)
 }
+
+
+def defined() -> set[str]:
+    """Every name that qfolio's source defines, and its files."""
+    root = Path(qfolio.__file__).parent
+    names: set[str] = set()
+    for path in root.rglob("*.py"):
+        names |= {path.stem, path.relative_to(root).as_posix()}
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names.add(node.name)
+            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                names.add(node.id)
+    return names
+
+
+def test_the_code_of_a_formula_is_where_its_page_says():
+    tables = [
+        table.splitlines()
+        for page in (DOCS / "algorithms").glob("*.md")
+        for table in re.findall(r"^\|.*\| where \|\n(?:\|.*\n)+", page.read_text(), re.M)
+    ]
+    named = {
+        name for _, _, *rows in tables for row in rows
+        for name in re.findall(r"`(.+?)`", row.split("|")[-2])
+    }  # fmt: skip
+    assert len(named) > 100
+    known = defined()
+    assert {x for x in named if not ({x} if "/" in x else {*x.split(".")}) <= known} == set()
 
 
 def test_every_public_name_has_its_reference():
