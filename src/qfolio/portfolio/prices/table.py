@@ -32,7 +32,7 @@ DEFAULT_NOTE = (
 OF_ALL = ("ended", "delisting_haircut", "members")
 """Choices that apply to a whole table, not to each file of a folder."""
 
-DEFAULT_TRIALS = 224
+DEFAULT_TRIALS = 222
 """Earlier trials on the default table, as docs/results/real_prices.md lists them."""
 
 
