@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from qfolio.agents.dqn import DQN
-from qfolio.core.evaluation import evaluate, play, start_keys, tail_steps
+from qfolio.core.evaluation import evaluate, play, start_keys, step_key, tail_steps
 from qfolio.core.mdp import Step
+from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.tasks.pendulum import Pendulum
 
 from probes import Endless, OneState
@@ -39,6 +40,18 @@ def test_returns_equal_gymnasiums():
             observation, reward, _, truncated, _ = env.step(np.array([task.torque(action)]))
             total += reward
         assert total == pytest.approx(float(value), rel=1e-4)
+
+
+def test_steps_are_independent_of_the_start():
+    keys, market = start_keys(2000), Ar1()
+    starts = jax.vmap(market.reset)(keys).market
+    first = jax.vmap(step_key, (0, None))(keys, jnp.array(0))
+    shocks = jax.vmap(market.next_market)(starts, first).signal - market.rho * starts.signal
+    assert abs(np.corrcoef(starts.signal, shocks)[0, 1]) < 0.1
+    for key in keys[:4]:
+        steps = jax.vmap(step_key, (None, 0))(key, jnp.arange(64))
+        drawn = jnp.concatenate([key[None], jax.random.split(key, 64), steps])
+        assert len(np.unique(jax.random.key_data(drawn), axis=0)) == 1 + 64 + 64
 
 
 def test_overestimation_by_hand():

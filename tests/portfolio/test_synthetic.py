@@ -9,7 +9,7 @@ from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Paths, Pathwise
 from qfolio.core import settings
 from qfolio.core.errors import QfolioError
-from qfolio.core.evaluation import evaluate, start_keys
+from qfolio.core.evaluation import evaluate, start_keys, step_key
 from qfolio.core.mdp import Agent, Box, Position
 from qfolio.core.registry import TASKS, find
 from qfolio.portfolio.costs import remainder_factor
@@ -303,8 +303,7 @@ def test_the_return_on_signals_is_the_solvers_value(kind):
     best = jax.vmap(task.best())
 
     def step(states, time):
-        keyed = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
-        after = jax.vmap(task.step)(states, best(states), keyed)
+        after = jax.vmap(task.step)(states, best(states), jax.vmap(step_key, (0, None))(keys, time))
         return after.state, after.reward
 
     returns = jax.lax.scan(step, starts, jnp.arange(1000))[1].sum(0)

@@ -385,6 +385,7 @@ class _Stepping:
         import jax
 
         from qfolio.core import simplex
+        from qfolio.core.evaluation import step_key
         from qfolio.core.mdp import Discrete, Simplex
 
         @jax.jit
@@ -398,8 +399,7 @@ class _Stepping:
                 action = action.astype(jax.numpy.int32)
             elif isinstance(task.actions, Simplex):
                 action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
-            key = jax.random.fold_in(jax.random.key(seed), time)
-            after = task.step(state, action, key)
+            after = task.step(state, action, step_key(jax.random.key(seed), time))
             return after, task.observe(after.state)
 
         self.reset, self.step = reset, step

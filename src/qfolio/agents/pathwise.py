@@ -21,6 +21,7 @@ from qfolio.agents.paths import OnPaths
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, require, require_counts, require_sizes, sizes, static
+from qfolio.core.keys import apart
 from qfolio.core.market import View
 from qfolio.core.mdp import (
     Box,
@@ -231,8 +232,7 @@ class Pathwise(OnPaths):
         policy = Band(network, task.actions)
         slopes = None
         if self.bootstrap:
-            key = jax.random.fold_in(key, 1)
-            network = Shared(self.network, view, self.hidden, pooled=0, each=1, key=key)
+            network = Shared(self.network, view, self.hidden, pooled=0, each=1, key=apart(key))
             slopes = Slopes(eqx.tree_at(last, network, replace_fn=jnp.zeros_like))
         return PathwiseState(
             policy=policy,

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 
+from qfolio.core.keys import apart
 from qfolio.core.mdp import Agent, Policy, Task
 
 STARTS = 1024
@@ -20,6 +21,11 @@ CURVE_STARTS = 64
 def start_keys(n: int = STARTS) -> Key[Array, " start"]:
     """Keys of the fixed start states; a smaller set is a prefix of a larger one."""
     return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(20151), i))(jnp.arange(n))
+
+
+def step_key(key: PRNGKeyArray, time: Int[Array, ""]) -> PRNGKeyArray:
+    """The key of a step of the episode that starts with ``key``, from which its start is drawn."""
+    return jax.random.fold_in(apart(key), time)
 
 
 class Greedy(NamedTuple):
@@ -55,8 +61,7 @@ def evaluate(
         values = agent.action_values(weights, observation)
         best = jnp.full(alive.shape, jnp.nan) if values is None else values.max(-1)
         actions = agent.policy(weights, observation)
-        step_keys = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
-        after = jax.vmap(task.step)(states, actions, step_keys)
+        after = jax.vmap(task.step)(states, actions, jax.vmap(step_key, (0, None))(keys, time))
         reward = jnp.where(alive, after.reward, 0.0)
         return (after.state, alive & ~after.terminated), (reward, best, alive)
 
@@ -100,7 +105,7 @@ def play(task: Task, agent: Agent, weights: PyTree, key: PRNGKeyArray) -> Episod
 
     def step(state: PyTree, time: Array) -> tuple[PyTree, tuple]:
         action = agent.policy(weights, task.observe(state)[None])[0]
-        after = task.step(state, action, jax.random.fold_in(key, time))
+        after = task.step(state, action, step_key(key, time))
         return after.state, (after.state, action, after.reward)
 
     start = task.reset(key)

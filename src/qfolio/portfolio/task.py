@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from qfolio.core import simplex
 from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.fields import constant, number, require, static
+from qfolio.core.keys import apart
 from qfolio.core.mdp import Actions, Box, Position, Simplex
 from qfolio.core.registry import own_modules
 from qfolio.portfolio import anchors, signals, universe
@@ -385,7 +386,7 @@ class Portfolio(Market):
         drawn = super().draw_reachable(market, key)
         if drawn.plan is not None and self.elapsed.shape[0]:
             pace = self.terms.turnover * self.elapsed[market]
-            spent = pace * jax.random.uniform(jax.random.fold_in(key, 1))
+            spent = pace * jax.random.uniform(apart(key))
             drawn = self.hold(drawn.weights, spent)
         if self.tradable is None:
             return drawn

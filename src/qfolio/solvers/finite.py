@@ -18,6 +18,7 @@ from scipy.sparse import csr_matrix, eye_array
 from scipy.sparse.linalg import spsolve
 
 from qfolio.core.errors import QfolioError
+from qfolio.core.evaluation import step_key
 from qfolio.core.mdp import Task
 
 Values = Float[np.ndarray, "state action"]
@@ -66,8 +67,7 @@ def _follow(
 ) -> Float[Array, " start"]:
     def step(states: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
         time, actions = now
-        # The keys of ``qfolio.core.evaluation.evaluate``: common random numbers.
-        step_keys = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
+        step_keys = jax.vmap(step_key, (0, None))(keys, time)  # common random numbers
         after = jax.vmap(task.step)(states, actions[states], step_keys)
         return after.state, after.reward
 

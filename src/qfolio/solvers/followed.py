@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Key, PyTree
 
+from qfolio.core.evaluation import step_key
 from qfolio.core.mdp import ExogenousTask
 
 
@@ -30,8 +31,7 @@ class FollowedOptimum:
 @eqx.filter_jit(donate="none")
 def _follow(task: ExogenousTask, policy: Any, keys: Key[Array, " start"]) -> Array:
     def step(states: PyTree, time: Array) -> tuple[PyTree, Array]:
-        # The keys of ``qfolio.core.evaluation.evaluate``: common random numbers.
-        step_keys = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
+        step_keys = jax.vmap(step_key, (0, None))(keys, time)  # common random numbers
         after = jax.vmap(task.step)(states, jax.vmap(policy)(states), step_keys)
         return after.state, after.reward
 
