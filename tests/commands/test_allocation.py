@@ -378,6 +378,19 @@ def test_orders_as_csv(folder, monkeypatch, capsys, tmp_path):
     assert "--layout is 'x'; choose from generic, ib, alpaca, schwab" in capsys.readouterr().err
 
 
+def test_orders_that_cannot_be_written_are_not_recorded(copy, monkeypatch, capsys, tmp_path):
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    of = ["--agent", "equal-weight", "--capital", 1000, "--orders"]
+    for place in (tmp_path, ".", copy / "config.json" / "orders.csv"):
+        assert qfolio(monkeypatch, "allocate", copy, *AS_OF, *of, place) == 2
+        assert "Traceback" not in capsys.readouterr().err
+    assert not (copy / "ledger").exists()
+    path = tmp_path / "orders.csv"
+    monkeypatch.setattr("qfolio.portfolio.desk.desk.Desk.record", lambda *_: 1 / 0)
+    assert qfolio(monkeypatch, "allocate", copy, *AS_OF, *of, path) == 2
+    assert not path.exists()
+
+
 def test_nothing_to_trade_is_an_empty_file_of_orders(folder, monkeypatch, capsys, tmp_path):
     path, holdings = tmp_path / "orders.csv", tmp_path / "holdings.csv"
     holdings.write_text("asset,shares\nA,100\n")

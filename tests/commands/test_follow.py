@@ -143,6 +143,14 @@ def test_a_ledger_without_returns_or_records(folder, monkeypatch, capsys, tmp_pa
     assert "is empty; record an allocation with qfolio allocate" in capsys.readouterr().err
 
 
+def test_a_backtest_that_lost_returns_promises_nothing(folder, monkeypatch, capsys, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    lines = (copy / "returns.csv").read_text().splitlines(keepends=True)
+    (copy / "returns.csv").write_text("".join(lines[:-10]))
+    assert qfolio(monkeypatch, "follow", copy, "--prices", table(tmp_path / "more.csv", 335)) == 2
+    assert "returns.csv is missing or damaged; write it again with" in capsys.readouterr().err
+
+
 def test_a_baseline_is_followed_without_training(folder, monkeypatch, capsys, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "copy")
     shutil.rmtree(copy / "ledger")

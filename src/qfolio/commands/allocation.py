@@ -147,15 +147,21 @@ def allocate(
     )
     rows = None if orders is None else order_rows(allocation, layout, currency)
     said, number = "A dry run: nothing is written.", None
+    if orders is not None and rows is not None and not dry_run:
+        write_csv(orders, *rows)  # first: what cannot be ordered is not recorded either
     if hindsight:
         said = f"{hindsight}, so that nothing is recorded."
     elif not dry_run:
-        if update and isinstance(followed, Policy):
-            desk.run.keep(name, followed)
-        record, said = desk.record(name, allocation, table, whole_shares)
+        try:
+            if update and isinstance(followed, Policy):
+                desk.run.keep(name, followed)
+            record, said = desk.record(name, allocation, table, whole_shares)
+        except BaseException:
+            if orders is not None:
+                orders.unlink(missing_ok=True)
+            raise
         number = record.number
-    if orders is not None and rows is not None and not dry_run:
-        write_csv(orders, *rows)
+    if rows is not None and not dry_run:
         said += f" {orders} has {amount(len(rows[1]), 'order')}."
     trained, why, notes = None, [], []
     if isinstance(followed, Policy):

@@ -48,7 +48,12 @@ def path_of(name: str, value: Path | str) -> Path:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes to a temporary name beside ``path``, then renames: a reader sees all or nothing."""
+    """Writes to a temporary name beside ``path``, then renames: a reader sees all or nothing.
+
+    Raises QfolioError if the path is a folder.
+    """
+    if path.is_dir():
+        raise QfolioError(f"{path} is a folder; name a file.")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
     try:

@@ -1,5 +1,6 @@
 """The ledger marked to market, against replays and by hand."""
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -177,7 +178,7 @@ def test_an_account_is_wiped_out_once():
         False, "1y",
     )  # fmt: skip
     said = followed.sentences()
-    assert "The account was wiped out on 2024-01-03: its debts exceeded what it owned." in said
+    assert "WIPED OUT on 2024-01-03: the account's debts exceeded what it owned." in said
     assert not any("consistent" in each or "differed" in each for each in said)
     assert mark([one], prices.between(None, 2), Proportional(0.0), lag=0).ruin is None
 
@@ -233,6 +234,29 @@ def test_orders_filled_over_several_rows_equal_the_replay_of_their_parts():
             cash -= value.sum() / (1 - 0.002)  # what is bought costs a share of what is paid
             shares = shares + plan.trades / fill
     np.testing.assert_allclose(live.wealth, wealth[1:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [1, 2, 3])
+@pytest.mark.parametrize("fill", [1, 2])
+def test_each_order_is_filled_after_the_lag_until_the_next_takes_its_place(lag, fill):
+    prices, model = table(), Proportional(0.0)
+    trades, rows = np.array([2.0, 1.0, 0.0]), range(10, 16)
+    shares, cash, wealth, records = np.zeros(3), 1e4, [], []
+    for row in range(10, 40):
+        if row > 10 + lag:
+            wealth.append(cash + shares @ prices.values[row])
+        for ordered in rows:  # part of a share at each of ``fill`` rows, cut off by the next order
+            later = row - ordered - lag
+            if 0 <= later < fill and (later == 0 or ordered + 1 not in rows):
+                cash -= trades / fill @ prices.values[row]
+                shares = shares + trades / fill
+        if row in rows:
+            idle = Fixed(np.eye(4)[0], model)
+            plan = Allocation.of(idle, prices.between(None, row + 1), shares, cash)
+            records.append(msgspec.structs.replace(record(plan, row), trades=trades.tolist()))
+    live = mark(records, prices.between(None, 40), model, lag, fill)
+    np.testing.assert_allclose(live.wealth, wealth, rtol=1e-12)
+    np.testing.assert_allclose(live.flows, 0, atol=1e-9)
 
 
 def test_a_split_and_a_deposit_earn_nothing():

@@ -16,7 +16,8 @@ from qfolio.portfolio.prices.table import Prices
 
 from tiny import PATHWISE
 
-AGENTS = {"pathwise": PATHWISE}
+ACTIVE = {**PATHWISE.task, "anchor": "equal-weight", "active": True}  # as in PPO's preset
+AGENTS = {"pathwise": PATHWISE._replace(task=ACTIVE)}
 NAMES = ("cash", "A", "B", "C")
 
 
@@ -135,3 +136,19 @@ def test_the_ledger_of_a_strategy_is_followed_and_reproduced(desk):
     assert len(found.live.returns) == 160 - 131
     np.testing.assert_allclose(found.live.returns[1:], returns["60/40"][132 - 160 :], atol=1e-12)
     assert "60/40 learns nothing, so there is nothing to train." in found.sentences()
+
+
+def test_orders_that_the_lag_leaves_unfilled_are_named(tmp_path):
+    run = {"train": "100d", "test": "50d", "seeds": 1, "lag": 2}
+    Backtest.create(table(), AGENTS, out=tmp_path / "run", **run)
+    desk, shares = Desk.open(tmp_path / "run"), np.zeros(3)
+    rule = desk.followed("equal-weight")
+    said = {}
+    for rows in (120, 121, 122):
+        known = table().between(0, rows)
+        allocation = Allocation.of(rule, known, shares, 1000.0)
+        said[rows] = " ".join(desk.terms(rule, known, allocation, 0.0))
+        if rows == 120:
+            desk.record("equal-weight", allocation, known, False)
+    assert "lag of 2 rows the orders of 2020-04-29 are not filled yet" in said[121]
+    assert "not filled" not in said[120] + said[122]

@@ -55,6 +55,8 @@ def print_allocation(
 
 def print_following(following: "Following") -> None:
     """A row for live, the benchmark and the backtest, and what is to be said of them."""
+    from qfolio.portfolio.desk.follow import URGENT
+
     forms = (".1%", ".1%", ".1%", ".2f", ".1%")
     print_table(
         ("net", "growth", "a year", "volatility", "Sharpe", "drawdown"),
@@ -64,7 +66,7 @@ def print_following(following: "Following") -> None:
         ],
     )
     for sentence in following.sentences():
-        if sentence.startswith("ALARM"):
+        if sentence.startswith(URGENT):
             console.print(Text(printable(sentence), style="bold red"))
         else:
             tell(sentence)

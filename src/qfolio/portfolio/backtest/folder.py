@@ -296,17 +296,19 @@ class BacktestFolder:
         write_csv(self.path / "returns.csv", ["date", *columns], rows)
 
     def read_returns(self) -> tuple[list[str], dict[str, np.ndarray]]:
-        """The days, and the returns by column; raises QfolioError if returns.csv is damaged."""
-        path = self.path / "returns.csv"
+        """The days, and the returns by column; raises QfolioError if returns.csv is damaged.
+
+        A file that lost whole rows is noticed, too: summary.json has their number.
+        """
+        path, summary = self.path / "returns.csv", self.path / "summary.json"
         try:
             header, *rows = csv.reader(path.read_text().splitlines())
             table = np.array([row[1:] for row in rows], dtype=float)
             columns = dict(zip(header[1:], table.T, strict=True))
-        except (OSError, csv.Error, ValueError) as error:
-            raise QfolioError(
-                f"{path} is damaged ({error}); write it again with qfolio backtest --resume "
-                f"{self.path}."
-            ) from None
+            if summary.exists() and len(rows) != read_json(summary)["periods"]:
+                raise ValueError
+        except (OSError, csv.Error, KeyError, TypeError, ValueError):
+            raise self._damaged(path) from None
         return [row[0] for row in rows], columns
 
     def write_weights(
@@ -345,17 +347,25 @@ class BacktestFolder:
                 if strategy["kind"] != "rebalancing"
             }
         except (AttributeError, KeyError, QfolioError, TypeError, ValueError):
-            raise QfolioError(
-                f"{path} is damaged; write it again with qfolio backtest --resume "
-                f"{shell(self.path)}."
-            ) from None
+            raise self._damaged(path) from None
 
     def write_why(self, content: dict[str, Any]) -> None:
         write_json(self.path / "why.json", content)
 
     def read_why(self) -> dict[str, Any]:
         """The content of why.json; raises QfolioError if it is missing or not a JSON object."""
-        return read_json(self.path / "why.json")
+        path = self.path / "why.json"
+        try:
+            return read_json(path)
+        except QfolioError:
+            raise self._damaged(path) from None
+
+    def _damaged(self, path: Path) -> QfolioError:
+        """The error of a file that a finished backtest can write again."""
+        return QfolioError(
+            f"{path} is missing or damaged; write it again with qfolio backtest --resume "
+            f"{shell(self.path)}."
+        )
 
     def _records(self, agent: str, fold: str) -> Path:
         return self.path / "training" / agent_folder(agent) / f"{fold}.csv"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import amount, near, quote
+from qfolio.core.text import amount, listed, near, quote
 from qfolio.core.version import __version__
 from qfolio.portfolio.backtest.folder import BacktestFolder
 from qfolio.portfolio.backtest.own import Own
@@ -152,7 +152,7 @@ class Desk:
         trading = followed.task.written.trading
         said = self._timing(followed, table, allocation)
         if allocation.trades.any():
-            said += waiting(table, self.run.config.lag)
+            said += [*waiting(table, self.run.config.lag), *self._pending(table)]
         if trading.fill > 1:
             said.append(
                 f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
@@ -164,6 +164,22 @@ class Desk:
                 f"used {spent:.1%} this year, and this one uses {allocation.turnover:.1%}."
             )
         return said
+
+    def _pending(self, table: Prices) -> list[str]:
+        """Says so if the lag leaves earlier orders unfilled at a table's last row."""
+        last, lag = len(table) - 1, self.run.config.lag
+        dates = [
+            record.date
+            for record in self.ledger.current()
+            if any(record.trades)
+            and (row := int(np.searchsorted(table.dates, record.moment))) < last < row + lag
+        ]
+        if not dates:
+            return []
+        return [
+            f"By the backtest's lag of {lag} rows the orders of {listed(dates)} are not filled "
+            "yet: unless these holdings contain them, the same is ordered again."
+        ]
 
     def _timing(
         self, followed: Policy | Untrained, table: Prices, allocation: Allocation

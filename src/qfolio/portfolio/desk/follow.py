@@ -29,6 +29,9 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of follow.csv; docs/reference/files.md explains them."""
 
+URGENT = ("ALARM", "MARGIN CALL", "WIPED OUT")
+"""How sentences begin that should not be overlooked."""
+
 SEED = 0
 """Seed of the bootstrap: the same ledger gives the same evidence whenever one looks."""
 
@@ -98,7 +101,7 @@ class Following:
         level = f"evidence against it {self.evidence[-1]:.2g}, alarm at {consistency.ALARM:.0f}"
         if live.ruin is not None:
             said.append(
-                f"The account was wiped out on {day(live.ruin)}: its debts exceeded what it owned."
+                f"WIPED OUT on {day(live.ruin)}: the account's debts exceeded what it owned."
             )
         elif self.alarm is None:
             said.append(f"Live returns are consistent with the backtest ({level}).")

@@ -11,9 +11,8 @@ from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.cells import CURRENCIES, is_missing, label, not_a_number, numbers
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.table import Prices
-from qfolio.portfolio.prices.vocabulary import plain
+from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, plain
 
-ASSET_NAMES = ("asset", "symbol", "ticker", "name", "instrument")
 SHARES_NAMES = ("shares", "quantity", "qty", "units", "position")
 CASH = "cash"
 

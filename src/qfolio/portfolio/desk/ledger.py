@@ -77,8 +77,8 @@ class Ledger:
 
     def records(self) -> list[Record]:
         """All records, in the order in which they were made."""
-        paths = sorted(self.folder.glob("[0-9]*.json")) if self.folder.is_dir() else []
-        return [self._read(path) for path in paths]
+        paths = self.folder.glob("[0-9]*.json") if self.folder.is_dir() else ()
+        return sorted(map(self._read, paths), key=lambda record: record.number)
 
     def current(self) -> list[Record]:
         """The record that counts for each date, in order of date."""

@@ -40,11 +40,12 @@ def mark(
 ) -> Live:
     """Follows the allocations of a ledger along a price table.
 
-    Trades of an allocation are filled ``lag`` rows after it, at the close, in the shares of the
-    ledger and at the costs of the model. Each allocation begins with the holdings that it was
-    given; their difference from those expected (deposits, other fills) is a flow, not a return.
-    Shares are converted to units of the table: where an adjusted price differs from the ledger's,
-    after a split or a dividend, the value at the allocation is the same.
+    Trades of an allocation are filled from ``lag`` rows after it on, at the close, in the shares of
+    the ledger and at the costs of the model, until those of a later one take their place. Each
+    allocation begins with the holdings that it was given; their difference from those expected
+    (deposits, other fills) is a flow, not a return. Shares are converted to units of the table:
+    where an adjusted price differs from the ledger's, after a split or a dividend, the value at the
+    allocation is the same.
 
     Args:
         records: One record for each date, in order of date.
@@ -118,7 +119,9 @@ def mark(
             if row == first:
                 total, flow = total + flow, 0.0
             part = np.array(record.trades) * scale / fill
-            due = {row + lag + later: part for later in range(fill)}
+            # Earlier orders go on until this one takes the place of what is left of them.
+            due = {then: parts for then, parts in due.items() if then < row + lag}
+            due |= {row + lag + later: part for later in range(fill)}
             if lag == 0:
                 units, cash, more = _filled(due.pop(row), units, cash, prices, row, model)
                 paid, short = paid + more, short + (not loan and cash < -1e-9 * total)

@@ -33,7 +33,7 @@ class Untrained(abc.ABC):
 
     def __init__(self, name: str, assets: tuple[str, ...], task: Portfolio, cap: float) -> None:
         self.name, self.assets, self.cap = name, assets, cap
-        self.task = dataclasses.replace(task, signals="", anchor="", menu="")
+        self.task = dataclasses.replace(task, signals="", anchor="", menu="", active=False)
 
     @property
     def costs(self) -> CostModel:

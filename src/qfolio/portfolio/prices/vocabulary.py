@@ -3,7 +3,7 @@
 import re
 
 DATE_NAMES = ("date", "dates", "datetime", "timestamp", "time")
-ASSET_NAMES = ("asset", "ticker", "tic", "symbol", "name")
+ASSET_NAMES = ("asset", "ticker", "tic", "symbol", "name", "instrument")
 ADJUSTED_NAMES = ("adjusted close", "adj close", "adjclose", "adjusted price", "adj price")
 PRICE_NAMES = ("close", "price", "value")
 SETTINGS = (
