@@ -149,7 +149,7 @@ def made_up_why(
              Worth(signals[1], -0.001, -0.002, 0.001, -0.4, True)]  # fmt: skip
     agent = AgentWhy(
         decomposition=Decomposition(
-            0.142, 0.131, 0.004, 0.011, 1.7, 0.002, 0.004,
+            0.142, 0.131, 0.004, 0.011, 1.7, 0.004,
             [AssetPart(each, 0.2, 0.03, 0.002) for each in ("cash", *assets)],
             [FoldPart(fold, 0.135, 0.02, 0.004, 0.151), FoldPart("next", 0.1, -0.01, 0.004, 0.086)],
         ),

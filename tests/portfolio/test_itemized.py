@@ -217,6 +217,23 @@ def test_jax_equals_numpy_and_its_derivative_is_exact() -> None:
             assert float(slope @ move) / 1e-6 == pytest.approx(wanted, abs=1e-8)
 
 
+def test_the_volatility_of_an_asset_that_joins_late() -> None:
+    values = table(3, rows=80).values.copy()
+    values[:40, 1] = np.nan
+    prices = Prices(
+        np.datetime64("2024-01-01") + np.arange(80, dtype="m8[D]"), tuple("ABC"), values
+    )
+    found = Conditions.of(prices, ("volatility",)).values["volatility"]
+    for row in (0, 3, 30, 45, 60, 79):
+        assert found[row, 0] == pytest.approx(volatility(values, row, 0), abs=1e-12)
+    for row in range(40, 45):  # it has no five returns yet
+        others = [volatility(values, row, asset) for asset in (0, 2)]
+        assert found[row, 1] == pytest.approx(np.mean(others), abs=1e-12)
+    for row in (45, 50, 61, 79):
+        returns = np.diff(np.log(values[max(40, row - 21) : row + 1, 1]))
+        assert found[row, 1] == pytest.approx(np.std(returns), abs=1e-12)
+
+
 def test_training_pays_what_the_replay_pays() -> None:
     prices = table(7, rows=40)
     text = (

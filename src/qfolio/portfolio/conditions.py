@@ -16,6 +16,9 @@ YEAR = np.timedelta64(365, "D") / np.timedelta64(1, "s")
 MEMORY = 21
 """Number of log returns that a volatility is estimated from."""
 
+FEWEST = 5
+"""Fewest of them that say more about an asset's volatility than those of the other assets."""
+
 
 class Conditions(NamedTuple):
     """Dates and columns of a table, in numpy or jax arrays; empty if a cost model reads none.
@@ -90,12 +93,19 @@ def _sums(values: Floats, years: Floats) -> Floats:
 
 
 def _volatility(values: Floats) -> Floats:
-    """The volatility of the last ``MEMORY`` log returns at each row, or of as many as there are."""
-    logs = np.zeros(values.shape)
-    logs[1:] = np.nan_to_num(np.diff(np.log(values), axis=0))
-    sums, squares = (np.cumsum(x, 0) for x in (logs, logs**2))
-    counts = np.minimum(np.arange(len(values)), MEMORY)
-    before = np.arange(len(values)) - counts
-    n = np.maximum(counts, 1)[:, None]
-    mean, square = (sums - sums[before]) / n, (squares - squares[before]) / n
-    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0)))
+    """The volatility of the last ``MEMORY`` log returns at each row, or of as many as there are.
+
+    Assets with fewer than ``FEWEST`` have the mean of those with as many or more, if there are any.
+    """
+    logs = np.full(values.shape, np.nan)
+    logs[1:] = np.diff(np.log(values), axis=0)
+    known, logs = np.isfinite(logs), np.nan_to_num(logs)
+    before = np.maximum(np.arange(len(values)) - MEMORY, 0)
+    counts, sums, squares = (
+        total - total[before] for total in (np.cumsum(x, 0) for x in (known, logs, logs**2))
+    )
+    n = np.maximum(counts, 1)
+    found = np.sqrt(np.maximum(squares / n - (sums / n) ** 2, 0))
+    enough = counts >= FEWEST
+    mean = (enough * found).sum(1, keepdims=True) / np.maximum(enough.sum(1, keepdims=True), 1)
+    return np.where(enough | ~enough.any(1, keepdims=True), found, mean)

@@ -224,6 +224,24 @@ def test_intervals_cover_the_mean_of_all_tables(between):
     assert covered >= 92  # the noise of days counts twice, so that intervals are rather wide
 
 
+@pytest.mark.parametrize("shared", [0.0, 0.6])
+def test_intervals_of_tables_with_common_shocks_cover_the_mean(shared, monkeypatch):
+    monkeypatch.setattr("qfolio.portfolio.study.pooling.RESAMPLES", 200)
+    rng, missed = np.random.default_rng(7), 0
+    for _ in range(60):
+        common, tables = rng.standard_normal(250), {}
+        for i in range(8):
+            active = shared**0.5 * common + (1 - shared) ** 0.5 * rng.standard_normal(250)
+            flat = 0.01 * rng.standard_normal(250)
+            each = {"a": flat + 0.003 * active}, {"ew": flat}, {"ew": flat}
+            tables[f"t{i}"] = TableReturns(days(0, 250), 252.0, *each)
+        pooled = pool(tables, ["a"])["a"].to_reference
+        assert pooled.low is not None
+        assert pooled.high is not None
+        missed += not pooled.low <= 0 <= pooled.high
+    assert missed <= 6  # 25 with shared shocks, if tables counted as independent
+
+
 def test_tables_are_pooled():
     tables = {f"t{i}": constant([0.002 * (i + 1), 0.0], 40 + 10 * i) for i in range(3)}
     pooled = pool(tables, ["a"])["a"].to_reference

@@ -229,7 +229,12 @@ def _pooled(
     """From differences by table, their weights and correlations, and resampled means."""
     growth = {name: _known(each.growth) for name, each in tables.items()}
     mean = float(np.mean(list(growth.values())))
-    low, high = percentile_interval(drawn) if math.isfinite(mean) else np.full(2, math.nan)
+    low, high = np.full(2, math.nan)
+    if math.isfinite(mean):
+        # The bootstrap draws tables independently; common shocks widen the interval.
+        errors = np.array([_known(x.tracking_error) for x in tables.values()]) / weights
+        wider = math.sqrt(ratio_or_zero(errors @ shared @ errors, errors @ errors))
+        low, high = mean + wider * (percentile_interval(drawn) - mean)
     z = stouffer([_known(each.z) for each in tables.values()], weights, shared)
     return Pooled(
         growth=finite(mean),
@@ -321,8 +326,8 @@ def hierarchical_bootstrap(
 
     Tables are drawn with replacement, and the days of each drawn table by the stationary bootstrap
     (Davison & Hinkley 1997, section 3.8; Politis & Romano 1994). The noise of days is already in
-    the differences between tables, so that intervals are too wide rather than too narrow. A single
-    table is resampled by days.
+    the differences between tables, so that intervals of independent tables are too wide rather than
+    too narrow. A single table is resampled by days.
 
     Args:
         tables: Daily numbers of each table, shape (series, days); all have the same series.

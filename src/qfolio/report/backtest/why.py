@@ -68,9 +68,9 @@ def headline(name: str, parts: Decomposition) -> str:
     }  # fmt: skip
     return (
         f"Of the {said['net']} a year that {name} earned, {said['equal']} come from equal "
-        f"weights, {said['tilts']} from weights that were constantly different, "
-        f"{said['timing']} from their timing (t = {number(parts.timing_t)}), and costs took "
-        f"{said['cost']}."
+        f"weights, {said['tilts']} from weights that were constantly different and "
+        f"{said['timing']} from their timing (together t = {number(parts.active_t)}), and costs "
+        f"took {said['cost']}."
     )
 
 
@@ -82,10 +82,9 @@ def _digits(values: Sequence[float]) -> int:
 def _parts(parts: Decomposition) -> list[dict[str, Any]]:
     """Bars of the parts of the agent's return over equal weights."""
     digits = _digits([parts.tilts, parts.timing, parts.cost])
-    between = percent(parts.between, digits, sign=True)
     rows = [
         ("Constant tilts", parts.tilts, "mean weights, less equal weights"),
-        ("Timing", parts.timing, f"{between} from fold to fold; t = {number(parts.timing_t)}"),
+        ("Timing", parts.timing, f"with constant tilts, t = {number(parts.active_t)}"),
         ("Costs", -parts.cost, "of all trades"),
         ("Net of equal weights", parts.net - parts.equal, "the sum"),
     ]

@@ -5,6 +5,11 @@ while they were held, and the day's cost c. Over all days the mean of Σᵢ wᵢ
 constant weights would have earned, plus Σᵢ cov(wᵢ, rᵢ), what was earned by holding more of an asset
 on its better days (Lo 2008, "Where do alphas come from?"). All parts are arithmetic and add up
 exactly.
+
+The mean weights are known only at the end, and those of a holding that drifts are high for the
+assets that did well. So a holding that is never traded seems to lose by timing what it seems to
+earn by constant tilts, and only the sum of the two has a t-statistic: on each day, its weights are
+known before the return.
 """
 
 from collections.abc import Sequence
@@ -45,8 +50,7 @@ class Decomposition(msgspec.Struct, frozen=True):
     equal: float  # return of equal weights of all assets that may be held, without costs
     tilts: float  # what the mean weights earned beyond that
     timing: float
-    timing_t: float  # HAC t-statistic, given the mean weights
-    between: float  # part of the timing: mean weights that differ from fold to fold
+    active_t: float  # HAC t-statistic of tilts + timing
     cost: float
     assets: list[AssetPart]  # cash first
     folds: list[FoldPart]
@@ -82,17 +86,12 @@ def decompose(
     static, timed = returns @ mean, ((weights - mean) * returns).sum(1)
     cost = (weights * returns).sum(1) - net
     by_asset = ((weights - mean) * returns).mean(0)
-    steps = [
-        len(net[days]) * float((weights[days].mean(0) - mean) @ returns[days].mean(0))
-        for days in folds.values()
-    ]
     return Decomposition(
         net=year * float(net.mean()),
         equal=year * float(equal.mean()),
         tilts=year * float((static - equal).mean()),
         timing=year * float(timed.mean()),
-        timing_t=mean_t(timed),
-        between=year * sum(steps) / len(net),
+        active_t=mean_t(static + timed - equal),
         cost=year * float(cost.mean()),
         assets=[
             AssetPart(name, float(weight), year * float(own), year * float(moved))
