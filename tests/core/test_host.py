@@ -1,5 +1,6 @@
 """Agents on environments of Gymnasium, stepped from Python."""
 
+import gc
 import json
 import sys
 
@@ -180,6 +181,16 @@ def test_rollouts_are_those_of_the_compiled_loop():
         (host.agent, host.tally),
         (compiled.agent, compiled.tally),
     )
+
+
+def test_environments_are_closed_when_they_are_no_longer_used(monkeypatch):
+    closed = []
+    monkeypatch.setattr(Delay, "close", lambda self: closed.append(self), raising=False)
+    population = trained(task(Delay), SMALL, [0], 8)
+    made = len(closed)
+    population.restore(population.fetch())
+    gc.collect()
+    assert len(closed) == made + SMALL.num_envs
 
 
 def test_transitions_end_before_the_reset():

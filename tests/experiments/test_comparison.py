@@ -172,6 +172,14 @@ def test_agents_that_cannot_be_told_apart_are_said_so():
     assert len(said) == 3
 
 
+def test_agents_with_equal_results_end_level():
+    said = conclusion(rank({"a": result(GOOD), "b": result(GOOD), "c": result(BAD)}))
+    assert said[0].startswith("a and b end nearest to the exact optimum: the regret of each is 1.6")
+    assert said[1] == "With 8 seeds each they can be told apart from c (36%)."
+    said = conclusion(rank({"a": result(GOOD), "b": result(GOOD)}))
+    assert len(said) == 2
+
+
 def test_a_best_return_of_zero_has_no_shares():
     ranking = rank({name: result([0.0, 0.0], curve=(0.0, 0.0), optimum=None) for name in "ab"})
     assert [entry["reached"] for entry in ranking["agents"]["a"]["within"]] == [0] * 6

@@ -218,8 +218,10 @@ class Members:
             lowered = program.lower(self.taken, *example)
         try:
             return lowered.compile(compiler_options=PRODUCTS_ONLY | effort(once=once))
-        except jax.errors.JaxRuntimeError:  # this version of XLA has no such option
-            return lowered.compile()
+        except jax.errors.JaxRuntimeError as error:
+            if "INVALID_ARGUMENT" not in str(error):
+                raise
+            return lowered.compile()  # this version of XLA has no such option
 
 
 def _map(function: Callable[[Any], Any], members: Any, count: Array) -> Any:

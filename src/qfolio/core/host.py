@@ -6,8 +6,10 @@ the programs of some compute, Python steps the environments of another.
 """
 
 import abc
+import contextlib
 from collections.abc import Callable, Generator, Hashable, Iterable, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+from weakref import finalize
 
 import equinox as eqx
 import jax
@@ -95,6 +97,8 @@ class Environments:
     def __init__(self, task: HostTask, limit: int, count: int) -> None:
         self._name, self._facts, self._limit = name_of(task), task.facts, limit
         self._environments = [task.make() for _ in range(count)]
+        # Closed when nothing refers to them any more; at exit the process frees what they hold.
+        finalize(self, _close, self._environments).atexit = False
         self._steppers = [environment.step for environment in self._environments]
         shape, kind = task.observation
         self.observation: np.ndarray = np.zeros((count, *shape), kind)
@@ -163,6 +167,12 @@ class Environments:
         step = int(self._steps[index])
         where = f"at step {step} of an episode" if step else "at the start of an episode"
         return QfolioError(f"{self._name} failed {where}: {reason}.")
+
+
+def _close(environments: Iterable[Any]) -> None:
+    for environment in environments:
+        with contextlib.suppress(Exception):  # nobody waits for its result
+            environment.close()
 
 
 class HostPopulation(Population):

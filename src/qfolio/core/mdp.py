@@ -1,8 +1,8 @@
 """The interfaces of tasks and agents, and the data that passes between them.
 
 Everything here is a pytree, and every method a pure function of pytrees, so that ``jit``, ``vmap``
-and ``scan`` apply directly. Agents never import tasks and tasks never import agents: both
-know only this file.
+and ``scan`` apply directly. Agents and tasks never import each other: they meet in the
+interfaces of this file.
 """
 
 import abc

@@ -104,5 +104,7 @@ def _listen(receiver: socket.socket, sender: socket.socket) -> None:
     """Acts on signal numbers; holds a reference to the sender to keep it open."""
     while numbers := receiver.recv(64):
         for number in numbers:
-            if number == signal.SIGINT and not (_trainings and _first(_trainings[0])):
-                _leave()
+            if number == signal.SIGINT:
+                stop = next(iter(_trainings), None)  # the main thread may remove it at any moment
+                if stop is None or not _first(stop):
+                    _leave()

@@ -76,6 +76,7 @@ class Log:
     def __init__(self, folder: Path | None) -> None:
         self.folder, self._file = folder, -1
         self._trackers: list[Tracker] = []
+        self._telling = threading.Lock()
         self.state = "done"  # how the work ends, unless an error ends it
 
     @contextlib.contextmanager
@@ -135,8 +136,12 @@ class Log:
             self._tell(lambda tracker: tracker.log(means, step))
 
     def _tell(self, tell: Callable[[Tracker], None]) -> None:
-        """Calls all trackers; one that fails is dropped with a warning, and training goes on."""
-        self._trackers = [tracker for tracker in self._trackers if self._heard(tracker, tell)]
+        """Calls all trackers; one that fails is dropped with a warning, and training goes on.
+
+        One call at a time: a study queues jobs while others report.
+        """
+        with self._telling:
+            self._trackers = [tracker for tracker in self._trackers if self._heard(tracker, tell)]
 
     def _heard(
         self, tracker: Tracker, tell: Callable[[Tracker], None], *fatal: type[Exception]

@@ -33,7 +33,7 @@ class Evidence(NamedTuple):
         """The evidence with a rollout's steps added.
 
         unseen: whether a member has not learned from a step; the step counts only then. memory:
-        factor on the evidence so far, so that older steps fade.
+        factor on all steps, so that older ones fade.
         """
         counted, earned = 1.0 * unseen.any(0), (unseen * active).sum(0)
         new = (counted, earned, earned**2)

@@ -14,6 +14,7 @@ from qfolio.core.registry import BASELINES, find
 from qfolio.experiments.events import read
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset, preset
+from qfolio.portfolio.backtest import notes
 from qfolio.portfolio.backtest.folder import MOST_WEIGHTS, rows_written
 from qfolio.portfolio.backtest.kept import LATEST
 from qfolio.portfolio.backtest.replay import Stretch, decide
@@ -447,6 +448,16 @@ def test_episodes_are_shorter_where_a_fold_is_short(tmp_path):
     ]
     longer = create(train="100d", test="100d", agents=agents)
     assert not any(entry.shortened for entry in longer.config.agents.values())
+
+
+def test_a_signal_that_no_training_row_has_is_named():
+    long = AGENTS["pathwise"]
+    agents = {"pathwise": long._replace(task={**long.task, "signals": "momentum:5,momentum:150"})}
+    run = create(train="100d", test="100d", agents=agents, seeds=1)
+    assert notes.unknown(run.tasks, run.folds) == [
+        "momentum:150 looks back on more rows than 1 of 2 folds has for training; there it is "
+        "unknown and counts as 0."
+    ]
 
 
 def test_an_agent_that_names_its_preset_can_be_opened(tmp_path):

@@ -198,6 +198,7 @@ GROUP = {"assets": ["XLE", "XOM"]}
          "cash of at most 10% and gross exposure of at most 50% clash"),
         ({"assets": {"floor": {"SPY": 0.2}, "forbidden": ["TLT", "SPY"]}},
          "the floor of SPY, 20%, and assets.forbidden, which names SPY, clash; change one of them"),
+        ({"assets": {"forbidden": list(ASSETS)}}, "it allows no weight in any asset; change"),
         ({"assets": {"cap": {"SPY": -0.1}, "floor": -0.3, "forbidden": ["SPY"]}},
          "the cap of SPY, -10%, and assets.forbidden"),
         ({"groups": {"theme": {"oil": {"assets": ["XLE", "XMO"], "cap": 0.1}}}},

@@ -69,6 +69,12 @@ def test_spells_before_the_end_are_counted_in_a_note():
     )
 
 
+def test_a_price_that_is_quoted_once_a_week_changes():
+    table = market()
+    table.loc[table.index.day_of_week != 4, "B"] = np.nan
+    assert not [each for each in found(table) if "never changes" in each.message]
+
+
 def test_a_price_that_never_changes():
     table = market()
     table["C"] = 20.0

@@ -11,22 +11,29 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
     """The conclusions that a ranking supports, in sentences."""
     first, seeds = ranking["order"][0], ranking["seeds"]
     each = f"with {seeds} {plural('seed', seeds)} each"
+    results = {name: entry["final"]["per_seed"] for name, entry in ranking["agents"].items()}
+    level = [name for name in ranking["order"] if results[name] == results[first]]
     beaten = {
         row["second"]: row["told_apart"] and row["probability"] > 0.5
         for row in ranking["pairs"]
-        if row["first"] == first
+        if row["first"] == first and row["second"] not in level
     }
     valued = {name: f"{name} ({result_of(ranking, name)})" for name in beaten}
     tied = [valued[name] for name, worse in beaten.items() if not worse]
     worse = [valued[name] for name, worse in beaten.items() if worse]
+    end, they, their = ("ends", "it", "its regret")
+    if len(level) > 1:
+        end, they, their = ("end", "they", "the regret of each")
     best = (
-        f"{first} ends nearest to the exact optimum: its regret is"
+        f"{listed(level)} {end} nearest to the exact optimum: {their} is"
         if ranking["measure"] == "regret"
-        else f"{first} ends with the highest return:"
+        else f"{listed(level)} {end} with the highest return:"
     )
-    sentence = f"{each.capitalize()} it can be told apart from {listed(worse)}." if worse else ""
+    sentence = (
+        f"{each.capitalize()} {they} can be told apart from {listed(worse)}." if worse else ""
+    )
     if tied:
-        sentence = f"{each.capitalize()} it cannot be told apart from {listed(tied, 'or')}"
+        sentence = f"{each.capitalize()} {they} cannot be told apart from {listed(tied, 'or')}"
         sentence += f"; {listed(worse)} do{'es' * (len(worse) == 1)} worse." if worse else "."
     if seeds < ranking["seeds_needed"]:
         count = len(ranking["order"])
@@ -35,7 +42,8 @@ def conclusion(ranking: dict[str, Any]) -> list[str]:
             f"{each.capitalize()} {none} be told apart, whatever their results; this needs "
             f"{ranking['seeds_needed']} seeds or more."
         )
-    return [f"{best} {result_of(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
+    said = [f"{best} {result_of(ranking, first, interval=True)}.", sentence, _quickest(ranking)]
+    return [each for each in said if each]
 
 
 def result_of(ranking: dict[str, Any], name: str, *, interval: bool = False) -> str:

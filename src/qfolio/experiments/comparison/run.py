@@ -288,13 +288,15 @@ class Comparison:
     def _fail(self, job: str, name: str, error: QfolioError, log: Log) -> None:
         self.failures[name] = str(error)
         log.write("failed", job=job, error=str(error))
+        self._write()
 
     def _keep(self, name: str, run: Run, executor: Executor, log: Log) -> None:
         try:
             self.results[name] = measure(run, executor.devices)
         except QfolioError as error:  # it cannot be graded
             self._fail(name, name, error, log)
-        self._write()
+        else:
+            self._write()
 
     @property
     def finished(self) -> bool:
@@ -331,8 +333,7 @@ class Comparison:
         if coarse:
             notes.append(
                 f"The learning curves of {listed(coarse)} have fewer than {COARSE} points, because "
-                "evaluations are far apart: these agents need fewer steps to come near the goal "
-                "than stated."
+                "evaluations are far apart: they may come near the goal earlier than stated."
             )
         return notes
 

@@ -8,6 +8,7 @@ import io
 import pickle
 from collections.abc import Mapping
 from typing import Any, NamedTuple
+from weakref import ReferenceType, ref
 
 import jax
 import numpy as np
@@ -36,7 +37,7 @@ class Packer:
 
     def __init__(self) -> None:
         self.arrays: dict[str, bytes] = {}
-        self._known: dict[int, tuple[Any, str]] = {}  # by id, with the object, which keeps the id
+        self._known: dict[int, tuple[ReferenceType[Any], str]] = {}  # by id, which may be reused
 
     def pack(self, job: Any) -> Parcel:
         """A job as bytes, in which the digests of large arrays stand for them."""
@@ -56,12 +57,13 @@ class Packer:
         return Parcel(content, tuple(needs), tuple(named))
 
     def _digest(self, array: Any) -> str:
-        if id(array) not in self._known:
+        known = self._known.get(id(array))
+        if known is None or known[0]() is not array:
             content = pickle.dumps(array, protocol=5)
             digest = hashlib.sha256(content).hexdigest()
             self.arrays[digest] = content
-            self._known[id(array)] = (array, digest)
-        return self._known[id(array)][1]
+            self._known[id(array)] = known = (ref(array), digest)
+        return known[1]
 
 
 def _names(pickled: bytes, module: str) -> bool:

@@ -240,7 +240,7 @@ def verdicts(found: Sensitivity | None, trials: Sequence[Trial]) -> list[str]:
         sentences.append("No setting by itself explains a tenth of the variation.")
     if idle:
         names = listed([e.dimension.name for e in idle])
-        verb = "does" if len(idle) == 1 else "do"
+        verb = "matters" if len(idle) == 1 else "matter"
         sentences.append(
             f"{names} hardly {verb}: once the others are right, at least three quarters of the "
             f"searched range costs no more than {found.outcome.tolerance}."

@@ -1,6 +1,6 @@
 """What a backtest has to say of its strategies besides their figures, in sentences."""
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,8 +8,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from qfolio.core.text import amount
+from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.folder import AgentConfig
-from qfolio.portfolio.backtest.folds import fewest
+from qfolio.portfolio.backtest.folds import Fold, fewest
 from qfolio.portfolio.backtest.replay import Entry, Replay
 from qfolio.portfolio.mandate import checks
 from qfolio.portfolio.prices.findings import first_of, listing
@@ -27,6 +29,25 @@ def shortened(agents: Mapping[str, AgentConfig], replay: Replay) -> list[str]:
         f"{agent.shortened}, because a fold trains on {rows} rows only."
         for name, agent in agents.items()
         if agent.shortened
+    ]
+
+
+def unknown(tasks: Mapping[str, Portfolio], folds: Sequence[Fold]) -> list[str]:
+    """A note on each signal that is unknown in all rows that a fold trains on."""
+    found = {
+        label: count
+        for task in tasks.values()
+        for label, signal in zip(
+            signals.labels(task.signals),
+            signals.parse(task.signals, float(task.year)),
+            strict=True,
+        )
+        if (count := sum(signal.rows >= fold.train.stop for fold in folds))
+    }
+    return [
+        f"{label} looks back on more rows than {count} of {amount(len(folds), 'fold')} "
+        f"{'has' if count == 1 else 'have'} for training; there it is unknown and counts as 0."
+        for label, count in found.items()
     ]
 
 

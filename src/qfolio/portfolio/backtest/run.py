@@ -425,6 +425,7 @@ class Backtest:
         entries = {name: entry for each in (*found, others) for name, entry in each.items()}
         return entries, [
             *notes.shortened(self.config.agents, replay),
+            *notes.unknown(self.tasks, self.folds),
             *notes.left_out(replay),
             *notes.mandated(replay),
             *said,

@@ -31,6 +31,11 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
     """
     made = feasible(text, usable, most)
     _require_members(text)
+    if not (made.limits.low.any() or made.limits.high.any()):
+        raise QfolioError(
+            "The mandate cannot be met: it allows no weight in any asset; change assets.forbidden "
+            "or assets.cap."
+        )
     _require_each(text, made.limits)
     said = _said(text, made, most)
     clash = list(range(len(said)))

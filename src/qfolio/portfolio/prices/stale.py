@@ -41,7 +41,7 @@ def check_stale(grid: Grid, rest: Rest, findings: Findings) -> None:
     moves = both & (values[1:] != values[:-1])
     idle = ~moves.any(axis=1) & (both.sum(axis=1) > 1)  # an asset alone may stand still
     _report_idle(dates, idle, moves, both, findings)
-    spells = list(_spells(known, moves, np.concatenate([[0], np.cumsum(~idle)])))
+    spells = list(_spells(known, _changes(values), np.concatenate([[0], np.cumsum(~idle)])))
     last = len(values) - 1
     constant = [spell for spell in spells if spell.whole]
     _report_constant(grid, rest, constant, findings)
@@ -58,12 +58,19 @@ def check_stale(grid: Grid, rest: Rest, findings: Findings) -> None:
         )
 
 
+def _changes(values: np.ndarray) -> np.ndarray:
+    """Whether a price differs from the last one before it, of shape (rows − 1, assets)."""
+    rows = np.where(np.isnan(values), 0, np.arange(len(values))[:, None])
+    filled = np.take_along_axis(values, np.maximum.accumulate(rows), 0)
+    return (filled[1:] != filled[:-1]) & ~np.isnan(filled[:-1])
+
+
 def _spells(known: np.ndarray, moves: np.ndarray, clock: np.ndarray) -> Iterator[_Spell]:
     """The long spells, by asset and row.
 
     Args:
         known: Whether there is a price, of shape (rows, assets).
-        moves: Whether it differs from the one before, of shape (rows − 1, assets).
+        moves: Whether it differs from the last one before it, of shape (rows − 1, assets).
         clock: The number of rows so far on which anything moves, of shape (rows,).
     """
     for j in np.flatnonzero(known.any(axis=0)).tolist():

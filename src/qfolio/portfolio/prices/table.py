@@ -122,11 +122,6 @@ class Prices:
         object.__setattr__(self, "feature_names", channels)
         object.__setattr__(self, "market_names", shared)
 
-    @classmethod
-    def from_frame(cls, frame: Any, **options: Any) -> "Prices":
-        """Read and check a data frame; the options are those of ``load``."""
-        return load(frame, **options)
-
     def __len__(self) -> int:
         return len(self.dates)
 
