@@ -79,6 +79,9 @@ def test_scores_become_the_nearest_weights_of_a_market():
         seen = env.step(np.array(scores, np.float32))[0]
         holdings = seen["holding"]
         assert 0.4 < holdings[0] < 0.6  # a half, drifted by one step
+    env.reset(seed=1)
+    holdings = env.step(np.array([0.3, 0.9], np.float32))[0]["holding"]
+    assert holdings[0] == pytest.approx(0.8, abs=0.02)  # 0.3 and 0.9 less 0.1 each
 
 
 def test_a_task_says_what_is_wrong():

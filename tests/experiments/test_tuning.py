@@ -513,7 +513,7 @@ def test_sensitivity_finds_what_matters():
     good = sum(-trial.value <= 107 + (-best.value - 102) for trial in trials[:40])
     assert f"Of 40 configurations drawn at random, {good} lost no more than 5 points" in text
     assert "What matters most: learning_rate" in text
-    assert "hidden hardly do" in text or "hidden and discount hardly do" in text
+    assert "hidden hardly matter" in text or "hidden and discount hardly matter" in text
     assert "The narrowest is learning_rate" in text
 
 

@@ -122,6 +122,10 @@ def test_scales_by_hand():
     np.testing.assert_allclose(of("centered")[0], [-1, 1, 0, 0])
     np.testing.assert_allclose(of("centered")[1], [-1.5, -1.5, 2.5, 0.5])
     np.testing.assert_allclose(of("raw")[0], [1, 3, 2, 0])
+    values[0, 3] = np.inf  # counts as unknown
+    for scale in signals.SCALES:
+        assert of(scale)[0, 3] == 0
+    np.testing.assert_allclose(of("z-score")[0], [-unit, unit, 0.0, 0.0])
 
 
 def test_drift_keeps_its_scale():

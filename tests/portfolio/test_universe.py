@@ -540,6 +540,42 @@ def test_a_table_with_leavers_is_read(tmp_path: Path) -> None:
         load(frame, delisting_haircut=0.5)
 
 
+@pytest.mark.parametrize("missing", ["error", "forward-fill", "drop-asset"])
+def test_a_folder_keeps_the_delistings_of_its_tables(tmp_path: Path, missing: str) -> None:
+    frame = frame_of(30, 3)
+    frame.loc[frame.index[20:], "B"] = np.nan
+    folder, apart = tmp_path / "together", tmp_path / "apart"
+    for place in (folder, apart):
+        place.mkdir()
+    frame.to_csv(folder / "prices.csv")
+    for name in frame:
+        frame[[name]].rename(columns={name: "close"}).to_csv(apart / f"{name}.csv")
+    whole = load(frame, missing=missing, ended="cash-out", delisting_haircut=0.5)
+    assert whole.listed is not None
+    assert whole.listed[:, 1].sum() == 20
+    for place in (folder, apart):
+        found = load(place, missing=missing, ended="cash-out", delisting_haircut=0.5)
+        assert found.assets == whole.assets
+        np.testing.assert_array_equal(found.listed, whole.listed)
+        np.testing.assert_allclose(found.values, whole.values)
+
+
+@pytest.mark.parametrize("choice", [{"missing": "forward-fill"}, {"ended": "cash-out"}])
+def test_a_column_of_all_assets_needs_no_row_of_each(choice: dict[str, str]) -> None:
+    frame = frame_of(30, 3)
+    rate = pd.Series(np.linspace(0.01, 0.02, 30), frame.index, name="rate")
+    long = frame.rename_axis(columns="ticker").stack().rename("close").reset_index()
+    long["rate"] = rate.reindex(long["date"]).to_numpy()
+    gone = (long["ticker"] == "B") & (long["date"] >= frame.index[28])
+    if "missing" in choice:
+        gone = (long["ticker"] == "B") & (long["date"] == frame.index[7])
+    found = load(long[~gone], columns=["rate"], **choice)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found.market[:, 0], rate)
+    long.loc[4, "rate"] = 0.5
+    with pytest.raises(QfolioError, match="has several numbers on one date"):
+        load(long, columns=["rate"])
+
+
 def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
     frame = frame_of(30, 3)
     rows = pd.DataFrame(
@@ -548,7 +584,7 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
     )
     rows.to_csv(tmp_path / "rows.csv")
     (tmp_path / "spans.csv").write_text(
-        "asset,from,to\nA,2024-01-03,\nB,2024-01-15,\nC,2024-01-03,2024-01-14\nZ,,\n"
+        "asset,from,to\nA,2024-01-03,\nB,2024-01-15,\nC,2024-01-03,2024-01-12\nZ,,\n"
     )
     day = frame.index
     wanted = np.stack(

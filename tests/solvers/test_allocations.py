@@ -57,6 +57,14 @@ def test_equal_risk_is_equal_and_that_of_skfolio() -> None:
     np.testing.assert_allclose(equal_risk(np.diag([1.0, 4.0])), [2 / 3, 1 / 3])
 
 
+def test_a_covariance_without_a_solution_is_refused() -> None:
+    with pytest.raises(QfolioError, match="is the covariance positive"):
+        equal_risk([[1.0, -1.0], [-1.0, 1.0]])
+    for solve in (equal_risk, minimum_variance):
+        with pytest.raises(QfolioError, match="must be symmetric"):
+            solve([[1.0, 0.2], [0.9, 1.0]])
+
+
 def ratio(weights: np.ndarray, mean: np.ndarray, sigma: np.ndarray) -> float:
     return float(mean @ weights / np.sqrt(weights @ sigma @ weights))
 

@@ -101,7 +101,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
                 self.prices.feature_names,
             ):
                 raise QfolioError("scaled_by must have the assets and features of prices.")
-            scale = Portfolio.of(other, **chosen)
+            scale = Portfolio.of(other, **{**chosen, "horizon": 1})  # whatever its length
             self.task = _programs().scaled(self.task, scale)
         assets, channels = len(self.prices.assets), self.task.center.shape[0]
         self.first = int(self.task.first_decision)
@@ -179,7 +179,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         if self.render_mode is None or self._row < 0:
             return None
         named = zip(("cash", *self.prices.assets), self._held, strict=True)
-        held = ", ".join(f"{name} {weight:.0%}" for name, weight in named if weight >= 0.005)
+        held = ", ".join(f"{name} {weight:.0%}" for name, weight in named if abs(weight) >= 0.005)
         return f"{self._day(self._row)}  wealth {self._wealth:.4f}  {held}\n"
 
     def _checked(self, action: Any) -> np.ndarray:

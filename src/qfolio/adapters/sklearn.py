@@ -103,6 +103,9 @@ class PortfolioPolicy(BaseOptimization):
     observations_ : pandas.Index or None
         Their dates.
 
+    periods_per_year_ : float
+        Rows a year, from their dates; those of trading days without any.
+
     n_samples_seen_ : int
         Number of all rows seen, including those no longer kept.
 

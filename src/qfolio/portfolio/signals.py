@@ -357,6 +357,7 @@ def _checked(signal: Signal, prices: Floats) -> Floats:
 
 
 def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
+    values = np.where(np.isfinite(values), values, np.nan)  # one alone would silence all
     if not shared and scale == "rank":
         import pandas as pd
 
@@ -370,7 +371,7 @@ def _scaled(values: Floats, shared: bool, scale: str) -> Floats:
         if scale == "z-score":
             spread = np.sqrt(np.nansum(values**2, 1, keepdims=True) / count)
             values = np.clip(values / np.where(spread > unit, spread, np.inf), -3, 3)
-    return np.nan_to_num(values, posinf=0, neginf=0)
+    return np.nan_to_num(values)
 
 
 def _unit(values: Floats) -> Floats:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qfolio.core.arrays import Floats
-from qfolio.solvers.shared import at_bounds, require, step_length
+from qfolio.solvers.shared import at_bounds, require, solve, step_length
 from qfolio.solvers.sifting import sift
 
 
@@ -89,10 +89,7 @@ def _interior_point(mu: Floats, sigma: Floats, cap: float, tol: float) -> Floats
             ratio = v / s
             system += cap * (cap * ratio.sum() - ratio[:, None] - ratio)
             system[diagonal] += ratio
-        try:
-            step = np.linalg.solve(system, target / y + room(pushed) - slope)
-        except np.linalg.LinAlgError:
-            break
+        step = solve(system, target / y + room(pushed) - slope)
         step_s = room(step)
         if not np.isfinite(step).all():
             break

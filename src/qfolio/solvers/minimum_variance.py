@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qfolio.core.arrays import Floats
-from qfolio.solvers.shared import at_bounds, require, square, step_length
+from qfolio.solvers.shared import at_bounds, require, solve, square, step_length
 from qfolio.solvers.sifting import sift
 
 
@@ -56,7 +56,7 @@ def _interior_point(sigma: Floats, cap: float, tol: float) -> Floats:
         target = 0.1 * gap
         system = sigma + np.diag(z / w + v / room)
         push = target / w - target / room - sigma @ w
-        moved, level = np.linalg.solve(system, np.stack([push, np.ones(count)], axis=1)).T
+        moved, level = solve(system, np.stack([push, np.ones(count)], axis=1)).T
         step = moved - moved.sum() / level.sum() * level  # of sum 0
         step_z = target / w - z - z / w * step
         step_v = target / room - v + v / room * step

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qfolio.core.arrays import Floats
-from qfolio.solvers.shared import require, square
+from qfolio.solvers.shared import require, solve, square
 
 
 def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> Floats:
@@ -39,7 +39,7 @@ def equal_risk(covariance: ArrayLike, tol: float = 1e-10) -> Floats:
         if np.max(np.abs(slope * y)) * count <= tol:
             break
         curvature = correlations + np.diag(1 / (count * y**2))
-        step = np.linalg.solve(curvature, slope)
+        step = solve(curvature, slope)
         decrement = np.sqrt(count * (step @ slope))  # in the units of a self-concordant function
         y = y - step / (1 + decrement if decrement > 0.2 else 1)
     else:

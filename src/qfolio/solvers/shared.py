@@ -50,13 +50,23 @@ def at_bounds(weights: Floats, *, empty: Bools, full: Bools, cap: float) -> Floa
 
 
 def square(covariance: ArrayLike) -> Floats:
-    """A covariance as an array; raises QfolioError unless it is square and finite."""
+    """A covariance as an array; raises QfolioError unless it is square, finite and symmetric."""
     sigma = np.asarray(covariance, dtype=float)
     require(
         sigma.ndim == 2 and sigma.shape[0] == sigma.shape[1] and bool(np.isfinite(sigma).all()),
         f"a covariance must be a square table of finite numbers; this one has shape {sigma.shape}",
     )
+    least = 1e-8 * float(abs(sigma).max(initial=0))
+    require(bool(np.allclose(sigma, sigma.T, atol=least)), "a covariance must be symmetric")
     return sigma
+
+
+def solve(system: Floats, right: Floats) -> Floats:
+    """The solution of a linear system; NaN if it is singular, so that the caller's search ends."""
+    try:
+        return np.asarray(np.linalg.solve(system, right))
+    except np.linalg.LinAlgError:
+        return np.full(right.shape, np.nan)
 
 
 def require(holds: bool, sentence: str) -> None:

@@ -139,9 +139,9 @@ def test_the_ledger_of_a_strategy_is_followed_and_reproduced(desk):
 
 
 def test_orders_that_the_lag_leaves_unfilled_are_named(tmp_path):
-    run = {"train": "100d", "test": "50d", "seeds": 1, "lag": 2}
-    Backtest.create(table(), AGENTS, out=tmp_path / "run", **run)
-    desk, shares = Desk.open(tmp_path / "run"), np.zeros(3)
+    out = tmp_path / "run"
+    Backtest.create(table(), AGENTS, out=out, train="100d", test="50d", seeds=1, lag=2)
+    desk, shares = Desk.open(out), np.zeros(3)
     rule = desk.followed("equal-weight")
     said = {}
     for rows in (120, 121, 122):

@@ -209,6 +209,17 @@ def test_names_are_whole_on_a_phone(browser: Browser, page_path: Path) -> None:
     assert np.all(np.array(lows) - highs > -0.5)  # none covers another
 
 
+def test_the_rolling_chart_is_followed_after_printing(browser: Browser, tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text(render_backtest(usual(400)), encoding="utf-8")
+    browser.show((tmp_path / "report.html").as_uri(), 1280, DRAWN)
+    for event in ("beforeprint", "afterprint"):
+        browser.evaluate(f"dispatchEvent(new Event('{event}'))")
+    browser.click("#sheet summary")
+    browser.wait("document.querySelectorAll('#rolling .main-svg').length > 0")
+    heard = "document.getElementById('rolling')._ev.listeners('plotly_hover').length"
+    browser.wait(f"{heard} === 1")
+
+
 def test_tear_sheet_opens_and_draws(browser: Browser, tmp_path: Path) -> None:
     browser.complaints.clear()
     (tmp_path / "report.html").write_text(render_backtest(usual(400)), encoding="utf-8")

@@ -99,6 +99,21 @@ def test_a_weight_that_never_changes_has_a_scale_with_round_ends(explained):
     assert {panel["y"] for panel in panels} == {("99.0%", "100.0%")}
 
 
+@pytest.mark.parametrize("line", [[1.1, 1.2, 1.4], [-0.3, -0.2, -0.1], [-0.2, 0.5, 1.3]])
+def test_weights_of_loans_and_shorts_lie_within_their_axes(explained, line):
+    (agent, why), *_ = explained.why.agents.items()
+    signals = [replace_in(each, lines=[line], above=[]) for each in why.slices.signals]
+    holding = replace_in(why.slices.holding, x=line, lines=[line])
+    slices = replace_in(why.slices, signals=signals, holding=holding)
+    changed = replace_in(why, slices=slices)
+    data = replace(explained, why=replace_in(explained.why, agents={agent: changed}))
+    panels = why_sections(data)[0]["slices"]
+    for panel in (panels["holding"], *panels["signals"]):
+        low, high = (float(end.replace("−", "-").rstrip("%")) / 100 for end in panel["y"])
+        assert low <= line[0] + 1e-9
+        assert high >= line[-1] - 1e-9
+
+
 def test_attributions_of_another_backtest_are_refused(explained):
     with pytest.raises(QfolioError, match="one backtest"):
         render_backtest(replace(explained, why=made_up_why("another")))

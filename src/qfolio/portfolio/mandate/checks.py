@@ -63,10 +63,11 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
             f"{_percent(left)} in cash, and cash is at most {_percent(cash.max)}; change one of "
             "them."
         )
-    if made.holdings and (floors := int((made.limits.low > 0).sum())) > made.holdings:
+    forced = int(((made.limits.low > 0) | (made.limits.high < 0)).sum())
+    if made.holdings and forced > made.holdings:
         raise QfolioError(
-            f"The mandate cannot be met: {floors} assets have a floor, and trading.holdings is "
-            f"{made.holdings}; change one of them."
+            f"The mandate cannot be met: {forced} assets have a floor above 0 or a cap below, and "
+            f"trading.holdings is {made.holdings}; change one of them."
         )
 
 

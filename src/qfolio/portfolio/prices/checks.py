@@ -10,7 +10,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import near, quote
 from qfolio.portfolio.prices.columns import find_columns
 from qfolio.portfolio.prices.duplicates import check_duplicates
-from qfolio.portfolio.prices.findings import Finding, Findings, day
+from qfolio.portfolio.prices.findings import Finding, Findings
 from qfolio.portfolio.prices.gaps import cash_outs, complete
 from qfolio.portfolio.prices.grid import arrange
 from qfolio.portfolio.prices.layout import Table
@@ -92,10 +92,10 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Findin
     check_stale(grid, rest, findings)
     check_duplicates(grid, rest, findings)
     check_size(grid, rest, findings)
-    dates = grid.dates[rest.head :]
-    market = _shared(rest.features[..., len(features) :], dates, shared, findings)
     if findings.bad:
         return {}, findings
+    dates = grid.dates[rest.head :]
+    market = np.array(rest.features[:, 0, len(features) :])
     seen = np.array(rest.features[..., : len(features)])
     content = {
         "dates": dates,
@@ -109,18 +109,3 @@ def examine(table: Table, choices: Choices) -> tuple[dict[str, Any], list[Findin
     if delists:
         content |= cash_outs(rest.values, seen, choices.delisting_haircut)
     return content, findings
-
-
-def _shared(
-    values: np.ndarray, dates: np.ndarray, names: tuple[str, ...], findings: Findings
-) -> np.ndarray:
-    """Numbers that all assets share, of shape (rows, names), from (rows, assets, names)."""
-    shared = np.fmax.reduce(values, axis=1)
-    differs = (values != shared[:, None]) & ~np.isnan(values)
-    for k in np.flatnonzero(differs.any(axis=(0, 1))).tolist():
-        row = int(differs[..., k].any(axis=1).argmax())
-        findings.error(
-            "has several numbers on one date", column=names[k], date=day(dates[row]),
-            advice="Give one for all assets, or name the column as a feature.",
-        )  # fmt: skip
-    return shared

@@ -23,7 +23,10 @@ LOOKED_AT = 1000  # cells of a column that are examined to tell its content
 
 
 class Feature(NamedTuple):
-    """Where a feature is: in one column, or in one for each asset of a wide table."""
+    """Where a feature is: in one column, or in one for each asset of a wide table.
+
+    by_asset: whether it is a number of each asset, not one of the whole market.
+    """
 
     columns: tuple[int, ...]
     by_asset: bool
@@ -92,7 +95,7 @@ def find_columns(
     if findings.bad:
         return None
     if label is not None and price is not None:
-        own = tuple(Feature((single[name],), True) for name in features)
+        own = tuple(Feature((single[name],), name not in shared) for name in features)
         return Columns(when, time, label, (), (price,), own)
     _check_wide(table, others, findings)
     if findings.bad:
@@ -107,7 +110,8 @@ def find_columns(
                 f"there is no {quote(name)} of {listing(lacking)}", advice="Add its column."
             )
         else:
-            wanted.append(Feature(tuple(by_asset[name][asset] for asset in assets), by_asset=True))
+            each = tuple(by_asset[name][asset] for asset in assets)
+            wanted.append(Feature(each, name not in shared))
     return None if findings.bad else Columns(when, time, None, assets, prices, tuple(wanted))
 
 

@@ -34,7 +34,7 @@ def join(folder: Path, load: Callable[[Path], Any]) -> Any:
             columns = {
                 "date": table.dates,
                 "ticker": np.full(len(table), file.stem if kind(name) else name, dtype=object),
-                "close": table.values[:, j],
+                "close": table.known[:, j],
                 **dict(zip(table.feature_names, table.features[:, j].T, strict=True)),
                 **dict(zip(table.market_names, table.market.T, strict=True)),
             }

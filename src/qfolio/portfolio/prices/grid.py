@@ -8,7 +8,7 @@ import numpy as np
 
 from qfolio.core.text import amount, listed, quote
 from qfolio.portfolio.prices.cells import currencies, label, numbers
-from qfolio.portfolio.prices.columns import Columns
+from qfolio.portfolio.prices.columns import Columns, Feature
 from qfolio.portfolio.prices.dates import NO_DATE, read_dates, with_times
 from qfolio.portfolio.prices.findings import LISTED, Findings, day
 from qfolio.portfolio.prices.layout import Table
@@ -126,13 +126,28 @@ def _wide(
     values, wrong, moments = values[lines], wrong[lines], moments[lines]
     blocks: list[Block] = []
     start = 0
-    for own, by_asset in ((columns.prices, True), *columns.features):
-        part = slice(start, start + len(own))
+    for feature in (Feature(columns.prices, True), *columns.features):
+        part = slice(start, start + len(feature.columns))
         kind = "feature" if blocks else "price"
-        blocks.append(Block(values[:, part], wrong[:, part], own, kind, by_asset))
+        block = Block(values[:, part], wrong[:, part], feature.columns, kind, by_asset=True)
+        blocks.append(block if feature.by_asset else _shared(table, block, moments, findings))
         start = part.stop
     rows = np.broadcast_to(lines[:, None], (len(lines), max(len(columns.assets), 1)))
     return Grid(table, False, moments, columns.assets, rows, blocks[0], tuple(blocks[1:]))
+
+
+def _shared(table: Table, block: Block, dates: np.ndarray, findings: Findings) -> Block:
+    """A block of numbers that all assets have in common, which some rows may lack of some."""
+    values = np.fmax.reduce(block.values, axis=1, keepdims=True)
+    differs = ((block.values != values) & ~np.isnan(block.values)).any(axis=1)
+    if differs.any():
+        findings.error(
+            "has several numbers on one date", column=table.names[block.columns[0]],
+            date=day(dates[int(differs.argmax())]),
+            advice="Give one for all assets, or name the column as a feature.",
+        )  # fmt: skip
+    wrong = np.asarray(block.wrong.any(axis=1, keepdims=True))
+    return Block(values, wrong, block.columns[:1], block.name, by_asset=False)
 
 
 def _empty_rows(
@@ -231,12 +246,11 @@ def _long(
         grid[place[::-1]] = column[::-1]  # the first of repeated rows is kept
         return grid.reshape(len(days), len(assets))
 
-    blocks = [
-        Block(
-            pivot(values[lines, k], np.nan), pivot(wrong[lines, k], False), (c,) * len(assets),
-            "feature" if k else "price", by_asset=True,
-        )
-        for k, (c,) in enumerate((columns.prices, *(own for own, _ in columns.features)))
-    ]  # fmt: skip
+    blocks: list[Block] = []
+    for k, feature in enumerate((Feature(columns.prices, True), *columns.features)):
+        cells, faults = pivot(values[lines, k], np.nan), pivot(wrong[lines, k], False)
+        kind, own = "feature" if blocks else "price", feature.columns * len(assets)
+        block = Block(cells, faults, own, kind, by_asset=True)
+        blocks.append(block if feature.by_asset else _shared(table, block, days, findings))
     where = pivot(lines, -1)
     return Grid(table, True, days, tuple(assets), where, blocks[0], tuple(blocks[1:]))

@@ -8,7 +8,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.cells import is_missing, label, numbers
 from qfolio.portfolio.prices.dates import read_dates
-from qfolio.portfolio.prices.findings import listing
+from qfolio.portfolio.prices.findings import day, listing
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, plain
@@ -57,7 +57,11 @@ def _of_rows(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.nda
     since = _dates(table, 0)
     if np.isnat(since).any():
         raise QfolioError("a row has no date; the first column must hold the dates.")
+    if not len(since):
+        raise QfolioError("there is no row.")
     order = np.argsort(since, kind="stable")
+    if len(twice := np.flatnonzero(np.diff(since[order]).astype(int) == 0)):
+        raise QfolioError(f"{day(since[order[twice[0]]])} appears twice; remove one of the rows.")
     latest = np.searchsorted(since[order], dates, side="right") - 1
     known = np.empty((len(since), len(assets)), bool)
     for j, name in enumerate(assets):

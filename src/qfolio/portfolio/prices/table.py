@@ -29,7 +29,7 @@ DEFAULT_NOTE = (
     "20 US stocks, chosen in hindsight from those still listed in 2022 (survivors): strategies "
     "that hold them look better than they could have been at the time."
 )
-OF_ALL = ("ended", "delisting_haircut", "members")
+OF_ALL = ("delisting_haircut", "members")
 """Choices that apply to a whole table, not to each file of a folder."""
 
 DEFAULT_TRIALS = 222

@@ -17,8 +17,8 @@ from qfolio.core.arrays import Floats
 from qfolio.core.text import finite
 from qfolio.portfolio.backtest.statistics.bootstrap import (
     block_length,
+    histories,
     percentile_interval,
-    stationary_bootstrap_indices,
 )
 from qfolio.portfolio.backtest.statistics.differences import estimates
 from qfolio.portfolio.backtest.statistics.estimates import Estimate, clear, estimate
@@ -34,8 +34,6 @@ RESAMPLES = 2000
 
 SPANS = ((1.5, "D"), (11.0, "W"), (46.0, "M"), (137.0, "3M"), (math.inf, "Y"))
 """Spans of the calendar, and the most days between the rows of a table that they suit."""
-
-_CHUNK = 2_000_000  # resampled days held at a time
 
 Against = Literal["to_reference", "to_rebalanced"]
 AGAINST: tuple[Against, ...] = ("to_reference", "to_rebalanced")
@@ -340,9 +338,11 @@ def hierarchical_bootstrap(
     picks = rng.integers(len(tables), size=(resamples, len(tables)))
     total = np.zeros((resamples, len(tables[0])))
     for place, table in enumerate(tables):
-        block = max(block_length(series) for series in table)
+        block, days = max(block_length(series) for series in table), table.shape[1]
         rows = np.nonzero(picks == place)[0]
-        np.add.at(total, rows, _resampled_means(table, block, len(rows), rng))
+        for _, counts in histories(days, block, len(rows), rng):
+            some, rows = rows[: len(counts)], rows[len(counts) :]
+            np.add.at(total, some, counts @ table.T / days)
     return total / len(tables)
 
 
@@ -351,22 +351,6 @@ def p_value(z: float, *, both: bool) -> float:
     from scipy.special import ndtr
 
     return float(np.minimum(1.0, 2 * ndtr(-abs(z) if both else -z)))
-
-
-def _resampled_means(
-    table: Floats, block: float, resamples: int, rng: np.random.Generator
-) -> Floats:
-    """Means of shape (resamples, series) over histories of shape (series, days)."""
-    days = table.shape[1]
-    means = np.zeros((resamples, len(table)))
-    chunk = max(1, _CHUNK // days)
-    for start in range(0, resamples, chunk):
-        size = min(chunk, resamples - start)
-        drawn = stationary_bootstrap_indices(days, block, size, rng)
-        cells = drawn + days * np.arange(size)[:, None]
-        counts = np.bincount(cells.ravel(), minlength=size * days).reshape(size, days)
-        means[start : start + size] = counts @ table.T / days
-    return means
 
 
 def _active(tested: TableReturns, agent: str, name: str, shown: Estimate, z: float) -> Active:

@@ -102,7 +102,7 @@ def _interval(
     The axis is that of the main strategies; others may be cut off at its ends.
     """
     ends = [end for each in column for end in each.over_time if math.isfinite(end)]
-    if not all(map(math.isfinite, (value, *interval))):
+    if not ends or not all(map(math.isfinite, (value, *interval))):
         return None
     at = partial(place, low=min(ends), high=max(ends))
     left, right = map(at, interval)

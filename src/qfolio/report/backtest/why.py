@@ -221,17 +221,21 @@ def _panels(slices: Slices) -> dict[str, Any]:
     ends = _range(values)
     held = slices.holding
     highest = max(held.x[-1], *(max(line) for line in held.lines))
+    lowest = min(0.0, held.x[0], *(min(line) for line in held.lines))
     return {
-        "holding": _panel(held, (0.0, highest), identity=True),
+        "holding": _panel(held, (lowest, highest), identity=True),
         "signals": [_panel(each, ends) for each in slices.signals],
     }
 
 
 def _range(values: Sequence[float]) -> tuple[float, float]:
-    """The ends of an axis: apart by a hundredth of the largest weight, where all are the same."""
+    """The ends of an axis: apart by a hundredth of the largest weight, where all are the same.
+
+    Weights without shorts and loans have an axis within 0 and 1.
+    """
     low, high = min(values, default=0.0), max(values, default=1.0)
-    margin = max(0.06 * (high - low), 0.01 * high, 5e-6)
-    return max(0.0, low - margin), min(1.0, high + margin)
+    margin = max(0.06 * (high - low), 0.01 * max(abs(low), abs(high)), 5e-6)
+    return max(min(low, 0.0), low - margin), min(max(high, 1.0), high + margin)
 
 
 def _panel(each: Slice, ends: tuple[float, float], identity: bool = False) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 /* The lines of all strategies: wealth, drawdown, costs, rolling ratios; their legends and choices. */
 "use strict";
 (() => {
-  const { data, dark, narrow, coarse, state, byId, last, color, translucent, dashes, percent,
+  const { data, dark, narrow, coarse, state, byId, color, translucent, dashes, percent,
     times, ratio, layout, options, logTicks, tidy, inView, extent, room, label } = tools;
   const hidden = new Set(data.hidden);
   const names = [...document.querySelectorAll("table[data-legend=wealth] button")]
@@ -183,10 +183,11 @@
     // The height follows what is in view; a range of the height alone is our own answer.
     if (Object.keys(event).some((key) => key.startsWith("xaxis"))) drawWealth();
   });
+  let followed = false; // printing may draw the chart before it is opened
   byId("sheet").addEventListener("toggle", () => {
-    const first = byId("rolling") && !byId("rolling").data;
     drawRolling();
-    if (first && byId("rolling").data) {
+    if (!followed && byId("rolling")?.data) {
+      followed = true;
       follow("rolling", data.dates, (i) => read("rolling", i), () => read("rolling", atEnd()));
     }
   });

@@ -2,11 +2,10 @@
    the effective number of assets below. Names and weights stand beside the rows. */
 "use strict";
 (() => {
-  const { data, dark, narrow, coarse, state, byId, last, color, percent, number, layout,
-    options } = tools;
+  const { data, dark, narrow, coarse, state, byId, color, percent, layout, options,
+    TOP, BOTTOM } = tools;
   const { dates, series: all, reference, effective } = data.weights;
   const tall = () => (state.printing ? [13, 72] : [23, 130]); // of a row, and of the panel below
-  const TOP = 26, BOTTOM = 40;
   let chosen = Number(byId("weights-strategy").value);
 
   /** The rows from top to bottom: the largest first, cash at the end. */

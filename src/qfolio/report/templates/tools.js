@@ -152,6 +152,6 @@ const tools = (() => {
     }
   }
 
-  return { data, dark, narrow, coarse, state, MARGIN, byId, last, color, translucent, dashes,
-    number, percent, times, ratio, layout, options, logTicks, tidy, inView, extent, room, label };
+  return { data, dark, narrow, coarse, state, TOP, BOTTOM, byId, color, translucent, dashes,
+    percent, times, ratio, layout, options, logTicks, tidy, inView, extent, room, label };
 })();

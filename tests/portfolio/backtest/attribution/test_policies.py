@@ -36,6 +36,10 @@ def test_the_rule_is_recovered(stretches):
     assert distil(noise, 0 * targets, seen, NAMES, open_to, fitted).r2 == pytest.approx(
         0.2, abs=0.1
     )
+    turned = np.where(fitted[:, None], targets, -targets)  # tested on the folds not fitted on
+    found = distil(turned, 0 * targets, seen, NAMES, open_to, fitted).r2
+    assert found is not None
+    assert found < -1
     same = distil(0 * targets, 0 * targets, seen, NAMES, open_to, fitted)
     assert same.r2 is None
 
