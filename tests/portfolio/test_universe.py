@@ -597,6 +597,10 @@ def test_members_by_rows_and_by_spans(tmp_path: Path) -> None:
     )
     for source in (rows, tmp_path / "rows.csv", tmp_path / "spans.csv"):
         np.testing.assert_array_equal(load(frame, members=source).members, wanted)
+    for text, said in (("", "has no rows"), ("2024-01-03,1,1,1\n" * 2, "2024-01-03 appears twice")):
+        (tmp_path / "wrong.csv").write_text("date,A,B,C\n" + text)
+        with pytest.raises(QfolioError, match=said):
+            load(frame, members=tmp_path / "wrong.csv")
 
 
 @pytest.mark.parametrize(

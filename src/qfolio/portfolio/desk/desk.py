@@ -168,6 +168,8 @@ class Desk:
     def _pending(self, table: Prices) -> list[str]:
         """Says so if the lag leaves earlier orders unfilled at a table's last row."""
         last, lag = len(table) - 1, self.run.config.lag
+        if lag < 2:
+            return []
         dates = [
             record.date
             for record in self.ledger.current()

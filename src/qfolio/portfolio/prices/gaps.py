@@ -52,9 +52,9 @@ def cash_outs(values: np.ndarray, features: np.ndarray, haircut: float) -> dict[
     if listed.all():
         return {}
     paid = np.where(listed, 1.0, max(1 - haircut, LEAST_PAID))
-    last = _fill_forward(features.reshape(len(values), -1)).reshape(features.shape)
+    last = fill_forward(features.reshape(len(values), -1)).reshape(features.shape)
     return {
-        "values": np.where(listed, values, _fill_forward(values) * paid),
+        "values": np.where(listed, values, fill_forward(values) * paid),
         "features": np.where(listed[..., None], features, last),
         "listed": listed & priced,
     }
@@ -124,9 +124,9 @@ def _treat_gaps(
     if missing == "forward-fill":
         if span.gaps.any():
             _report_filled(grid, span.gaps, findings)
-        filled = _fill_forward(values)
+        filled = fill_forward(values)
         values = np.where(span.gaps, filled, values) if span.delists else filled
-        channels = [_fill_forward(channel) for channel in channels]
+        channels = [fill_forward(channel) for channel in channels]
         holes = [h & np.isnan(channel) for h, channel in zip(holes, channels, strict=True)]
     if missing == "error":
         advice = (
@@ -179,7 +179,8 @@ def _treat_late_starts(
     return span.head, keep
 
 
-def _fill_forward(values: np.ndarray) -> np.ndarray:
+def fill_forward(values: np.ndarray) -> np.ndarray:
+    """Values of shape (rows, columns) with gaps closed by the last one before; NaN before any."""
     rows = np.where(np.isnan(values), 0, np.arange(len(values))[:, None])
     return np.take_along_axis(values, np.maximum.accumulate(rows, axis=0), axis=0)
 

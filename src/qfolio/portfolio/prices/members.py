@@ -8,9 +8,10 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.cells import is_missing, label, numbers
 from qfolio.portfolio.prices.dates import read_dates
-from qfolio.portfolio.prices.findings import day, listing
+from qfolio.portfolio.prices.findings import listing
 from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
+from qfolio.portfolio.prices.records import in_order
 from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, plain
 
 SPANS = ("from", "to")
@@ -58,10 +59,8 @@ def _of_rows(table: Table, dates: np.ndarray, assets: tuple[str, ...]) -> np.nda
     if np.isnat(since).any():
         raise QfolioError("a row has no date; the first column must hold the dates.")
     if not len(since):
-        raise QfolioError("there is no row.")
-    order = np.argsort(since, kind="stable")
-    if len(twice := np.flatnonzero(np.diff(since[order]).astype(int) == 0)):
-        raise QfolioError(f"{day(since[order[twice[0]]])} appears twice; remove one of the rows.")
+        raise QfolioError("the table has no rows.")
+    order = in_order(since, table)
     latest = np.searchsorted(since[order], dates, side="right") - 1
     known = np.empty((len(since), len(assets)), bool)
     for j, name in enumerate(assets):

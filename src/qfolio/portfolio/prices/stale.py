@@ -12,7 +12,7 @@ import numpy as np
 
 from qfolio.core.text import amount, quote
 from qfolio.portfolio.prices.findings import LISTED, Findings, day
-from qfolio.portfolio.prices.gaps import Rest
+from qfolio.portfolio.prices.gaps import Rest, fill_forward
 from qfolio.portfolio.prices.grid import Grid
 
 FEWEST = 20  # unchanged rows of a long spell: a month of days
@@ -60,8 +60,7 @@ def check_stale(grid: Grid, rest: Rest, findings: Findings) -> None:
 
 def _changes(values: np.ndarray) -> np.ndarray:
     """Whether a price differs from the last one before it, of shape (rows − 1, assets)."""
-    rows = np.where(np.isnan(values), 0, np.arange(len(values))[:, None])
-    filled = np.take_along_axis(values, np.maximum.accumulate(rows), 0)
+    filled = fill_forward(values)
     return (filled[1:] != filled[:-1]) & ~np.isnan(filled[:-1])
 
 
