@@ -15,7 +15,6 @@ from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.keys import apart
 from qfolio.core.mdp import ExogenousTask, Position, Task, Transition
 from qfolio.learning.targets import Scalar, bootstrap, td_target
 
@@ -87,7 +86,8 @@ def errors(
     actions = jnp.arange(q.shape[-1])
     if rule.outcomes:
         shape = (rule.outcomes, count)
-        actions = jax.random.randint(apart(key), shape, 0, len(actions))
+        # The first holding of a batch is drawn from the same key; the others are independent.
+        actions = jax.random.randint(jax.random.fold_in(key, 0), shape, 0, len(actions))
         q = jnp.take_along_axis(values, actions.T, 1)
     settle = jax.vmap(task.settle, (0, 0, 0, 0 if rule.outcomes else None))
     after = partial(settle, moves.market, moves.next_market)
