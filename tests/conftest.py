@@ -36,7 +36,7 @@ typechecker.install([f"qfolio.{wing}" for wing in WINGS.split()])
 import jax  # noqa: E402
 
 from qfolio.agents.dqn import DQN  # noqa: E402
-from qfolio.core import devices  # noqa: E402
+from qfolio.core import devices, registry  # noqa: E402
 from qfolio.core.population import programs_of  # noqa: E402
 from qfolio.tasks.pendulum import Pendulum  # noqa: E402
 
@@ -69,6 +69,15 @@ def forget_programs():
     gc.collect()
     if sys.platform == "linux":  # glibc keeps what was freed, gigabytes of it
         ctypes.CDLL(None).malloc_trim(0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_modules():
+    """What one file has written, imported and so trusted is not there in the next ones."""
+    before = set(registry._trusted)
+    yield
+    registry._trusted.clear()
+    registry._trusted.update(before)
 
 
 @pytest.fixture

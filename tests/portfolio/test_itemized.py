@@ -177,7 +177,7 @@ def test_equals_a_ledger(group: int) -> None:
             cost=model,
             lag=lag,
             start=start,
-            conditions=Conditions.of(prices, model.columns),
+            conditions=Conditions.of(prices, model),
             long_only=False,
         )
         np.testing.assert_allclose(
@@ -223,7 +223,7 @@ def test_the_volatility_of_an_asset_that_joins_late() -> None:
     prices = Prices(
         np.datetime64("2024-01-01") + np.arange(80, dtype="m8[D]"), tuple("ABC"), values
     )
-    found = Conditions.of(prices, ("volatility",)).values["volatility"]
+    found = Conditions.of(prices, Itemized(impact=1, volume="1000")).values["volatility"]
     for row in (0, 3, 30, 45, 60, 79):
         assert found[row, 0] == pytest.approx(volatility(values, row, 0), abs=1e-12)
     for row in range(40, 45):  # it has no five returns yet
@@ -251,7 +251,7 @@ def test_training_pays_what_the_replay_pays() -> None:
         cost=task.costs,
         lag=2,
         start=held,
-        conditions=Conditions.of(prices, task.costs.columns),
+        conditions=Conditions.of(prices, task.costs),
     )
     states = jnp.array(row), jnp.array(row + 1)
     holding = task.hold(jnp.asarray(held, jnp.float32))
@@ -267,7 +267,7 @@ def test_cash_earns_its_rate_over_weekends() -> None:
     prices = table(1)
     still = np.tile(np.eye(4)[0], (ROWS - 1, 1))
     model = Itemized(cash_rate="0.05")
-    known = Conditions.of(prices, model.columns)
+    known = Conditions.of(prices, model)
     earned = simulate(prices.values, still, first=0, cost=model, lag=0, conditions=known)
     days = np.diff(prices.dates) / np.timedelta64(1, "D")
     np.testing.assert_allclose(earned.growth, 0.05 * days / 365, rtol=1e-12)
@@ -320,6 +320,37 @@ def test_settings_that_do_not_fit(text: str, said: str) -> None:
         settle()
 
 
+@pytest.mark.parametrize(
+    ("text", "wrong", "said"),
+    [
+        ("itemized(spread=column:spread)", 5.0, r"'spread' is 5 on 2024-01-21 for B; .* 0 to 0.2"),
+        ("itemized(spread=column:spread)", -0.01, "'spread' is -0.01 on 2024-01-21 for B"),
+        ("itemized(buy=column:fee)", 0.3, "'fee' is 0.3 on 2024-01-21 for B"),
+        ("itemized(impact=1)", 0.0, "'volume' is 0 on 2024-01-21 for B; .* above 0"),
+        ("itemized(carry_rate=column:dividend)", 4.5, "'dividend' is 4.5 .* -1 to 1 per year"),
+        ("itemized(cash_rate=column:bills)", 4.5, r"'bills' is 4.5 on 2024-01-21; .* -1 to 1 per"),
+    ],
+)
+def test_columns_have_the_limits_of_numbers(text: str, wrong: float, said: str) -> None:
+    """An interest rate in percent would earn more than all else."""
+    values, rows = table(1, rows=30).values.copy(), np.arange(30)
+    values[:10, 1] = np.nan
+    features, bills = np.full((30, 3, 4), 0.01), np.full((30, 1), 0.03)
+    features[:10, 1] = np.nan
+
+    def trade() -> None:
+        prices = Prices(
+            np.datetime64("2024-01-01") + rows.astype("m8[D]"), tuple("ABC"), values, features,
+            COLUMNS, market=bills, market_names=("bills",),
+        )  # fmt: skip
+        Portfolio.of(prices, window=5, horizon=5, cost_model=text)
+
+    trade()
+    features[20, 1] = bills[20] = wrong
+    with pytest.raises(QfolioError, match=said):
+        trade()
+
+
 def test_later_rows_change_no_earlier_return() -> None:
     for case in range(60):
         rng = np.random.default_rng(case)
@@ -338,7 +369,7 @@ def test_later_rows_change_no_earlier_return() -> None:
                 first=0,
                 cost=model,
                 lag=lag,
-                conditions=Conditions.of(each, model.columns),
+                conditions=Conditions.of(each, model),
                 long_only=False,
             )
             for each in (prices, other)
@@ -352,7 +383,7 @@ def test_later_rows_change_no_earlier_return() -> None:
 def test_fees_that_exceed_the_wealth_wipe_an_account_out() -> None:
     prices, model = table(2), Itemized(fixed=400, capital=1000)
     orders = np.tile([0.1, 0.3, 0.3, 0.3], (ROWS - 1, 1))
-    known = Conditions.of(prices, model.columns)
+    known = Conditions.of(prices, model)
     replayed = simulate(prices.values, orders, first=0, cost=model, lag=0, conditions=known)
     assert replayed.returns.tolist() == [-1, *[0] * (ROWS - 2)]
     assert replayed.cost[0] == pytest.approx(1, abs=1e-5)

@@ -94,9 +94,57 @@ def test_a_signal_of_ones_own_skips_rows_as_the_others_do():
     np.testing.assert_array_equal(Level(rows=8, skip=2)(values)[2:], values[:-2])
 
 
+class Running(signals.Signal):
+    """A mean of all rows so far, whose rounding depends on how it is computed."""
+
+    def measure(self, prices, rows):
+        weights = np.tri(len(prices)) / np.arange(1, len(prices) + 1)[:, None]
+        return weights @ np.nan_to_num(prices)
+
+
 class Tomorrow(signals.Signal):
     def measure(self, prices, rows):
         return np.vstack([prices[1:], prices[-1:]])
+
+
+class Crash(signals.Signal):
+    """Sells before the worst rows alone."""
+
+    def measure(self, prices, rows):
+        returns = np.vstack([np.diff(np.log(prices), axis=0), 0 * prices[-1:]])
+        return np.where(returns < -0.05, -1.0, 0.0)
+
+
+class Sometimes(signals.Signal):
+    """A sum of squares that grows, except on a tenth of the rows."""
+
+    def measure(self, prices, rows):
+        ahead = np.arange(len(prices))[:, None] % 10 == 3
+        found = np.cumsum(np.nan_to_num(prices) ** 2, axis=0)
+        return np.where(ahead, np.vstack([found[1:], found[-1:]]), found)
+
+
+class Filled(signals.Signal):
+    """Knows an asset's first price too early."""
+
+    def measure(self, prices, rows):
+        return pd.DataFrame(prices).bfill(limit=1).to_numpy()
+
+
+class Standardized(signals.Signal):
+    def measure(self, prices, rows):
+        return prices / np.nanstd(prices, axis=0)
+
+
+class Whole(signals.Signal):
+    def measure(self, prices, rows):
+        return prices - prices[-1:] if len(prices) > 50 else prices
+
+
+class Silent(signals.Signal):
+    def measure(self, prices, rows):
+        with np.errstate(divide="ignore"):
+            return prices / np.zeros(1)
 
 
 class Words(signals.Signal):
@@ -172,14 +220,21 @@ def test_the_names_alone_need_lengths_that_can_be_read():
     ("wrong", "says"),
     [
         (Tomorrow(), "Tomorrow looks ahead: its value at row"),
+        (Crash(), "Crash looks ahead"),
+        (Sometimes(), "Sometimes looks ahead"),
+        (Filled(), "Filled looks ahead"),
+        (Standardized(), "Standardized looks ahead"),
+        (Whole(), "Whole looks ahead"),
+        (Silent(), "Silent is unknown at each row and for each asset"),
         (Short(), "shape"),
         (Words(), "The signal Words returns 'up'; it must return an array of numbers."),
     ],
 )
 def test_a_signal_of_ones_own_is_checked(wrong, says):
     with pytest.raises(QfolioError, match=says):
-        signals.compute([wrong], prices()[:, :4])
-    signals.compute([Level()], prices()[:, :4])
+        signals.compute([wrong], prices(rows=2000))
+    for right in (Level(), Running()):
+        signals.compute([right], prices(rows=2000))
 
 
 @pytest.mark.parametrize(

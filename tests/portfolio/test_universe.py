@@ -144,7 +144,7 @@ def random_decisions(rng: np.random.Generator, prices: Prices, days: int) -> np.
 
 
 def replayed(prices: Prices, decisions: np.ndarray, model: Itemized, lag: int) -> Any:
-    known = Conditions.of(prices, model.columns)
+    known = Conditions.of(prices, model)
     return simulate(prices.values, decisions, first=0, cost=model, lag=lag, conditions=known)
 
 
@@ -299,7 +299,7 @@ def test_survivors_alone_look_better_than_the_truth() -> None:
             "equal-weight", baseline("equal-weight"), folds, table.dates, table.values,
             universe=table.tradable,
         )  # fmt: skip
-        known = Conditions.of(table, ())
+        known = Conditions.of(table)
         result = simulate(table.values, given.decisions, first=200, cost=0.001, conditions=known)
         growth.append(result.growth.sum())
     assert growth[1] > growth[0] + 0.3
@@ -433,7 +433,7 @@ def test_an_order_over_several_rows_buys_nothing_that_has_left(seed: int) -> Non
     terms = AT_EVERY_ROW._replace(decides=np.arange(60) % 8 == 0, fill=6)
     found = orders(
         "equal-weight", baseline("equal-weight"), folds, prices.dates, prices.values,
-        universe=prices.tradable, conditions=Conditions.of(prices, ()), terms=terms,
+        universe=prices.tradable, conditions=Conditions.of(prices), terms=terms,
     )  # fmt: skip
     relatives = np.nan_to_num(prices.values[1:] / prices.values[:-1], nan=1.0)
     holding = np.eye(6)[0]

@@ -93,7 +93,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             task["mandate"] = mandate_text(task["mandate"], self.prices.assets)
         chosen = settings.convert(Portfolio, task)
         self.task = Portfolio.of(self.prices, **chosen)
-        self._conditions = Conditions.of(self.prices, self.task.costs.columns)
+        self._conditions = Conditions.of(self.prices, self.task.costs)
         if scaled_by is not None:
             other = load(scaled_by)
             if (other.assets, other.feature_names) != (

@@ -299,7 +299,7 @@ class PortfolioPolicy(BaseOptimization):
         rows = np.concatenate([still, before, returns])
         prices = _prices(rows, self._assets(), self.periods_per_year_)
         values, last = prices.values, missing + len(before)  # the last row before X
-        known = Conditions.of(prices, task.costs.columns)
+        known = Conditions.of(prices, task.costs)
 
         def growth(weights: np.ndarray, start: int, end: int) -> Any:
             period = known.holding(np.array(start), np.array(end))

@@ -1,13 +1,13 @@
 """What cost models read at each row besides prices: dates and columns of the table."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
-from qfolio.portfolio.costs import Context
+from qfolio.portfolio.costs import Context, CostModel, Limits
+from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 
 YEAR = np.timedelta64(365, "D") / np.timedelta64(1, "s")
@@ -36,9 +36,15 @@ class Conditions(NamedTuple):
     listed: Any = None
 
     @staticmethod
-    def of(prices: Prices, columns: Sequence[str]) -> "Conditions":
-        """The columns that a cost model asks for. Raises QfolioError if the table lacks one."""
+    def of(prices: Prices, costs: CostModel | None = None) -> "Conditions":
+        """The columns that a cost model asks for (default: none).
+
+        Raises QfolioError if the table lacks one, or a value is outside the model's limits.
+        """
+        columns = costs.columns if costs else ()
         values = {name: _column(name, prices) for name in columns if name != "years"}
+        for name, limits in (costs.limits if costs else {}).items():
+            _require(name, values[name], prices, limits)
         listed = None if prices.listed is None else prices.listed.astype(float)
         if not columns:
             return Conditions(np.empty(0), {}, {}, listed)
@@ -85,6 +91,19 @@ def _column(name: str, prices: Prices) -> Floats:
         f"The cost model reads the column {name!r}, which the price table does not have (it has "
         f"{known}); load it as a feature or as a column, or give a number instead."
     )
+
+
+def _require(name: str, values: Floats, prices: Prices, limits: Limits) -> None:
+    """Raises QfolioError if a column is outside limits where there is a price."""
+    wrong = ~((values >= limits.least) & (values <= limits.most)) & ~np.isnan(prices.values)
+    if wrong.any():
+        row, asset = np.argwhere(wrong)[0]
+        shared = values.shape[1] == 1
+        whose = "" if shared else f" for {prices.assets[asset]}"
+        raise QfolioError(
+            f"The column {name!r} is {values[row, 0 if shared else asset]:g} on "
+            f"{day(prices.dates[row])}{whose}; the cost model needs numbers {limits.words}."
+        )
 
 
 def _sums(values: Floats, years: Floats) -> Floats:

@@ -46,6 +46,14 @@ class Context(NamedTuple):
     listed: Any = None
 
 
+class Limits(NamedTuple):
+    """The least and the largest value of a quantity, also in words."""
+
+    least: float
+    most: float
+    words: str
+
+
 class CostModel(abc.ABC):
     """Costs of trading and holding; every method takes numpy arrays and jax arrays, traced or not.
 
@@ -64,6 +72,11 @@ class CostModel(abc.ABC):
         the table has a column of this name. "years" asks only for the lengths of holding periods.
         """
         return ()
+
+    @property
+    def limits(self) -> Mapping[str, Limits]:
+        """What the values of columns must be, by the columns' names (default: anything)."""
+        return {}
 
     @abc.abstractmethod
     def trade(self, before: Any, after: Any, context: Context) -> tuple[Any, dict[str, Any]]:

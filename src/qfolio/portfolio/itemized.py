@@ -2,19 +2,33 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require
-from qfolio.portfolio.costs import Context, CostModel
+from qfolio.portfolio.costs import Context, CostModel, Limits
 
 COLUMN = "column:"
 """Prefix of a quantity that is a column of the price table."""
 
 SMALLEST = 1e-6
 """Smaller changes of a weight do not count as orders: they pay no fixed or minimum commission."""
+
+SHARE, RATE = Limits(0, 0.2, "from 0 to 0.2"), Limits(-1, 1, "from -1 to 1 per year")
+
+QUANTITIES = {
+    "buy": SHARE,
+    "sell": SHARE,
+    "spread": SHARE,
+    "cash_rate": RATE,
+    "borrow_fee": RATE,
+    "carry_rate": RATE,
+    "volume": Limits(1e-9, math.inf, "above 0"),  # nothing can be traded where there is none
+}
+"""What a quantity must be, whether it is a number or a column."""
 
 STEPS = 6
 """Newton's steps under jax; in numpy they go on until nothing changes, up to ``MOST``."""
@@ -70,11 +84,8 @@ class Itemized(CostModel):
         require(self, "impact_power", lambda x: 0 < x <= 2, "above 0 and at most 2")
         require(self, "capital", lambda x: 0 < x < math.inf, "above 0")
         require(self, "borrow_spread", lambda x: 0 <= x <= 1, "from 0 to 1 per year")
-        for name in ("buy", "sell", "spread"):
-            require(self, name, lambda x: _fits(x, 0, 0.2), "from 0 to 0.2, or column:NAME")
-        require(self, "volume", lambda x: _fits(x, 1e-9, math.inf), "above 0, or column:NAME")
-        for name in ("cash_rate", "borrow_fee", "carry_rate"):
-            require(self, name, lambda x: _fits(x, -1, 1), "from -1 to 1 per year, or column:NAME")
+        for name, limits in QUANTITIES.items():
+            require(self, name, partial(_fits, limits=limits), f"{limits.words}, or column:NAME")
 
     @property
     def depends_on_wealth(self) -> bool:  # type: ignore[override]
@@ -82,14 +93,21 @@ class Itemized(CostModel):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        read = ["buy", "sell", "spread", "cash_rate", "borrow_fee", "carry_rate"]
-        read += ["volume"] * (self.impact > 0)
-        columns = [_column(getattr(self, name)) for name in read]
-        named = [column for column in columns if column is not None]
-        named += ["volatility", "price"] * (self.impact > 0)
+        named = [*self._read.values(), *["volatility", "price"] * (self.impact > 0)]
         financed = any(getattr(self, name) != "0" for name in ("cash_rate", "borrow_fee"))
         timed = financed or self.borrow_spread > 0 or self.carry_rate != "0"
         return tuple(dict.fromkeys([*named, *["years"] * timed]))
+
+    @property
+    def limits(self) -> dict[str, Limits]:
+        return {column: QUANTITIES[name] for name, column in self._read.items()}
+
+    @property
+    def _read(self) -> dict[str, str]:
+        """The columns of the quantities that are charged, by the quantities' names."""
+        charged = [name for name in QUANTITIES if name != "volume" or self.impact > 0]
+        columns = {name: _column(getattr(self, name)) for name in charged}
+        return {name: column for name, column in columns.items() if column is not None}
 
     def trade(self, before: Any, after: Any, context: Context) -> tuple[Any, dict[str, Any]]:
         """The remainder factor mu solves mu = 1 − Σᵢ kᵢ(mu·bᵢ − wᵢ), with the costs kᵢ of a trade.
@@ -173,6 +191,7 @@ class _Rates:
         self.money = self.money[..., None]
         if model.impact > 0:
             volume = known(model.volume) * context.columns["price"]
+            # Before an asset's first price both are 0.
             share = self.money / xp.maximum(xp.asarray(volume, dtype=dtype), TINY)
             volatility = context.columns["volatility"]
             self.impact = model.impact * volatility * share**model.impact_power
@@ -204,10 +223,10 @@ def _column(quantity: str) -> str | None:
     return quantity.removeprefix(COLUMN) if quantity.startswith(COLUMN) else None
 
 
-def _fits(text: str, least: float, most: float) -> bool:
+def _fits(text: str, limits: Limits) -> bool:
     if text.startswith(COLUMN):
         return len(text) > len(COLUMN)
     try:
-        return least <= float(text) <= most
+        return limits.least <= float(text) <= limits.most
     except ValueError:
         return False

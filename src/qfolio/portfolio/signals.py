@@ -11,11 +11,13 @@ is not scaled. docs/concepts/signals.md lists formulas and sources.
 
 import abc
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
+from numpy.typing import NDArray
 
 from qfolio.core.arrays import Bools, Floats, numbers
 from qfolio.core.errors import QfolioError
@@ -29,6 +31,9 @@ COLUMN = "feature:"
 LENGTHS = {"d": 1, "w": 5, "m": 21, "y": 252}
 """Rows in a day, a week, a month and a year of a daily table. A slower table has fewer, at least
 one; in a faster one, whose prices move on another scale, they are the same numbers of rows."""
+
+CUTS = 12
+"""A user's own signal is computed again on a table cut after this many rows of each kind."""
 
 ROUNDING = 1e-9
 """Differences between assets that are smaller than this share of the largest number are none."""
@@ -346,14 +351,44 @@ def _checked(signal: Signal, prices: Floats) -> Floats:
             "for each row and asset."
         )
     if f"{type(signal).__module__}:{name}" not in SIGNALS.values():
-        for cut in np.linspace(1, len(prices) - 1, 4).astype(int):
-            then = numbers(f"The signal {name}", signal(prices[:cut]))
-            if not np.array_equal(then[-1:], found[cut - 1 : cut], equal_nan=True):
+        known = np.isfinite(found)
+        if len(prices) > signal.rows and not known.any():
+            raise QfolioError(
+                f"The signal {name} is unknown at each row and for each asset (NaN or infinite); "
+                "it must be a number where prices are known."
+            )
+        for row in _telling(found, prices):
+            with warnings.catch_warnings(action="ignore"):  # of what is not known yet
+                then = numbers(f"The signal {name}", signal(prices[: row + 1]))
+            same = then.shape == (row + 1, prices.shape[1]) and np.isclose(
+                then, found[: row + 1], rtol=0, atol=_unit(then), equal_nan=True
+            )
+            if not np.all(same):
                 raise QfolioError(
-                    f"The signal {name} looks ahead: its value at row {cut - 1} changes when later "
-                    "rows are taken away."
+                    f"The signal {name} looks ahead: its value at row {row} or earlier changes "
+                    "when later rows are taken away."
                 )
     return found
+
+
+def _telling(found: Floats, prices: Floats) -> NDArray[np.int64]:
+    """Rows after which the table is cut: evenly spaced, and where looking ahead shows most.
+
+    There the signal is largest or moves most, the next prices move most, or they begin or end.
+    """
+    if len(prices) < 2:
+        return np.arange(0)
+
+    def largest(values: Floats) -> NDArray[np.int64]:
+        size = np.max(abs(values), 1, initial=0, where=np.isfinite(values))
+        return np.argsort(-size[: len(prices) - 1], kind="stable")[:CUTS]
+
+    with np.errstate(invalid="ignore"):
+        moved, jumped = found - _before(found, 1), np.diff(np.log(prices), axis=0)
+    ends = np.diff(np.isnan(prices), axis=0).astype(float)
+    even = np.linspace(0, len(prices) - 2, CUTS).astype(int)
+    each = [even, largest(found), largest(moved), largest(jumped), largest(ends)]
+    return np.unique(np.concatenate(each))
 
 
 def _scaled(values: Floats, shared: bool, scale: str) -> Floats:

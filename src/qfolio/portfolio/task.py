@@ -146,7 +146,7 @@ class Portfolio(Market):
         if self.anchor:
             can = buyable(self.mandate) if self.mandate else None
             followed = anchors.path(self.anchor, prices, can)
-        then = Conditions.of(prices, self.costs.columns)
+        then = Conditions.of(prices, self.costs)
         if own_modules(self.costs):
             row = len(prices.dates) - 2
             moves = np.nan_to_num(prices.values[-1] / prices.values[-2], nan=1.0)

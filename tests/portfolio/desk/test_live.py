@@ -65,7 +65,7 @@ def traded(prices, model, rows, targets):
     for row, target in zip(rows, targets, strict=True):
         if last is not None:
             before = np.append(cash, shares * prices.values[last])
-            known = Conditions.of(prices, model.columns)
+            known = Conditions.of(prices, model)
             relatives = prices.values[row] / prices.values[last]
             cash *= float(model.growth(before, relatives, known.holding(last, row))[0])
         plan = Allocation.of(Fixed(target, model), prices.between(None, row + 1), shares, cash)
@@ -78,7 +78,7 @@ def replayed(prices, model, rows, targets, **rules):
     """The replay of the same decisions, from row 10 on."""
     decisions = np.full((len(prices) - 1 - 10, 4), np.nan)
     decisions[np.array(rows) - 10] = targets
-    known = Conditions.of(prices, model.columns)
+    known = Conditions.of(prices, model)
     return simulate(
         prices.values, decisions, first=10, cost=model, lag=0, conditions=known, **rules
     )

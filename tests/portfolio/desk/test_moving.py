@@ -103,7 +103,7 @@ def test_a_delisting_is_marked_as_the_replay_does(desk):
     decisions[0] = made.weights
     replay = simulate(
         prices.values, decisions, first=first, cost=followed.costs, lag=0,
-        conditions=Conditions.of(prices, followed.costs.columns),
+        conditions=Conditions.of(prices, followed.costs),
     )  # fmt: skip
     found = mark([record], prices, followed.costs, 0)
     np.testing.assert_allclose(found.returns, replay.returns, atol=1e-12)

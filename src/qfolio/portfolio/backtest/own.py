@@ -141,7 +141,7 @@ def _placed_weights(
     before = np.flatnonzero(rows < days.start)
     if before.size and np.isnan(decisions[0, 0]):
         last = before[-1]
-        known = Conditions.of(prices, task.costs.columns)
+        known = Conditions.of(prices, task.costs)
         growth = Growth(filled_in(prices.values)[0], task.costs, known)
         decisions[0] = growth.held(own.values[last], int(rows[last]), days.start)
     ordered = ~np.isnan(decisions[:, 0])

@@ -107,7 +107,7 @@ class Replay:
 
     @cached_property
     def _conditions(self) -> Conditions:
-        return Conditions.of(self.prices, self.task.costs.columns)
+        return Conditions.of(self.prices, self.task.costs)
 
     @cached_property
     def growth(self) -> np.ndarray:

@@ -242,7 +242,7 @@ def turnover(held: Any, reached: Any, trades: Any) -> float:
 
 def context_of(model: CostModel, prices: Prices, wealth: float) -> Context:
     """The circumstances of a trade at the table's last row."""
-    known = Conditions.of(prices, model.columns)
+    known = Conditions.of(prices, model)
     capital = model.capital if isinstance(model, Itemized) else wealth
     return known.trade(len(prices) - 1, 1, wealth / capital)
 

@@ -274,7 +274,7 @@ def _tested(desk: Desk, name: str, first: Record) -> np.ndarray:
 
 def _earned_by_cash(table: Prices, costs: CostModel, first: int, count: int) -> np.ndarray:
     """What cash earned over some rows of a table; the first return begins at row ``first``."""
-    rows, known = np.arange(first, first + count), Conditions.of(table, costs.columns)
+    rows, known = np.arange(first, first + count), Conditions.of(table, costs)
     still = np.ones((count, len(table.assets)))
     return np.asarray(costs.carry(still, known.holding(rows, rows + 1))[:, 0] - 1)
 

@@ -60,7 +60,7 @@ def mark(
     if not records:
         raise QfolioError("The ledger is empty; record an allocation with qfolio allocate first.")
     rows = np.searchsorted(prices.dates, [record.moment for record in records])
-    known = Conditions.of(prices, model.columns)
+    known = Conditions.of(prices, model)
     values = np.nan_to_num(prices.values)
     at: dict[int, Record] = {}
     for row, record in zip(rows.tolist(), records, strict=True):
