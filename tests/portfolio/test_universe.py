@@ -22,6 +22,7 @@ from qfolio.portfolio.backtest.replay import Replay
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.desk.desk import Desk
 from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.mandate.feasible import exactly
 from qfolio.portfolio.mandate.limits import feasible, mandate_text
@@ -315,6 +316,13 @@ def test_a_backtest_keeps_its_universe(tmp_path: Path) -> None:
     again = Backtest.open(tmp_path / "run").prices
     assert again.digest == made.prices.digest
     np.testing.assert_array_equal(again.tradable, prices.tradable)
+    # Orders of later days lose what a delisting lost there.
+    known = pd.DataFrame(prices.known, pd.DatetimeIndex(prices.dates, name="date"), prices.assets)
+    known.to_csv(tmp_path / "latest.csv")
+    for options, lost in (({}, 0.2), ({"delisting_haircut": 0.5}, 0.5), ({"ended": "gap"}, None)):
+        read = Desk.open(tmp_path / "run", missing="forward-fill", **options).inspect
+        latest, _ = read(tmp_path / "latest.csv")
+        assert latest.haircut == lost
 
 
 # Mandates and menus.
@@ -527,6 +535,7 @@ def test_a_table_with_leavers_is_read(tmp_path: Path) -> None:
     assert "--ended" in said
     prices = load(file, late="join", ended="cash-out", delisting_haircut=0.25)
     assert prices.tradable is not None
+    assert (prices.haircut, prices.between(0, 20).haircut) == (0.25, None)
     np.testing.assert_array_equal(prices.tradable, frame.notna())
     np.testing.assert_allclose(prices.values[20:, 2], 0.75 * frame["C"].iloc[19], rtol=1e-12)
     np.testing.assert_allclose(prices.values[prices.tradable], frame.to_numpy()[frame.notna()])

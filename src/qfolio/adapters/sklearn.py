@@ -393,6 +393,11 @@ def _prices(
 
     Their rows are counted from ``first``, and dated so that there are ``per_year`` a year.
     """
+    if np.quantile(returns, 0.05) > 0.5:
+        raise ValueError(
+            "X looks like prices or price relatives: nearly all of its numbers are above 0.5; give "
+            "simple returns, such as prices.pct_change().dropna()."
+        )
     if not (returns > -1).all():
         row, asset = np.argwhere(~(returns > -1))[0]
         raise ValueError(

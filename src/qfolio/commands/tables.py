@@ -103,7 +103,8 @@ class Latest:
         missing: How to treat missing prices.
         ended: How to treat prices that end early: as missing ones, or as a delisting (default:
             cash-out, if assets come and go in the backtest).
-        delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1.
+        delisting_haircut: Share of a holding that is lost when it is cashed out, from 0 to 1
+            (default: that of the delistings in the backtest).
         members: Table of the assets that may be bought at each date (default: all).
         features: Columns that hold features (default: those of the backtest).
         columns: Columns of the whole market; NAME=FILE reads one from a file (default: those of
@@ -113,7 +114,7 @@ class Latest:
 
     missing: Missing = "error"
     ended: EndedAsBefore = None
-    delisting_haircut: float = 0.0
+    delisting_haircut: float | None = None
     members: File = None
     features: Names = ()
     columns: Names = ()

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from PIL import Image
 
@@ -14,8 +13,6 @@ from qfolio.core.errors import QfolioError
 from qfolio.portfolio.backtest.capacity import Capacity
 from qfolio.portfolio.backtest.statistics.differences import Contrast
 from qfolio.portfolio.backtest.statistics.verdict import verdicts
-from qfolio.portfolio.prices.table import load
-from qfolio.report.backtest.collect import haircut
 from qfolio.report.backtest.data import BacktestData, StrategySeries, shown_order
 from qfolio.report.backtest.page import render_backtest
 from qfolio.report.rendering import number, percent
@@ -124,16 +121,6 @@ def test_calls_nothing_a_limit_that_the_backtest_may_replace(data: BacktestData)
     page = Page(render_backtest(replace(data, config={**data.config, "mandate": mandate})))
     limits = "trading.turnover = 0.4; risk.tracking_error = 0.05; risk.benchmark = SPY"
     assert f"Every order obeys these limits: {limits}." in page.text
-
-
-def test_the_haircut_is_found_from_the_payout() -> None:
-    frame = pd.DataFrame(
-        {"date": ["2020-01-01", "2020-01-02", "2020-01-03", "2020-01-06"], "A": [1, 2, 3, 4.0],
-         "B": [10, 20, None, None], "C": [None, 1, 2, 3.0]}
-    )  # fmt: skip
-    prices = load(frame, late="join", ended="cash-out", delisting_haircut=0.3)
-    assert haircut(prices) == 0.3
-    assert haircut(load(frame[["date", "A"]])) is None
 
 
 def test_table_has_every_figure_with_its_intervals(data: BacktestData) -> None:

@@ -53,6 +53,9 @@ class Desk:
         known["columns"] = options.get("columns") or tuple(run.config.prices.get("columns", ()))
         ends = "gap" if run.prices.tradable is None else "cash-out"
         known["ended"] = options.get("ended") or ends
+        if known.get("delisting_haircut") is None:
+            lost = run.prices.haircut if known["ended"] == "cash-out" else None
+            known["delisting_haircut"] = lost or 0.0
         # Policies and baselines look at the last rows only; assets may start at any row before.
         known["late"] = "join"
         return Desk(run, Path(folder), partial(inspect, **known))

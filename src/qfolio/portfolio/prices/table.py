@@ -146,6 +146,19 @@ class Prices:
         return self.values if self.listed is None else np.where(self.listed, self.values, np.nan)
 
     @property
+    def haircut(self) -> float | None:
+        """The share of a holding that is lost when its asset ends, found from the payout.
+
+        None if no asset ends.
+        """
+        if self.listed is None or self.listed[-1].all():
+            return None
+        ended = np.flatnonzero(~self.listed[-1] & self.listed.any(axis=0))
+        last = len(self) - 1 - self.listed[::-1, ended].argmax(axis=0)
+        paid = self.values[last + 1, ended] / self.values[last, ended]
+        return round(float(1 - paid.min()), 8)
+
+    @property
     def relatives(self) -> np.ndarray:
         """Price relatives price[k] / price[k-1], k = 1 … rows-1, of shape (rows-1, assets).
 

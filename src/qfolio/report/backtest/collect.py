@@ -14,7 +14,6 @@ from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.backtest.simulation import Simulation
 from qfolio.portfolio.backtest.statistics.assessment import Assessment
 from qfolio.portfolio.prices.findings import day
-from qfolio.portfolio.prices.table import Prices
 from qfolio.report import rendering
 from qfolio.report.backtest.convergence import FoldTraining
 from qfolio.report.backtest.data import BacktestData, StrategySeries
@@ -51,7 +50,7 @@ def backtest_data(
             )
             for name, entry in entries.items()
         },
-        prices={**config.prices, "haircut": haircut(backtest.prices)},
+        prices={**config.prices, "haircut": backtest.prices.haircut},
         config={
             key: value
             for key, value in msgspec.to_builtins(config).items()
@@ -74,20 +73,6 @@ def backtest_data(
         capacity=capacity(backtest.replay, entries, assessment.reference),
         risk_free=backtest.replay.growth[:, 0] - 1,
     )
-
-
-def haircut(prices: Prices) -> float | None:
-    """The share of a holding that is lost when its asset ends, found from the payout.
-
-    None if no asset ends.
-    """
-    listed, rows = prices.listed, len(prices)
-    if listed is None or listed[-1].all():
-        return None
-    ended = np.flatnonzero(~listed[-1] & listed.any(axis=0))
-    last = rows - 1 - listed[::-1, ended].argmax(axis=0)
-    paid = prices.values[last + 1, ended] / prices.values[last, ended]
-    return round(float(1 - paid.min()), 8)
 
 
 def _costs(simulation: Simulation, year: float) -> dict[str, float]:
