@@ -186,9 +186,19 @@ class Blind(RewardDelay):
         return super().observe(state) / (state < 0.5)
 
 
+class Uncounted(RewardDelay):
+    """Numbers more states than it says there are."""
+
+    states = 1
+
+    def observe(self, state):
+        return state.astype(int)
+
+
 @pytest.mark.parametrize(
     ("task", "changes", "says"),
     [
+        (Uncounted(), {}, "observation of Uncounted is not from 0 to 0 after step 1"),
         (Endless(), {"learning_rate": 1e30}, "loss of seed 4, 5 is no longer finite"),
         (Explosive(), {}, "reward of Explosive is not finite at step 42 of an episode"),
         (Blind(), {}, "observation of Blind is not finite after step 1 of an episode"),

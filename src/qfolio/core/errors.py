@@ -22,6 +22,10 @@ class QfolioError(Exception):
     """
 
 
+class TooFewRowsError(QfolioError):
+    """A table has too few rows for what is asked of it; a study leaves such a table out."""
+
+
 class WorkerError(RuntimeError):
     """An error that a job raised on a worker, with its traceback there.
 

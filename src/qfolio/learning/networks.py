@@ -86,7 +86,8 @@ def _rows(
     if encoder is not None:
         observation = jax.nn.relu(encoder(observation))
     if states is not None:
-        observation = jax.nn.one_hot(observation, states)
+        there = (observation >= 0) & (observation < states)
+        observation = jnp.where(there[:, None], jax.nn.one_hot(observation, states), jnp.nan)
     leaves = jax.tree.leaves(observation)
     return jnp.concatenate([leaf.reshape(leaf.shape[0], -1) for leaf in leaves], axis=1)
 

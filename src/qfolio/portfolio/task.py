@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from qfolio.core import simplex
-from qfolio.core.errors import QfolioError, require_type
+from qfolio.core.errors import QfolioError, TooFewRowsError, require_type
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.keys import apart
 from qfolio.core.mdp import Actions, Box, Position, Simplex
@@ -212,7 +212,7 @@ class Portfolio(Market):
         decisions = last - self.lag - 1 - (first + self.window) + 1
         if decisions < self.horizon:
             both, alone = "window or horizon (--set horizon=…)", "window (--set window=…)"
-            raise QfolioError(
+            raise TooFewRowsError(
                 f"{last - first + 1} rows are too few: a window of {self.window}, a lag of "
                 f"{self.lag} and an episode of {self.horizon} need at least "
                 f"{self.window + self.lag + self.horizon + 1}; give more rows (a longer --train in "

@@ -122,6 +122,6 @@ def test_all_dates_of_a_long_table_are_spelled_at_once() -> None:
     begun = time.process_time()
     texts = spell_all(minutes, minutes)
     assert time.process_time() - begun < 5
-    assert texts[:2] == ["2020-01-01-093000", "2020-01-01-093100"]
+    assert texts[:2] == ["2020-01-01 09:30:00", "2020-01-01 09:31:00"]
     assert texts[-1] == spell(minutes[-1], minutes)
     assert spell_all(minutes[:1], minutes[::1440]) == ["2020-01-01"]

@@ -236,6 +236,22 @@ def test_short_tables_are_left_out_with_a_reason(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+def test_tables_too_short_for_an_agent_are_left_out(tmp_path):
+    """At two of the lags it is long enough, and the backtests there do not stay."""
+    agent = AGENTS["pathwise"]
+    agent = agent._replace(task={**agent.task, "window": 60, "horizon": 10})
+    weeks = table(3)
+    weeks = Prices(weeks.dates[0] + np.arange(len(weeks)) * np.timedelta64(7, "D"), weeks.assets,
+                   weeks.values)  # fmt: skip
+    made = Study.create(
+        {"days": table(0, rows=700), "weeks": weeks}, {"p": agent}, out=tmp_path / "part",
+        lags=(1, 2, 9), train="18m", test="3m", seeds=1, baselines=[],
+    )  # fmt: skip
+    assert list(made.config.tables) == ["days"]
+    assert "rows are too few: a window of 60, a lag of 9" in made.config.left_out["weeks"]
+    assert [place.name for place in (tmp_path / "part" / "tables").iterdir()] == ["days"]
+
+
 def test_a_fold_may_end_on_a_holiday():
     weekdays = np.busday_offset("2001-01-01", np.arange(520), roll="forward")
     last = np.searchsorted(weekdays, np.datetime64("2002-12-30"))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, TooFewRowsError
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import Prices
 
@@ -58,13 +58,13 @@ def walk_forward(
         recent = _before(dates, first, train) if folds else 0
         begin = 0 if expanding else recent
         if first - begin < 1:
-            raise QfolioError(f"train={train} is shorter than the lag of {lag}; make it longer.")
+            raise TooFewRowsError(f"train={train} is shorter than the lag of {lag}; make it longer.")
         decisions = slice(first, end - lag - 1)
-        name = spell(dates[start], dates)
+        name = spell(dates[start], dates).replace(" ", "-").replace(":", "")  # of a folder
         folds.append(Fold(name, slice(begin, first + 1), decisions, slice(recent, first + 1)))
         start = end
     if not folds:
-        raise QfolioError(
+        raise TooFewRowsError(
             f"{len(dates)} rows, {day(dates[0])} to {day(dates[-1])}, leave nothing to "
             f"test after train={train}; shorten it (--train), or give more rows."
         )
@@ -91,7 +91,7 @@ def require_fold(dates: np.ndarray, train: str, test: str, lag: int) -> None:
         grace = max(np.timedelta64(7, "D"), np.median(np.diff(dates)))
         whole = dates[-1] + grace >= _shift(dates[start], count, unit)
     if not whole:
-        raise QfolioError(
+        raise TooFewRowsError(
             f"{len(dates)} rows, {day(dates[0])} to {day(dates[-1])}, are fewer than "
             f"train={train} and one fold of test={test}; shorten them, or give more rows."
         )
@@ -122,7 +122,7 @@ def spell_all(some: np.ndarray, dates: np.ndarray) -> list[str]:
     if (days[1:] > days[:-1]).all():
         return list(map(str, some.astype("datetime64[D]")))
     texts = map(str, some.astype("datetime64[s]"))
-    return [text.replace(":", "").replace("T", "-") for text in texts]
+    return [text.replace("T", " ") for text in texts]
 
 
 def parse_length(text: str) -> tuple[int, str]:

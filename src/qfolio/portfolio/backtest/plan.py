@@ -138,7 +138,7 @@ class Plan:
                 else:
                     jax.eval_shape(partial(agent.init, task), key)
             except QfolioError as error:
-                raise QfolioError(f"{name}: {error}") from None
+                raise type(error)(f"{name}: {error}") from None
 
     def require_begins_with(self, folds: Sequence[Fold]) -> None:
         """Raises QfolioError unless its first folds are those of a table before it grew."""
@@ -174,7 +174,7 @@ class Plan:
         try:
             return task.part(fold.train.start, fold.train.stop - 1, usable)
         except QfolioError as error:
-            raise QfolioError(f"{name}, fold {fold.name}: {error}") from None
+            raise type(error)(f"{name}, fold {fold.name}: {error}") from None
 
     def _missing(self, name: str, kept: Kept, executor: Executor) -> list[FoldsJob]:
         """The folds that are still to be trained, in groups that fill a worker's devices."""

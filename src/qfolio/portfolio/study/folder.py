@@ -132,7 +132,11 @@ class StudyFolder:
 
     def place(self, table: str, variant: Variant) -> Path:
         """The folder of a backtest."""
-        return self.path / "tables" / table / variant.name
+        return self.table(table) / variant.name
+
+    def table(self, table: str) -> Path:
+        """The folder of a table's backtests."""
+        return self.path / "tables" / table
 
     def read_returns(self, table: str, variant: Variant, agents: Iterable[str]) -> TableReturns:
         """The returns of a finished backtest.

@@ -9,6 +9,7 @@ import contextlib
 import itertools
 import os
 import re
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 import msgspec
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError, require_list, require_type, require_whole
+from qfolio.core.errors import QfolioError, TooFewRowsError, require_list, require_type, require_whole
 from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
@@ -90,7 +91,8 @@ class Study:
     ) -> "Study":
         """A study before its first backtest.
 
-        Tables without one whole fold are left out (``config.left_out`` says why).
+        Tables that are too short for one whole fold, or for an agent's window and episodes, are
+        left out (``config.left_out`` says why).
 
         Args:
             tables: Price tables by name, or anything else that ``load_prices`` reads; names become
@@ -125,41 +127,50 @@ class Study:
         variants = [Variant(int(lag), float(cost)) for lag, cost in itertools.product(lags, costs)]
         _require_plan(tables, variants)
         earlier = list(dict.fromkeys(look for folder in after for look in looks_of(folder)))
-        left_out = _too_short(tables, train, test, max(lags, default=1))
-        kept = {name: table for name, table in tables.items() if name not in left_out}
-        if not kept:
-            reasons = " ".join(f"{name} is too short: {why}" for name, why in left_out.items())
-            raise QfolioError(reasons)
-        config = StudyConfig(
-            tables={
-                name: _table_config(table, int(trials) + _count(earlier, table.digest))
-                for name, table in kept.items()
-            },
-            left_out=left_out,
-            variants=variants,
-            agents=list(agents),
-            train=train,
-            test=test,
-            command=command,
-            earlier=earlier,
-            **devices.circumstances(),
-        )
+        looks = {
+            name: int(trials) + _count(earlier, table.digest) for name, table in tables.items()
+        }
+        left_out = {}
         with new_folder(place) as folder:
             files = StudyFolder(folder)
-            for (name, table), variant in itertools.product(kept.items(), variants):
-                with of_table(name):
-                    Backtest.create(
-                        table,
-                        agents,
-                        train=train,
-                        test=test,
-                        lag=variant.lag,
-                        cost=variant.cost,
-                        trials=config.tables[name].trials,
-                        command=command,
-                        out=files.place(name, variant),
-                        **options,
-                    )
+            for name, table in tables.items():
+                try:
+                    require_fold(table.dates, train, test, max(lags, default=1))
+                    with of_table(name):
+                        for variant in variants:
+                            Backtest.create(
+                                table,
+                                agents,
+                                train=train,
+                                test=test,
+                                lag=variant.lag,
+                                cost=variant.cost,
+                                trials=looks[name],
+                                command=command,
+                                out=files.place(name, variant),
+                                **options,
+                            )
+                except TooFewRowsError as error:
+                    left_out[name] = str(error).removeprefix(f"{name}: ")
+                    shutil.rmtree(files.table(name), ignore_errors=True)
+            if len(left_out) == len(tables):
+                reasons = (f"{name} is too short: {why}" for name, why in left_out.items())
+                raise QfolioError(" ".join(reasons))
+            config = StudyConfig(
+                tables={
+                    name: _table_config(table, looks[name])
+                    for name, table in tables.items()
+                    if name not in left_out
+                },
+                left_out=left_out,
+                variants=variants,
+                agents=list(agents),
+                train=train,
+                test=test,
+                command=command,
+                earlier=earlier,
+                **devices.circumstances(),
+            )
             files.write(config)
         own = {name: agent for name, agent in agents.items() if isinstance(agent, Agent)}
         return cls(config, place, own)
@@ -381,17 +392,6 @@ def _found(pooled: Pooled, p: float, threshold: float) -> Pooled:
     if p <= 1 - LEVEL and pooled.z is not None and not 0 < pooled.z < threshold:
         finding = "better" if pooled.z > 0 else "worse"
     return msgspec.structs.replace(pooled, p_holm=p, finding=finding)
-
-
-def _too_short(tables: Mapping[str, Prices], train: str, test: str, lag: int) -> dict[str, str]:
-    """The tables without one whole fold, each with the reason."""
-    reasons = {}
-    for name, table in tables.items():
-        try:
-            require_fold(table.dates, train, test, lag)
-        except QfolioError as error:
-            reasons[name] = str(error)
-    return reasons
 
 
 def _table_config(prices: Prices, trials: int) -> TableConfig:
