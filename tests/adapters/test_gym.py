@@ -190,7 +190,7 @@ def test_assets_that_come_and_go_are_held_while_they_are_there(task):
     prices = coming_and_going()
     env, lag = environment(prices, **task), task.get("lag", 1)
     check_env(env.unwrapped)
-    known, lost = Conditions.of(prices, ()), 0
+    known, lost = Conditions.of(prices), 0
     for start in range(env.unwrapped.first, env.unwrapped.last, 2):
         record = play(env, options={"start": start})
         decisions = np.array([info["target"] for _, _, info in record[1:]])

@@ -13,6 +13,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.experiments.presets import preset
 from qfolio.portfolio.backtest.run import Backtest
 from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.itemized import Itemized
 from qfolio.portfolio.prices.table import load
 
 from shell import qfolio
@@ -75,7 +76,7 @@ def test_a_backtest_says_what_is_implausible_in_its_table(tmp_path, capsys):
 
 def test_costs_read_a_column_of_the_market(table):
     prices = Options(returns="percent", columns=("rate",)).load(table)
-    known = Conditions.of(prices, ["rate"]).values["rate"]
+    known = Conditions.of(prices, Itemized(cash_rate="column:rate")).values["rate"]
     np.testing.assert_array_equal(known, prices.market)
 
 

@@ -322,6 +322,7 @@ def test_a_backtest_keeps_its_universe(tmp_path: Path) -> None:
     for options, lost in (({}, 0.2), ({"delisting_haircut": 0.5}, 0.5), ({"ended": "gap"}, None)):
         read = Desk.open(tmp_path / "run", missing="forward-fill", **options).inspect
         latest, _ = read(tmp_path / "latest.csv")
+        assert latest is not None
         assert latest.haircut == lost
 
 

@@ -58,7 +58,9 @@ def walk_forward(
         recent = _before(dates, first, train) if folds else 0
         begin = 0 if expanding else recent
         if first - begin < 1:
-            raise TooFewRowsError(f"train={train} is shorter than the lag of {lag}; make it longer.")
+            raise TooFewRowsError(
+                f"train={train} is shorter than the lag of {lag}; make it longer."
+            )
         decisions = slice(first, end - lag - 1)
         name = spell(dates[start], dates).replace(" ", "-").replace(":", "")  # of a folder
         folds.append(Fold(name, slice(begin, first + 1), decisions, slice(recent, first + 1)))

@@ -18,7 +18,13 @@ from typing import Any
 import msgspec
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError, TooFewRowsError, require_list, require_type, require_whole
+from qfolio.core.errors import (
+    QfolioError,
+    TooFewRowsError,
+    require_list,
+    require_type,
+    require_whole,
+)
 from qfolio.core.files import locked, new_folder, path_of
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
