@@ -102,10 +102,17 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_for_results_is_new_or_empty(tmp_path):
-    used, file = tmp_path / "used", tmp_path / "prices.csv"
+def test_a_folder_for_results_is_new_or_empty(tmp_path, monkeypatch):
+    used, file, empty = tmp_path / "used", tmp_path / "prices.csv", tmp_path / "empty"
+    empty.mkdir()
+    with new_folder(empty):
+        pass
     write_bytes(used / "results", b"")
     write_bytes(file, b"")
+    monkeypatch.chdir(empty)
+    for here in (Path(), empty):
+        with pytest.raises(QfolioError, match="current folder itself"), new_folder(here):
+            pass
     with pytest.raises(QfolioError, match="is not empty; name a new folder"), new_folder(used):
         pass
     with pytest.raises(QfolioError, match="is a file; name a new folder"), new_folder(file):

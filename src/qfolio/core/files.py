@@ -80,13 +80,18 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def require_new(folder: Path, option: str = "--resume") -> None:
-    """Raises QfolioError unless ``folder`` is new or empty; option: continues the work in it."""
+    """Raises QfolioError unless ``folder`` is new, or empty and not the current one.
+
+    option: continues the work in it.
+    """
     if folder.exists() and not folder.is_dir():
         raise QfolioError(f"{folder} is a file; name a new folder.")
     if folder.exists() and any(folder.iterdir()):
         raise QfolioError(
             f"{folder} is not empty; name a new folder, or continue with {option} {shell(folder)}."
         )
+    if folder.resolve() == Path.cwd():  # which no other folder can replace
+        raise QfolioError("The results cannot lie in the current folder itself; name a new one.")
 
 
 @contextlib.contextmanager

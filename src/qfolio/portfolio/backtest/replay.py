@@ -110,14 +110,23 @@ class Replay:
         return Conditions.of(self.prices, self.task.costs)
 
     @cached_property
+    def rows(self) -> np.ndarray:
+        """The row at which each of the test's returns begins, shape (day,)."""
+        begin, end = self.folds[0].decisions.start, self.folds[-1].decisions.stop
+        return np.arange(begin, end) + self.task.lag
+
+    @cached_property
+    def relatives(self) -> np.ndarray:
+        """Price relatives over the test's returns, shape (day, asset); 1 before a first price."""
+        values = self.prices.values
+        return np.nan_to_num(values[self.rows + 1] / values[self.rows], nan=1.0)
+
+    @cached_property
     def growth(self) -> np.ndarray:
         """Growth factors of cash and each asset over the test's returns, shape (day, entry)."""
-        begin, end = self.folds[0].decisions.start, self.folds[-1].decisions.stop
-        rows, values = np.arange(begin, end) + self.task.lag, self.prices.values
-        relatives = np.nan_to_num(values[rows + 1] / values[rows], nan=1.0)
-        context = self._conditions.holding(rows, rows + 1)
-        growth = np.asarray(self.task.costs.carry(relatives, context))
-        return np.asarray(delisted(growth, relatives, context.listed))
+        context = self._conditions.holding(self.rows, self.rows + 1)
+        growth = np.asarray(self.task.costs.carry(self.relatives, context))
+        return np.asarray(delisted(growth, self.relatives, context.listed))
 
     @cached_property
     def relaxed(self) -> list[tuple[Mandated, list[str]]]:

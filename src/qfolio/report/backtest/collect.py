@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 
 import msgspec
-import numpy as np
 
-from qfolio.core.arrays import Floats
 from qfolio.core.text import listed
 from qfolio.portfolio.backtest.attribution.why import Why
 from qfolio.portfolio.backtest.capacity import capacity
@@ -69,7 +67,7 @@ def backtest_data(
         notes=list(notes),
         training={name: folds for name in backtest.agents if (folds := _training(backtest, name))},
         why=why,
-        moves=_moves(backtest),
+        moves=backtest.replay.relatives - 1,
         capacity=capacity(backtest.replay, entries, assessment.reference),
         risk_free=backtest.replay.growth[:, 0] - 1,
     )
@@ -81,13 +79,6 @@ def _costs(simulation: Simulation, year: float) -> dict[str, float]:
     if simulation.financing is not None:
         costs["interest and carry"] = -year * float(simulation.financing.mean())
     return costs
-
-
-def _moves(backtest: Backtest) -> Floats:
-    """Simple returns of the assets on the days of the test, 0 before an asset's first price."""
-    begin = backtest.folds[0].decisions.start + backtest.config.lag
-    values = backtest.prices.values[begin : begin + 1 + len(backtest.dates)]
-    return np.nan_to_num(values[1:] / values[:-1] - 1)
 
 
 def _training(backtest: Backtest, agent: str) -> list[FoldTraining]:

@@ -67,7 +67,7 @@ def _explained(
             folds,
             prices.assets,
             year,
-            open_to(stretches) & there[begin + config.lag :][: len(net)],
+            open_to(stretches) & there[backtest.replay.rows],
         ),
         exposures=exposures(net - reference, factors, year),
         importance=worth,
