@@ -4,8 +4,9 @@ A difference is estimated from pairs of returns of the same days, so its error i
 to first order. The variance of that mean allows for autocorrelation: it is the mean square of the
 first ν cosine transforms of the days' contributions, which are almost independent, and the
 difference over its error has Student's t distribution with ν degrees of freedom (Lazarus, Lewis,
-Stock & Watson 2018, "HAR Inference: Recommendations for Practice"). Seeds add the variance of their
-mean.
+Stock & Watson 2018, "HAR Inference: Recommendations for Practice"). Volatility wanders for months,
+and each strategy's own way, so that only slow transforms show how far (Müller & Watson 2008,
+"Testing Models of Low-Frequency Variability"). Seeds add the variance of their mean.
 """
 
 import math
@@ -29,6 +30,14 @@ Measured = Literal["growth", "sharpe", "volatility"]
 
 MARGIN = 1e-6
 """Smaller differences are rounding errors: in annual log growth, Sharpe ratio, log volatility."""
+
+
+SLOW = 0.8
+"""Cosine transforms a year for a difference in volatility: they take two years and a half or more
+for a period."""
+
+FEWEST = 4
+"""Cosine transforms of a test that is shorter than five years."""
 
 
 def clear(difference: ArrayLike) -> Floats:
@@ -128,6 +137,7 @@ def estimate(ours: Floats, theirs: Floats, periods_per_year: float) -> dict[Meas
             "volatility": _estimate(
                 np.log(mine.deviation) - np.log(other.deviation).mean(),
                 squares / (2 * scale[:, None]),
+                max(FEWEST, int(SLOW * ours.shape[1] / periods_per_year)),
             ),
         }
 
@@ -177,13 +187,16 @@ def _moments(returns: Floats) -> _Moments:
     return _Moments(centered, deviation, ratio_or_zero(returns.mean(axis=1), deviation))
 
 
-def _estimate(per_seed: Floats, contributions: Floats) -> Estimate:
-    """From values of shape (seeds,) and contributions of shape (seeds, periods) to their errors."""
+def _estimate(per_seed: Floats, contributions: Floats, most: float = math.inf) -> Estimate:
+    """From values of shape (seeds,) and contributions of shape (seeds, periods) to their errors.
+
+    most: the largest number of cosine transforms.
+    """
     from scipy.fft import dct
 
     seeds, periods = contributions.shape
     values = np.sort(per_seed)
-    count = max(1, min(int(0.41 * periods ** (2 / 3)), periods - 1))
+    count = int(max(1, min(0.41 * periods ** (2 / 3), most, periods - 1)))
     with np.errstate(invalid="ignore"):
         total = contributions.mean(axis=0)
         finite = bool(np.isfinite(total).all() and np.isfinite(values).all())
