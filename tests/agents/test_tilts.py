@@ -90,8 +90,28 @@ def test_a_weight_of_zero_can_grow():
 
 def test_target_keeps_the_cap():
     found = tilt([1.0], cap=0.5).target(view([0, 0, 0], [[3.0], [0.0], [0.0]]))
-    assert found[1:].max() <= 0.5 + 1e-6
-    np.testing.assert_allclose(found.sum(), 1, atol=1e-6)
+    np.testing.assert_allclose(found, [0, 0.5, 0.125, 0.375], atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [5, 12])
+def test_a_cap_moves_nothing_into_cash(count):
+    """What an asset may not hold goes to the others, unless all of them are at the cap."""
+    scores = 3 * jax.random.normal(jax.random.key(0), (200, count))
+    anchor = jax.random.dirichlet(jax.random.key(1), jnp.ones(count), (200,))
+    anchor *= jnp.linspace(0, 1, 200)[:, None]
+    anchor = jnp.where(jnp.arange(count) == 2, 0.0, anchor)  # untradable
+    cap = 0.7 / (count - 1)
+    found = np.asarray(tilted(anchor, scores, Simplex(count, cap)), float)
+    assets = np.minimum(np.asarray(anchor).sum(1), 0.7)
+    np.testing.assert_allclose(found[:, 0], 1 - assets, atol=1e-5)
+    np.testing.assert_allclose(found.sum(1), 1, atol=1e-5)
+    assert (found[:, 3] == 0).all()
+    assert found[:, 1:].max() <= cap + 1e-6
+    free = (found[:, 1:] > 1e-6) & (found[:, 1:] < cap - 1e-6)
+    share = np.asarray(anchor.sum(1, keepdims=True)) / (count - 1)
+    level = np.where(free, anchor + share * scores - found[:, 1:], np.nan)
+    spread = np.nanmax(level, 1, initial=-9) - np.nanmin(level, 1, initial=9)
+    assert np.nanmax(spread) < 1e-5  # the same amount is taken from each
 
 
 def test_untradable_assets_stay_at_zero():

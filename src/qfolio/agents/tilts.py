@@ -123,8 +123,9 @@ def tilted(
 ) -> Float[Array, "*batch entry"]:
     """The weights nearest to the anchor plus scores over the number of assets, cash first.
 
-    Their sum is the anchor's. None is negative, unless actions are a box: the task then projects
-    them onto what its mandate allows. Weights that are exactly 0 in the anchor cannot be traded.
+    Their sum is the anchor's, or as much of it as caps allow. None is negative, unless actions are
+    a box: the task then projects them onto what its mandate allows. Weights that are exactly 0 in
+    the anchor cannot be traded.
     """
     total = anchor.sum(-1, keepdims=True)
     open_to, count = anchor > 0, (anchor > 0).sum(-1, keepdims=True)
@@ -133,9 +134,13 @@ def tilted(
         mean = ratio(jnp.where(open_to, scores, 0.0).sum(-1, keepdims=True), count)
         wanted = jnp.where(open_to, anchor + share * (scores - mean), 0.0)
         return jnp.concatenate([1 - total, wanted], -1)
-    wanted = _nearest(anchor + share * scores, open_to, total)
-    target = jnp.concatenate([1 - total, wanted], -1)
-    return target if actions.cap == 1 else simplex.project(target, jnp.asarray(actions.caps))
+    wanted = anchor + share * scores
+    if actions.cap == 1:
+        return jnp.concatenate([1 - total, _nearest(wanted, open_to, total)], -1)
+    cash = 1 - jnp.minimum(total, actions.cap * count)
+    caps = jnp.concatenate([cash, jnp.where(open_to, actions.cap, 0.0)], -1)
+    more = wanted.max(-1, keepdims=True) + 1  # so much that cash is at its cap
+    return simplex.project(jnp.concatenate([more, wanted], -1), caps)
 
 
 def _nearest(

@@ -16,7 +16,8 @@ HALVINGS = 32
 
 
 def project(
-    scores: Float[Array, "*batch entry"], cap: Float[Array, " entry"] | float = 1.0
+    scores: Float[Array, "*batch entry"],
+    cap: Float[Array, " entry"] | Float[Array, "*batch entry"] | float = 1.0,
 ) -> Float[Array, "*batch entry"]:
     """The weights nearest to ``scores``: between 0 and ``cap``, summing to 1.
 
