@@ -49,12 +49,12 @@ def content(tmp_path_factory):
 class Names(list):
     """What is under way, noted; with Ctrl-C at one of them."""
 
-    def __init__(self, stop=None):
-        self.stop = stop
+    def __init__(self, stop=None, when=lambda training: True):
+        self.stop, self.when = stop, when
 
     def __call__(self, name):
         self.append(name)
-        return Interrupt() if name == self.stop else Listener()
+        return Interrupt(self.when) if name == self.stop else Listener()
 
 
 def regrets(task, population):
@@ -144,6 +144,16 @@ def test_an_interrupted_comparison_goes_on_as_if_it_never_was(content, way, tmp_
     assert lasting(found) == lasting(content)
     names = {path.name for path in (tmp_path / "stopped").iterdir()}
     assert names == {"continual.json", "events.jsonl"}
+
+
+@pytest.mark.parametrize("way", ["first training", "going on"])
+def test_a_training_that_ends_while_it_is_stopped_is_kept(way, tmp_path):
+    create(PLAN, tmp_path / "stopped", "qfolio continual")
+    assert compare(tmp_path / "stopped", Names(way, lambda training: training.finished)) is None
+    done = Names(way)
+    assert compare(tmp_path / "stopped", done) is not None
+    ways = ["first training", *continual.WAYS]
+    assert done == ways[ways.index(way) + 1 :]
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,26 @@ def test_a_stopped_run_asks_for_what_is_missing(task, agent, tmp_path, folder):
     same(alone, run)
 
 
+def test_seeds_of_a_folder_that_was_moved_are_not_written_into_a_new_one(task, agent, tmp_path):
+    """A new one would lack the run's settings, so that nothing could be done with the seeds."""
+    run = start(task, agent, tmp_path / "run")
+
+    def listen(job, done, share):
+        if job.name == "dqn/1":
+            (tmp_path / "run").rename(tmp_path / "moved")
+        return []
+
+    with pytest.raises(QfolioError, match="run is gone; if it was moved, resume it there"):
+        run.train(executor=Elsewhere(), listen=listen)
+    assert not (tmp_path / "run").exists()
+    again = Run.open(tmp_path / "moved")
+    assert again.groups.begun
+    again.train(executor=Elsewhere())
+    alone = start(task, agent)
+    alone.train()
+    same(alone, again)
+
+
 def test_a_run_that_was_stopped_before_its_first_group_keeps_its_steps(task, agent, tmp_path):
     """Episodes may end early: resumed in this process, it has to take the steps of its groups."""
     run = start(task, agent, tmp_path / "run")

@@ -386,6 +386,15 @@ def _frequency(labels: Any) -> float:
     return periods_per_year(labels.to_numpy("datetime64[s]") if known else np.zeros(0, "M8[s]"))
 
 
+def _require_returns(returns: np.ndarray) -> None:
+    """Raises ValueError for what nobody earns: prices, or new over old prices."""
+    if np.quantile(returns, 0.05) > 0.5:
+        raise ValueError(
+            "X looks like prices or price relatives: nearly all of its numbers are above 0.5; give "
+            "simple returns, such as prices.pct_change().dropna()."
+        )
+
+
 def _prices(
     returns: np.ndarray, assets: tuple[str, ...], per_year: float, first: int = 0
 ) -> Prices:
@@ -393,11 +402,7 @@ def _prices(
 
     Their rows are counted from ``first``, and dated so that there are ``per_year`` a year.
     """
-    if np.quantile(returns, 0.05) > 0.5:
-        raise ValueError(
-            "X looks like prices or price relatives: nearly all of its numbers are above 0.5; give "
-            "simple returns, such as prices.pct_change().dropna()."
-        )
+    _require_returns(returns)
     if not (returns > -1).all():
         row, asset = np.argwhere(~(returns > -1))[0]
         raise ValueError(

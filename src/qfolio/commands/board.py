@@ -25,6 +25,7 @@ def board(
         port: Port on 127.0.0.1; 0 chooses a free one.
         open: Open the page in a browser.
     """
+    import threading
     import webbrowser
 
     from qfolio.commands.console import say
@@ -32,6 +33,6 @@ def board(
 
     with Board(runs, port) as server:
         say(f"The board of {runs} is at {server.url}")
-        if open:
-            webbrowser.open(server.url)
+        if open:  # some browsers return only when they are closed
+            threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         server.serve_forever()

@@ -24,6 +24,7 @@ from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError, require_whole
 from qfolio.core.text import amount, listed
 from qfolio.experiments.budget import MOST_STARTS
+from qfolio.experiments.events import CONTRAST
 
 if TYPE_CHECKING:
     from qfolio.experiments.budget import Budget
@@ -282,7 +283,7 @@ def _contrast(run: "Run", folder: Path, executor: "Executor") -> "Run | None":
     variant = contrast_of(run.agent)
     if variant is None:
         return None
-    place = folder / "contrast"
+    place = folder / CONTRAST
     if (place / "checkpoint.safetensors").exists():
         contrast = Run.open(place)
     else:
@@ -309,7 +310,7 @@ def write_again(folder: Path) -> None:
     from qfolio.report.collect import report_data
     from qfolio.report.training import write_report
 
-    run, place = Run.open(folder), folder / "contrast"
+    run, place = Run.open(folder), folder / CONTRAST
     contrast = Run.open(place) if (place / "checkpoint.safetensors").exists() else None
     path = folder / "summary.json"
     summary = read_json(path) if path.is_file() else {}

@@ -94,6 +94,14 @@ def require_new(folder: Path, option: str = "--resume") -> None:
         raise QfolioError("The results cannot lie in the current folder itself; name a new one.")
 
 
+def require_there(folder: Path) -> None:
+    """Raises QfolioError if a folder was deleted or moved: a new one would lack what is in it."""
+    if not folder.exists():
+        raise QfolioError(
+            f"{folder} is gone; if it was moved, resume it there: what was finished is kept."
+        )
+
+
 @contextlib.contextmanager
 def new_folder(folder: Path, option: str = "--resume") -> Iterator[Path]:
     """A temporary folder that is renamed to ``folder`` at the end: it is complete or absent.

@@ -263,7 +263,9 @@ def _compare(
         state = msgspec.structs.replace(state, **results)
         write_config(folder / FILE, state)
 
-    def learn(name: str, population: Population, episodes: int, points: int) -> Course | None:
+    def learn(
+        name: str, population: Population, episodes: int, points: int
+    ) -> tuple[Course | None, bool]:
         worlds = grades if name == FIRST else grades[::-1]
         listeners = [] if listen is None else [listen(name)]
         job = log.job(name, seed_names(seeds))
@@ -274,11 +276,13 @@ def _compare(
     missing = [way for way in WAYS if way not in state.courses]
     log.queue([*([FIRST] if state.training is None else []), *missing])
     if state.training is None:
-        training = learn(FIRST, first, plan.episodes, 1)
+        training, stopped = learn(FIRST, first, plan.episodes, 1)
         if training is None:
             return None
         write_tree(folder / LEARNED, first.fetch())
         keep(optimum={"old": grades[0].optimum, "new": grades[1].optimum}, training=training)
+        if stopped:
+            return None
     elif missing:
         first.restore(read_tree(folder / LEARNED, first.fetch()))
     learned = first.fetch()
@@ -290,13 +294,15 @@ def _compare(
         elif way != "fresh":
             population.restore(learned)
         share = {"frozen": 0.0, "renewed": plan.renewal}.get(way, 1.0)
-        course = learn(way, population, round(share * plan.episodes), POINTS)
+        course, stopped = learn(way, population, round(share * plan.episodes), POINTS)
         if course is None:
             return None
         keep(
             courses={**state.courses, way: course},
             recovery={**state.recovery, way: recovery(course)},
         )
+        if stopped and way != missing[-1]:
+            return None
     (folder / LEARNED).unlink(missing_ok=True)
     return msgspec.to_builtins(state)
 
@@ -377,23 +383,25 @@ def _learn(
     worlds: tuple[Grades, Grades],
     job: JobLog,
     listeners: list[Listener],
-) -> Course | None:
-    """Learns for ``episodes`` more, with regular grading; None if Ctrl-C stopped it.
+) -> tuple[Course | None, bool]:
+    """Learns for ``episodes`` more, with regular grading.
+
+    Returns what it learned, None if it was stopped before the end, and whether Ctrl-C was pressed.
 
     worlds: the world learned in, and the other one.
     """
     here, there = worlds
     curve = _Curve(here, job)
     curve.add(population, 0)
-    seconds = 0.0
+    seconds, stopped = 0.0, False
     if episodes:
         budget = Budget(population.episodes + episodes)
         chunk = -(-budget.left(population) // points)
         training = fit(population, budget, [job, curve, *listeners], chunk=chunk)
-        seconds = training.seconds
-        if training.interrupted:
-            return None
+        seconds, stopped = training.seconds, training.interrupted
+        if stopped and not training.finished:
+            return None, True
     else:
         job.log.write("done", job=job.name, step=0)
     final, other = (world.regrets(population, population.starts) for world in (here, there))
-    return Course(curve.steps, curve.regrets, final, other, seconds)
+    return Course(curve.steps, curve.regrets, final, other, seconds), stopped

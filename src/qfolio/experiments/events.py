@@ -22,19 +22,26 @@ import msgspec
 
 EVENTS = "events.jsonl"
 
+CONTRAST = "contrast"
+"""The folder of a run's second training, with one setting changed, in the folder of the run."""
+
 BEAT, SILENT = 2.0, 10.0
 
 Event = dict[str, Any]
 
 
-def read(path: Path, offset: int = 0) -> tuple[list[Event], int]:
-    """Reads the events from a byte offset; also returns the offset from which to continue.
+CHUNK = 2**21
+"""Bytes of a log that are read at once, besides the rest of a line."""
 
-    An incomplete last line is left for the next call; damaged lines are skipped.
+
+def read(path: Path, offset: int = 0) -> tuple[list[Event], int]:
+    """Reads the next events from a byte offset; also returns the offset from which to continue.
+
+    An incomplete last line is left for a later call; damaged lines are skipped.
     """
     with path.open("rb") as file:
         file.seek(offset)
-        content = file.read()
+        content = file.read(CHUNK) + file.readline()
     whole = content[: content.rfind(b"\n") + 1]
     events = []
     for line in whole.split(b"\n"):

@@ -91,10 +91,11 @@ class Log:
             here = {"pid": os.getpid(), "host": platform.node()}
             self.write("start", **about, **here)
             stack.callback(self._tell, lambda tracker: tracker.finish())
-            for tracker in trackers:
-                if self._heard(tracker, lambda each: each.start(self.folder, about), QfolioError):
-                    self._trackers.append(tracker)
+            begin = lambda tracker: tracker.start(self.folder, about)  # noqa: E731
             try:
+                for tracker in trackers:
+                    if self._heard(tracker, begin, QfolioError):
+                        self._trackers.append(tracker)
                 yield self
             except BaseException as error:
                 failed = isinstance(error, Exception)

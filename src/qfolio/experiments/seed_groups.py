@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.files import new_folder
+from qfolio.core.files import new_folder, require_there
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.registry import short
 from qfolio.experiments.budget import Budget
@@ -134,6 +134,7 @@ class SeedGroups:
             raise trained
         self._done[trained.config.seed] = trained
         if self._place is not None:
+            require_there(self._place.parent)
             _write(self._place, trained, self._run.agent)
         said = log.job(job.name, job.members)
         for step, rows in groupby(trained.evaluations, lambda row: row["env_steps"]):

@@ -209,6 +209,22 @@ def test_a_script_that_its_workers_run_again(tmp_path):
     )
 
 
+def test_a_script_that_its_workers_cannot_read(tmp_path):
+    script = (
+        "import sys; sys.path[:0] = sys.argv[1:]\n"
+        "from qfolio.experiments.machines.processes import Processes\n"
+        "from jobs import Add\n"
+        "if __name__ == '__main__':\n"
+        "    list(Processes(1).map([Add('a', 1.0)], lambda job: ()))\n"
+    )
+    command = [sys.executable, "-", str(Path(jobs.__file__).parent)]
+    done = subprocess.run(
+        command, input=script, capture_output=True, text=True, timeout=60, check=False
+    )
+    (*_, last) = done.stderr.splitlines()
+    assert last.endswith("as it started; save the script in a file, which new processes can read.")
+
+
 def test_workers_end_with_a_driver_that_is_killed(tmp_path):
     code = (
         "import sys; sys.path[:0] = sys.argv[2:]\n"

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 from qfolio.core.errors import QfolioError
+from qfolio.experiments import events
 from qfolio.experiments.events import EVENTS, SILENT
 from qfolio.experiments.log import Log
+from qfolio.report.board import experiment as experiments
 from qfolio.report.board import shelf as shelves
 from qfolio.report.board.experiment import POINTS, Experiment
 from qfolio.report.board.server import Board
@@ -70,11 +72,63 @@ def test_a_resumed_job_counts_nothing_twice(tmp_path):
 def test_it_reads_on_where_it_stopped(tmp_path):
     write(tmp_path, start(), RUNNING, record(1, 1.0))
     experiment = read_again(tmp_path)
-    content = (tmp_path / EVENTS).read_bytes()
-    (tmp_path / EVENTS).write_bytes(b"?" * (len(content) - 1) + b"\n")  # is not read again
+    first, *others = (tmp_path / EVENTS).read_bytes().splitlines(keepends=True)
+    unreadable = b"?" * (sum(map(len, others)) - 1) + b"\n"
+    (tmp_path / EVENTS).write_bytes(first + unreadable)  # is not read again
     write(tmp_path, record(2, 2.0))
     experiment.refresh(2)
     assert [point[0] for point in experiment.jobs[""].curves["return"].points] == [1, 2]
+
+
+def test_another_run_in_the_same_folder_takes_the_place_of_the_first(tmp_path):
+    """Its log may even have the same inode."""
+    jobs = [{**RUNNING, "job": name} for name in ("a", "b")]
+    write(tmp_path, start(task="old"), *jobs, record(1, 1.0, "a"), {**END, "state": "failed"})
+    experiment, log = read_again(tmp_path), tmp_path / EVENTS
+    before = log.read_bytes()
+    log.write_bytes(b"")
+    later = {"time": time.time() + 60}
+    write(tmp_path, start(task="new", **later), {**RUNNING, "job": "b"})
+    write(tmp_path, *(record(step, step, "b") for step in range(20)))
+    assert log.stat().st_size > len(before)
+    experiment.refresh(2)
+    found = experiment.summary("key")
+    assert (found["task"], found["state"], found["begun"]) == ("new", "running", later["time"])
+    detail = experiment.detail(0)
+    assert [job["name"] for job in detail["jobs"]] == ["b"]
+    assert len(detail["jobs"][0]["curves"]["return"]) == 20
+    assert detail["begun"] == later["time"]
+
+
+def test_a_long_log_is_read_in_several_answers(tmp_path, monkeypatch):
+    monkeypatch.setattr(events, "CHUNK", 100)
+    write(tmp_path, start(), RUNNING, *(record(step, step) for step in range(50)))
+    experiment = Experiment(tmp_path.name, tmp_path / EVENTS)
+    known = []
+    for version in range(1, 500):
+        experiment.refresh(version, until=time.perf_counter() + 1e-4)
+        known.append(
+            len(experiment.jobs[""].curves["return"].points) if "" in experiment.jobs else 0
+        )
+        if known[-1] == 50:
+            break
+    assert known[-1] == 50
+    assert known[0] < 50
+
+
+def test_a_page_gets_few_points_of_many_curves(monkeypatch, tmp_path):
+    monkeypatch.setattr(experiments, "SHOWN", 60)
+    jobs = [{**RUNNING, "job": name} for name in "abc"]
+    write(
+        tmp_path,
+        start(),
+        *jobs,
+        *(record(step, step, name) for step in range(90) for name in "abc"),
+    )
+    for job in read_again(tmp_path).detail(0)["jobs"]:
+        points = job["curves"]["return"]
+        assert 10 <= len(points) <= 20
+        assert points[-1][0] == 89
 
 
 def test_long_logs_are_kept_short(tmp_path):
@@ -152,7 +206,11 @@ def test_what_lies_in_an_experiment_belongs_to_it(tmp_path):
     write(tmp_path / "comparison" / "agents" / "dqn", start())
     write(tmp_path / ".hidden", start())
     (tmp_path / "link").symlink_to(tmp_path / "comparison")
-    assert [run["name"] for run in Shelf(tmp_path).runs(0)["runs"]] == ["comparison"]
+    write(tmp_path / "run", start())
+    write(tmp_path / "run" / "contrast", start())  # trained when the run has ended
+    (tmp_path / "comparison" / "contrast").symlink_to(tmp_path / ".hidden")
+    names = [run["name"] for run in Shelf(tmp_path).runs(0)["runs"]]
+    assert sorted(names) == ["comparison", "run", "run/contrast"]
 
 
 def test_the_log_of_a_training_is_understood(tmp_path):
@@ -250,7 +308,9 @@ def test_only_known_names_are_served(board, name):
     assert ask(board, f"/reports/{key_of(board)}/{name}")[0].status == 404
 
 
-@pytest.mark.parametrize("path", ["/../x", "/runs/0123456789abcdef", "/runs/x", "/style.css"])
+@pytest.mark.parametrize(
+    "path", ["/../x", "/runs/0123456789abcdef", "/runs/x", "/style.css", "http://[x/"]
+)
 def test_other_paths_are_not_there(board, path):
     assert ask(board, path)[0].status == 404
 

@@ -8,10 +8,12 @@ import contextlib
 import multiprocessing
 import pickle
 import signal
+import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import connection, resource_tracker
 from multiprocessing.context import SpawnProcess
+from pathlib import Path
 from typing import TypeVar
 
 import jax
@@ -125,8 +127,16 @@ class _Pool:
         else:
             why = f"its process ended with code {code}"
         if self._sent.pop(worker, None) is None:
-            why += ' as it started; a script needs if __name__ == "__main__": around the call'
+            why += f" as it started; {_advice()}"
         return why
+
+
+def _advice() -> str:
+    """What a script needs so that a new process can import it."""
+    file = getattr(sys.modules["__main__"], "__file__", None)
+    if file is not None and not Path(file).exists():
+        return "save the script in a file, which new processes can read"
+    return 'a script needs if __name__ == "__main__": around the call'
 
 
 @contextlib.contextmanager

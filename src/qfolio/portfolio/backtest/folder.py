@@ -32,6 +32,7 @@ from qfolio.core.files import (
     read_arrays,
     read_json,
     read_tree,
+    require_there,
     write_arrays,
     write_bytes,
     write_csv,
@@ -280,10 +281,7 @@ class BacktestFolder:
 
     def write_records(self, agent: str, fold: str, rows: Records) -> None:
         """Writes the training episodes of a fold; raises QfolioError if the folder is gone."""
-        if not self.path.exists():  # or a new one would get only the folds that are still to come
-            raise QfolioError(
-                f"{self.path} is gone; if it was moved, resume it there: what was finished is kept."
-            )
+        require_there(self.path)
         write_bytes(self._records(agent, fold), rows.csv(header=True))
 
     def read_records(self, agent: str, fold: str) -> Records:

@@ -16,6 +16,12 @@ from qfolio.experiments.events import SILENT, Event, read
 POINTS = 400
 """Maximum number of points of a curve; beyond it, every other point and record is dropped."""
 
+SHOWN = 100_000
+"""Maximum number of points that a page gets of all curves of an experiment, if two of each fit."""
+
+FIRST = 500
+"""Bytes of the first line by which a log is told from an earlier one of the same name."""
+
 JOBS = 20_000
 """Maximum number of jobs kept of an experiment."""
 
@@ -23,6 +29,9 @@ REPORT = "report.html"
 
 SHARED = "search"
 """The kind of experiment that several processes may work on at once."""
+
+Point = tuple[float, float, float, float]
+"""A step, and the mean, lowest and highest value there."""
 
 State = Literal["queued", "running", "done", "stopped", "failed"]
 
@@ -83,7 +92,7 @@ class Curve:
     """A metric over a job's steps: the mean, lowest and highest value over its members."""
 
     def __init__(self) -> None:
-        self.points: list[tuple[float, float, float, float]] = []
+        self.points: list[Point] = []
         self._every, self._skipped = 1, 0
 
     def add(self, step: float, values: Sequence[float | None]) -> None:
@@ -137,12 +146,13 @@ class Job:
             if name != "episode":
                 self.curves.setdefault(name, Curve()).add(said.step, values)
 
-    def to_json(self, name: str) -> dict[str, Any]:
+    def to_json(self, name: str, most: int = POINTS) -> dict[str, Any]:
+        """What a page shows of it; most: the maximum number of points of a curve."""
         return {
             "name": name, "state": self.state, "worker": self.worker, "share": self.share,
             "members": len(self.members), "rate": self.rate, "left": self.left, "step": self.step,
             "begun": self.begun, "ended": self.ended,
-            "curves": {name: curve.points for name, curve in self.curves.items()},
+            "curves": {name: thinned(curve.points, most) for name, curve in self.curves.items()},
         }  # fmt: skip
 
 
@@ -154,7 +164,7 @@ class Experiment:
         self._forget()
 
     def _forget(self) -> None:
-        self._offset, self._inode, self._touched = 0, -1, 0.0
+        self._offset, self._first, self._touched = 0, b"", 0.0
         self.about = Start(0.0)
         self.begun: float | None = None  # the first time
         self.last = 0.0  # time of the last event
@@ -164,16 +174,22 @@ class Experiment:
         self.results: dict[str, dict[str, float | None]] = {}
         self._seen: tuple[Any, ...] = ()
 
-    def refresh(self, version: int) -> None:
-        """Reads the new events of the log; what they change gets this version."""
+    def refresh(self, version: int, until: float = math.inf) -> None:
+        """Reads the new events of the log; what they change gets this version.
+
+        until: when to go on at the next call, by ``perf_counter``.
+        """
         try:
             status = self.log.stat()
-            if status.st_ino != self._inode or status.st_size < self._offset:
+            if status.st_size != self._offset and (first := _first_line(self.log)) != self._first:
                 self._forget()
-                self._inode, self.version = status.st_ino, version
+                self._first, self.version = first, version
             self._touched = status.st_mtime
-            if status.st_size > self._offset:
-                events, self._offset = read(self.log, self._offset)
+            while self._offset < status.st_size and time.perf_counter() < until:
+                events, offset = read(self.log, self._offset)
+                if offset == self._offset:
+                    break
+                self._offset = offset
                 for event in events:
                     self._take(event, version)
         except OSError:  # deleted, or on a disk that is gone
@@ -249,13 +265,27 @@ class Experiment:
 
     def detail(self, since: int) -> dict[str, Any]:
         """All results, and the jobs that have changed after a version of the board."""
+        curves = sum(len(job.curves) for job in self.jobs.values())
+        most = min(POINTS, max(2, SHOWN // max(curves, 1)))
+        changed = {name: job for name, job in self.jobs.items() if job.version > since}
         return {
+            "begun": self.begun,
             "results": self.results,
-            "jobs": [job.to_json(name) for name, job in self.jobs.items() if job.version > since],
+            "jobs": [job.to_json(name, most) for name, job in changed.items()],
         }
+
+
+def thinned(points: list[Point], most: int) -> list[Point]:
+    """At most about so many of the points, evenly spaced, the last one among them."""
+    return points[:: -max(1, -(-len(points) // most))][::-1]
+
+
+def _first_line(log: Path) -> bytes:
+    with log.open("rb") as file:
+        return file.readline(FIRST)
 
 
 def _spark(job: Job) -> list[float]:
     """About 40 means of the most informative curve."""
     curve = job.curves.get("return") or next(iter(job.curves.values()))
-    return [point[1] for point in curve.points[:: max(1, len(curve.points) // 40)]]
+    return [point[1] for point in thinned(curve.points, 40)]

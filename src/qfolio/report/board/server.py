@@ -73,7 +73,10 @@ class Handler(BaseHTTPRequestHandler):
         if self.headers.get("Host") not in self.server.hosts:
             self._send(HTTPStatus.FORBIDDEN, "text/plain", b"This board has another address.\n")
             return
-        address = urlsplit(self.path)
+        try:
+            address = urlsplit(self.path)
+        except ValueError:
+            address = urlsplit("")
         for pattern, answer in ROUTES:
             if match := re.fullmatch(pattern, unquote(address.path)):
                 since = re.fullmatch("since=([0-9]{1,15})", address.query)

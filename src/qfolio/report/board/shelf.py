@@ -8,14 +8,17 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from qfolio.experiments.events import EVENTS
+from qfolio.experiments.events import CONTRAST, EVENTS
 from qfolio.report.board.experiment import REPORT, Experiment
 
 DEPTH = 4
-"""How deep folders are searched; what lies within an experiment belongs to it."""
+"""How deep folders are searched; what lies within an experiment is its own, except a contrast."""
 
 FRESH = 0.3
 """Seconds for which further requests are answered without reading again."""
+
+READING = 1.0
+"""Seconds after which an answer has what has been read of long logs so far."""
 
 
 class Shelf:
@@ -82,8 +85,9 @@ class Shelf:
             key = hashlib.sha256(log.encode(errors="surrogateescape")).hexdigest()[:16]
             found[key] = self._experiments.get(key) or Experiment(_readable(name), path)
         self._experiments = found
+        until = perf_counter() + READING
         for experiment in found.values():
-            experiment.refresh(self._version)
+            experiment.refresh(self._version, until)
         self._read = perf_counter()
 
 
@@ -97,10 +101,10 @@ def _logs(folder: str, depth: int) -> Iterator[str]:
     try:
         with os.scandir(folder) as entries:
             inside = [entry for entry in entries if not entry.name.startswith(".")]
+            folders = [entry.path for entry in inside if entry.is_dir(follow_symlinks=False)]
             if any(e.name == EVENTS and e.is_file(follow_symlinks=False) for e in inside):
                 yield os.path.join(folder, EVENTS)
-                return
-            folders = [entry.path for entry in inside if entry.is_dir(follow_symlinks=False)]
+                folders, depth = [path for path in folders if Path(path).name == CONTRAST], 1
     except OSError:
         return
     if depth:

@@ -484,11 +484,13 @@ async function look() {
 }
 
 async function refresh(key) {
-  const known = details.get(key) || { version: 0, jobs: new Map(), results: {} };
+  const known = details.get(key) || { version: 0, begun: null, jobs: new Map(), results: {} };
   const news = await ask(`/runs/${key}?since=${known.version}`);
   if (!news || !chosen.includes(key)) return false;
   details.set(key, known);
   known.version = news.version;
+  if (known.begun !== news.begun) known.jobs.clear(); // another run in the same folder
+  known.begun = news.begun;
   known.results = news.results;
   for (const job of news.jobs) known.jobs.set(job.name, job);
   return news.jobs.length > 0;
