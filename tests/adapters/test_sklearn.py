@@ -176,6 +176,9 @@ def test_odd_returns_are_refused():
     for prices in (100 * (1 + x).cumprod(), 1 + x):
         with pytest.raises(ValueError, match="looks like prices"):
             model().fit(prices)
+    for wrong in (x[::-1], pd.concat([x, x[-1:]])):
+        with pytest.raises(ValueError, match="not in ascending order, or some repeat"):
+            model().fit(wrong)
     with pytest.raises(QfolioError, match="too few"):
         model().fit(x[:10])
     with pytest.raises(QfolioError, match="set agent to tilts and preset to low-risk"):

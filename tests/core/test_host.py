@@ -91,6 +91,16 @@ class Aim(Tiny):
         return -abs(action[0] - 1) - abs(action[1] - 30) / 10, self.t == 2, False
 
 
+class Shares(Tiny):
+    """Whole numbers of three shares, at most five."""
+
+    action_space = gymnasium.spaces.Box(0, 5, (3,), np.int32)
+
+    def outcome(self, action):
+        assert self.action_space.contains(action), action
+        return float(-abs(action - 2).sum()), False, False
+
+
 class Named(Tiny):
     observation_space = gymnasium.spaces.Dict({"x": gymnasium.spaces.Discrete(2)})
 
@@ -126,8 +136,8 @@ class Faulty(Tiny):
         return seen, reward, False, False, {}
 
 
-ENVIRONMENTS = {kind: f"Test{kind.__name__}-v0" for kind in (Delay, Endless, Numbered, Aim, Named,
-                                                             Unbounded, Faulty)}  # fmt: skip
+KINDS = (Delay, Endless, Numbered, Aim, Shares, Named, Unbounded, Faulty)
+ENVIRONMENTS = {kind: f"Test{kind.__name__}-v0" for kind in KINDS}
 for _kind, _id in ENVIRONMENTS.items():
     gymnasium.register(_id, entry_point=_kind, max_episode_steps=4)
 
@@ -301,6 +311,7 @@ def test_it_goes_on_from_a_checkpoint_in_new_episodes(tmp_path):
         (lambda: task(Unbounded), "actions of TestUnbounded-v0 .* bounds"),
         (lambda: task(Endless, kwargs='{"cuts": 3}'), "cannot be made with kwargs"),
         (lambda: task(Endless, kwargs="cut=3"), "JSON object"),
+        (lambda: task(Endless, kwargs={"cut": 3}), "kwargs is {'cut': 3}; it must be JSON"),
         (lambda: task(Delay, horizon=-1), "horizon is -1"),
         (lambda: Population(task(Delay), SMALL, [0]).advance(4), "cannot be compiled"),
         (lambda: HostPopulation(task(Aim), SMALL, [0]), "dqn"),
@@ -332,6 +343,36 @@ def test_a_fault_of_an_environment_is_told_as_its_own(fault, says):
             environments.reset(index)
         for _ in range(2):
             environments.step(np.zeros(2, np.int32))
+
+
+@pytest.mark.parametrize("state", [4, 7, 5.5])
+def test_a_number_that_is_no_state_is_told(state):
+    environments = Environments(task(Numbered), limit=4, count=1)
+    with pytest.raises(QfolioError, match=rf"is {state} and .* the whole numbers from 5 to 6$"):
+        environments._seen(state)
+
+
+def test_whole_numbers_are_given_where_actions_are_whole():
+    environments = Environments(task(Shares), limit=4, count=2)
+    for index in range(2):
+        environments.reset(index)
+    found = environments.step(np.array([[-1, -0.15, 2], [0.7, 0, 1]], np.float32))
+    np.testing.assert_array_equal(found.reward, [-5, -5])  # of 0, 2, 5 and of 4, 2, 5
+
+
+def test_an_environment_that_is_registered_anew_is_read_anew():
+    """As in a notebook whose cell is run again."""
+
+    class Wider(Delay):
+        observation_space = gymnasium.spaces.Box(-10, 10, (3,), np.float32)
+
+    gymnasium.register("TestAgain-v0", entry_point=Delay, max_episode_steps=4)
+    before = GymnasiumTask("TestAgain-v0")
+    assert (before.horizon, before.observation[0]) == (4, (2,))
+    gymnasium.registry.pop("TestAgain-v0")
+    gymnasium.register("TestAgain-v0", entry_point=Wider, max_episode_steps=9)
+    after = GymnasiumTask("TestAgain-v0")
+    assert (after.horizon, after.observation[0]) == (9, (3,))
 
 
 def test_an_agent_that_diverges_is_not_the_environments_fault():

@@ -279,12 +279,14 @@ class Wrong(WithInterest):
             "unknown": (left * float("nan"), paid),
             "always": (left - 0.001, {**paid, "more": 0.001 + 0 * left}),
             "sum": (left, {"fee": 0 * left}),
+            "small": (np.where(abs(after - before).sum(-1) == 1, 1.01, left), paid),
         }
         return kinds.get(self.mistake, (left, paid))
 
     def carry(self, relatives, context):
         growth = super().carry(relatives, context)
-        return {"short": growth[..., 1:], "lost": -growth}.get(self.mistake, growth)
+        kinds = {"short": growth[..., 1:], "lost": -growth, "joined": growth.reshape(-1)}
+        return kinds.get(self.mistake, growth)
 
 
 @pytest.mark.parametrize(
@@ -301,6 +303,8 @@ class Wrong(WithInterest):
         ("sum", "Wrong.trade must return costs that sum to 1 minus the share of wealth that rem"),
         ("short", "Wrong.carry must return growth factors of cash and of each of 3 assets, of s"),
         ("lost", "Wrong.carry must return positive growth factors."),
+        ("small", "Wrong.trade must return shares of wealth above 0 and at most 1."),
+        ("joined", "Wrong.carry must return growth factors of cash and of each of 3 assets, of s"),
     ],
 )
 def test_a_model_of_ones_own_is_tried(mistake, says, monkeypatch):

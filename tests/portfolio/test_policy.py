@@ -241,6 +241,17 @@ def test_programs_that_are_used_again_learn_the_same():
     assert same(learned("pathwise", agent=fast).learner, used[1].learner)
 
 
+def test_a_mandate_may_be_a_dictionary():
+    limited = learned("pathwise", episodes=8, mandate={"assets": {"cap": np.float64(0.4)}})
+    assert max(value for name, value in limited.weights(table()).items() if name != "cash") < 0.41
+
+
+def test_a_policy_is_saved_into_a_new_folder_only(policy, tmp_path):
+    policy.save(tmp_path / "policy")
+    with pytest.raises(QfolioError, match=r"policy is not empty; name a new folder\.$"):
+        policy.save(tmp_path / "policy")
+
+
 def test_progress_and_settings():
     seen = []
     short = learned(

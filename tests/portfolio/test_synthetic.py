@@ -7,11 +7,12 @@ from equinox import filter_jit as jit
 
 from qfolio.agents.dqn import DQN
 from qfolio.agents.pathwise import Paths, Pathwise
-from qfolio.core import settings
+from qfolio.core import faults, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import evaluate, start_keys, step_key
 from qfolio.core.mdp import Agent, Box, Position
 from qfolio.core.registry import TASKS, find
+from qfolio.experiments.run import Run
 from qfolio.portfolio.costs import remainder_factor
 from qfolio.portfolio.synthetic.ar1 import Ar1
 from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen, Signals
@@ -383,6 +384,26 @@ def test_agents_that_do_not_fit(agent, menu, message):
     task = settings.build(Regime, {"menu": menu, "horizon": 40})
     with pytest.raises(QfolioError, match=message):
         agent.init(task, jax.random.key(0))
+
+
+class Unscaled(Pathwise):
+    """Forgets that weights sum to 1."""
+
+    def policy(self, weights, observation):
+        return 0.9 * super().policy(weights, observation)
+
+
+class Unknown(Pathwise):
+    def act(self, state, observation, key):
+        return jnp.nan * super().act(state, observation, key)
+
+
+def test_weights_of_ones_own_agent_are_those_of_a_portfolio():
+    task = Merton()
+    with pytest.raises(QfolioError, match=r"Unscaled.policy gives weights .* that sum to 0\.9;"):
+        Run.create(task, Unscaled(), episodes=8, seeds=1)
+    with pytest.raises(QfolioError, match="The action of Unknown is not finite at step 1"):
+        raise QfolioError(faults.find(task, Unknown(), 0))
 
 
 def test_all_actions_need_a_market(task):

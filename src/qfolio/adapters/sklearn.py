@@ -288,6 +288,11 @@ class PortfolioPolicy(BaseOptimization):
         try:
             return self.returns_[: int(self.observations_.searchsorted(dates[0]))]
         except TypeError:  # labels of different kinds have no order
+            if _are_dates(dates) and _are_dates(self.observations_):
+                raise ValueError(
+                    "Either the dates of X or those of the returns learned have a time zone, and "
+                    "the others have none; give both or neither, such as by X.tz_localize(None)."
+                ) from None
             return self.returns_
 
     def _followed(self, before: np.ndarray, returns: np.ndarray) -> Simulation:
@@ -376,14 +381,24 @@ def _dates(X: Any) -> Any:
     if not hasattr(index, "is_monotonic_increasing"):
         return None
     counted = index.dtype.kind == "i" and np.array_equal(index, np.arange(len(index)))
-    return index if index.is_monotonic_increasing and index.is_unique and not counted else None
+    ordered = index.is_monotonic_increasing and index.is_unique
+    if not ordered and _are_dates(index):
+        raise ValueError(
+            "The dates of X are not in ascending order, or some repeat; sort its rows, such as by "
+            "X.sort_index(), and keep one for each date."
+        )
+    return index if ordered and not counted else None
+
+
+def _are_dates(labels: Any) -> bool:
+    return getattr(getattr(labels, "dtype", None), "kind", "") == "M"
 
 
 def _frequency(labels: Any) -> float:
     """Rows per year by the dates of the rows (default: 252, if they have no dates)."""
     labels = labels.to_timestamp() if hasattr(labels, "to_timestamp") else labels  # of periods
-    known = getattr(getattr(labels, "dtype", None), "kind", "") == "M"
-    return periods_per_year(labels.to_numpy("datetime64[s]") if known else np.zeros(0, "M8[s]"))
+    dates = labels.to_numpy("datetime64[s]") if _are_dates(labels) else np.zeros(0, "M8[s]")
+    return periods_per_year(dates)
 
 
 def _require_returns(returns: np.ndarray) -> None:

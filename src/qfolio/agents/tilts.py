@@ -223,6 +223,11 @@ class Tilts(Onlooker):
             raise QfolioError("tilts gives weights; leave menu empty.")
         self._require_whole(task)
         channels = view.features.shape[-1] - 1
+        if not channels:
+            raise QfolioError(
+                f"tilts weighs signals, and {task.name} has none; set some, such as "
+                "signals=momentum:1y-1m,volatility:1m."
+            )
 
         linear = jnp.zeros((self.members, channels))
         square = jnp.zeros((self.members, channels, channels))

@@ -5,8 +5,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
-from qfolio.core.mdp import Agent, Task
+from qfolio.core.mdp import Agent, Simplex, Task
 from qfolio.core.training import episode_steps
+
+OFF = 1e-3
+"""How far weights may be off in single precision."""
 
 
 def find(task: Task, agent: Agent, seed: int) -> str | None:
@@ -15,8 +18,9 @@ def find(task: Task, agent: Agent, seed: int) -> str | None:
     Observations of a task with ``states`` have to be numbers of states. Checks one episode of each
     environment under the untrained agent.
     """
-    observed, paid = jax.jit(lambda key: _finite(task, agent, key))(jax.random.key(seed))
-    for time, (seen, reward) in enumerate(zip(observed.tolist(), paid.tolist(), strict=True)):
+    found = jax.jit(lambda key: _finite(task, agent, key))(jax.random.key(seed))
+    rows = zip(*(each.tolist() for each in found), strict=True)
+    for time, (seen, acted, reward) in enumerate(rows):
         if not seen:
             where = f"after step {time}" if time else "at the start"
             wrong = "finite" if task.states is None else f"from 0 to {task.states - 1}"
@@ -24,24 +28,52 @@ def find(task: Task, agent: Agent, seed: int) -> str | None:
                 f"The observation of {task.name} is not {wrong} {where} of an episode; check its "
                 f"observe, step and reset{'' if task.states is None else ', and its states'}."
             )
+        if not acted:
+            return (
+                f"The action of {type(agent).__name__} is not finite at step {time + 1} of an "
+                "episode; check its init and act."
+            )
         if not reward:
+            parts = "reward and cost model" if hasattr(task, "cost_model") else "step"
             return (
                 f"The reward of {task.name} is not finite at step {time + 1} of an episode; check "
-                "its step."
+                f"its {parts}."
             )
     return None
 
 
-def _finite(
-    task: Task, agent: Agent, key: PRNGKeyArray
-) -> tuple[Bool[Array, " time"], Bool[Array, " time"]]:
-    """Whether all observations and all rewards are finite, for each step of an episode."""
+def off_simplex(task: Task, agent: Agent) -> str | None:
+    """A sentence on weights of an untrained agent that nobody can hold; None if there are none."""
+    if not isinstance(task.actions, Simplex):
+        return None
+
+    def chosen(key: PRNGKeyArray) -> dict[str, Array]:
+        agent_key, reset_key, act_key = jax.random.split(key, 3)
+        state = agent.init(task, agent_key)
+        starts = jax.vmap(task.reset)(jax.random.split(reset_key, agent.num_envs))
+        seen = jax.vmap(task.observe)(starts)
+        acts = agent.act(state, seen, act_key)
+        return {"act": acts, "policy": agent.policy(agent.weights(state), seen)}
+
+    for method, weights in jax.jit(chosen)(jax.random.key(0)).items():
+        sums = weights.sum(-1)
+        if float(weights.min()) < -OFF or float(abs(sums - 1).max()) > OFF:
+            return (
+                f"{type(agent).__name__}.{method} gives weights of at least "
+                f"{float(weights.min()):.3g} that sum to {float(sums[0]):.3g}; weights, cash "
+                "first, must be at least 0 and sum to 1, as a softmax is."
+            )
+    return None
+
+
+def _finite(task: Task, agent: Agent, key: PRNGKeyArray) -> tuple[Bool[Array, " time"], ...]:
+    """Whether all observations, actions and rewards are finite, for each step of an episode."""
     agent_key, reset_key, key = jax.random.split(key, 3)
     state, count = agent.init(task, agent_key), agent.num_envs
 
     def step(
         carry: tuple[PyTree, Bool[Array, " environment"]], key: PRNGKeyArray
-    ) -> tuple[tuple[PyTree, Bool[Array, " environment"]], tuple[Array, Array]]:
+    ) -> tuple[tuple[PyTree, Bool[Array, " environment"]], tuple[Array, ...]]:
         states, over = carry
         act_key, step_key = jax.random.split(key)
         observation = jax.vmap(task.observe)(states)
@@ -52,7 +84,8 @@ def _finite(
         valid = lambda x: jnp.isfinite(x) & (least <= x) & (x <= most)  # noqa: E731
         leaves = [valid(x).reshape(count, -1).all(1) for x in jax.tree.leaves(observation)]
         seen = jnp.stack(leaves).all(0)
-        fine = (seen | over).all(), (jnp.isfinite(after.reward) | over).all()
+        acted = jnp.isfinite(action.reshape(count, -1)).all(1)
+        fine = tuple((each | over).all() for each in (seen, acted, jnp.isfinite(after.reward)))
         return (after.state, over | after.terminated), fine
 
     start = jax.vmap(task.reset)(jax.random.split(reset_key, count)), jnp.zeros(count, bool)

@@ -79,17 +79,16 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
-def require_new(folder: Path, option: str = "--resume") -> None:
+def require_new(folder: Path, option: str | None = "--resume") -> None:
     """Raises QfolioError unless ``folder`` is new, or empty and not the current one.
 
-    option: continues the work in it.
+    option: continues the work in it, if it is work.
     """
     if folder.exists() and not folder.is_dir():
         raise QfolioError(f"{folder} is a file; name a new folder.")
     if folder.exists() and any(folder.iterdir()):
-        raise QfolioError(
-            f"{folder} is not empty; name a new folder, or continue with {option} {shell(folder)}."
-        )
+        more = f", or continue with {option} {shell(folder)}" if option else ""
+        raise QfolioError(f"{folder} is not empty; name a new folder{more}.")
     if folder.resolve() == Path.cwd():  # which no other folder can replace
         raise QfolioError("The results cannot lie in the current folder itself; name a new one.")
 
@@ -103,7 +102,7 @@ def require_there(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def new_folder(folder: Path, option: str = "--resume") -> Iterator[Path]:
+def new_folder(folder: Path, option: str | None = "--resume") -> Iterator[Path]:
     """A temporary folder that is renamed to ``folder`` at the end: it is complete or absent.
 
     option: as for ``require_new``, which raises QfolioError if ``folder`` is not empty.

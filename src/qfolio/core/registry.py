@@ -8,6 +8,7 @@ from someone else: they must be in modules that have already been imported (``im
 ``build``).
 """
 
+import dataclasses
 import os
 import sys
 from collections.abc import Iterable, Mapping
@@ -199,6 +200,11 @@ def build(kind: Kind, name: str, chosen: Mapping[str, Any]) -> Any:
     try:
         return settings.build(found, chosen)
     except TypeError as error:
+        if not dataclasses.is_dataclass(found):
+            raise QfolioError(
+                f"the {kind} {name} is no dataclass, so that its settings cannot be given by name "
+                f"({error}); write @dataclass(frozen=True) before its class."
+            ) from None
         raise QfolioError(
             f"the {kind} {name} cannot be made from the folder's settings alone ({error}); make it "
             "in Python and pass it when opening the folder."

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from qfolio.core.errors import require_list
 from qfolio.core.population import Population
 from qfolio.core.training import Episodes
 from qfolio.experiments.budget import Budget
@@ -137,6 +138,8 @@ def fit(
         strict: Whether a loss that is not finite raises QfolioError; otherwise the other members
             continue.
     """
+    wanted = "a list of objects whose classes derive from qfolio.Listener"
+    require_list("listeners", listeners, Listener, wanted)
     training = Training(population, budget, config or {}, population.steps, budget.left(population))
     if training.finished:
         return training

@@ -138,15 +138,18 @@ def require_sound(model: CostModel, trade: Context, relatives: Any, holding: Con
 
     assets = relatives.shape[-1]
     cash, last = np.eye(1 + assets)[[0, -1]]
-    before, after = np.stack([[cash, cash, last, last], [cash, last, cash, last]])
+    half = (cash + last) / 2
+    pairs = [(one, other) for one in (cash, half, last) for other in (cash, half, last)]
+    before, after = np.swapaxes(pairs, 0, 1)
+    same = [one is other for one, other in pairs]
     answer = model.trade(before, after, trade)
     pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], Mapping)
     require("trade", pair, "the share of wealth that remains, and its costs by kind in a dict")
     left, paid = np.asarray(answer[0]), [np.asarray(each) for each in answer[1].values()]
     shapes = {each.shape for each in (left, *paid)}
-    require("trade", shapes == {(4,)}, "numbers of shape (...) for weights of shape (..., N + 1)")
+    require("trade", shapes == {(9,)}, "numbers of shape (...) for weights of shape (..., N + 1)")
     require("trade", ((left > 0) & (left <= 1)).all(), "shares of wealth above 0 and at most 1")
-    require("trade", (left[[0, 3]] == 1).all(), "exactly 1 where nothing is traded")
+    require("trade", (left[same] == 1).all(), "exactly 1 where nothing is traded")
     gap = abs(sum(paid) - (1 - left)).max()
     require("trade", gap < 1e-6, "costs that sum to 1 minus the share of wealth that remains")
     for method in ("carry", "owe"):
@@ -158,6 +161,9 @@ def require_sound(model: CostModel, trade: Context, relatives: Any, holding: Con
             )
             require(method, grown.shape == (1 + assets,), entries)
             require(method, ((grown > 0) & (grown < np.inf)).all(), "positive growth factors")
+            several = holding._replace(rows=np.array([holding.rows] * 2))
+            both = np.asarray(getattr(model, method)(np.stack([relatives] * 2), several))
+            require(method, both.shape == (2, 1 + assets), entries)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio import policy_folder, signals
 from qfolio.portfolio.costs import CostModel, cashed
 from qfolio.portfolio.following import begin, follow, on_table
+from qfolio.portfolio.mandate.limits import mandate_text
 from qfolio.portfolio.prices.findings import day, listing
 from qfolio.portfolio.prices.frequency import require_alike
 from qfolio.portfolio.prices.table import Prices, load
@@ -72,7 +73,11 @@ def train(
     if isinstance(agent, str):
         agent = preset("fast", "portfolio", agent)
     if isinstance(agent, Preset):
-        agent = fitted(agent._replace(task={**agent.task, **task}), len(table))
+        task = {**agent.task, **task}
+    if "mandate" in task:
+        task["mandate"] = mandate_text(task["mandate"], table.assets)
+    if isinstance(agent, Preset):
+        agent = fitted(agent._replace(task=task), len(table))
         task = dict(agent.task)
         episodes = agent.episodes if episodes is None else episodes
         seeds = agent.seeds if seeds is None else seeds

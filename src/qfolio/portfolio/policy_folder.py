@@ -72,7 +72,7 @@ def save(content: Content, seeds: int, rows: int, folder: Path) -> None:
         learns=content.learner is not None,
         periods_per_year=float(content.task.year),
     )
-    with new_folder(folder) as place:
+    with new_folder(folder, None) as place:
         write_config(place / "policy.json", config)
         kept = jax.tree.map(np.asarray, _kept(content.task, content.members))
         write_tree(place / "policy.safetensors", kept)

@@ -7,14 +7,13 @@ steps it. This file provides the shapes that agents need and converts observatio
 import copy
 import json
 import math
-from functools import cache
 from typing import Any, NamedTuple, NoReturn
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type
 from qfolio.core.fields import require, static
 from qfolio.core.host import HostTask
 from qfolio.core.mdp import Box, Discrete, Step
@@ -38,6 +37,7 @@ class GymnasiumTask(HostTask):
     horizon: int = static(0)  # steps of an episode; 0: the environment's limit
 
     def __post_init__(self) -> None:
+        require_type("kwargs", self.kwargs, str, "JSON, such as '{\"continuous\": true}'")
         if not self.horizon:
             self.horizon = self.facts.limit
 
@@ -105,15 +105,40 @@ class Facts(NamedTuple):
             return (actions.ravel() + self.first_action).tolist()
         # A diverged agent is detected by its losses; the environment should not get its NaN.
         share = (np.clip(np.nan_to_num(actions), -1.0, 1.0) + 1) / 2
-        return list(self.low + share.reshape(-1, *self.low.shape) * (self.high - self.low))
+        made = self.low + share.reshape(-1, *self.low.shape) * (self.high - self.low)
+        whole = np.issubdtype(self.low.dtype, np.integer)
+        return list(np.rint(made).astype(self.low.dtype) if whole else made)
 
     def seen(self, observation: Any) -> Any:
-        """An environment's observation in the agents' format."""
-        return observation if self.states is None else observation - self.first_state
+        """An environment's observation in the agents' format.
+
+        Raises QfolioError for a number that is none of its states.
+        """
+        if self.states is None:
+            return observation
+        seen = observation - self.first_state
+        if np.ndim(seen) == 0 and not (0 <= seen < self.states and seen == int(seen)):
+            last = self.first_state + self.states - 1
+            raise QfolioError(
+                f"its observation is {observation} and its observation space has the whole numbers "
+                f"from {self.first_state} to {last}"
+            )
+        return seen
 
 
-@cache
 def _facts(id: str, kwargs: str) -> Facts:
+    """The facts of an environment, read again if another one is registered with its ID."""
+    spec, (known, facts) = _spec(id), _known.get((id, kwargs), (None, None))
+    if facts is None or known is not spec:
+        facts = _read(id, kwargs)
+        _known[id, kwargs] = spec, facts
+    return facts
+
+
+_known: dict[tuple[str, str], tuple[Any, Facts]] = {}
+
+
+def _read(id: str, kwargs: str) -> Facts:
     spaces = _gymnasium().spaces
     env = _make(id, kwargs)
     seen, done = env.observation_space, env.action_space

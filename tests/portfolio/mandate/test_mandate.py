@@ -205,11 +205,19 @@ GROUP = {"assets": ["XLE", "XOM"]}
          "the cap of SPY, -10%, and assets.forbidden"),
         ({"groups": {"theme": {"oil": {"assets": ["XLE", "XMO"], "cap": 0.1}}}},
          "group theme oil names 'XMO', which is no asset of the table; did you mean XOM?"),
+        ({"assets": {"cap": {"SPY": 2}}}, "The cap of SPY, 200%, is above 100%"),
     ],
 )  # fmt: skip
 def test_limits_that_clash_are_refused_with_their_names(mandate, message):
     with pytest.raises(QfolioError, match=message):
         checks.require(mandate_text(mandate, ASSETS), ALL)
+
+
+def test_numbers_of_numpy_are_numbers():
+    given = {"assets": {"cap": np.float64(0.4), "forbidden": np.array(["TLT"])},
+             "trading": {"holdings": np.int64(3)}}  # fmt: skip
+    plain = {"assets": {"cap": 0.4, "forbidden": ["TLT"]}, "trading": {"holdings": 3}}
+    assert mandate_text(given, ASSETS) == mandate_text(plain, ASSETS)
 
 
 def test_what_is_unusual_is_said():
@@ -222,6 +230,12 @@ def test_what_is_unusual_is_said():
     assert notes_on(mandate_text({"cash": {"max": 0.1}}, ASSETS), ALL) == []
     [note] = notes_on(mandate_text({"trading": {"smallest_trade": 0.3}}, ASSETS), ALL)
     assert note.startswith("The smallest trade, 30%, is more than an equal weight, 25%")
+    file = {"assets": ["spy", "xl-e", "XOM", "gld"], "cap": 0.3, "ignore_unknown": True}
+    notes = notes_on(mandate_text({"groups": {"sector": {"Energy": file}}}, ASSETS), ALL)
+    assert [note.partition(":")[0] for note in notes] == [
+        "SPY has no sector in the mandate's file of groups, which names spy",
+        "XLE has no sector in the mandate's file of groups, which names xl-e",
+    ]
     [note] = checks.unusual("", np.ones(15, bool), 0.05)
     assert note == "The cap of 5% for each of 15 assets forces at least 25% cash."
     assert checks.unusual("", ALL, 0.25) == checks.unusual("", ALL) == []

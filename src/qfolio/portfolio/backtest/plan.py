@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from qfolio.core import settings
+from qfolio.core import faults, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Agent
 from qfolio.core.registry import own_modules
@@ -135,6 +135,8 @@ class Plan:
             try:
                 if own_modules(agent):
                     jax.eval_shape(partial(begin, task, agent), seed)
+                    if fault := faults.off_simplex(task, agent):
+                        raise QfolioError(fault)
                 else:
                     jax.eval_shape(partial(agent.init, task), key)
             except QfolioError as error:

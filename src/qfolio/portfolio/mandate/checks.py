@@ -36,7 +36,7 @@ def require(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
             "The mandate cannot be met: it allows no weight in any asset; change assets.forbidden "
             "or assets.cap."
         )
-    _require_each(text, made.limits)
+    _require_each(text, made.limits, made.long_only)
     said = _said(text, made, most)
     clash = list(range(len(said)))
     if _found(made.limits, clash) is None:
@@ -81,7 +81,7 @@ def unusual(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) ->
         left = 1 - most * count
         said = f"The cap of {_percent(most)} for each of {count} assets"
         return [f"{said} forces at least {_percent(left)} cash."] if left > TINY else []
-    made, notes = feasible(text, usable, most), []
+    made, notes = feasible(text, usable, most), _misspelt(text)
     limits = made.limits
     equal = 1 / int(usable.sum())
     if made.smallest_trade > equal:
@@ -270,9 +270,37 @@ def _require_members(text: str) -> None:
                 )
 
 
-def _require_each(text: str, limits: Limits) -> None:
+def _misspelt(text: str) -> list[str]:
+    """Notes on assets that a file of groups seems to name in another spelling."""
+    assets, mandate = parse(text)
+    notes = []
+    for column, values in mandate.groups.items():
+        named = {name for group in values.values() if group.ignore_unknown for name in group.assets}
+        unknown = {_letters(name): name for name in named - set(assets)}
+        for asset in assets:
+            if asset not in named and (other := unknown.get(_letters(asset))):
+                notes.append(
+                    f"{asset} has no {column} in the mandate's file of groups, which names "
+                    f"{other}: no limit of a group applies to {asset}."
+                )
+    return notes
+
+
+def _letters(name: str) -> str:
+    """A name without case, spaces and signs: BRK.B is brk-b."""
+    return "".join(filter(str.isalnum, name.casefold()))
+
+
+def _require_each(text: str, limits: Limits, long_only: bool) -> None:
     assets, mandate = parse(text)
     signed = (("floor", mandate.assets.floor, 1), ("cap", mandate.assets.cap, -1))
+    caps = mandate.assets.cap
+    for name, most in (caps if isinstance(caps, dict) else {"each asset": caps}).items():
+        if most > 1 and long_only:
+            raise QfolioError(
+                f"The cap of {name}, {_percent(most)}, is above 100%, which only a mandate with "
+                "loans or short sales allows; write 0.2 for 20%."
+            )
     for name in mandate.assets.forbidden:
         for said, of_each, sign in signed:
             bound = of_each.get(name, 0.0) if isinstance(of_each, dict) else 0.0

@@ -251,6 +251,7 @@ def _named(given: float | dict[str, float] | None) -> Sequence[str]:
 
 def _made(content: Any, source: str) -> Mandate:
     """The mandate in a dictionary, with the assets of groups from its CSV, if it names one."""
+    content = _plain(content)
     groups = content.get("groups") if isinstance(content, dict) else None
     if not (isinstance(groups, dict) and "file" in groups):
         return _converted(content, source)
@@ -279,6 +280,13 @@ def _assigned(content: dict[str, Any], assignments: Sequence[str]) -> dict[str, 
             )
         _merge(content, read, key.strip())
     return content
+
+
+def _plain(content: Any) -> Any:
+    """The content with Python's numbers and lists in place of numpy's."""
+    if isinstance(content, dict):
+        return {key: _plain(value) for key, value in content.items()}
+    return content.tolist() if hasattr(content, "tolist") else content
 
 
 def _converted(content: Any, source: str) -> Mandate:
