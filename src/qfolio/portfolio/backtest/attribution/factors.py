@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 
 from qfolio.core.arrays import Bools, Floats
-from qfolio.portfolio import signals
 from qfolio.portfolio.backtest.attribution.hac import regress
 from qfolio.portfolio.backtest.folds import Fold
+from qfolio.portfolio.signals import Signal, compute, formulas
 
 COMPONENTS = 2
 
@@ -106,23 +106,23 @@ def factor_returns(
     market = moves.sum(1) / np.maximum(held.sum(1), 1)
     found = {"market": market[days] - cash}
     for name, signal in _signals(periods_per_year).items():
-        ranks = signals.compute([signal], values, tradable=there)[..., 0]
+        ranks = compute([signal], values, tradable=there)[..., 0]
         weights = _long_short(-ranks if name == "low volatility" else ranks)
         found[name] = (weights[:-1] * moves[1:]).sum(1)[days.start - 1 : days.stop - 1]
     active = np.where(held, moves - market[:, None], 0)
     return found | _components(values, there, active, folds, shift)
 
 
-def _signals(periods_per_year: float) -> dict[str, signals.Signal]:
+def _signals(periods_per_year: float) -> dict[str, Signal]:
     """Signals by name, with lengths in rows; those that the table's frequency allows."""
     year, month, week = (max(0, round(periods_per_year / part)) for part in (1, 12, 52))
-    found: dict[str, signals.Signal] = {}
+    found: dict[str, Signal] = {}
     if year > month > 0:
-        found[f"momentum {year}\N{MINUS SIGN}{month}"] = signals.Momentum(year, month)
+        found[f"momentum {year}\N{MINUS SIGN}{month}"] = formulas.Momentum(year, month)
     for rows in sorted({month, week} - {0}, reverse=True):
-        found[f"reversal {rows}"] = signals.Reversal(rows)
+        found[f"reversal {rows}"] = formulas.Reversal(rows)
     if year >= 3:
-        found["low volatility"] = signals.Volatility(year)
+        found["low volatility"] = formulas.Volatility(year)
     return found
 
 
