@@ -52,7 +52,10 @@ class GridOptimum:
         return self._cached(name, lambda: {"returns": solve()})["returns"]
 
     def stationary(self, discount: float) -> tuple[np.ndarray, np.ndarray]:
-        """Value and best action, each (n, m), for the infinite-horizon discounted problem."""
+        """Value and best action, each (n, m), for the infinite-horizon discounted problem.
+
+        Values are off by at most γ/(1 − γ) times 1e-4: 0.01 with a discount of 0.99.
+        """
 
         def solve() -> dict[str, Array]:
             # Backward induction until the values converge, at most to float32's precision.

@@ -32,7 +32,10 @@ class VolatilityTiming(Fitted):
 
 
 class RewardToRiskTiming(VolatilityTiming):
-    """Weights in proportion to (μ⁺/σ²)^η, where μ⁺ is the mean return, or 0 if it is negative."""
+    """Weights in proportion to (μ⁺/σ²)^η, where μ⁺ is the mean return, or 0 if it is negative.
+
+    What cash earns is not subtracted.
+    """
 
     def fit(self, returns: Floats, cap: float) -> Floats:
         ratio = np.maximum(returns.mean(axis=0), 0) / returns.var(axis=0)
