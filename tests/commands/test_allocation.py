@@ -6,6 +6,8 @@ import shutil
 
 import pytest
 
+from qfolio.portfolio.desk.ledger import Ledger
+
 from shell import TINY_BACKTEST, qfolio
 from tables import write_table
 
@@ -205,6 +207,21 @@ def test_prices_that_end_early_are_read_as_in_the_backtest(folder, monkeypatch, 
 def test_the_help_names_what_may_be_typed_of_prices_that_end(command, monkeypatch, capsys):
     assert qfolio(monkeypatch, command, "--help") == 0
     assert "--ended {gap,cash-out}" in capsys.readouterr().out
+
+
+def test_the_ledger_goes_on_beyond_four_digits(copy, monkeypatch, capsys):
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    allocation(copy, monkeypatch, capsys, "--capital", 1000)
+    (first,) = records(copy)
+    (copy / "ledger" / "0001.json").unlink()
+    (copy / "ledger" / "9999.json").write_text(json.dumps({**first, "number": 9999}))
+    for number, capital in ((10_000, 7), (10_001, 8), (10_002, 9)):
+        made = allocation(copy, monkeypatch, capsys, "--capital", capital)
+        assert made["record"] == number
+    found = Ledger(copy / "ledger").records()
+    assert [(each.number, each.supersedes) for each in found] == [
+        (9999, None), (10_000, 9999), (10_001, 10_000), (10_002, 10_001)
+    ]  # fmt: skip
 
 
 def test_the_ledger_has_one_record_for_the_same_inputs(copy, monkeypatch, capsys, tmp_path):

@@ -34,6 +34,16 @@ def test_a_large_array_travels_beside_its_jobs_once():
     np.testing.assert_array_equal(mine, large)
 
 
+def test_an_array_in_the_place_of_one_that_is_gone_is_another():
+    """Python gives a new object the number of one that was freed."""
+    packer, one = Packer(), np.arange(LARGE)
+    (digest,) = packer.pack(one).arrays
+    other = one + 1
+    packer._known[id(other)] = packer._known.pop(id(one))
+    del one
+    assert packer.pack(other).arrays != (digest,)
+
+
 def test_a_class_that_a_worker_does_not_have(monkeypatch):
     parcel = Packer().pack(Add("a", 1.0))
     monkeypatch.delattr(jobs, "Add")
