@@ -176,6 +176,17 @@ def test_rows_of_any_length_share_shocks():
     assert correlations([text(dates), text(months)], [x, other])[0, 1] < 0.3
 
 
+def test_shocks_that_arrive_a_day_later_are_shared():
+    """As in Asia those of America; from two years on, months show it."""
+    x = np.random.default_rng(5).standard_normal(1201)
+    days = text(weekdays("2001-01-01", 1200).astype("M8[D]"))
+    assert correlations([days, days], [x[1:], x[:-1]])[0, 1] > 0.85
+    assert correlations([days[:200]] * 2, [x[1:201], x[:200]])[0, 1] < 0.3
+    rng = np.random.default_rng(6)
+    others = [correlations([days] * 2, [*rng.standard_normal((2, 1200))])[0, 1] for _ in range(50)]
+    assert np.mean(others) < 0.1
+
+
 def test_one_market_with_two_frequencies_counts_once():
     """Were its rows independent, its z would be √2 times as large."""
     rng = np.random.default_rng(7)

@@ -67,7 +67,7 @@ def test_the_conclusion_says_who_beats_the_reference(plain: BacktestData) -> Non
     assert lead_name(data) == "pathwise"
     assert conclusion(data) == (
         "pathwise beats equal weight, however it is rebalanced, in growth and Sharpe ratio: it "
-        f"grew {growth(data, 'pathwise')} a year after costs, against {growth(data, 'never')} of "
+        f"grew {growth(data, 'pathwise')} a year after costs, against {growth(data, 'never')} for "
         "never."
     )
     both = found(plain, pathwise=("better", "none"), DQN=("better", "none"))
@@ -143,7 +143,7 @@ def test_all_stand_beside_the_reference_of_the_verdict(plain: BacktestData) -> N
             data, strategies={n: s for n, s in data.strategies.items() if "DQN" not in n}
         )
         assert rival_name(alone_tested) == other
-        assert conclusion(alone_tested).endswith(f", against {growth(plain, other)} of {other}.")
+        assert conclusion(alone_tested).endswith(f", against {growth(plain, other)} for {other}.")
         assert all(tile["other"].startswith(other) for tile in tiles(alone_tested))
     # Where the others are not the same, each line names its own.
     assert verdict_lines(data)["against"] == ""

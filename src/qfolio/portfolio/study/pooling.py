@@ -32,6 +32,9 @@ from qfolio.portfolio.prices.frequency import spacing
 RESAMPLES = 2000
 """Number of histories that the hierarchical bootstrap draws."""
 
+MONTHS = 24
+"""Months of two tables from which on the sums of months say how much they share."""
+
 SPANS = ((1.5, "D"), (11.0, "W"), (46.0, "M"), (137.0, "3M"), (math.inf, "Y"))
 """Spans of the calendar, and the most days between the rows of a table that they suit."""
 
@@ -286,7 +289,9 @@ def correlations(days: Sequence[Sequence[str]], active: Sequence[Floats]) -> Flo
     Rows of different length have no common days to speak of, and two monthly tables may give a
     month its first or its last day. So the days are those of the calendar for daily and intraday
     rows only; otherwise they are its weeks, months, quarters or years, whichever are as long as the
-    rows of both tables, with the sums of the differences.
+    rows of both tables, with the sums of the differences. Shocks also arrive a day later in another
+    part of the world, and in stale prices, so that two years or more are also compared by months,
+    and the larger correlation counts.
 
     Args:
         days: Days of each table, with a time of day if there are several rows a day.
@@ -299,15 +304,23 @@ def correlations(days: Sequence[Sequence[str]], active: Sequence[Floats]) -> Flo
     for i in range(len(days)):
         for j in range(i):
             longest = max(lengths[i], lengths[j])
-            unit = next(unit for most, unit in SPANS if longest <= most)
-            (own, x), (other, y) = sums(i, unit), sums(j, unit)
-            _, here, there = np.intersect1d(own, other, return_indices=True)
-            first, second = x[here], y[there]
-            if len(here) > 2 and first.std() > 0 and second.std() > 0:
-                rho = float(np.corrcoef(first, second)[0, 1])
-                part = len(here) / math.sqrt(len(own) * len(other))
-                shared[i, j] = shared[j, i] = max(0.0, rho * part)
+            units = [next(unit for most, unit in SPANS if longest <= most)]
+            if min(len(sums(table, "M")[0]) for table in (i, j)) >= MONTHS and units[0] in "DW":
+                units.append("M")
+            found = max(_shared(sums(i, unit), sums(j, unit)) for unit in units)
+            shared[i, j] = shared[j, i] = found
     return shared
+
+
+def _shared(one: tuple[NDArray, Floats], other: tuple[NDArray, Floats]) -> float:
+    """The correlation of two means, from sums in spans of the calendar; 0 if it is negative."""
+    (own, x), (others, y) = one, other
+    _, here, there = np.intersect1d(own, others, return_indices=True)
+    first, second = x[here], y[there]
+    if len(here) < 3 or first.std() == 0 or second.std() == 0:
+        return 0.0
+    part = len(here) / math.sqrt(len(own) * len(others))
+    return max(0.0, float(np.corrcoef(first, second)[0, 1]) * part)
 
 
 def _sums(dates: NDArray, values: Floats, unit: str) -> tuple[NDArray, Floats]:

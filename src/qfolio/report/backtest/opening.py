@@ -89,7 +89,9 @@ def conclusion(data: BacktestData) -> str:
     def told(subject: str) -> str:
         who, other = "it" if subject == lead else lead, difference.reference
         own, theirs = (test.strategies[name].measures["growth"].mean for name in (lead, other))
-        return f"{who} grew {percent(own)} a year after costs, against {percent(theirs)} of {other}"
+        return (
+            f"{who} grew {percent(own)} a year after costs, against {percent(theirs)} for {other}"
+        )
 
     if winners := which("growth", "better"):
         verb = "beats" if len(winners) == 1 else "beat"

@@ -147,6 +147,7 @@ def render_backtest(data: BacktestData) -> str:
         said=account(data),
         settings=setting_groups(data.config),
         thinned=days_per_point(len(data.dates)),
+        several_seeds=any(entry.seeds > 1 for entry in data.assessment.strategies.values()),
         few_seeds=few_seeds(data.assessment),
         averaged=math.ceil(len(data.dates) / BLOCKS),
         unit=unit_of(data.assessment.periods_per_year),

@@ -86,7 +86,7 @@ def _parts(parts: Decomposition) -> list[dict[str, Any]]:
         ("Constant tilts", parts.tilts, "mean weights, less equal weights"),
         ("Timing", parts.timing, f"with constant tilts, t = {number(parts.active_t)}"),
         ("Costs", -parts.cost, "of all trades"),
-        ("Net of equal weights", parts.net - parts.equal, "the sum"),
+        ("Net of equal weights", parts.net - parts.equal, "the sum; these pay no costs here"),
     ]
     places = bars([value for _, value, _ in rows])
     return [
@@ -155,7 +155,7 @@ def _signals(why: AgentWhy) -> list[dict[str, Any]]:
     order = [*sorted(worth[:-1], key=lambda each: -each.lost), worth[-1]]
     places = bars([each.lost for each in order], [(each.low, each.high) for each in order])
     pulls = {each.name: each for each in why.gradients.pulls} if why.gradients else {}
-    terms = {each.name: each for each in why.rule.terms}
+    terms = {} if why.importance.ignored else {each.name: each for each in why.rule.terms}
     longest = max((each.size for each in pulls.values()), default=0.0) or 1.0
     digits = _digits([each.lost for each in order])
     rows = []
@@ -205,7 +205,9 @@ def _told(why: AgentWhy) -> list[str]:
         sentences.append(
             "This agent chooses from a menu; its weights jump, so they have no gradients."
         )
-    if rule.r2 is None:
+    if found.ignored:
+        sentences.append("No signal changes what it decides, so no rule of signals describes it.")
+    elif rule.r2 is None:
         sentences.append("Its weights did not differ between assets, so no rule can describe them.")
     elif rule.terms:
         sentences.append(

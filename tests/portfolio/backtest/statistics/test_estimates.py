@@ -92,7 +92,7 @@ def test_seeds_add_their_doubt() -> None:
 def test_leverage_changes_no_sharpe_ratio() -> None:
     """Half in cash: the same ratio, exactly, though growth and volatility differ."""
     rng = np.random.default_rng(3)
-    market = 0.001 + 0.01 * rng.standard_normal((1, 500))
+    market = 0.001 + 0.01 * rng.standard_normal((1, 5040))  # twenty years
     found = estimate(market / 2, market, 252)
     assert found["sharpe"].tails() == (1, 1)
     assert found["volatility"].value == pytest.approx(-math.log(2))
@@ -130,10 +130,7 @@ def test_the_luckiest_of_several() -> None:
 @pytest.mark.parametrize("count", [120, 500, 1260, 5000])
 @pytest.mark.parametrize("volatilities", [0, 1, 3])
 def test_p_values_are_right_as_often_as_they_say(count: int, volatilities: int) -> None:
-    """Two strategies without a difference: 5% of the p-values are at most 5%, 1% at most 1%.
-
-    Half a year does not show how far volatilities of their own wander.
-    """
+    """Two strategies without a difference: 5% of the p-values are at most 5%, 1% at most 1%."""
     rng = np.random.default_rng(6)
     p_values = np.empty((1500, len(MEASURED)))
     for world in p_values:
@@ -142,7 +139,5 @@ def test_p_values_are_right_as_often_as_they_say(count: int, volatilities: int) 
         world[:] = [2 * min(found[key].tails()) for key in MEASURED]
     for level, tolerance in ((0.05, 0.018), (0.01, 0.009)):  # three standard errors
         rates = dict(zip(MEASURED, (p_values <= level).mean(axis=0), strict=True))
-        if volatilities == 3 and count == 120:
-            assert rates.pop("volatility") <= 3 * level, rates
         assert max(rates.values()) <= level + tolerance, rates
         assert volatilities or min(rates.values()) >= level - tolerance, rates

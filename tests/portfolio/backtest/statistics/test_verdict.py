@@ -264,7 +264,7 @@ def test_luck_in_words(assessment: Assessment) -> None:
         "less than the usual 95%."
     )
     assert said(-0.9, 0.0, 0.9499999, 1).endswith(
-        "-0.90, may be luck: the probability that the true one exceeds zero is 94.9%, "
+        "-0.90, is no sign of skill: the probability that the true one exceeds zero is 94.9%, "
         "less than the usual 95%."
     )
     assert "is more than luck is likely to explain" in said(0.9, 0.31, 0.95, 10)

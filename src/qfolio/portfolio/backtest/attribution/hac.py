@@ -2,7 +2,9 @@
 
 Newey & West (1987), "A simple, positive semi-definite, heteroskedasticity and autocorrelation
 consistent covariance matrix"; the number of lags is chosen from the data as for Bartlett's kernel
-in Newey & West (1994), "Automatic lag selection in covariance matrix estimation".
+in Newey & West (1994), "Automatic lag selection in covariance matrix estimation". Residuals are
+those of a fit without their own row, e/(1 − h) where h is the row's leverage, as in HC3 of MacKinnon
+& White (1985): with few rows and several regressors, errors are too small otherwise.
 """
 
 import math
@@ -11,6 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from qfolio.core.arrays import Floats
+
+
+LEAST = 1e-6
+"""Least distance of a leverage from 1, at which a row alone decides a coefficient."""
 
 
 class Regression(NamedTuple):
@@ -36,21 +42,22 @@ def regress(values: Floats, regressors: Floats) -> Regression:
         regressors: Shape (T, K), not collinear, K + 1 < T; K may be 0.
 
     Returns:
-        Estimates whose variances are those of Newey & West, times T / (T − K − 1).
+        Estimates whose variances are those of Newey & West, of residuals over 1 − leverage.
     """
     count = len(values)
     design = np.concatenate([np.ones((count, 1)), regressors], axis=1)
     coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
     residuals = values - design @ coefficients
-    scores = design * residuals[:, None]
+    bread = np.linalg.inv(design.T @ design)
+    leverage = np.einsum("tk,kl,tl->t", design, bread, design)
+    scores = design * (residuals / np.maximum(1 - leverage, LEAST))[:, None]
     # As in the paper, the intercept does not count in the choice of lags, unless it is alone.
     lags = newey_west_lags(scores[:, 1:].sum(1) if regressors.shape[1] else scores[:, 0])
     middle = scores.T @ scores
     for lag in range(1, lags + 1):
         crossed = scores[lag:].T @ scores[:-lag]
         middle += (1 - lag / (lags + 1)) * (crossed + crossed.T)
-    bread = np.linalg.inv(design.T @ design)
-    variance = np.diag(bread @ middle @ bread) * count / (count - design.shape[1])
+    variance = np.diag(bread @ middle @ bread)
     total = float(((values - values.mean()) ** 2).sum())
     r2 = 1 - float((residuals**2).sum()) / total if total > 0 else 0.0
     return Regression(coefficients, np.sqrt(np.maximum(variance, 0.0)), r2, lags)

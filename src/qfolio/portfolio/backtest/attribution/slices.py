@@ -58,7 +58,7 @@ class Slices(msgspec.Struct, frozen=True):
     asset: str
     partner: str
     holding: Slice  # against the weight held
-    signals: list[Slice]
+    signals: list[Slice]  # those that vary in the test
 
 
 def slices(
@@ -120,6 +120,7 @@ def slices(
                 bool(same),
             )
             for i, (name, same) in enumerate(zip(names, shared, strict=True))
+            if grids[i][0] < grids[i][-1]
         ],
     )
 

@@ -36,8 +36,8 @@ SLOW = 0.8
 """Cosine transforms a year for a difference in volatility: they take two years and a half or more
 for a period."""
 
-FEWEST = 4
-"""Cosine transforms of a test that is shorter than five years."""
+FEWEST = 2
+"""Cosine transforms of a test that is shorter than that: it shows little of volatility."""
 
 
 def clear(difference: ArrayLike) -> Floats:

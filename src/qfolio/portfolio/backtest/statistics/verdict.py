@@ -225,6 +225,8 @@ def _luck(subject: str, test: SharpeTest, best: str = "") -> str:
     claim, shortfall = "is more than luck is likely to explain", ""
     if not test.deflated >= LEVEL:
         claim, shortfall = "may be luck", ", less than the usual 95%"
+        if test.ratio <= 0:
+            claim = "is no sign of skill"
     return (
         f"{subject}, {_number(test.ratio, 2)}, {claim}: the probability that the true one exceeds "
         f"{bar} is {_number(chance, 1)}%{shortfall}."
