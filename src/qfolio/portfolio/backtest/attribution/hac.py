@@ -14,7 +14,6 @@ import numpy as np
 
 from qfolio.core.arrays import Floats
 
-
 LEAST = 1e-6
 """Least distance of a leverage from 1, at which a row alone decides a coefficient."""
 
