@@ -3,8 +3,8 @@
 Newey & West (1987), "A simple, positive semi-definite, heteroskedasticity and autocorrelation
 consistent covariance matrix"; the number of lags is chosen from the data as for Bartlett's kernel
 in Newey & West (1994), "Automatic lag selection in covariance matrix estimation". Residuals are
-those of a fit without their own row, e/(1 − h) where h is the row's leverage, as in HC3 of MacKinnon
-& White (1985): with few rows and several regressors, errors are too small otherwise.
+those of a fit without their own row, e/(1 − h) where h is the row's leverage (HC3, MacKinnon &
+White 1985): with few rows and several regressors, errors are too small otherwise.
 """
 
 import math
