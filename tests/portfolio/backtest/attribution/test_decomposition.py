@@ -70,6 +70,24 @@ def test_constant_weights_have_no_timing():
     assert parts.static == pytest.approx(parts.net, abs=1e-12)
 
 
+def test_equal_weights_of_what_is_there_have_neither_tilts_nor_timing():
+    """Each asset joins or leaves; an agent that holds twice as much of one is tilted only."""
+    rng = np.random.default_rng(3)
+    returns = np.concatenate([np.zeros((400, 1)), rng.normal(3e-4, 0.02, (400, 4))], 1)
+    there = np.ones((400, 4), bool)
+    there[:150, 0] = there[250:, 1] = False
+    even = np.concatenate([np.zeros((400, 1)), there / there.sum(1, keepdims=True)], 1)
+    tilted = even + np.array([0, 0, 0, 0.1, -0.1])
+    for weights, tilts in ((even, 0.0), (tilted, 252 * 0.1 * (returns @ [0, 0, 0, 1, -1]).mean())):
+        net = (weights * returns).sum(1)
+        names, folds = list("abcd"), {"all": slice(0, 400)}
+        parts = decompose(net, weights, returns, folds, names, 252, there)
+        assert parts.tilts == pytest.approx(tilts, abs=1e-12)
+        assert parts.timing == pytest.approx(0, abs=1e-12)
+        assert sum(each.static for each in parts.assets) == pytest.approx(parts.static, abs=1e-12)
+        assert parts.net == pytest.approx(parts.static + parts.timing - parts.cost, abs=1e-12)
+
+
 def test_a_holding_that_drifts_has_no_skill():
     """Its timing and its tilts are artefacts of mean weights that are known at the end only."""
     rng = np.random.default_rng(2)

@@ -4,7 +4,8 @@ A day's net return is R = Σᵢ wᵢrᵢ − c, with weights w after the trade, 
 while they were held, and the day's cost c. Over all days the mean of Σᵢ wᵢrᵢ is Σᵢ w̄ᵢr̄ᵢ, what
 constant weights would have earned, plus Σᵢ cov(wᵢ, rᵢ), what was earned by holding more of an asset
 on its better days (Lo 2008, "Where do alphas come from?"). All parts are arithmetic and add up
-exactly.
+exactly. Where assets come and go, equal weights differ from day to day; so the weights that are
+constant are those in excess of equal weights, and equal weights alone have no timing.
 
 The mean weights are known only at the end, and those of a holding that drifts are high for the
 assets that did well. So a holding that is never traded seems to lose by timing what it seems to
@@ -26,14 +27,15 @@ class AssetPart(msgspec.Struct, frozen=True):
 
     name: str
     weight: float  # the mean
-    static: float  # mean weight times mean return
-    timing: float  # covariance of weight and return
+    static: float  # what the mean of its weight earned, in excess of a changing equal weight
+    timing: float  # covariance of that weight and return
 
 
 class FoldPart(msgspec.Struct, frozen=True):
     """A fold's parts, annualized over its own days: static + timing − cost = net.
 
-    static: return of the mean weights of the whole test. timing: return of departures from them.
+    static: return of the mean weights (in excess of equal weights) of the whole test. timing:
+    return of departures from them.
     """
 
     name: str
@@ -81,22 +83,25 @@ def decompose(
         open_to: Whether an asset could be held on a day, shape (D, N) (default: all could).
     """
     year = periods_per_year
-    mean, there = weights.mean(0), np.ones_like(weights[:, 1:]) if open_to is None else open_to
-    equal = (there * returns[:, 1:]).sum(1) / np.maximum(there.sum(1), 1)
-    static, timed = returns @ mean, ((weights - mean) * returns).sum(1)
-    cost = (weights * returns).sum(1) - net
-    by_asset = ((weights - mean) * returns).mean(0)
+    there = np.ones_like(weights[:, 1:]) if open_to is None else open_to
+    even = np.zeros_like(weights)
+    even[:, 1:] = there / np.maximum(there.sum(1, keepdims=True), 1)
+    active = weights - even
+    parts, moves = weights * returns, (active - active.mean(0)) * returns
+    equal, earned, timed = (even * returns).sum(1), parts.sum(1), moves.sum(1)
+    static, cost = earned - timed, earned - net
+    constant = (parts - moves).mean(0)
     return Decomposition(
         net=year * float(net.mean()),
         equal=year * float(equal.mean()),
         tilts=year * float((static - equal).mean()),
         timing=year * float(timed.mean()),
-        active_t=mean_t(static + timed - equal),
+        active_t=mean_t(earned - equal),
         cost=year * float(cost.mean()),
         assets=[
             AssetPart(name, float(weight), year * float(own), year * float(moved))
             for name, weight, own, moved in zip(
-                ("cash", *assets), mean, mean * returns.mean(0), by_asset, strict=True
+                ("cash", *assets), weights.mean(0), constant, moves.mean(0), strict=True
             )
         ],
         folds=[
