@@ -63,7 +63,8 @@ def test_a_backtest_says_what_is_implausible_in_its_table(tmp_path, capsys):
     prices = pd.DataFrame(np.exp(moves.cumsum(0)), pd.date_range("2020-01-01", periods=260), NAMES)
     path = tmp_path / "prices.csv"
     prices.rename_axis("date").to_csv(path)
-    Options().load(path)
+    doubts = Options().load(path).note
+    assert "row 202 (2020-07-19), column 'B': the price" in doubts  # on the report's page
     printed = " ".join(capsys.readouterr().out.split())
     assert "Warning: prices.csv, row 202 (2020-07-19), column 'B': the price" in printed
     assert "close to 1/2: perhaps a split that was not adjusted" in printed

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.text import hint, quote
+from qfolio.core.text import amount, hint, quote
 from qfolio.portfolio.prices import folder, reading
 from qfolio.portfolio.prices.checks import Choices, examine
 from qfolio.portfolio.prices.columns import text_columns
@@ -31,6 +31,9 @@ DEFAULT_NOTE = (
 )
 OF_ALL = ("delisting_haircut", "members")
 """Choices that apply to a whole table, not to each file of a folder."""
+
+CAVEATS = 3
+"""Warnings that a table's note has in full."""
 
 DEFAULT_TRIALS = 222
 """Earlier trials on the default table, as docs/results/real_prices.md lists them."""
@@ -290,7 +293,10 @@ def load(
 
 
 def accepted(prices: Prices | None, findings: Sequence[Finding], source: Any) -> Prices:
-    """The prices that ``inspect`` found in a source; a QfolioError with its errors if none."""
+    """The prices that ``inspect`` found in a source, with a note of its warnings.
+
+    Raises QfolioError with the errors if it found none.
+    """
     if prices is None:
         errors = [finding for finding in findings if finding.severity == "error"]
         shown = "; ".join(str(finding) for finding in errors[:2])
@@ -299,7 +305,12 @@ def accepted(prices: Prices | None, findings: Sequence[Finding], source: Any) ->
         advice = " ".join(dict.fromkeys(f.advice for f in errors[:2] if f.advice))
         label = f"{quote(Path(source).name)}: " if isinstance(source, str | Path) else ""
         raise QfolioError(f"{label}{shown}{more}.{' ' * bool(advice)}{advice}")
-    return prices
+    if not (doubts := [finding for finding in findings if finding.severity == "warning"]):
+        return prices
+    rest = sum(finding.count for finding in doubts[CAVEATS:])
+    said = [f"{finding}." for finding in doubts[:CAVEATS]]
+    said += [f"And {amount(rest, 'more warning')}."] * bool(rest)
+    return replace(prices, note=" ".join([*filter(None, [prices.note]), *said]))
 
 
 def inspect(source: Any = None, **choices: Any) -> tuple[Prices | None, list[Finding]]:
