@@ -293,7 +293,9 @@ def load(
 
 
 def accepted(prices: Prices | None, findings: Sequence[Finding], source: Any) -> Prices:
-    """The prices that ``inspect`` found in a source, with a note of its warnings.
+    """The prices that ``inspect`` found in a source (None: the default table).
+
+    Their note has the warnings.
 
     Raises QfolioError with the errors if it found none.
     """
@@ -305,7 +307,8 @@ def accepted(prices: Prices | None, findings: Sequence[Finding], source: Any) ->
         advice = " ".join(dict.fromkeys(f.advice for f in errors[:2] if f.advice))
         label = f"{quote(Path(source).name)}: " if isinstance(source, str | Path) else ""
         raise QfolioError(f"{label}{shown}{more}.{' ' * bool(advice)}{advice}")
-    if not (doubts := [finding for finding in findings if finding.severity == "warning"]):
+    doubts = [finding for finding in findings if finding.severity == "warning"]
+    if source is None or not doubts:  # the default table's have been looked at
         return prices
     rest = sum(finding.count for finding in doubts[CAVEATS:])
     said = [f"{finding}." for finding in doubts[:CAVEATS]]
