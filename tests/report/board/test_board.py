@@ -100,6 +100,17 @@ def test_another_run_in_the_same_folder_takes_the_place_of_the_first(tmp_path):
     assert detail["begun"] == later["time"]
 
 
+def test_a_log_that_was_cut_is_read_again(tmp_path):
+    write(tmp_path, start(), RUNNING, *(record(step, step) for step in range(9)))
+    experiment, log = read_again(tmp_path), tmp_path / EVENTS
+    log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[:4]))
+    experiment.refresh(2)
+    assert len(experiment.jobs[""].curves["return"].points) == 2
+    write(tmp_path, record(20, 1.0))
+    experiment.refresh(3)
+    assert [point[0] for point in experiment.jobs[""].curves["return"].points] == [0, 1, 20]
+
+
 def test_a_long_log_is_read_in_several_answers(tmp_path, monkeypatch):
     monkeypatch.setattr(events, "CHUNK", 100)
     write(tmp_path, start(), RUNNING, *(record(step, step) for step in range(50)))

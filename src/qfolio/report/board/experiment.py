@@ -181,7 +181,8 @@ class Experiment:
         """
         try:
             status = self.log.stat()
-            if status.st_size != self._offset and (first := _first_line(self.log)) != self._first:
+            first = _first_line(self.log) if status.st_size != self._offset else self._first
+            if status.st_size < self._offset or first != self._first:
                 self._forget()
                 self._first, self.version = first, version
             self._touched = status.st_mtime
