@@ -5,7 +5,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
+from qfolio.core.errors import QfolioError
 from qfolio.core.mdp import Agent, Simplex, Task
+from qfolio.core.registry import own_modules
 from qfolio.core.training import episode_steps
 
 OFF = 1e-3
@@ -42,10 +44,10 @@ def find(task: Task, agent: Agent, seed: int) -> str | None:
     return None
 
 
-def off_simplex(task: Task, agent: Agent) -> str | None:
-    """A sentence on weights of an untrained agent that nobody can hold; None if there are none."""
-    if not isinstance(task.actions, Simplex):
-        return None
+def require_weights(task: Task, agent: Agent) -> None:
+    """Raises QfolioError if a user's own agent, untrained, gives weights that nobody can hold."""
+    if not (isinstance(task.actions, Simplex) and own_modules(agent)):
+        return
 
     def chosen(key: PRNGKeyArray) -> dict[str, Array]:
         agent_key, reset_key, act_key = jax.random.split(key, 3)
@@ -58,12 +60,11 @@ def off_simplex(task: Task, agent: Agent) -> str | None:
     for method, weights in jax.jit(chosen)(jax.random.key(0)).items():
         sums = weights.sum(-1)
         if float(weights.min()) < -OFF or float(abs(sums - 1).max()) > OFF:
-            return (
+            raise QfolioError(
                 f"{type(agent).__name__}.{method} gives weights of at least "
                 f"{float(weights.min()):.3g} that sum to {float(sums[0]):.3g}; weights, cash "
                 "first, must be at least 0 and sum to 1, as a softmax is."
             )
-    return None
 
 
 def _finite(task: Task, agent: Agent, key: PRNGKeyArray) -> tuple[Bool[Array, " time"], ...]:

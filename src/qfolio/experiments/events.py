@@ -27,11 +27,10 @@ CONTRAST = "contrast"
 
 BEAT, SILENT = 2.0, 10.0
 
-Event = dict[str, Any]
-
-
 CHUNK = 2**21
 """Bytes of a log that are read at once, besides the rest of a line."""
+
+Event = dict[str, Any]
 
 
 def read(path: Path, offset: int = 0) -> tuple[list[Event], int]:

@@ -11,7 +11,6 @@ from qfolio.core.errors import QfolioError, require_whole
 from qfolio.core.evaluation import greedy, start_keys
 from qfolio.core.mdp import Optimum
 from qfolio.core.population import Population
-from qfolio.core.registry import own_modules
 from qfolio.core.statistics import mean_interval, regret
 from qfolio.core.text import listed
 from qfolio.experiments.budget import MOST_STARTS
@@ -27,8 +26,7 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
     if starts is not None:
         require_whole("starts", starts, 1, MOST_STARTS)
     task, keys = population.task, start_keys(starts or population.starts)
-    if own_modules(population.agent) and (fault := faults.off_simplex(task, population.agent)):
-        raise QfolioError(fault)
+    faults.require_weights(task, population.agent)
     played = population.evaluate(keys)
     returns = played.returns.mean(1)
     if not np.isfinite(returns).all():  # although all losses were: no file could hold it

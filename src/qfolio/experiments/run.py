@@ -10,11 +10,11 @@ import jax
 import numpy as np
 
 from qfolio.core import devices, faults
-from qfolio.core.errors import QfolioError, require_type
+from qfolio.core.errors import require_type
 from qfolio.core.files import locked, new_folder, path_of, require_new
 from qfolio.core.mdp import Agent, Task
 from qfolio.core.notebook import card, number
-from qfolio.core.registry import own_modules, short
+from qfolio.core.registry import short
 from qfolio.core.text import amount
 from qfolio.experiments.budget import Budget, require_budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
@@ -85,8 +85,7 @@ class Run(Seeds):
         if place is not None:
             require_new(place)
         run = cls(task, agent, config, None)
-        if own_modules(agent) and (fault := faults.off_simplex(task, agent)):
-            raise QfolioError(fault)
+        faults.require_weights(task, agent)
         if place is not None:
             with new_folder(place) as unfinished:
                 run._folder = RunFolder(unfinished)

@@ -127,7 +127,8 @@ class Plan:
         """Raises QfolioError if an agent cannot begin, such as one with a wrong menu or rollout.
 
         Some settings can be checked only with a task. Only shapes are traced: of all methods of a
-        user's own agent, which takes seconds, and otherwise of ``init``.
+        user's own agent, which takes seconds, and otherwise of ``init``. The first weights of one's
+        own agent are computed, too.
         """
         key, seed = jax.random.key(0), jnp.uint32(0)
         for name, agent in self.agents.items():
@@ -135,8 +136,7 @@ class Plan:
             try:
                 if own_modules(agent):
                     jax.eval_shape(partial(begin, task, agent), seed)
-                    if fault := faults.off_simplex(task, agent):
-                        raise QfolioError(fault)
+                    faults.require_weights(task, agent)
                 else:
                     jax.eval_shape(partial(agent.init, task), key)
             except QfolioError as error:

@@ -140,9 +140,9 @@ class Study:
         with new_folder(place) as folder:
             files = StudyFolder(folder)
             for name, table in tables.items():
-                try:
-                    require_fold(table.dates, train, test, max(lags, default=1))
-                    with of_table(name):
+                with of_table(name):
+                    try:
+                        require_fold(table.dates, train, test, max(lags, default=1))
                         for variant in variants:
                             Backtest.create(
                                 table,
@@ -156,9 +156,9 @@ class Study:
                                 out=files.place(name, variant),
                                 **options,
                             )
-                except TooFewRowsError as error:
-                    left_out[name] = str(error).removeprefix(f"{name}: ")
-                    shutil.rmtree(files.table(name), ignore_errors=True)
+                    except TooFewRowsError as error:
+                        left_out[name] = str(error)
+                        shutil.rmtree(files.table(name), ignore_errors=True)
             if len(left_out) == len(tables):
                 reasons = (f"{name} is too short: {why}" for name, why in left_out.items())
                 raise QfolioError(" ".join(reasons))

@@ -100,4 +100,4 @@ def of_table(name: str) -> Iterator[None]:
     try:
         yield
     except QfolioError as error:
-        raise type(error)(f"{name}: {error}") from None
+        raise QfolioError(f"{name}: {error}") from None
