@@ -188,6 +188,13 @@ def test_the_report_says_what_happened(content):
     assert "does not settle" in verdict(content)
 
 
+def test_the_verdict_says_which_way_had_too_few_steps_to_learn(content):
+    renewed = {**content["courses"]["renewed"], "steps": [0, 8]}
+    found = verdict({**content, "courses": {**content["courses"], "renewed": renewed}})
+    assert "Renewed learning learned nothing: it begins after 8 environment steps" in found
+    assert "A new agent does not settle" in found
+
+
 def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):
     folder = tmp_path / "there"
     words = ["continual", "pendulum", "--change", "mass=1.5", "--episodes", 8, "--seeds", 2]

@@ -54,7 +54,7 @@ def allocate(
         holdings: Table with a column of assets (asset, symbol, ticker) and one of shares (shares,
             quantity, qty); a row "cash" holds money (default: all is cash). Shares sold short and
             loans are negative, where the mandate allows them.
-        capital: Cash to invest, unless the holdings include a cash row.
+        capital: Cash to invest; not beside holdings that have a cash row.
         agent: Agent to follow; or a baseline such as equal-weight, the benchmark or a strategy of
             your own, if the backtest has it (default: the first agent of the backtest).
         anyway: Allocate even if the backtest is not finished, or found the agent worse than the

@@ -67,8 +67,9 @@ def train(
             double-q or dyna-q; for markets pathwise; or your own as module:Name.
         preset: Preset of the agent (default: fast). DQN on the pendulum also has best, categorical,
             rainbow and report (the settings of the report that qfolio grew out of).
-        episodes: Training episodes of each seed (default: the preset's number). Episodes of DQN's
-            presets fast and best are short: 28 and 40 steps.
+        episodes: Training episodes of each seed, or a few more where environments side by side
+            finish theirs together (default: the preset's number). Episodes of DQN's presets fast
+            and best are short: 28 and 40 steps.
         steps: Environment steps of each seed, instead of episodes.
         seeds: Number of seeds trained side by side (default: the preset's number).
         seed: First seed; the others follow it (default: 0).
@@ -322,6 +323,7 @@ def write_again(folder: Path) -> None:
 def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
     from qfolio.commands.console import say, working
     from qfolio.commands.console.training import print_result, print_rule
+    from qfolio.experiments.budget import unlearned
     from qfolio.report.collect import report_data
     from qfolio.report.training import write_report
 
@@ -332,6 +334,8 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
     print_result(run.population.seeds, summary)
     if summary["rule"]:
         print_rule(summary["rule"])
+    if why := unlearned(run.agent, summary["env_steps"]):
+        say(f"The agent {why}")
     say(
         f"{summary['env_steps'] * summary['seeds']:,} steps in {summary['seconds_train']:.1f} s of "
         f"training ({summary['steps_per_second']:,.0f} a second), "

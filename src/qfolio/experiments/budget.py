@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from qfolio.core.errors import QfolioError, require_type, require_whole
 
 if TYPE_CHECKING:
+    from qfolio.core.mdp import Agent
     from qfolio.core.population import Population
 
 
@@ -61,6 +62,20 @@ def require_budget(value: object) -> Budget:
     require_type("budget", value, Budget, "a budget, such as Budget(episodes=100)")
     assert isinstance(value, Budget)
     return value
+
+
+def unlearned(agent: "Agent", steps: int) -> str:
+    """Why an agent learned nothing in ``steps`` steps of all its environments; empty if it did.
+
+    The verb and the rest of a sentence whose subject is the agent.
+    """
+    stored = agent.warm_up() * agent.num_envs
+    if steps > stored:
+        return ""
+    return (
+        f"learned nothing: it begins after {stored:,} environment steps, and a seed had {steps:,}. "
+        "Give it more episodes or steps, or lower learning_starts."
+    )
 
 
 def seed_range(seeds: int, seed: int) -> range:

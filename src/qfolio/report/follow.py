@@ -89,7 +89,7 @@ def draw_following(rows: LiveRows, width: float) -> Figure:
     # With fewer, no step fits between 18 and 24 months, and matplotlib warns.
     ticks = AutoDateLocator(minticks=2, maxticks=5 if few else 8)
     below.xaxis.set_major_locator(ticks)
-    below.xaxis.set_major_formatter(ConciseDateFormatter(ticks, show_offset=False))
+    below.xaxis.set_major_formatter(ConciseDateFormatter(ticks))
     marks = {"live": live, rows.benchmark_name: other, "backtest, median": median, "95%": shade}
     legend_above(figure, marks)
     return figure

@@ -28,7 +28,7 @@ from qfolio.core.notebook import card, number
 from qfolio.core.statistics import regret
 from qfolio.core.text import amount, listed
 from qfolio.core.training import begin
-from qfolio.experiments.budget import Budget, seed_range
+from qfolio.experiments.budget import Budget, seed_range, unlearned
 from qfolio.experiments.comparison.conclusion import conclusion
 from qfolio.experiments.comparison.measure import measure
 from qfolio.experiments.comparison.ranking import Result, rank
@@ -323,6 +323,9 @@ class Comparison:
             said = "; ".join(filter(None, differing))
             notes.append(f"Task settings differ between agents: {said}. {self._comparable()}")
         steps = {name: self.results[name].env_steps for name in entrants}
+        for name, entrant in entrants.items():
+            if why := unlearned(entrant.agent, steps[name]):
+                notes.append(f"{name} {why}")
         most, least = max(steps, key=lambda n: steps[n]), min(steps, key=lambda n: steps[n])
         if steps[most] > 1.05 * steps[least]:
             notes.append(

@@ -33,13 +33,13 @@ def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> 
     # The last day of every block, preceded by the start.
     ends = np.arange(days - 1, -1, -days_per_point(days))[::-1]
     start = data.dates[:1] - min(np.timedelta64(1, "D"), *np.diff(data.dates[:2]))
-    months, firsts = np.unique(data.dates.astype("datetime64[M]"), return_index=True)
+    _, firsts = np.unique(data.dates.astype("datetime64[M]"), return_index=True)
     window = rolling_window(data)
     return {
         "themes": {"light": palette.LIGHT, "dark": palette.DARK},
         "dates": texts(np.concatenate([start, data.dates[ends]])),
         "hidden": [place for place, name in enumerate(names) if name in faint_names(data)],
-        "months": texts(months.astype("datetime64[D]")),
+        "months": texts(data.dates[firsts]),
         "strategies": [
             {
                 "color": looks[name].color,

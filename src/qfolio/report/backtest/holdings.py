@@ -64,6 +64,7 @@ def _rows(
     return {
         "names": ["Cash", *(assets[asset - 1] for asset in top)]
         + [f"{len(rest)} others"] * bool(rest),
+        "others": bool(rest),  # the last row is a sum
         "values": [compact(value, 3) for value in values],
         "active": [np.round(each, 4).tolist() for each in active],
         "effective": compact(_averages(effective_number(weights), blocks), 3),

@@ -31,7 +31,7 @@ HEADINGS = {
 }
 
 _MEASURED: dict[Measured, str] = {
-    "growth": "Growth",
+    "growth": "Log growth",
     "sharpe": "Sharpe",
     "volatility": "Volatility",
 }

@@ -10,6 +10,7 @@ import numpy as np
 
 from qfolio.core.arrays import Floats
 from qfolio.core.text import plural
+from qfolio.portfolio.backtest.folds import spell
 from qfolio.portfolio.backtest.statistics.tearsheet import (
     alpha,
     contributions,
@@ -155,7 +156,7 @@ def _drawdowns(series: StrategySeries, data: BacktestData) -> list[list[str]]:
     def spelled(place: int | None) -> str:
         if place is None:
             return "not yet"
-        return str((days[0] - before if place < 0 else days[place]).astype("datetime64[D]"))
+        return spell(days[0] - before if place < 0 else days[place], days)
 
     unit = unit_of(data.assessment.periods_per_year)
     return [

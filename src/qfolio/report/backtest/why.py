@@ -6,7 +6,7 @@ stand beside them as text.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -31,12 +31,14 @@ def why_sections(data: BacktestData) -> list[dict[str, Any]]:
     """The section's content for each agent that has an attribution."""
     if data.why is None:
         return []
+    begun = {fold["name"]: fold["test_first"] for fold in data.folds}
     return [
         {
             "name": name,
             "headline": headline(name, why.decomposition),
             "parts": _parts(why.decomposition),
-            "folds": _folds(why.decomposition),
+            "folds": _folds(why.decomposition, begun),
+            "last": data.folds[-1]["test_last"],
             "assets": _assets(why.decomposition),
             "others": len(why.decomposition.assets) > LISTED + 2,
             "exposures": _exposures(why.exposures, data.why.reference),
@@ -95,11 +97,12 @@ def _parts(parts: Decomposition) -> list[dict[str, Any]]:
     ]
 
 
-def _folds(parts: Decomposition) -> list[dict[str, Any]]:
+def _folds(parts: Decomposition, begun: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Bars and figures of the folds, each named by the first day of its test."""
     highest = max((abs(fold.timing) for fold in parts.folds), default=0.0) or 1.0
     return [
         {
-            "name": fold.name,
+            "name": begun.get(fold.name, fold.name),
             "height": round(50 * abs(fold.timing) / highest, 2),
             "side": "gain" if fold.timing >= 0 else "loss",
             "cells": [

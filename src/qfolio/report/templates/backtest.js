@@ -62,7 +62,7 @@
         yaxis: { type: "log", domain: [0.36, 1], tickvals: ticks, ticktext: ticks.map(tidy),
           range: [Math.log10(low / margin), Math.log10(high * margin)] },
         yaxis2: { domain: [0, 0.26], range: [Math.min(1.08 * deepest, -0.001), 0],
-          tickformat: ".0%", nticks: 5 },
+          tickformat: "~%", nticks: 5 },
         shapes: [{ yref: "y", y0: 1, y1: 1 }, { yref: "y2", y0: 0, y1: 0 }],
       }), options("wealth")).then(() => nameEnds("wealth", "yaxis", "wealth", view, (value) =>
       Math.log10(value / (low / margin)) / Math.log10(high / low * margin ** 2)));

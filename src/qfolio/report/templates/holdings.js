@@ -12,9 +12,10 @@
   const rows = (series) => [...series.names.keys()].slice(1).concat(0);
   const margin = () => (narrow.matches ? { l: 92, r: 58 } : { l: 150, r: 66 });
 
-  /** Half of the width of the colors: most values are within it. */
+  /** Half of the width of the colors: most values of single assets are within it. */
   function reach(series) {
-    const sizes = series.active.flat().map(Math.abs).sort((a, b) => a - b);
+    const single = series.others ? series.active.slice(0, -1) : series.active;
+    const sizes = single.flat().map(Math.abs).sort((a, b) => a - b);
     return Math.max(sizes[Math.floor(0.99 * (sizes.length - 1))], 0.005);
   }
 

@@ -48,8 +48,8 @@ const tools = (() => {
       xaxis: {
         type: "date", showgrid: false, linecolor: text, ticks: "outside", tickcolor: text,
         ticklen: 4, nticks: narrow.matches ? 5 : 9,
-        // With their years below, months need not be turned to fit.
-        tickformatstops: narrow.matches ? [{ dtickrange: ["M1", "M6"], value: "%b\n%Y" }] : [],
+        // With their years below, months fit without being turned, which would cut them off.
+        tickangle: 0, tickformatstops: [{ dtickrange: ["M1", "M6"], value: "%b\n%Y" }],
         showspikes: true, spikemode: "across", spikesnap: "hovered data", spikedash: "solid",
         spikethickness: 1, spikecolor: color("faint"), fixedrange: coarse.matches, ...more.xaxis,
       },
