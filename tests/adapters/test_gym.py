@@ -121,15 +121,26 @@ def test_gymnasium_finds_nothing_to_warn_of(task):
 
 
 @pytest.mark.parametrize("lag", [0, 1, 3])
-@pytest.mark.parametrize("task", [{}, {"menu": "tilts:0.3"}, {"max_weight": 0.4}])
+@pytest.mark.parametrize(
+    "task",
+    [
+        {},
+        {"menu": "tilts:0.3"},
+        {"max_weight": 0.4},
+        # A fee that takes the more of the wealth, the less of it is left.
+        {"cost_model": "itemized(cost=0.01,fixed=4,capital=1000)"},
+    ],
+)
 def test_its_wealth_is_that_of_the_replay(lag, task):
     env, prices = environment(lag=lag, **task), table()
+    costs = env.unwrapped.task.costs
+    terms = {"cost": costs, "lag": lag, "conditions": Conditions.of(prices, costs)}
     for start in (env.unwrapped.first, 20, env.unwrapped.last):
         (_, _, begun), *steps = play(env, options={"start": start})
         assert len(steps) == HORIZON
         infos = [info for _, _, info in steps]
         decisions = np.array([info["target"] for info in infos])
-        replay = simulate(prices.values, decisions, first=start, cost=0.01, lag=lag)
+        replay = simulate(prices.values, decisions, first=start, **terms)
         wealth = [begun["wealth"], *(info["wealth"] for info in infos)]
         np.testing.assert_allclose(wealth, replay.wealth, rtol=1e-12)
         np.testing.assert_allclose([info["cost"] for info in infos], replay.cost, atol=1e-12)

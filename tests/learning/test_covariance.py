@@ -18,9 +18,9 @@ def returns(rows=500, assets=4, seed=0):
 
 
 def exact(**changes):
-    """Without shrinkage or a network; half-lives so long that all rows count alike."""
+    """Without limits, shrinkage or a network; half-lives so long that all rows count alike."""
     start = Covariance(3, jax.random.key(0))
-    values = {"volatility": 20.0, "correlation": 20.0, "shrinkage": -30.0, **changes}
+    values = {"volatility": 20.0, "correlation": 20.0, "limit": 9.0, "shrinkage": -30.0, **changes}
     where = lambda c: [getattr(c, name) for name in values]  # noqa: E731
     return eqx.tree_at(where, start, [jnp.asarray(x) for x in values.values()])
 
@@ -39,6 +39,19 @@ def test_half_lives_weigh_late_rows_more():
     early = 0.5 - 0.5**10  # what the rows before the last ten weigh, over all but what is cut
     ratio = (0.5 / (early + 0.5 * 0.25)) * 1.0
     np.testing.assert_allclose(found[0, 0] / found[1, 1], ratio, rtol=0.01)
+
+
+def test_a_crash_counts_up_to_the_limit():
+    """A day of 50 deviations, which alone would make the asset look seven times as volatile."""
+    seen = np.array(returns())
+    seen[0, 100] = 50 * seen[0].std()
+    found = np.asarray(exact(limit=np.log(2.0))(jnp.asarray(seen), ALL), float)
+    most = 2 * np.sqrt((seen**2).mean(1, keepdims=True))
+    cut = most * np.tanh(seen / most)
+    moments = cut @ cut.T / seen.shape[1]
+    np.testing.assert_allclose(found, moments / np.trace(moments) * 4, rtol=1e-3, atol=1e-3)
+    plain = np.asarray(exact()(jnp.asarray(seen), ALL), float)
+    assert plain[0, 0] / plain[1, 1] > 3 * found[0, 0] / found[1, 1]
 
 
 def test_the_identity_takes_its_share_of_the_correlations():

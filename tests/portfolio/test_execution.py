@@ -11,7 +11,8 @@ from qfolio.portfolio.backtest.folds import Fold
 from qfolio.portfolio.backtest.notes import called
 from qfolio.portfolio.backtest.orders import AT_EVERY_ROW, orders
 from qfolio.portfolio.backtest.replay import Replay
-from qfolio.portfolio.calendars import decision_rows, elapsed
+from qfolio.portfolio.calendars import calendar_years, decision_rows, elapsed
+from qfolio.portfolio.execution import Terms
 from qfolio.portfolio.following import begin
 from qfolio.portfolio.market import Holding
 from qfolio.portfolio.prices.table import Prices
@@ -161,6 +162,20 @@ def test_a_year_trades_no_more_than_its_budget(fill):
         assert (spent <= budget * (1 + (1e-4 if fill == 1 else 0.02))).all()
         assert (spent > 0.99 * budget).all()
     np.testing.assert_allclose(by_task(task, wanted), by_baseline(prices, task, wanted), atol=2e-4)
+
+
+@pytest.mark.parametrize("days", [["01-01"], ["12-31"], ["06-30", "12-31"], ["03-31"]])
+def test_each_calendar_year_has_a_budget_of_its_own(days):
+    """Also on rows of the same day of each year, leap years included."""
+    dates = np.array([f"{y}-{day}" for y in range(1990, 2030) for day in days], "datetime64[s]")
+    dates[-1] = np.datetime64("2029-12-31T23:59:59")  # rounds to 2030 in single precision
+    passed = calendar_years(dates).astype(np.float32)
+    terms = Terms(np.zeros(0, bool), passed, turnover=1.0)
+    plan = terms.begin(np.eye(4)[0], 0.7)
+    years = dates.astype("datetime64[Y]")
+    for row in range(len(dates) - 1):
+        spent = terms.next_row(row, plan, plan.order).spent
+        assert (spent == 0) == (years[row + 1] > years[row])
 
 
 def test_training_begins_with_some_of_the_budget_spent():

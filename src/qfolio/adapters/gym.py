@@ -162,6 +162,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             start=self._held,
             conditions=known,
             long_only=self.task.feasible.long_only,
+            wealth=self._wealth,
         )
         reward, self._memory = _programs().reward(self.task, self._memory, traded)
         coming = np.nan_to_num(values[1] / values[0], nan=1.0)

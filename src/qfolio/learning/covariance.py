@@ -2,9 +2,10 @@
 
 Its parts are those of Bongiorno, Manolakis & Mantegna (2025, "End-to-end large portfolio
 optimization for variance minimization with neural networks through covariance cleaning"): weights
-of past days, a cleaning of the eigenvalues of the correlations by a network that does not depend on
-the number of assets, and volatilities. Here the weights of days decay exponentially with their age,
-and the network sees one eigenvalue at a time.
+of past days, a limit to what the largest returns count, a cleaning of the eigenvalues of the
+correlations by a network that does not depend on the number of assets, and volatilities. Here the
+weights of days decay exponentially with their age, one limit serves all days, and the network sees
+one eigenvalue at a time.
 """
 
 import math
@@ -26,6 +27,9 @@ TINY = 1e-9
 class Covariance(eqx.Module):
     """The estimate Σ = D C D of volatilities D and cleaned correlations C.
 
+    Both see a return r as c tanh(r / c), so that a single day of a crash or a takeover does not
+    rule the estimate; c is a learned multiple of the asset's root mean square return.
+
     C has the eigenvectors of the weighted sample correlations. Their eigenvalues λ become
     ((1 − a)λ + a) exp(g(log λ, log λ₊)), with a learned share a of the identity and a layer g of
     tanh units; then the diagonal is made 1 again. λ₊ = (1 + √q)² is the largest eigenvalue of noise
@@ -34,14 +38,16 @@ class Covariance(eqx.Module):
 
     volatility: Float[Array, ""]  # log of a half-life in rows
     correlation: Float[Array, ""]  # likewise
+    limit: Float[Array, ""]  # log of that multiple
     shrinkage: Float[Array, ""]  # logit of a
     layer: Float[Array, "input unit"]
     offset: Float[Array, " unit"]
     output: Float[Array, " unit"]
 
     def __init__(self, units: int, key: PRNGKeyArray) -> None:
-        """Starts with half-lives of 60 and 250 rows, a = 10% and g = 0."""
+        """Starts with half-lives of 60 and 250 rows, a limit of 4, a = 10% and g = 0."""
         self.volatility, self.correlation = jnp.log(60.0), jnp.log(250.0)
+        self.limit = jnp.log(4.0)
         self.shrinkage = jnp.array(math.log(0.1 / 0.9))
         first, second = jax.random.split(key)
         self.layer = jax.random.normal(first, (2, units))
@@ -50,10 +56,11 @@ class Covariance(eqx.Module):
 
     @property
     def described(self) -> dict[str, Array]:
-        """Half-lives in rows and the share of the identity, as named scalars."""
+        """Half-lives in rows, the limit and the share of the identity, as named scalars."""
         return {
             "volatility_half_life": jnp.exp(self.volatility),
             "correlation_half_life": jnp.exp(self.correlation),
+            "limit": jnp.exp(self.limit),
             "shrinkage": jax.nn.sigmoid(self.shrinkage),
         }
 
@@ -65,7 +72,7 @@ class Covariance(eqx.Module):
         returns: in the same unit for all assets, the latest last. open_to: the assets that can be
         traded.
         """
-        returns = jnp.where(open_to[..., None], returns, 0.0)
+        returns = self._limited(jnp.where(open_to[..., None], returns, 0.0))
         weights = _decay(self.correlation, returns.shape[-1])
         seen = returns * jnp.sqrt(weights)
         count = open_to.sum(-1, keepdims=True)
@@ -75,6 +82,12 @@ class Covariance(eqx.Module):
         variance = (returns**2 @ _decay(self.volatility, returns.shape[-1])) + TINY
         scale = jnp.sqrt(variance / (variance.sum(-1, keepdims=True) / count))
         return cleaned * scale[..., :, None] * scale[..., None, :]
+
+    def _limited(
+        self, returns: Float[Array, "*batch asset time"]
+    ) -> Float[Array, "*batch asset time"]:
+        limit = jnp.exp(self.limit) * jnp.sqrt((returns**2).mean(-1, keepdims=True) + TINY)
+        return limit * jnp.tanh(returns / limit)
 
     def _cleaned(
         self, correlations: Float[Array, "*batch asset asset"], per_day: Float[Array, "*batch 1"]

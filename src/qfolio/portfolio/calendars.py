@@ -52,6 +52,16 @@ def elapsed(dates: NDArray[np.datetime64]) -> Floats:
     return np.asarray((dates - begin) / length)
 
 
+def calendar_years(dates: NDArray[np.datetime64]) -> Floats:
+    """Years since the first row's calendar year began, of shape (row,).
+
+    The whole part is another one in each calendar year, in single precision, too: the last hour of
+    a year is not rounded up into the next.
+    """
+    years = dates.astype("datetime64[Y]").astype(int)
+    return np.asarray(years - years[0] + np.minimum(elapsed(dates), 0.9999))
+
+
 def band(calendar: str) -> float:
     """How far some weight, cash included, must be from its target before there is an order.
 

@@ -17,9 +17,9 @@ class Plan(NamedTuple):
 class Terms(NamedTuple):
     """When orders are given, and how they are filled; arrays of numpy or jax.
 
-    decides: whether a decision is due at each row, shape (row,); no rows if always. elapsed: share
-    of the calendar year that has passed at each row, shape (row,); no rows unless ``turnover`` is
-    limited. band: an order is given only if some weight, cash included, is to change by more. fill:
+    decides: whether a decision is due at each row, shape (row,); no rows if always. elapsed: years
+    at each row, as ``calendars.calendar_years`` counts them, shape (row,); no rows unless
+    ``turnover`` is limited. band: an order is given only if some weight, cash included, is to change by more. fill:
     rows over which an order is filled, in equal parts. turnover: maximum in a calendar year, bought
     plus sold, as a multiple of wealth. called: sum of the assets' absolute weights above which a
     decision is due at any row (a margin call).
@@ -90,5 +90,6 @@ class Terms(NamedTuple):
         if len(self.elapsed):
             xp = spent.__array_namespace__()
             after = xp.minimum(row + 1, len(self.elapsed) - 1)
-            spent = xp.where(self.elapsed[after] < self.elapsed[row], 0.0, spent)
+            begins = xp.floor(self.elapsed[after]) > xp.floor(self.elapsed[row])
+            spent = xp.where(begins, 0.0, spent)
         return Plan(spent, order, plan.left)

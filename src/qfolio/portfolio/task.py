@@ -25,7 +25,7 @@ from qfolio.core.mdp import Actions, Box, Position, Simplex
 from qfolio.core.registry import own_modules
 from qfolio.portfolio import anchors, signals, universe
 from qfolio.portfolio.backtest.baselines import baseline
-from qfolio.portfolio.calendars import band, decision_rows, elapsed
+from qfolio.portfolio.calendars import band, calendar_years, decision_rows
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import cashed, require_sound
 from qfolio.portfolio.execution import Plan, Terms
@@ -65,7 +65,7 @@ class Portfolio(Market):
     scale: Float[Array, " channel"]  # divides each observed channel; likewise
     conditions: Conditions  # the columns that the cost model reads; empty if it reads none
     decides: Bool[Array, " decision"]  # whether a decision is due at each row; no rows if always
-    elapsed: Float[Array, " dated"]  # share of the year at each row, see Terms; no rows if unused
+    elapsed: Float[Array, " dated"]  # years at each row, see Terms; no rows if unused
     benchmarks: Float[Array, "benchmarked asset"]  # a benchmark's weights; no rows without one
     covariances: Float[Array, "estimated asset asset"]  # of returns; no rows without limits on risk
     joined: Int[Array, " asset"]  # the row of an asset's first price
@@ -152,7 +152,7 @@ class Portfolio(Market):
             moves = np.nan_to_num(prices.values[-1] / prices.values[-2], nan=1.0)
             require_sound(self.costs, then.trade(row, 1), moves, then.holding(row, row + 1))
         terms, risk = self.written.trading, self.written.risk
-        passed = elapsed(prices.dates) if terms.turnover_a_year else np.zeros(0)
+        passed = calendar_years(prices.dates) if terms.turnover_a_year else np.zeros(0)
         compared = anchors.path(risk.benchmark, prices) if risk.benchmark else logs[:0]
         estimated = np.zeros((0, *self.covariances.shape[1:]))
         if self.allowed is not None and self.allowed.limits_risk:
@@ -385,7 +385,7 @@ class Portfolio(Market):
         """A random holding, with turnover spent up to the elapsed share of the year's maximum."""
         drawn = super().draw_reachable(market, key)
         if drawn.plan is not None and self.elapsed.shape[0]:
-            pace = self.terms.turnover * self.elapsed[market]
+            pace = self.terms.turnover * (self.elapsed[market] % 1)
             spent = pace * jax.random.uniform(apart(key))
             drawn = self.hold(drawn.weights, spent)
         if self.tradable is None:

@@ -42,12 +42,15 @@ INDEX = pd.DataFrame({"date": days(slice(160)), "level": np.exp(np.arange(160) *
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
-    """Of a backtest that is not trained; its benchmark is an asset."""
+    """Of a backtest that is not trained; its benchmark is an asset.
+
+    Agents fill orders over two rows; strategies of one's own are filled at once.
+    """
     out = tmp_path_factory.mktemp("rule") / "run"
     Backtest.create(
         table(), AGENTS, out=out, train="100d", test="60d", seeds=1, baselines=["momentum"], lag=0,
         strategies={"60/40": WEIGHTS, "traded": SHARES, "fund": RETURNS, "index": INDEX},
-        benchmark="C", mandate={"assets": {"cap": 0.55}},
+        benchmark="C", mandate={"assets": {"cap": 0.55}, "trading": {"fill": 2}},
     )  # fmt: skip
     return Desk.open(out)
 
@@ -124,7 +127,8 @@ def test_an_asset_without_a_price_is_refused(desk):
 def test_the_ledger_of_a_strategy_is_followed_and_reproduced(desk):
     run, start = desk.run, table().between(0, 131)
     assert Standing.of(desk.folder, "60/40", desk.kind("60/40")).kind == "strategy"
-    allocation = Allocation.of(desk.followed("60/40"), start, np.zeros(3), 1000.0)
+    known = desk.followed("60/40")
+    allocation = Allocation.of(known, start, np.zeros(3), 1000.0)
     record, _ = desk.record("60/40", allocation, start, False)
     assert record.policy is None
     assert desk.reproduce(record.date)[1].weights == pytest.approx([0.4, 0.5, 0.1, 0])
@@ -136,19 +140,27 @@ def test_the_ledger_of_a_strategy_is_followed_and_reproduced(desk):
     assert len(found.live.returns) == 160 - 131
     np.testing.assert_allclose(found.live.returns[1:], returns["60/40"][132 - 160 :], atol=1e-12)
     assert "60/40 learns nothing, so there is nothing to train." in found.sentences()
+    assert not any("fills orders" in x for x in desk.terms(known, start, allocation, 0.0))
+    rule = desk.followed("momentum")
+    assert any("over 2 rows" in x for x in desk.terms(rule, start, allocation, 0.0))
 
 
-def test_orders_that_the_lag_leaves_unfilled_are_named(tmp_path):
+@pytest.mark.parametrize(("fill", "pending"), [(1, [121]), (3, [121, 122, 123])])
+def test_orders_that_the_lag_leaves_unfilled_are_named(tmp_path, fill, pending):
+    """The last part of an order of row 119 is filled at the close of row 120 + fill."""
     out = tmp_path / "run"
-    Backtest.create(table(), AGENTS, out=out, train="100d", test="50d", seeds=1, lag=2)
+    Backtest.create(
+        table(), AGENTS, out=out, train="100d", test="50d", seeds=1, lag=2,
+        mandate={"trading": {"fill": fill}},
+    )  # fmt: skip
     desk, shares = Desk.open(out), np.zeros(3)
     rule = desk.followed("equal-weight")
     said = {}
-    for rows in (120, 121, 122):
+    for rows in range(120, 126):
         known = table().between(0, rows)
         allocation = Allocation.of(rule, known, shares, 1000.0)
         said[rows] = " ".join(desk.terms(rule, known, allocation, 0.0))
         if rows == 120:
             desk.record("equal-weight", allocation, known, False)
-    assert "lag of 2 rows the orders of 2020-04-29 are not filled yet" in said[121]
-    assert "not filled" not in said[120] + said[122]
+    unfilled = "lag of 2 rows the orders of 2020-04-29 are not filled yet"
+    assert [rows for rows, text in said.items() if unfilled in text] == pending

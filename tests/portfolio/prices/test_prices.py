@@ -423,6 +423,17 @@ def test_assets_with_gaps_are_dropped_on_demand():
         load(table[["B", "C"]], missing="drop-asset")
 
 
+@pytest.mark.parametrize("late", ["error", "drop-asset", "join", "trim"])
+def test_an_asset_that_is_dropped_does_not_say_where_the_table_starts(late):
+    nan = np.nan
+    table = frame(
+        A=[*A[:3], nan, A[4]], B=[nan, nan, *B[2:]], C=[nan, nan, *B[2:]], rate=[nan, nan, 1, 1, 1]
+    )
+    prices = load(table, missing="drop-asset", late=late, features=("rate",))
+    assert prices.assets == ("B", "C")
+    assert len(prices) == len(A) - 2
+
+
 @pytest.mark.parametrize("name", ["cash", "Cash", "CASH"])
 def test_no_asset_may_be_called_cash(name: str):
     """Weights and holdings have money under this name."""

@@ -94,6 +94,7 @@ def simulate(
     start: ArrayLike | None = None,
     conditions: Conditions | None = None,
     long_only: bool = True,
+    wealth: float = 1.0,
 ) -> Simulation:
     """Replay decisions made at the rows first, first + 1, …; each earns one return.
 
@@ -109,6 +110,8 @@ def simulate(
         conditions: The columns of the table that the cost model reads, at the rows of ``values``,
             and which assets are listed: at a trade, holdings of others are cash.
         long_only: Whether negative weights are refused.
+        wealth: Wealth before the first trade, as a multiple of the initial one that costs in money
+            refer to.
 
     Returns:
         The returns of rows first + lag + 1 to first + lag + D, and the trades before them.
@@ -166,7 +169,7 @@ def simulate(
     together = max(1, columns // max(1, days))
     for low in range(0, len(orders), together):
         some = slice(low, low + together)
-        _replay(market, orders, held, columns, result, some)
+        _replay(market, orders, held, wealth, columns, result, some)
     shaped = lambda array: array.reshape(*leading, *array.shape[1:])  # noqa: E731
     return Simulation(
         shaped(returns),
@@ -232,6 +235,7 @@ def _replay(
     market: _Market,
     orders: Floats,
     held: Floats,
+    begun: float,
     columns: int,
     result: Simulation,
     some: slice,
@@ -249,7 +253,7 @@ def _replay(
     # The value of the holding's entries at the next trade.
     worth = start * by_sign(start, market.moved(np.array(0), np.array(0)))
     latest = np.full((len(orders), 1), -1)  # day of the last order
-    wealth, ruined = np.ones((len(orders), 1)), np.zeros((len(orders), 1), bool)
+    wealth, ruined = np.full((len(orders), 1), begun), np.zeros((len(orders), 1), bool)
     for low in range(0, market.days, columns):
         now = slice(low, min(low + columns, market.days))
         after, given = _checked(market, orders[:, now], low)

@@ -155,7 +155,7 @@ class Desk:
         trading = followed.task.written.trading
         said = self._timing(followed, table, allocation)
         if allocation.trades.any():
-            said += [*waiting(table, self.run.config.lag), *self._pending(table)]
+            said += [*waiting(table, self.run.config.lag), *self._pending(table, trading.fill)]
         if trading.fill > 1:
             said.append(
                 f"The mandate fills orders over {trading.fill} rows: trade an equal part of each "
@@ -168,8 +168,11 @@ class Desk:
             )
         return said
 
-    def _pending(self, table: Prices) -> list[str]:
-        """Says so if the lag leaves earlier orders unfilled at a table's last row."""
+    def _pending(self, table: Prices, fill: int) -> list[str]:
+        """Says so if parts of earlier orders are filled between a table's last row and its trade.
+
+        fill: rows over which an order is filled.
+        """
         last, lag = len(table) - 1, self.run.config.lag
         if lag < 2:
             return []
@@ -177,7 +180,7 @@ class Desk:
             record.date
             for record in self.ledger.current()
             if any(record.trades)
-            and (row := int(np.searchsorted(table.dates, record.moment))) < last < row + lag
+            and (row := int(np.searchsorted(table.dates, record.moment))) < last < row + lag + fill - 1
         ]
         if not dates:
             return []

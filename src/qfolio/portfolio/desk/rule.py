@@ -128,7 +128,8 @@ class Rule(Untrained):
 class Ordered(Untrained):
     """A strategy of the user's own: its latest order up to the last row of a table.
 
-    As in the backtest, its orders are carried out even if they break the mandate or the cap.
+    As in the backtest, its orders are carried out even if they break the mandate or the cap, and
+    each is filled at once.
     """
 
     kind = "strategy"
@@ -142,7 +143,7 @@ class Ordered(Untrained):
                 f"The backtest knows only the {own.kind} of {name}, not its weights, so that it "
                 "cannot be followed; follow another strategy, or run a backtest with its weights."
             )
-        super().__init__(name, assets, task, cap)
+        super().__init__(name, assets, task.filling(1), cap)
         self.own = own
 
     def weights(self, prices: Any, holdings: Any = None, *, spent: float = 0.0) -> dict[str, float]:

@@ -68,9 +68,14 @@ def complete(
     delists: whether an asset ends with its last price, so that none is missing after it.
     """
     span = _span(grid, delists)
+    keep = ~span.empty
+    if missing == "drop-asset":
+        keep = _without_gaps(grid, span, findings)
+        # An asset that is left out does not say where the table starts.
+        span = span._replace(head=int(span.start[keep].min()) if keep.any() else 0)
     if span.head:
         findings.warn(f"left out at the start: {amount(span.head, 'row')} without prices")
-    values, channels, keep = _treat_gaps(grid, span, missing, findings)
+    values, channels = _treat_gaps(grid, span, keep, missing, findings)
     head, keep = _treat_late_starts(grid, span, keep, late, findings)
     if grid.assets and not keep.any():
         findings.error("no asset is left", advice="Look at the gaps of the table first.")
@@ -93,30 +98,39 @@ def _span(grid: Grid, delists: bool) -> _Span:
     return _Span(int(start.min()) if some.any() else 0, start, end, gaps, delists)
 
 
-def _treat_gaps(
-    grid: Grid, span: _Span, missing: str, findings: Findings
-) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-    """Prices and features with their gaps treated, and which assets to keep."""
-    values, channels = grid.prices.values, [block.values for block in grid.features]
-    rows = np.arange(len(values))[:, None]
-    # Features start with their asset; those of the market with the table.
-    holes = [
+def _holes(grid: Grid, span: _Span) -> list[np.ndarray]:
+    """Where each feature is missing: it starts with its asset, or with the table if of no asset."""
+    rows = np.arange(len(grid.prices.values))[:, None]
+    return [
         np.isnan(block.values)
         & ~block.wrong
         & (rows >= (span.start if block.by_asset else span.head))
         & (rows < (span.end if block.by_asset and span.delists else len(rows)))
         for block in grid.features
     ]
-    keep = ~span.empty
-    if missing == "drop-asset":
-        drop = span.empty | span.gaps.any(axis=0)
-        for k, block in enumerate(grid.features):
-            if block.by_asset:
-                drop |= holes[k].any(axis=0)
-        holes = [h & ~drop if b.by_asset else h for h, b in zip(holes, grid.features, strict=True)]
-        _report_dropped(grid, drop, "prices are missing", findings)
-        keep = ~drop
-    else:
+
+
+def _without_gaps(grid: Grid, span: _Span, findings: Findings) -> np.ndarray:
+    """Which assets have no gaps, in their features neither."""
+    drop = span.empty | span.gaps.any(axis=0)
+    for block, hole in zip(grid.features, _holes(grid, span), strict=True):
+        if block.by_asset:
+            drop |= hole.any(axis=0)
+    _report_dropped(grid, drop, "prices are missing", findings)
+    return ~drop
+
+
+def _treat_gaps(
+    grid: Grid, span: _Span, keep: np.ndarray, missing: str, findings: Findings
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Prices and features with their gaps treated."""
+    values, channels = grid.prices.values, [block.values for block in grid.features]
+    rows = np.arange(len(values))[:, None]
+    holes = [
+        hole & keep if block.by_asset else hole
+        for hole, block in zip(_holes(grid, span), grid.features, strict=True)
+    ]
+    if missing != "drop-asset":
         _report_assets(
             grid, span.empty, lambda j: "there are no prices at all", "without prices",
             "Remove the asset.", findings,
@@ -148,7 +162,7 @@ def _treat_gaps(
     )
     for block, unknown in zip(grid.features, holes, strict=True):
         report_cells(grid, block, unknown, "is missing", advice, findings)
-    return values, channels, keep
+    return values, channels
 
 
 def _treat_late_starts(
