@@ -332,6 +332,24 @@ def test_on_workers_it_is_the_same(tmp_path, one_core):
     assert resumed.finish()["ranking"]["order"] == here.finish()["ranking"]["order"]
 
 
+def test_what_workers_began_goes_on_here_in_the_same_log(tmp_path, one_core):
+    def stop_in_the_second(job, done, share):
+        return [Interrupt()] if job.name == "slow/1" else []
+
+    stopped = Comparison.create(tiny(), seeds=3, out=tmp_path / "run")
+    stopped.run(stop_in_the_second, Elsewhere())
+    assert stopped.interrupted
+    resumed = Comparison.open(stopped.folder)
+    resumed.run()
+    assert resumed.finished
+    lines = (stopped.folder / "events.jsonl").read_text().splitlines()
+    events = [json.loads(line) for line in lines]
+    done = [event["job"] for event in events if event["event"] == "done"]
+    assert sorted(done) == [f"{name}/{seed}" for name in ("quick", "slow") for seed in range(3)]
+    recorded = {event["job"] for event in events if event["event"] == "record"}
+    assert recorded == set(done)
+
+
 def strip(result):
     """A result without the times that were measured."""
     return {name: value for name, value in vars(result).items() if "second" not in name}

@@ -172,6 +172,7 @@ def test_each_calendar_year_has_a_budget_of_its_own(days):
     passed = calendar_years(dates).astype(np.float32)
     terms = Terms(np.zeros(0, bool), passed, turnover=1.0)
     plan = terms.begin(np.eye(4)[0], 0.7)
+    assert plan is not None
     years = dates.astype("datetime64[Y]")
     for row in range(len(dates) - 1):
         spent = terms.next_row(row, plan, plan.order).spent

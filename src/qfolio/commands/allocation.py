@@ -87,9 +87,9 @@ def allocate(
     from qfolio.commands.console.desk import print_allocation
     from qfolio.commands.console.tables import print_warnings
     from qfolio.core.text import amount
-    from qfolio.portfolio.backtest.attribution.drivers import reasons, sentence
     from qfolio.portfolio.desk.allocation import Allocation, require_fresh
     from qfolio.portfolio.desk.desk import Desk
+    from qfolio.portfolio.desk.drivers import reasons, sentence
     from qfolio.portfolio.desk.holdings import cashed_out, read_holdings
     from qfolio.portfolio.desk.orders_csv import order_rows
     from qfolio.portfolio.desk.standing import Standing

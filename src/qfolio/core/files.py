@@ -194,7 +194,7 @@ def csv_lines(rows: Iterable[Iterable[Any]]) -> bytes:
 def read_json(path: Path) -> dict[str, Any]:
     """Reads a JSON object; raises QfolioError if the file is missing or holds anything else."""
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text("utf-8"))
     except OSError as error:
         raise QfolioError(f"{path} cannot be read: {error.strerror or error}.") from None
     except (ValueError, RecursionError) as error:

@@ -42,7 +42,7 @@ class Records(Sequence[Row]):
         if not path.exists():
             return Records()
         try:
-            return Records._parsed(path.read_text(errors="replace").splitlines(), cut)
+            return Records._parsed(path.read_text("utf-8", errors="replace").splitlines(), cut)
         except (csv.Error, ValueError) as error:
             raise QfolioError(f"{path} is damaged ({error}); restore or delete it.") from None
 

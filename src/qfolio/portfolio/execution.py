@@ -19,10 +19,10 @@ class Terms(NamedTuple):
 
     decides: whether a decision is due at each row, shape (row,); no rows if always. elapsed: years
     at each row, as ``calendars.calendar_years`` counts them, shape (row,); no rows unless
-    ``turnover`` is limited. band: an order is given only if some weight, cash included, is to change by more. fill:
-    rows over which an order is filled, in equal parts. turnover: maximum in a calendar year, bought
-    plus sold, as a multiple of wealth. called: sum of the assets' absolute weights above which a
-    decision is due at any row (a margin call).
+    ``turnover`` is limited. band: an order is given only if some weight, cash included, is to
+    change by more. fill: rows over which an order is filled, in equal parts. turnover: maximum in a
+    calendar year, bought plus sold, as a multiple of wealth. called: sum of the assets' absolute
+    weights above which a decision is due at any row (a margin call).
     """
 
     decides: Any

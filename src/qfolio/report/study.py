@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -15,7 +14,7 @@ import msgspec
 from qfolio.core.files import write_text
 from qfolio.core.text import amount
 from qfolio.portfolio.backtest.statistics.verdict import p_text
-from qfolio.portfolio.study.folder import Result, StudyConfig, Variant
+from qfolio.portfolio.study.folder import Result, StudyConfig, StudyFolder, Variant
 from qfolio.portfolio.study.pooling import Active, Evidence, Pools
 from qfolio.portfolio.study.run import Study
 from qfolio.portfolio.study.verdict import decimal, looks_sentence, percent
@@ -65,10 +64,12 @@ def write_study_report(study: Study) -> None:
     result = study.config.result or study.result()
     first = study.backtest(next(iter(study.config.tables))).config
     settings = {k: v for k, v in msgspec.to_builtins(first).items() if k not in HIDDEN}
+    files, main = StudyFolder(study.folder), study.config.variants[0]
+    pages = {name: files.place(name, main) / "report.html" for name in study.config.tables}
     links = {
-        name: folder
-        for name in study.config.tables
-        if (study.folder / (folder := _place(name, study.config.variants[0]))).exists()
+        name: page.relative_to(study.folder).as_posix()
+        for name, page in pages.items()
+        if page.exists()
     }
     page = render_study(study.config, result, settings, links)
     write_text(study.folder / "report.html", page)
@@ -258,10 +259,6 @@ def _spread(active: Active) -> str:
 
 def _spelled(variant: Variant) -> str:
     return f"lag {variant.lag}, {variant.bps:g}{THIN_SPACE}bp"
-
-
-def _place(table: str, variant: Variant) -> str:
-    return str(Path("tables") / table / variant.name / "report.html")
 
 
 def _or(value: float | None) -> float:

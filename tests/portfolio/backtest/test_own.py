@@ -351,6 +351,11 @@ def test_benchmarks_by_name():
     assert isinstance(held._own["B"].decisions, np.ndarray)
     np.testing.assert_allclose(held._own["B"].decisions[0], [0, 0, 1, 0])
     assert np.isnan(held._own["B"].decisions[1:]).all()
+    index = table().values
+    priced = Prices(table().dates, ("^GSPC", "=B", "C"), index)
+    assert create(priced, benchmark="^GSPC").config.benchmark == "^GSPC"
+    with pytest.raises(QfolioError, match="cannot be called '=B'"):  # a formula in returns.csv
+        create(priced, benchmark="=B")
     framed = create(benchmark=weights([0], A=[1.0]))
     assert framed.config.benchmark == "benchmark"
     assert isinstance(read_own("x", mine, table()), Own)

@@ -1,7 +1,9 @@
 import dataclasses
 import json
+import os
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from qfolio.experiments.events import read
 from qfolio.experiments.executor import Here
 from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio.backtest import notes
-from qfolio.portfolio.backtest.folder import MOST_WEIGHTS, rows_written
+from qfolio.portfolio.backtest.folder import MOST_WEIGHTS, BacktestFolder, rows_written
 from qfolio.portfolio.backtest.kept import LATEST
 from qfolio.portfolio.backtest.replay import Stretch, decide
 from qfolio.portfolio.backtest.results import write_tables
@@ -503,6 +505,21 @@ def test_backtests_that_cannot_be(settings, message, tmp_path):
     with pytest.raises(QfolioError, match=message):
         create(tmp_path / "run", **settings)
     assert not (tmp_path / "run").exists()
+
+
+def test_names_beyond_ascii_are_read_whatever_the_locale(tmp_path):
+    folder = BacktestFolder(tmp_path)
+    folder.write_returns(["2024-01-02"], {"Börse": np.array([0.01])})
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from qfolio.portfolio.backtest.folder import BacktestFolder\n"
+        "print(ascii(list(BacktestFolder(Path(sys.argv[1])).read_returns()[1])))"
+    )
+    plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], env=plain, capture_output=True, text=True
+    )
+    assert done.stdout.strip() == r"['B\xf6rse']", done.stderr
 
 
 @pytest.mark.parametrize(

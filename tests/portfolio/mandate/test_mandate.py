@@ -266,6 +266,13 @@ def test_every_way_to_give_a_mandate_may_name_a_file_of_groups(tmp_path, monkeyp
         Mandate().changed(["groups.file=none.csv", "groups.sector.Index.floor=0.02"])
 
 
+def test_a_line_of_a_file_of_groups_without_an_asset_is_passed_over(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "groups.csv").write_text("sector,asset\nIndex,SPY\nIndex\nIndex,\n")
+    made = Mandate().changed(["groups.file=groups.csv", "groups.sector.Index.floor=0.02"])
+    assert made.groups["sector"]["Index"].assets == ("SPY",)
+
+
 def test_a_file_of_groups_may_name_assets_of_other_tables(tmp_path):
     mandate = Mandate.read(written(tmp_path)).changed(["cash.max=1.0"])
     assert "other" in mandate.groups["sector"]["Energy"].assets

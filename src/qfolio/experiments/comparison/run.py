@@ -38,6 +38,7 @@ from qfolio.experiments.fit import Listener
 from qfolio.experiments.log import JobLog, Log, add_result, seed_names
 from qfolio.experiments.machines.choice import on
 from qfolio.experiments.run import Run
+from qfolio.experiments.seed_groups import FOLDER as SEEDS
 from qfolio.experiments.seed_groups import SeedsJob
 from qfolio.experiments.seeds import TrainedSeeds
 
@@ -231,7 +232,9 @@ class Comparison:
             return
         self.failures = {}  # they are tried again
         with locked(self.folder), Log(self.folder).opened(**self._about) as log:
-            run = self._run_here if isinstance(executor, Here) else self._run_groups
+            # Seeds that were begun in groups go on in them, wherever they are resumed.
+            groups = any((self.place(name) / SEEDS).exists() for name in missing)
+            run = self._run_here if isinstance(executor, Here) and not groups else self._run_groups
             self.interrupted = run(missing, executor, listen, log)
 
     @property

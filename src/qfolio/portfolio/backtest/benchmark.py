@@ -9,7 +9,7 @@ import msgspec
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import BASELINES, short
-from qfolio.core.text import hint, quote
+from qfolio.core.text import csv_cell, hint, quote
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT, TOGETHER
 from qfolio.portfolio.backtest.own import Own, buy_and_hold
 from qfolio.portfolio.backtest.own_tables import read_own
@@ -59,7 +59,8 @@ def field_of(
     own: dict[str, Own] = {}
 
     def add(name: str, source: Any) -> None:
-        if not _NAME.fullmatch(name):
+        column = name in prices.assets and csv_cell(name) == name  # of returns.csv
+        if not column and not _NAME.fullmatch(name):
             raise QfolioError(
                 f"A strategy cannot be called {quote(name)}; begin with a letter or digit, and use "
                 "up to 60 letters, digits, spaces and the signs . , : & + - _ / % ( )."

@@ -47,6 +47,7 @@ from qfolio.experiments.presets import Preset
 from qfolio.experiments.records import Records
 from qfolio.portfolio.backtest.own import KINDS, Own
 from qfolio.portfolio.mandate.mandate import Mandate
+from qfolio.portfolio.prices.stored import from_arrays, to_arrays
 from qfolio.portfolio.prices.table import Prices
 from qfolio.portfolio.short import fitted
 
@@ -198,15 +199,8 @@ class BacktestFolder:
 
     def write_prices(self, prices: Prices, trained: Sequence[tuple[int, int]] = ()) -> None:
         """Writes the table; trained: as ``Backtest`` takes it."""
-        arrays = {
-            "dates": prices.dates.astype("datetime64[s]").astype(np.int64),
-            "values": prices.values,
-            "features": prices.features,
-            "market": prices.market,
-            **({"trained": np.array(trained)} if trained else {}),
-            **prices.masks,
-        }
-        write_arrays(self.path / "prices.safetensors", arrays)
+        begun = {"trained": np.array(trained)} if trained else {}
+        write_arrays(self.path / "prices.safetensors", to_arrays(prices) | begun)
 
     def grow(self, prices: Prices, trained: Sequence[tuple[int, int]]) -> None:
         """Replaces the table by a longer one; the backtest is unfinished until it has run."""
@@ -225,18 +219,13 @@ class BacktestFolder:
         path = self.path / "prices.safetensors"
         arrays = read_arrays(path)
         try:
-            prices = Prices(
-                arrays["dates"].astype("datetime64[s]"),
+            prices = from_arrays(
+                arrays,
                 tuple(config.assets),
-                arrays["values"],
-                arrays["features"],
-                tuple(config.feature_names),
+                feature_names=tuple(config.feature_names),
                 source=str(config.prices["source"]),
                 note=str(config.prices.get("note", "")),
-                market=arrays.get("market", np.empty(0)),
                 market_names=tuple(config.prices.get("columns", ())),
-                listed=arrays.get("listed"),
-                members=arrays.get("members"),
                 levels=bool(config.prices.get("levels", False)),
             )
             first = prices.between(0, int(config.prices["rows"]))
@@ -300,7 +289,7 @@ class BacktestFolder:
         """
         path, summary = self.path / "returns.csv", self.path / "summary.json"
         try:
-            header, *rows = csv.reader(path.read_text().splitlines())
+            header, *rows = csv.reader(path.read_text("utf-8").splitlines())
             table = np.array([row[1:] for row in rows], dtype=float)
             columns = dict(zip(header[1:], table.T, strict=True))
             if summary.exists() and len(rows) != read_json(summary)["periods"]:

@@ -12,7 +12,6 @@ from qfolio.core.arrays import Floats
 from qfolio.core.errors import QfolioError
 from qfolio.core.text import hint, quote
 from qfolio.portfolio.backtest.own import Own, rows_at
-from qfolio.portfolio.desk.holdings import CASH, SHARES_NAMES
 from qfolio.portfolio.prices.cells import is_missing, label
 from qfolio.portfolio.prices.columns import text_columns
 from qfolio.portfolio.prices.findings import day
@@ -20,7 +19,13 @@ from qfolio.portfolio.prices.layout import Table
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.records import dates_of, in_order, numbers_of
 from qfolio.portfolio.prices.table import Prices, load
-from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, DATE_NAMES, plain
+from qfolio.portfolio.prices.vocabulary import (
+    ASSET_NAMES,
+    CASH,
+    DATE_NAMES,
+    SHARES_NAMES,
+    plain,
+)
 
 RETURN_NAMES = ("return", "returns", "ret", "net return", "net returns", "daily return")
 WEIGHT_NAMES = ("weight", "weights", "target", "target weight")

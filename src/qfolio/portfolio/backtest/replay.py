@@ -179,13 +179,12 @@ class Replay:
 
     def baseline(self, kind: str, name: str, baseline: Baseline) -> tuple[Entry, tuple[str, ...]]:
         """A baseline, and notes on its decisions."""
-        folds = self.folds if self.prices.tradable is None else self._complete
-        given = self._orders(name, baseline, folds)
+        given = self._orders(name, baseline, self._complete)
         return self.entry(kind, given.decisions[None]), given.notes
 
     def try_out(self, name: str, baseline: Baseline) -> None:
         """Asks a baseline for its first decision; raises QfolioError if that is invalid."""
-        fold = self.folds[0] if self.prices.tradable is None else self._complete[0]
+        fold = self._complete[0]
         start = fold.decisions.start
         self._orders(name, baseline, [fold._replace(decisions=slice(start, start + 1))])
 

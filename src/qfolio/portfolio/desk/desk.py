@@ -176,12 +176,11 @@ class Desk:
         last, lag = len(table) - 1, self.run.config.lag
         if lag < 2:
             return []
-        dates = [
-            record.date
-            for record in self.ledger.current()
-            if any(record.trades)
-            and (row := int(np.searchsorted(table.dates, record.moment))) < last < row + lag + fill - 1
-        ]
+        records = [record for record in self.ledger.current() if any(record.trades)]
+        moments = np.array([record.moment for record in records], table.dates.dtype)
+        rows = np.searchsorted(table.dates, moments)
+        pending = (rows < last) & (last < rows + lag + fill - 1)
+        dates = [record.date for record, yes in zip(records, pending, strict=True) if yes]
         if not dates:
             return []
         return [

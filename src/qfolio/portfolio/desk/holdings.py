@@ -11,10 +11,7 @@ from qfolio.core.text import hint, quote
 from qfolio.portfolio.prices.cells import CURRENCIES, is_missing, label, not_a_number, numbers
 from qfolio.portfolio.prices.reading import read
 from qfolio.portfolio.prices.table import Prices
-from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, plain
-
-SHARES_NAMES = ("shares", "quantity", "qty", "units", "position")
-CASH = "cash"
+from qfolio.portfolio.prices.vocabulary import ASSET_NAMES, CASH, SHARES_NAMES, plain
 
 
 def read_holdings(

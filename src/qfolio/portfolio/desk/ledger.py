@@ -18,6 +18,7 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.files import locked, read_arrays, read_json, write_arrays, write_json
 from qfolio.core.text import listed, quote
 from qfolio.portfolio.desk.allocation import Allocation, turnover
+from qfolio.portfolio.prices.stored import from_arrays, to_arrays
 from qfolio.portfolio.prices.table import Prices
 
 FORMAT = 1
@@ -173,13 +174,13 @@ class Ledger:
             raise QfolioError(f"{path} is missing; give the prices of record {record.number}.")
         arrays = read_arrays(path)
         try:
-            dates = arrays["dates"].astype("datetime64[s]")
-            assets, features = tuple(record.assets), known.feature_names
-            table = Prices(
-                dates, assets, arrays["values"], arrays["features"], features,
-                market=arrays.get("market", np.empty(0)), market_names=known.market_names,
-                listed=arrays.get("listed"), members=arrays.get("members"),
-            )  # fmt: skip
+            table = from_arrays(
+                arrays,
+                tuple(record.assets),
+                feature_names=known.feature_names,
+                market_names=known.market_names,
+                levels=known.levels,
+            )
         except (KeyError, ValueError, QfolioError) as error:
             raise QfolioError(f"{path} is damaged ({error}); give the prices again.") from None
         if table.sha256 != wanted:
@@ -189,9 +190,7 @@ class Ledger:
     def _keep(self, prices: Prices) -> None:
         path = self._prices(prices.sha256)
         if not path.exists():
-            seconds = prices.dates.astype("datetime64[s]").astype(np.int64)
-            arrays = {"dates": seconds, "values": prices.values, "features": prices.features}
-            write_arrays(path, {**arrays, "market": prices.market, **prices.masks})
+            write_arrays(path, to_arrays(prices))
 
     def _prices(self, digest: str) -> Path:
         return self.folder / "prices" / f"{digest[:16]}.safetensors"

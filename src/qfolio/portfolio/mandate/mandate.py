@@ -414,7 +414,8 @@ def _with_members(mandate: Mandate, file: Path, source: str) -> Mandate:
                 f"{source}: [groups.{column}] is no column of {file}, and [groups.{column}."
                 f"{value}] lists no assets; {near(column, columns[1:])}"
             )
-        members = tuple(row["asset"].strip() for row in table if _cell(row, column) == value)
+        named = (_cell(row, "asset") for row in table if _cell(row, column) == value)
+        members = tuple(filter(None, named))
         if not members:
             values = sorted({_cell(row, column) for row in table})
             raise QfolioError(

@@ -4,6 +4,8 @@ import re
 
 DATE_NAMES = ("date", "dates", "datetime", "timestamp", "time")
 ASSET_NAMES = ("asset", "ticker", "tic", "symbol", "name", "instrument")
+SHARES_NAMES = ("shares", "quantity", "qty", "units", "position")
+CASH = "cash"
 ADJUSTED_NAMES = ("adjusted close", "adj close", "adjclose", "adjusted price", "adj price")
 PRICE_NAMES = ("close", "price", "value")
 SETTINGS = (

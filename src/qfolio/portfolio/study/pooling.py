@@ -20,7 +20,7 @@ from qfolio.portfolio.backtest.statistics.bootstrap import (
     histories,
     percentile_interval,
 )
-from qfolio.portfolio.backtest.statistics.differences import estimates
+from qfolio.portfolio.backtest.statistics.differences import Finding, estimates
 from qfolio.portfolio.backtest.statistics.estimates import Estimate, clear, estimate
 from qfolio.portfolio.backtest.statistics.measures import (
     log_growth,
@@ -41,8 +41,6 @@ SPANS = ((1.5, "D"), (11.0, "W"), (46.0, "M"), (137.0, "3M"), (math.inf, "Y"))
 Against = Literal["to_reference", "to_rebalanced"]
 AGAINST: tuple[Against, ...] = ("to_reference", "to_rebalanced")
 """What an agent is compared with: the reference, and its best rebalancing."""
-
-Finding = Literal["better", "worse", "none"]
 
 
 class TableReturns(NamedTuple):

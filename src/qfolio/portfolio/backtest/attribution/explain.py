@@ -16,7 +16,12 @@ from qfolio.portfolio.backtest.attribution.distillation import Rule, distil
 from qfolio.portfolio.backtest.attribution.factors import exposures, factor_returns
 from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
 from qfolio.portfolio.backtest.attribution.importance import importance, of_seeds
-from qfolio.portfolio.backtest.attribution.replays import channel_names, channels, open_to
+from qfolio.portfolio.backtest.attribution.replays import (
+    channel_names,
+    channels,
+    open_to,
+    shared_channels,
+)
 from qfolio.portfolio.backtest.attribution.slices import slices
 from qfolio.portfolio.backtest.attribution.why import AgentWhy, Why
 from qfolio.portfolio.backtest.folder import followed
@@ -58,7 +63,6 @@ def _explained(
     worth, held = importance(agent, stretches, names, prices.values, year)
     few = of_seeds(stretches, worth.seeds)
     there = ~np.isnan(prices.values) if prices.tradable is None else prices.tradable
-    shared = [each.shared for each in worth.signals] or [False] * len(names)
     why = AgentWhy(
         decomposition=decompose(
             net,
@@ -71,7 +75,7 @@ def _explained(
         ),
         exposures=exposures(net - reference, factors, year),
         importance=worth,
-        slices=slices(agent, few, names, prices.assets, held, shared),
+        slices=slices(agent, few, names, prices.assets, held, shared_channels(stretches).tolist()),
         gradients=integrated_gradients(agent, few, names, held),
         rule=_rule(entry.decisions[0], stretches, names),
         menu=bool(stretches[0].task.menu),

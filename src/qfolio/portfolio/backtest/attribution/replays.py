@@ -98,7 +98,7 @@ class Shuffles(NamedTuple):
         pad = ((0, 0), (0, longest))
         rows, shown = np.pad(rows, pad, "edge"), np.pad(shown, (*pad, (0, 0)), "edge")
         own = others = channels(task)
-        shared = _shared(stretches, own)
+        shared = shared_channels(stretches)
         if task.tradable is not None:
             # Where an asset is not tradable its signals are 0, those that all share as well. It
             # may be tradable in the row that sees them, so it gets another's.
@@ -134,10 +134,10 @@ def open_to(stretches: Sequence[Stretch]) -> np.ndarray:
     return np.asarray(allowed & np.asarray(tradable)[begin : begin + len(allowed)])
 
 
-def _shared(stretches: Sequence[Stretch], own: Array) -> np.ndarray:
+def shared_channels(stretches: Sequence[Stretch]) -> np.ndarray:
     """Whether a channel is the same for all assets that may be bought on the days of the test."""
     begin, end = stretches[0].fold.decisions.start, stretches[-1].fold.decisions.stop
-    shown, there = np.asarray(own)[begin:end], open_to(stretches)
+    shown, there = np.asarray(channels(stretches[0].task))[begin:end], open_to(stretches)
     least = (np.where(there, each, np.inf).min(1) for each in np.moveaxis(shown, -1, 0))
     most = (np.where(there, each, -np.inf).max(1) for each in np.moveaxis(shown, -1, 0))
     return np.array([bool((x <= y).all()) for x, y in zip(most, least, strict=True)])

@@ -170,8 +170,8 @@ def shown(key: Measured, contrast: Contrast) -> tuple[float, float, float]:
     values = (contrast.value, *contrast.interval)
     if key != "volatility":
         return values
-    low, middle, high = (math.expm1(min(value, 700.0)) for value in values)
-    return low, middle, high
+    value, low, high = (math.expm1(min(value, 700.0)) for value in values)
+    return value, low, high
 
 
 def telling(value: float, digits: int) -> int:

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from qfolio.core.text import figure
-from qfolio.portfolio.backtest.attribution.drivers import (
+from qfolio.portfolio.desk.allocation import Allocation
+from qfolio.portfolio.desk.drivers import (
     Driver,
     Reason,
     _bounds,
     reasons,
     sentence,
 )
-from qfolio.portfolio.desk.allocation import Allocation
 from qfolio.portfolio.mandate.feasible import CappedSimplex
 from qfolio.portfolio.mandate.limits import feasible, mandate_text
 from qfolio.portfolio.policy import Policy
