@@ -323,6 +323,8 @@ def test_it_says_what_is_wrong():
     for number in (9, -1, 0.5):
         with pytest.raises(QfolioError, match="from 0 to 8"):
             menu.unwrapped.step(number)
+    with pytest.raises(QfolioError, match="options has 'begin'; the only option of reset"):
+        env.reset(options={"begin": 12})
     with pytest.raises(QfolioError, match="did you mean window"):
         environment(windw=5)
     with pytest.raises(QfolioError, match="render_mode"):

@@ -183,6 +183,12 @@ def test_odd_returns_are_refused():
         model().fit(x[:10])
     with pytest.raises(QfolioError, match="set agent to tilts and preset to low-risk"):
         model(agent="tilts:low-risk").fit(x)
+    with pytest.raises(QfolioError, match=r"lag is 1\.5; it must be a whole number"):
+        model(lag=1.5).fit(x)
+    with pytest.raises(QfolioError, match="lag is 300; it must be from 0 to 69"):
+        model(lag=300).fit(x)
+    with pytest.raises(QfolioError, match=r"settings is .*; it must be a dict"):
+        model(settings=[1]).fit(x)
     with pytest.raises(QfolioError, match="cost is a parameter"):
         model(settings={"cost": 0.1}).fit(x)
     with pytest.raises(QfolioError, match="did you mean horizon"):

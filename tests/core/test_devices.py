@@ -1,5 +1,9 @@
 """What is asked of jax before it computes."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import pytest
 
@@ -31,3 +35,28 @@ def test_a_worker_has_its_own_number_of_cores(monkeypatch):
     assert worker.environment(2) == flags
     monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "4")
     assert worker.environment(2) == flags | {"JAX_NUM_CPU_DEVICES": "2"}
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "from qfolio.portfolio.synthetic.merton import Merton; Merton()",
+        "from qfolio import Portfolio; Portfolio.blank(3, 0)",
+        "from qfolio import DQN, Backtest; DQN()",
+    ],
+)
+def test_jax_is_set_up_before_the_first_array_of_a_task(first, tmp_path):
+    """Whatever is made first, as jax takes no settings of devices after its first array."""
+    code = (
+        f"{first}\n"
+        "import jax; from qfolio.core import devices\n"
+        "assert len(jax.devices()) == len(devices.cores())\n"
+        "print(jax.config.jax_default_matmul_precision, jax.config.jax_compilation_cache_dir)\n"
+    )
+    unset = {"XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR"}
+    plain = {key: value for key, value in os.environ.items() if key not in unset}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=plain | {"QFOLIO_CACHE": str(tmp_path)},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.stdout.strip() == f"highest {tmp_path / 'programs'}", done.stderr

@@ -5,6 +5,7 @@ import re
 import pytest
 
 from qfolio.agents.dqn import DQN
+from qfolio.agents.sac import SAC
 from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, static
@@ -113,6 +114,14 @@ def test_settings_are_divided_by_their_owners():
     assert parts == [{"horizon": "3"}, {"discount": "0.5"}]
     with pytest.raises(QfolioError, match=r"neither OneState nor DQN .* did you mean discount\?"):
         settings.divide({"discont": 1}, OneState, DQN)
+    with pytest.raises(QfolioError, match=r"^DQN and SAC both have a setting 'discount', so that"):
+        settings.divide({"discount": "0.5"}, DQN, SAC)
+
+
+def test_a_setting_that_is_given_twice_is_refused():
+    with pytest.raises(QfolioError, match=r"^--set names learning_rate twice; give it one value"):
+        settings.parse(["learning_rate=1", "learning-rate=2"])
+    assert len(settings.parse(["a-b.lambda=1", "b.lambda=2"])) == 2
 
 
 def test_a_default_that_would_change_nothing_is_refused():

@@ -12,8 +12,11 @@ from qfolio.core.errors import QfolioError
 from qfolio.core.evaluation import start_keys
 from qfolio.core.population import Population
 from qfolio.experiments import continual
+from qfolio.experiments.budget import Budget
 from qfolio.experiments.continual import Course, Plan, compare, create, recovery, renew
 from qfolio.experiments.fit import Listener
+from qfolio.experiments.presets import preset
+from qfolio.portfolio.synthetic.no_trade import NoTrade
 from qfolio.report.continual import render_page, verdict
 from qfolio.tasks.catch import Catch
 from qfolio.tasks.pendulum import Pendulum
@@ -175,8 +178,29 @@ def test_an_agent_without_a_schedule_cannot_go_on():
 
 
 def test_a_task_without_numbers_cannot_change():
-    with pytest.raises(QfolioError, match="only numbers"):
+    with pytest.raises(QfolioError, match=r"only numbers .*; Catch has none\.$"):
         Plan(Catch(), Catch(rows=12), AGENT, EPISODES)
+
+
+def test_only_the_inputs_of_a_program_are_named_as_numbers_that_may_change():
+    """A constant such as a cost is a part of the program."""
+    task = NoTrade()
+    with pytest.raises(QfolioError, match=r"only numbers .*; NoTrade has rate, volatility, dt\.$"):
+        Plan(task, dataclasses.replace(task, cost=0.02), AGENT, EPISODES)
+
+
+def test_a_preset_in_steps_has_a_number_of_episodes(monkeypatch):
+    made = []
+    monkeypatch.setattr(continual, "create", lambda plan, *_: made.append(plan) or stop())
+
+    def stop():
+        raise QfolioError("enough.")
+
+    words = ("market/liquidation", "--agent", "sac", "--change", "volatility=0.9")
+    assert qfolio(monkeypatch, "continual", *words) == 2
+    (plan,) = made
+    assert preset("fast", "market/liquidation", "sac").budget == Budget(steps=30_000)
+    assert plan.episodes == 30_000 / plan.task.horizon
 
 
 def test_the_report_says_what_happened(content):

@@ -21,6 +21,14 @@ def test_an_agent_that_does_not_fit_gets_advice(task, agent, says):
         presets.preset("fast", task, agent)
 
 
+@pytest.mark.parametrize("task", ["portfolio", "pendulum", "gym:CartPole-v1", "own:Task"])
+def test_a_wrong_agent_gets_advice(task):
+    with pytest.raises(QfolioError, match=r"there is no agent 'ppp'; did you mean ppo\?"):
+        presets.preset("fast", task, "ppp")
+    if task != "pendulum":
+        assert presets.preset("fast", task, "own:Agent").agent == "own:Agent"
+
+
 def test_a_wrong_preset_gets_advice():
     with pytest.raises(QfolioError, match=r"no preset 'rainbo'.*; did you mean rainbow\?"):
         presets.preset("rainbo", "pendulum", "dqn")

@@ -684,9 +684,14 @@ def test_the_learning_rate_ends_with_the_training(tmp_path, monkeypatch, capsys)
         raise QfolioError(f"{self.agent.learning_rate_steps}")
 
     monkeypatch.setattr(Tuning, "run", fail)
-    for number, (more, steps) in enumerate([([], 75.0), (["learning_rate_steps=9"], 9.0)]):
+    cases = [
+        (["--episodes", 86], [], 75.0),
+        (["--steps", 86 * 20], [], 75.0),  # of as many episodes
+        (["--episodes", 86], ["learning_rate_steps=9"], 9.0),
+    ]
+    for number, (budget, more, steps) in enumerate(cases):
         out = tmp_path / str(number)
-        assert qfolio(monkeypatch, "tune", "--episodes", 86, "--out", out, *TINY, *more) == 2
+        assert qfolio(monkeypatch, "tune", *budget, "--out", out, *TINY, *more) == 2
         said = capsys.readouterr().err
         assert float(said.split()[-1]) == pytest.approx(steps, rel=0.01)
 

@@ -393,6 +393,17 @@ class Unscaled(Pathwise):
         return 0.9 * super().policy(weights, observation)
 
 
+class Drifting(Pathwise):
+    """Leaves the simplex as it learns."""
+
+    def weights(self, state):
+        return super().weights(state), state.optimizer.count
+
+    def policy(self, weights, observation):
+        learned, count = weights
+        return super().policy(learned, observation) * (1 + count)
+
+
 class Unknown(Pathwise):
     def act(self, state, observation, key):
         return jnp.nan * super().act(state, observation, key)
@@ -402,6 +413,10 @@ def test_weights_of_ones_own_agent_are_those_of_a_portfolio():
     task = Merton()
     with pytest.raises(QfolioError, match=r"Unscaled.policy gives weights .* that sum to 0\.9;"):
         Run.create(task, Unscaled(), episodes=8, seeds=1)
+    run = Run.create(task, Drifting(num_envs=8, rollout_length=20), episodes=8, seeds=2)
+    run.train()
+    with pytest.raises(QfolioError, match=r"Drifting.policy gives weights .* that sum to [^1]"):
+        run.grade()
     with pytest.raises(QfolioError, match="The action of Unknown is not finite at step 1"):
         raise QfolioError(faults.find(task, Unknown(), 0))
 

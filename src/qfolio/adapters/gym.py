@@ -126,6 +126,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Starts an episode in cash, at a row from ``first`` to ``last``: drawn, or ``start``."""
         super().reset(seed=seed)
+        if unknown := sorted({*(options or {})} - {"start"}):
+            raise QfolioError(f"options has {unknown[0]!r}; the only option of reset is 'start'.")
         start = (options or {}).get("start")
         if start is None:
             start = self.np_random.integers(self.first, self.last + 1)

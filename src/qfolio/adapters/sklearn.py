@@ -6,6 +6,7 @@
 """
 
 import inspect
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from skfolio import Portfolio
 from skfolio.optimization import BaseOptimization
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.errors import QfolioError, require_type, require_whole
 from qfolio.core.registry import find
 from qfolio.core.settings import names
 from qfolio.experiments import presets
@@ -169,6 +170,8 @@ class PortfolioPolicy(BaseOptimization):
 
         devices.configure()
         returns = validate_data(self, X, dtype=np.float64)
+        require_whole("lag", self.lag, 0, len(returns) - 1)
+        require_type("settings", self.settings or {}, Mapping, "a dict of settings by name")
         chosen, task = self._chosen()
         self._held()  # rejects invalid holdings before training
         self.returns_, self.observations_ = returns, _dates(X)

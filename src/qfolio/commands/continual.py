@@ -137,6 +137,7 @@ def _plan(
     assignments: tuple[str, ...],
     options: dict[str, Any],
 ) -> "Plan":
+    from qfolio.core.training import episode_steps
     from qfolio.experiments import presets
     from qfolio.experiments.continual import Plan
 
@@ -150,11 +151,14 @@ def _plan(
     changes = settings.parse(change, "--change", "mass=2")
     before, chosen = settings.divide(settings.parse(assignments), task_class, agent_class)
     before = {**preset.task, **before}
+    made, learner = settings.build(task_class, before), preset.build(**chosen)
+    if episodes is None:  # a preset may count steps
+        episodes = -(-preset.budget.env_steps(made, learner) // episode_steps(made, learner))
     return Plan(
-        task=settings.build(task_class, before),
+        task=made,
         changed=settings.build(task_class, {**before, **changes}),
-        agent=preset.build(**chosen),
-        episodes=preset.episodes if episodes is None else episodes,
+        agent=learner,
+        episodes=episodes,
         seeds=preset.seeds if seeds is None else seeds,
         **options,
     )

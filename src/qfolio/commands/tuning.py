@@ -178,20 +178,20 @@ def _new(
     if both := [dim.name for dim in space if dim.name in chosen]:
         raise QfolioError(f"--set and --search both name {both[0]}; name it in one of them.")
     budget = budget or preset.budget
-    scheduled: dict[str, Any] = {}
-    if budget.unit == preset.budget.unit:
-        share = budget.amount / preset.budget.amount
-        schedules = {"learning_rate_steps", "importance_steps"} & preset.settings.keys()
-        scheduled = {name: round(preset.settings[name] * share, 1) for name in schedules}
+    task = settings.build(task_class, {**preset.task, **task_settings})
+    usual = preset.build(**chosen)
+    share = budget.env_steps(task, usual) / preset.budget.env_steps(task, usual)
+    schedules = {"learning_rate_steps", "importance_steps"} & preset.settings.keys()
+    scheduled = {name: round(preset.settings[name] * share, 1) for name in schedules}
     agent = preset.build(**{**scheduled, **chosen})
     space = space or [dim for dim in search.usual(agent) if dim.name not in chosen]
     if both := [dim.name for dim in space if dim.name in settings.names(task_class)]:
         raise QfolioError(  # no command line could train what was found
-            f"{agent_name} and {task_name} both have a setting {both[0]}, and --set gives it to "
-            "the task; rename that of the task, or name others with --search."
+            f"{agent_name} and {task_name} both have a setting {both[0]}, so that --set cannot "
+            "tell whose it is; rename that of the task, or name others with --search."
         )
     return Tuning.create(
-        settings.build(task_class, {**preset.task, **task_settings}),
+        task,
         agent,
         space,
         trials=64 if trials is None else trials,

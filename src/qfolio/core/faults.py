@@ -1,12 +1,15 @@
 """Faults of a task that look like faults of learning."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.mdp import Agent, Simplex, Task
+from qfolio.core.mdp import Agent, Discrete, Simplex, Task
 from qfolio.core.registry import own_modules
 from qfolio.core.training import episode_steps
 
@@ -44,27 +47,47 @@ def find(task: Task, agent: Agent, seed: int) -> str | None:
     return None
 
 
-def require_weights(task: Task, agent: Agent) -> None:
-    """Raises QfolioError if a user's own agent, untrained, gives weights that nobody can hold."""
-    if not (isinstance(task.actions, Simplex) and own_modules(agent)):
+def require_actions(task: Task, agent: Agent, learned: PyTree | None = None) -> None:
+    """Raises QfolioError if a user's own agent chooses what the task does not have.
+
+    These are weights that nobody can hold, or numbers of no choice, at the start of an episode.
+
+    learned: what members have learned, with a leading member axis (default: an untrained agent).
+    """
+    if not (task.compiled and own_modules(agent)):
         return
 
     def chosen(key: PRNGKeyArray) -> dict[str, Array]:
         agent_key, reset_key, act_key = jax.random.split(key, 3)
-        state = agent.init(task, agent_key)
         starts = jax.vmap(task.reset)(jax.random.split(reset_key, agent.num_envs))
         seen = jax.vmap(task.observe)(starts)
+        if learned is not None:
+            return {"policy": jax.vmap(agent.policy, in_axes=(0, None))(learned, seen)}
+        state = agent.init(task, agent_key)
         acts = agent.act(state, seen, act_key)
         return {"act": acts, "policy": agent.policy(agent.weights(state), seen)}
 
-    for method, weights in jax.jit(chosen)(jax.random.key(0)).items():
-        sums = weights.sum(-1)
-        if float(weights.min()) < -OFF or float(abs(sums - 1).max()) > OFF:
-            raise QfolioError(
-                f"{type(agent).__name__}.{method} gives weights of at least "
-                f"{float(weights.min()):.3g} that sum to {float(sums[0]):.3g}; weights, cash "
-                "first, must be at least 0 and sum to 1, as a softmax is."
+    for method, actions in jax.jit(chosen)(jax.random.key(0)).items():
+        if said := _refused(task.actions, np.asarray(actions)):
+            raise QfolioError(f"{type(agent).__name__}.{method} gives {said}")
+
+
+def _refused(actions: Any, given: np.ndarray) -> str:
+    """Why a task does not have the actions given; empty if it has them."""
+    if isinstance(actions, Discrete):
+        wrong = given[(given < 0) | (given >= actions.n)]
+        return (
+            f"the action {wrong[0]:g}; it must be from 0 to {actions.n - 1}." if wrong.size else ""
+        )
+    if isinstance(actions, Simplex):
+        sums = given.sum(-1)
+        worst = float(sums.ravel()[abs(sums - 1).argmax()])
+        if float(given.min()) < -OFF or abs(worst - 1) > OFF:
+            return (
+                f"weights of at least {float(given.min()):.3g} that sum to {worst:.3g}; weights, "
+                "cash first, must be at least 0 and sum to 1, as a softmax is."
             )
+    return ""
 
 
 def _finite(task: Task, agent: Agent, key: PRNGKeyArray) -> tuple[Bool[Array, " time"], ...]:

@@ -17,8 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
+from qfolio.core import devices
 from qfolio.core.errors import require_type, require_whole
 from qfolio.core.fields import require, require_static
+
+# Every task and every agent begins with this module: here jax has not made an array yet, after
+# which settings of its devices have no effect.
+devices.configure()
 
 
 class Discrete(eqx.Module):

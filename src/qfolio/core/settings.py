@@ -97,8 +97,8 @@ def parse(
 ) -> dict[str, str]:
     """``["name=value", …]`` as a dictionary; hyphens in names become underscores.
 
-    In "agent.name=value" the agent keeps its hyphens. Raises QfolioError for anything else, which
-    names the option that they were given to.
+    In "agent.name=value" the agent keeps its hyphens. Raises QfolioError for anything else, and for
+    a name that is given twice, with the option that they were given to.
     """
     pairs = {}
     for assignment in assignments:
@@ -108,23 +108,31 @@ def parse(
                 f"{option} takes name=value, for example {example}; not {assignment!r}."
             )
         agent, dot, setting = name.strip().rpartition(".")
-        pairs[agent + dot + setting.replace("-", "_")] = value.strip()
+        whole = agent + dot + setting.replace("-", "_")
+        if whole in pairs:
+            raise QfolioError(f"{option} names {whole} twice; give it one value.")
+        pairs[whole] = value.strip()
     return pairs
 
 
 def divide(chosen: Mapping[str, T], *kinds: type) -> list[dict[str, T]]:
-    """Splits settings by class; each goes to the first of ``kinds`` that has it.
+    """Splits settings by class; each goes to the one of ``kinds`` that has it.
 
-    Raises QfolioError if none has.
+    Raises QfolioError if none has, or several have.
     """
     parts: list[dict[str, T]] = [{} for _ in kinds]
     for name, value in chosen.items():
-        owner = next((i for i, kind in enumerate(kinds) if name in names(kind)), None)
-        if owner is None:
+        found = [i for i, kind in enumerate(kinds) if name in names(kind)]
+        if len(found) > 1:
+            raise QfolioError(
+                f"{listed([kinds[i].__name__ for i in found])} both have a setting {name!r}, "
+                "so that --set cannot tell whose it is; rename one of them."
+            )
+        if not found:
             owners = listed([kind.__name__ for kind in kinds], "nor")
             advice = near(name, sorted(set().union(*map(names, kinds))))
             raise QfolioError(f"neither {owners} has a setting {name!r}; {advice}")
-        parts[owner][name] = value
+        parts[found[0]][name] = value
     return parts
 
 

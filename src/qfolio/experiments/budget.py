@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from qfolio.core.errors import QfolioError, require_type, require_whole
 
 if TYPE_CHECKING:
-    from qfolio.core.mdp import Agent
+    from qfolio.core.mdp import Agent, Task
     from qfolio.core.population import Population
 
 
@@ -41,6 +41,12 @@ class Budget:
         amount = self.episodes if self.steps is None else self.steps
         assert amount is not None
         return amount
+
+    def env_steps(self, task: "Task", agent: "Agent") -> int:
+        """Environment steps of a member, if no episode ends early."""
+        from qfolio.core.training import episode_steps
+
+        return self.amount * (episode_steps(task, agent) if self.steps is None else 1)
 
     def to_json(self) -> dict[str, int]:
         """``{"episodes": n}`` or ``{"steps": n}``."""

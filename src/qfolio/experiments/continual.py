@@ -77,7 +77,7 @@ class Plan:
         if jax.tree.structure(self.task) != jax.tree.structure(self.changed):  # type: ignore[operator]
             raise QfolioError(
                 "only numbers of a task may change, because its compiled program stays the same; "
-                f"those of {type(self.task).__name__} are {', '.join(_numbers(self.task))}."
+                f"{type(self.task).__name__} has {', '.join(_numbers(self.task)) or 'none'}."
             )
         if not self.changes:
             raise QfolioError(
@@ -127,7 +127,9 @@ def _setting(agent: Agent, name: str) -> float:
 
 
 def _numbers(task: Task) -> list[str]:
-    return [name for name in settings.describe(task) if isinstance(getattr(task, name), float)]
+    """The settings that are inputs of the compiled program."""
+    inputs = {each.name for each in dataclasses.fields(task) if not each.metadata.get("static")}
+    return [name for name in settings.describe(task) if name in inputs]
 
 
 class Course(msgspec.Struct):

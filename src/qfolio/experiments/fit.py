@@ -116,6 +116,12 @@ class Listener:
         """After the last chunk, also if Ctrl-C stopped the training; not after an error."""
 
 
+def require_listeners(listeners: object) -> None:
+    """Raises QfolioError unless the argument is a list of listeners."""
+    wanted = "a list of objects whose classes derive from qfolio.Listener"
+    require_list("listeners", listeners, Listener, wanted)
+
+
 def fit(
     population: Population,
     budget: Budget,
@@ -138,8 +144,7 @@ def fit(
         strict: Whether a loss that is not finite raises QfolioError; otherwise the other members
             continue.
     """
-    wanted = "a list of objects whose classes derive from qfolio.Listener"
-    require_list("listeners", listeners, Listener, wanted)
+    require_listeners(listeners)
     training = Training(population, budget, config or {}, population.steps, budget.left(population))
     if training.finished:
         return training

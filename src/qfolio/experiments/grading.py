@@ -26,7 +26,7 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
     if starts is not None:
         require_whole("starts", starts, 1, MOST_STARTS)
     task, keys = population.task, start_keys(starts or population.starts)
-    faults.require_weights(task, population.agent)
+    faults.require_actions(task, population.agent, population.weights())
     played = population.evaluate(keys)
     returns = played.returns.mean(1)
     if not np.isfinite(returns).all():  # although all losses were: no file could hold it

@@ -19,7 +19,7 @@ from qfolio.core.text import amount
 from qfolio.experiments.budget import Budget, require_budget, seed_range
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.executor import Executor, Here, ListenToJob, carry_out
-from qfolio.experiments.fit import Listener
+from qfolio.experiments.fit import Listener, require_listeners
 from qfolio.experiments.grading import grade
 from qfolio.experiments.log import JobLog, Log, add_result
 from qfolio.experiments.machines.choice import on
@@ -85,7 +85,7 @@ class Run(Seeds):
         if place is not None:
             require_new(place)
         run = cls(task, agent, config, None)
-        faults.require_weights(task, agent)
+        faults.require_actions(task, agent)
         if place is not None:
             with new_folder(place) as unfinished:
                 run._folder = RunFolder(unfinished)
@@ -164,6 +164,7 @@ class Run(Seeds):
             log: Log of the experiment that the run is a part of (default: the folder's own).
         """
         budget = self.budget if budget is None else require_budget(budget)
+        require_listeners(listeners)
         executor = on(executor)
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
             if isinstance(executor, Here) and not self.groups.begun:

@@ -499,6 +499,7 @@ def test_a_wrong_baseline_of_ones_own_is_found_before_the_training(tmp_path, mon
         ({"episodes": 3}, "are for agents without a preset; change those of a preset with"),
         ({"agents": {"../dqn": AGENTS["dqn"]}}, "called '../dqn'; use letters, digits, - and _"),
         ({"agents": {"dqn:a": AGENTS["dqn"], "dqn-a": AGENTS["dqn"]}}, "would share a folder"),
+        ({"agents": {"x": AGENTS["dqn"], "x-together": AGENTS["dqn"]}}, "all seeds of x hold tog"),
     ],
 )  # fmt: skip
 def test_backtests_that_cannot_be(settings, message, tmp_path):

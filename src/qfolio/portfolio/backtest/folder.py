@@ -178,6 +178,11 @@ class BacktestConfig(Config, frozen=True):
                 raise QfolioError(
                     f"an agent cannot have the name of the baseline {name}; give it another."
                 )
+            if f"{name}{TOGETHER}" in self.agents:
+                raise QfolioError(
+                    f"{name}{TOGETHER} is what all seeds of {name} hold together; give that agent "
+                    "another name."
+                )
             if agent_folder(name) in self.agents.keys() - {name}:
                 raise QfolioError(
                     f"{name} and {agent_folder(name)} would share a folder; rename one."

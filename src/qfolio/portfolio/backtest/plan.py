@@ -136,7 +136,7 @@ class Plan:
             try:
                 if own_modules(agent):
                     jax.eval_shape(partial(begin, task, agent), seed)
-                    faults.require_weights(task, agent)
+                    faults.require_actions(task, agent)
                 else:
                     jax.eval_shape(partial(agent.init, task), key)
             except QfolioError as error:
