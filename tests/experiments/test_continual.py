@@ -191,11 +191,12 @@ def test_only_the_inputs_of_a_program_are_named_as_numbers_that_may_change():
 
 def test_a_preset_in_steps_has_a_number_of_episodes(monkeypatch):
     made = []
-    monkeypatch.setattr(continual, "create", lambda plan, *_: made.append(plan) or stop())
 
-    def stop():
+    def stop(plan, *_):
+        made.append(plan)
         raise QfolioError("enough.")
 
+    monkeypatch.setattr(continual, "create", stop)
     words = ("market/liquidation", "--agent", "sac", "--change", "volatility=0.9")
     assert qfolio(monkeypatch, "continual", *words) == 2
     (plan,) = made
