@@ -12,7 +12,7 @@ from qfolio.core.files import write_csv
 from qfolio.core.text import amount, figure
 from qfolio.portfolio.backtest.folder import BacktestFolder, followed
 from qfolio.portfolio.backtest.folds import overdue, spell_all
-from qfolio.portfolio.backtest.statistics.measures import drawdown
+from qfolio.portfolio.backtest.statistics.measures import log_growth, measures
 from qfolio.portfolio.conditions import Conditions
 from qfolio.portfolio.costs import CostModel
 from qfolio.portfolio.desk import consistency
@@ -282,14 +282,10 @@ def _earned_by_cash(table: Prices, costs: CostModel, first: int, count: int) -> 
 def _measures(returns: np.ndarray, cash: np.ndarray, year: float) -> dict[str, float]:
     if len(returns) < 2:
         return {}
-    excess = returns - cash
-    spread = float(excess.std(ddof=1))
-    with np.errstate(divide="ignore"):  # all may be lost
-        growth = float(np.log1p(returns).sum())
+    free = np.zeros(len(returns))
+    found = measures(returns, free, free, year, cash)
     return {
-        "growth": float(np.expm1(growth)),
-        "a year": float(np.expm1(growth * year / len(returns))),
-        "volatility": float(returns.std(ddof=1)) * year**0.5,
-        "sharpe": float(excess.mean()) / spread * year**0.5 if spread else 0.0,
-        "drawdown": float(drawdown(returns).max()),
+        "growth": float(np.expm1(log_growth(returns).sum())),
+        "a year": float(found["growth"]),
+        **{name: float(found[name]) for name in ("volatility", "sharpe", "drawdown")},
     }

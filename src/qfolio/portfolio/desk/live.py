@@ -60,8 +60,6 @@ def mark(
     if not records:
         raise QfolioError("The ledger is empty; record an allocation with qfolio allocate first.")
     rows = np.searchsorted(prices.dates, [record.moment for record in records])
-    known = Conditions.of(prices, model)
-    values = np.nan_to_num(prices.values)
     at: dict[int, Record] = {}
     for row, record in zip(rows.tolist(), records, strict=True):
         if row == len(prices) or prices.dates[row] != record.moment:
@@ -76,70 +74,91 @@ def mark(
             )
         at[row] = record
     first = int(rows[0])
-    units, cash = np.zeros(values.shape[1]), 0.0
-    base = total = paid = flow = 0.0
-    due: dict[int, np.ndarray] = {}
+    account = _Account(prices, model, lag, fill)
+    base = total = 0.0
+    paid = flow = 0.0
     table: list[tuple[float, ...]] = []
-    short, loan = 0, False
     for row in range(first, len(prices)):
         if row > first:
-            before = np.append(cash, units * values[row - 1])
-            relatives = np.divide(
-                values[row], values[row - 1], out=np.ones(len(units)), where=values[row - 1] > 0
-            )
-            growth = model.growth(before, relatives, known.holding(row - 1, row))
-            # What a holding earns besides its price is paid in cash, as brokers do: the shares
-            # of the next record are the account's, so none may be bought with it here.
-            cash = cash * growth[0] + float(before[1:] @ (growth[1:] - relatives))
-            if known.listed is not None:  # delisted assets become cash, and their orders void
-                gone = known.listed[row] == 0
-                cash += float(units[gone] @ values[row][gone])
-                units = np.where(gone, 0.0, units)
-                due = {then: np.where(gone, 0.0, part) for then, part in due.items()}
-            total = cash + float(units @ values[row])
+            account.grow(row)
+            total = account.wealth(row)
             if row > first + lag:
                 # As in the backtest, an account loses at most everything, and then earns nothing.
                 earned = max(total / base - 1, -1.0) if base > 0 else 0.0
-                held = float(abs(units * values[row]).sum())
-                gross = held / total if total > 0 else np.inf
-                table.append((earned, total, cash, paid, flow, gross))
-        paid, flow, after = 0.0, 0.0, total
-        if row in due:
-            units, cash, paid = _filled(due.pop(row), units, cash, prices, row, model)
-            after, short = total - paid, short + (not loan and cash < -1e-9 * total)
+                table.append((earned, total, account.cash, paid, flow, account.gross(row)))
+        paid, flow = account.fill(row), 0.0
         if row in at:
-            record = at[row]
-            loan = record.target[0] < -1e-6  # negative cash was wanted
-            scale = np.divide(
-                np.array([price or 0.0 for price in record.prices]), values[row],
-                out=np.ones(len(units)), where=values[row] > 0,
-            )  # fmt: skip
-            units, cash = np.array(record.shares) * scale, record.cash
-            flow = cash + float(units @ values[row]) - after
+            flow = account.take(at[row], row) - (total - paid)
             if row == first:
                 total, flow = total + flow, 0.0
-            part = np.array(record.trades) * scale / fill
-            # Earlier orders go on until this one takes the place of what is left of them.
-            due = {then: parts for then, parts in due.items() if then < row + lag}
-            due |= {row + lag + later: part for later in range(fill)}
             if lag == 0:
-                units, cash, more = _filled(due.pop(row), units, cash, prices, row, model)
-                paid, short = paid + more, short + (not loan and cash < -1e-9 * total)
+                paid += account.fill(row)
         base = total + flow
     returns, wealth, money, costs, flows, gross = np.array(table).reshape(-1, 6).T
     dates = prices.dates[first + lag + 1 :]
-    return Live(dates, returns, wealth, money, costs, flows, gross, first + lag, int(short))
+    return Live(dates, returns, wealth, money, costs, flows, gross, first + lag, account.short)
 
 
-def _filled(
-    trades: np.ndarray, units: np.ndarray, cash: float, prices: Prices, row: int, model: CostModel
-) -> tuple[np.ndarray, float, float]:
-    """Units and cash after trades at a row's prices, and what they cost."""
-    values = np.nan_to_num(prices.values[row])
-    wealth = cash + float(units @ values)
-    if not trades.any() or wealth <= 0:
-        return units, cash, 0.0
-    held = np.append(cash, units * values) / wealth
-    context = context_of(model, prices.between(None, row + 1), wealth)
-    left, costs = settled(model, context, held, wealth, units, values, trades)
-    return units + trades, left, sum(costs.values())
+class _Account:
+    """Units and cash along the rows of a table, and orders that are still to be filled.
+
+    short: number of trades that left an overdraft which was not wanted.
+    """
+
+    def __init__(self, prices: Prices, model: CostModel, lag: int, rows: int) -> None:
+        self._prices, self._model, self._lag, self._rows = prices, model, lag, rows
+        self._values = np.nan_to_num(prices.values)
+        self._known = Conditions.of(prices, model)
+        self._due: dict[int, np.ndarray] = {}  # by row
+        self._loan = False  # whether negative cash was wanted
+        self.units, self.cash, self.short = np.zeros(self._values.shape[1]), 0.0, 0
+
+    def wealth(self, row: int) -> float:
+        return self.cash + float(self.units @ self._values[row])
+
+    def gross(self, row: int) -> float:
+        """Absolute values of assets, as a multiple of wealth; infinite without any."""
+        total = self.wealth(row)
+        return float(abs(self.units * self._values[row]).sum()) / total if total > 0 else np.inf
+
+    def grow(self, row: int) -> None:
+        """Goes on from the row before."""
+        values, earlier, known = self._values[row], self._values[row - 1], self._known
+        before = np.append(self.cash, self.units * earlier)
+        relatives = np.divide(values, earlier, out=np.ones(len(values)), where=earlier > 0)
+        growth = self._model.growth(before, relatives, known.holding(row - 1, row))
+        # What a holding earns besides its price is paid in cash, as brokers do: the shares of the
+        # next record are the account's, so none may be bought with it here.
+        self.cash = self.cash * growth[0] + float(before[1:] @ (growth[1:] - relatives))
+        if known.listed is not None:  # delisted assets become cash, and their orders void
+            gone = known.listed[row] == 0
+            self.cash += float(self.units[gone] @ values[gone])
+            self.units = np.where(gone, 0.0, self.units)
+            self._due = {then: np.where(gone, 0.0, part) for then, part in self._due.items()}
+
+    def take(self, record: Record, row: int) -> float:
+        """Takes an allocation's holdings and orders; returns the wealth of these holdings."""
+        values, prices = self._values[row], np.array([price or 0.0 for price in record.prices])
+        scale = np.divide(prices, values, out=np.ones(len(values)), where=values > 0)
+        self._loan = record.target[0] < -1e-6
+        self.units, self.cash = np.array(record.shares) * scale, record.cash
+        # Earlier orders go on until this one takes the place of what is left of them.
+        first, part = row + self._lag, np.array(record.trades) * scale / self._rows
+        self._due = {then: parts for then, parts in self._due.items() if then < first}
+        self._due |= {first + later: part for later in range(self._rows)}
+        return self.wealth(row)
+
+    def fill(self, row: int) -> float:
+        """Fills what is due at a row's prices; returns what that costs."""
+        trades, wealth = self._due.pop(row, None), self.wealth(row)
+        if trades is None:
+            return 0.0
+        paid = 0.0
+        if trades.any() and wealth > 0:
+            held = np.append(self.cash, self.units * self._values[row]) / wealth
+            context = context_of(self._model, self._prices.between(None, row + 1), wealth)
+            given = (self.units, self._values[row], trades)
+            self.cash, costs = settled(self._model, context, held, wealth, *given)
+            self.units, paid = self.units + trades, sum(costs.values())
+        self.short += int(not self._loan and self.cash < -1e-9 * wealth)
+        return paid
