@@ -107,6 +107,17 @@ def test_the_tail_is_long_enough():
     assert tail_steps(1.0) == 2000
 
 
+def test_a_value_that_no_tail_reaches_is_not_compared():
+    """At a discount of 0.999 a reward of 1 for ever is worth 1,000, an eighth of it after 2,000."""
+    agent = DQN(discount=0.999)
+    weights = constant(agent, Endless(), [1000.0, 1.0])
+    greedy = evaluate(Endless(), agent, weights, start_keys(4), tail_steps(0.999))
+    assert np.isnan(greedy.overestimation)
+    weights = constant(agent, OneState(), [0.0, 1.25])  # whose episodes end
+    greedy = evaluate(OneState(), agent, weights, start_keys(4), tail_steps(0.999))
+    np.testing.assert_allclose(greedy.overestimation, 0.25, rtol=1e-5)
+
+
 def test_few_starts_are_the_first_of_many():
     few, many = (jax.random.key_data(start_keys(n)) for n in (3, 10))
     np.testing.assert_array_equal(few, many[:3])

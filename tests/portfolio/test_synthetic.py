@@ -1,3 +1,5 @@
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -60,6 +62,26 @@ def test_the_optimum_is_followed_on_the_paths_of_an_evaluation():
     followed = FollowedOptimum(task, lambda state: weights).returns(keys)
     graded = evaluate(task, Fixed(), weights, keys, 0).returns
     np.testing.assert_allclose(followed, graded, atol=1e-6)
+
+
+@pytest.mark.parametrize(("stay", "mean", "cost"), [(0.5, 0.2, 0.2), (0.5, 0.02, 0.02)])
+def test_no_band_beats_the_optimum_of_regimes_that_do_not_pay_for_a_switch(stay, mean, cost):
+    task, keys = Regime(stay=(stay,), mean=(mean,), cost=cost), start_keys(256)
+    best = task.optimum().returns(keys).mean()
+    for low, high in ((0, 0), (0, 1), (0.1, 0.9), (0.2, 0.8), (0.3, 0.7), (0.4, 0.6), (1, 1)):
+
+        def policy(state, low=low, high=high):
+            weight = jnp.clip(state.holding.weights[1], low, high)
+            return jnp.stack([1 - weight, weight])
+
+        assert FollowedOptimum(task, policy).returns(keys).mean() < best
+
+
+def test_the_optimum_of_a_persistent_signal_looks_as_far_ahead_as_an_episode():
+    task, keys = Ar1(rho=0.99, noise=0.1409, cost=0.1), start_keys(128)
+    short = dataclasses.replace(task, horizon=33)  # looks ahead by a discount of 0.97
+    near = FollowedOptimum(task, short.best()).returns(keys).mean()
+    assert task.optimum().returns(keys).mean() > 1.05 * near
 
 
 def test_no_perturbed_policy_beats_the_exact_one(market):

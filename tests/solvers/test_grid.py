@@ -1,10 +1,13 @@
+import dataclasses
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from qfolio.core.evaluation import start_keys
+from qfolio.solvers.grid import GridOptimum
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 
 
@@ -63,3 +66,38 @@ def test_solutions_come_back_from_disk(tmp_path, monkeypatch):
     monkeypatch.setenv("QFOLIO_CACHE", str(tmp_path))
     file.write_bytes(b"damaged")
     np.testing.assert_array_equal(task.optimum().returns(keys), first)
+
+
+def test_solutions_of_other_grids_and_of_other_arrays_are_not_taken(tmp_path, monkeypatch):
+    """A task's text shows the shapes of its arrays, not what they hold."""
+    monkeypatch.setenv("QFOLIO_CACHE", str(tmp_path))
+    task = Pendulum(torques=2, horizon=2)
+    angles = jnp.linspace(-jnp.pi, jnp.pi, 20, endpoint=False)
+
+    def values(task, fastest):
+        axes = (angles, jnp.linspace(-fastest, fastest, 21))
+        return GridOptimum(task, PendulumState, axes, (True, False)).stationary(0.5)[0]
+
+    wide, narrow = values(task, 8.0), values(task, 1.0)
+    assert abs(wide - narrow).max() > 1
+    light = eqx.tree_at(lambda t: t.mass, task, np.array([0.5], np.float32))
+    heavy = eqx.tree_at(lambda t: t.mass, task, np.array([2.0], np.float32))
+    assert repr(light) == repr(heavy)
+    assert len(list((tmp_path / "optimum").iterdir())) == 2
+    for each in (light, heavy):
+        optimum = GridOptimum(each, PendulumState, (angles, angles), (True, True))
+        optimum._cached(b"x", lambda: {"x": jnp.zeros(1)})
+    assert len(list((tmp_path / "optimum").iterdir())) == 4
+
+
+def test_a_light_pendulum_has_more_torques_or_no_optimum():
+    """So strong a motor changes the speed by more than the grid can tell in one of 11 torques."""
+    keys = start_keys(8)
+    light = Pendulum(torques=0, horizon=20, mass=0.2)
+    optimum = light.optimum()
+    assert optimum.task.torques == 51
+    coarse = dataclasses.replace(light, torques=11)
+    assert optimum.returns(keys).mean() > coarse.optimum().returns(keys).mean()
+    assert Pendulum(torques=0).optimum().task.torques == 11
+    assert Pendulum(torques=0, mass=0.1, length=0.2).optimum() is None
+    assert Pendulum(torques=5, mass=0.1, length=0.2).optimum() is not None

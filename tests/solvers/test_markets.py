@@ -11,7 +11,7 @@ from qfolio.solvers.ar1 import Ar1Optimum, ar1
 from qfolio.solvers.kelly import kelly
 from qfolio.solvers.merton import growth_optimal, lognormal_scenarios, merton
 from qfolio.solvers.no_trade import no_trade_growth, no_trade_region, no_trade_region_discrete
-from qfolio.solvers.regime import regime
+from qfolio.solvers.regime import regime, regime_bands
 
 # ------------------------------------------------------------------------ Kelly, growth, Merton
 
@@ -167,6 +167,19 @@ def test_regime_limits() -> None:
     assert never.policy[:, 0].tolist() == [0, 0]
     # With a mean above 0 overall, one purchase pays off in the long run at any cost.
     assert regime(stay, (0.0, 0.004), 100.0).gain == pytest.approx(0.004 / 3)
+
+
+def test_bands_of_regimes_are_all_in_and_out_where_switching_pays() -> None:
+    """Where it does not, weights between are better than any of the two positions."""
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        stay, mean = rng.uniform(0.5, 0.98, 2), rng.uniform(0.005, 0.02)
+        bands = regime_bands(stay, (-mean, mean), 1e-4)
+        np.testing.assert_array_equal(bands, [[0, 0], [1, 1]])
+    apart = regime_bands((0.5, 0.5), (-0.2, 0.2), 0.2)
+    np.testing.assert_allclose(apart, 1 - apart[::-1, ::-1], atol=0.02)  # good and bad mirror
+    assert 0 < apart[1, 0] < apart[0, 1] < 1
+    np.testing.assert_array_equal(regime_bands((0.9, 0.8), (-0.1, 0.1), 0.0), [[0, 0], [1, 1]])
 
 
 # --------------------------------------------------------------------------------------- AR(1)

@@ -28,6 +28,13 @@ def step_key(key: PRNGKeyArray, time: Int[Array, ""]) -> PRNGKeyArray:
     return jax.random.fold_in(apart(key), time)
 
 
+LONGEST = 2000
+"""Most steps that are followed beyond the horizon."""
+
+FADED = 0.01
+"""Discounts below this no longer matter to the overestimation."""
+
+
 class Greedy(NamedTuple):
     """Results of greedy episodes from several start states."""
 
@@ -39,7 +46,7 @@ def tail_steps(discount: float | None) -> int:
     """Steps after which a reward is discounted to 1%: at most 2,000, and 0 without a discount."""
     if discount is None:
         return 0
-    return min(2000, math.ceil(math.log(0.01) / math.log(min(max(discount, 1e-9), 1 - 1e-9))))
+    return min(LONGEST, math.ceil(math.log(FADED) / math.log(min(max(discount, 1e-9), 1 - 1e-9))))
 
 
 def evaluate(
@@ -50,7 +57,8 @@ def evaluate(
     The return covers the horizon. The overestimation is the mean, over the states visited within
     the horizon, of max_a Q(s, a) minus the realized discounted return (van Hasselt et al. 2016,
     section 3); the tail keeps that return from being cut off. The overestimation leaves out starts
-    from which the task's data end within the tail, such as the last rows of a price table.
+    from which the task's data end within the tail, such as the last rows of a price table, and
+    those whose episode goes on after a tail of ``LONGEST`` that the discount has not faded by then.
     """
     starts = jax.vmap(task.reset)(keys)
     known = jax.vmap(task.steps_left)(starts) >= task.horizon + tail
@@ -69,7 +77,9 @@ def evaluate(
 
     alive = jnp.ones(keys.shape, bool)
     times = jnp.arange(task.horizon + tail)
-    _, (rewards, best, visited) = lax.scan(step, (starts, alive), times)
+    (_, goes_on), (rewards, best, visited) = lax.scan(step, (starts, alive), times)
+    if tail >= LONGEST:
+        known &= ~(goes_on & (discount**tail > FADED + 1e-4))
 
     def back(following: Array, reward: Array) -> tuple[Array, Array]:
         now = reward + discount * following

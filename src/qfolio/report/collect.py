@@ -24,6 +24,7 @@ from qfolio.report.contrast import contrast_of
 from qfolio.report.data import Curve, Episode, Maps, MarketData, ReportData, Responses, Weights
 from qfolio.report.words import agent_name, words_of
 from qfolio.solvers.followed import FollowedOptimum
+from qfolio.solvers.grid import GridOptimum
 from qfolio.tasks.pendulum import Pendulum, PendulumState
 
 _HELD = 201
@@ -43,6 +44,7 @@ def report_data(
         optimum = float(solution.returns(start_keys())[: run.population.curve_starts].mean())
     pendulum = run.task if isinstance(run.task, Pendulum) else None
     known = solution if isinstance(solution, FollowedOptimum) else None
+    exact = solution if isinstance(solution, GridOptimum) else None
     # In a market, training episodes have other random paths, so their returns are not comparable.
     whole = known is None and episode_steps(run.task, run.agent) == run.task.horizon
     episodes = run.metrics if whole else Records()
@@ -60,7 +62,7 @@ def report_data(
         training_done=_done(run, unit, episodes.column("episode").astype(float)),
         training_returns=episodes.column("return"),
         optimum=optimum,
-        maps=_maps(run, pendulum) if pendulum else None,
+        maps=_maps(run, pendulum, exact) if pendulum and exact else None,
         episode=greedy_episode(run, pendulum) if pendulum else None,
         market=_market(run, summary, known) if known else None,
         unit=unit,
@@ -182,7 +184,7 @@ def responses(
     )
 
 
-def _maps(run: Run, task: Pendulum) -> Maps:
+def _maps(run: Run, task: Pendulum, optimum: GridOptimum) -> Maps:
     theta = np.linspace(-np.pi, np.pi, 200, endpoint=False)
     theta_dot = np.linspace(-task.max_speed, task.max_speed, 201)
     grid = np.meshgrid(theta.astype(np.float32), theta_dot.astype(np.float32), indexing="ij")
@@ -190,7 +192,6 @@ def _maps(run: Run, task: Pendulum) -> Maps:
     agent, weights = run.agent, run.first_weights()
     values = agent.action_values(weights, observation)
     torque = task.torque(agent.policy(weights, observation))
-    optimum = task.optimum()
     assert agent.discount is not None
     assert isinstance(optimum.task, Pendulum)
     discount = float(agent.discount)

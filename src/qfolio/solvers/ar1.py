@@ -54,7 +54,7 @@ def ar1(
     levels: ArrayLike = LEVELS,
     discount: float = 0.97,
     drifting: bool = True,
-    signal_points: int = 201,
+    signal_points: int | None = None,
     holding_parts: int = 4,
     steps_per_year: int = 252,
 ) -> Ar1Optimum:
@@ -78,7 +78,8 @@ def ar1(
         levels: Ascending weights in [0, 1] to choose from.
         discount: Discount per step, from 0 to 0.9999.
         drifting: Whether prices move the weights.
-        signal_points: Size of the signal's grid, at least 11.
+        signal_points: Size of the signal's grid, at least 11 (default: 201, or as many more as keep
+            its points within a shock of each other).
         holding_parts: Cells of the grid of held weights between two levels.
         steps_per_year: Turns growth per step into growth a year.
 
@@ -95,8 +96,10 @@ def ar1(
         b.ndim == 1 and b.size > 1 and b[0] >= 0 and b[-1] <= 1 and bool(np.all(np.diff(b) > 0)),
         "levels must be two or more ascending weights between 0 and 1",
     )
-    require(signal_points >= 11 and holding_parts >= 1, "the grids are too coarse")
     spread = noise / math.sqrt(1 - rho**2)
+    if signal_points is None:
+        signal_points = max(201, math.ceil(10 * spread / noise) + 1)
+    require(signal_points >= 11 and holding_parts >= 1, "the grids are too coarse")
     x = np.linspace(-5 * spread, 5 * spread, signal_points)
     transition = np.exp(-0.5 * ((x - rho * x[:, None]) / noise) ** 2)
     transition /= transition.sum(1, keepdims=True)

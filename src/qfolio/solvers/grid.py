@@ -129,7 +129,10 @@ class GridOptimum:
         self, name: bytes, compute: Callable[[], dict[str, Array]]
     ) -> dict[str, np.ndarray]:
         parts = [name, repr(self.task).encode(), repr((self._shape, self.periodic)).encode()]
-        sources = [inspect.getsourcefile(type(self.task)), __file__]
+        arrays = (*self.axes, *jax.tree.leaves(self.task))  # a task's text shows their shapes only
+        parts += [np.asarray(array).tobytes() for array in arrays]
+        kinds = [kind for kind in type(self.task).__mro__ if issubclass(kind, Task)]
+        sources = [*map(inspect.getsourcefile, kinds), __file__]
         parts += [Path(source).read_bytes() for source in sources if source]
         path = cache_directory() / "optimum" / f"{hashlib.sha256(b'|'.join(parts)).hexdigest()}"
         try:

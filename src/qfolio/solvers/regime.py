@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from qfolio.solvers.shared import require
+from qfolio.solvers.shared import log_remainder, require
 
 
 class RegimeOptimum(NamedTuple):
@@ -61,3 +61,48 @@ def regime(stay: ArrayLike, means: ArrayLike, cost_log: float) -> RegimeOptimum:
     policy = np.where(enter[:, None], 1, np.where(leave[:, None], 0, [0, 1]))
     gain = float(stationary @ np.where(enter, worth - cost_log, 0.0))
     return RegimeOptimum(policy, gain, advantage)
+
+
+def regime_bands(
+    stay: ArrayLike, means: ArrayLike, cost: float, discount: float = 1.0, points: int = 401
+) -> Float[np.ndarray, "2 2"]:
+    """The best policy of weights in the same market: between which weights to let them drift.
+
+    A weight b earns log(1 + b (e^m − 1)) in a regime of mean m, then drifts with the price; a trade
+    from weight a to b pays the remainder factor. Rewards are concave in weights and costs are
+    proportional, so that each regime has a band: a weight below it is bought up to its lower edge,
+    one above is sold down to its upper edge (Davis & Norman 1990). Where costs are small, the edges
+    are those of ``regime``: all in good times and nothing in bad ones. Relative value iteration on
+    a grid of weights finds them.
+
+    Args:
+        stay: As for ``regime``.
+        means: As for ``regime``.
+        cost: Proportional and one way, at least 0 and below 1.
+        discount: Discount per step; at 1, the average reward of all steps is maximized, so that a
+            first purchase costs nothing.
+        points: Size of the grid of weights from 0 to 1, whose spacing is the edges' precision.
+
+    Returns:
+        The lower and the upper edge, by regime.
+    """
+    last, m = np.asarray(stay, dtype=float), np.asarray(means, dtype=float)
+    weights = np.linspace(0, 1, points)
+    gain = np.expm1(m)[:, None]
+    earned = np.log1p(weights * gain)
+    drifted = weights * (1 + gain) / (1 + weights * gain)
+    trade = log_remainder(weights[:, None], weights, cost)  # (held, ordered)
+    transition = discount * np.array([[last[0], 1 - last[0]], [1 - last[1], last[1]]])
+    value = np.zeros((2, points))
+    while True:
+        later = transition @ value
+        after = earned + np.stack([np.interp(drifted[s], weights, later[s]) for s in (0, 1)])
+        # Between the edges a weight is held; from below and above it is traded to them.
+        low, high = ((trade[end] + after).argmax(1) for end in (0, -1))
+        best = np.clip(np.arange(points), low[:, None], high[:, None])
+        found = trade[np.arange(points), best] + np.take_along_axis(after, best, 1)
+        change = found - value
+        value = found - found.min()
+        if np.ptp(change) < 1e-10:
+            break
+    return weights[np.stack([low, high], 1)]

@@ -58,6 +58,6 @@ class HiddenPendulum(Task):
         row = self._pendulum.observe(pendulum)[:2]
         return jnp.concatenate([window[1:], row[None]])
 
-    def optimum(self) -> GridOptimum:
+    def optimum(self) -> GridOptimum | None:
         """The optimum of the pendulum with observed velocity, from the same starts."""
         return self._pendulum.optimum()

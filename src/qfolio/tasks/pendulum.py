@@ -6,6 +6,7 @@ tests compare both step by step.
 """
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from qfolio.core.fields import number, require, static
 from qfolio.core.mdp import Box, Discrete, Step, Task
 from qfolio.solvers.grid import GridOptimum
+
+MOST_TORQUES = 101
+"""Most torques that stand for continuous ones; the optimum then takes half a minute."""
 
 
 class PendulumState(NamedTuple):
@@ -66,6 +70,12 @@ class Pendulum(Task):
             return jnp.clip(action[..., 0], -self.max_torque, self.max_torque)
         return self.max_torque * (2.0 * action / (self.torques - 1) - 1.0)
 
+    @property
+    def _dense(self) -> int:
+        """The number of torques, odd, whose neighbors change the speed by at most 0.06 a step."""
+        pushed = 3 * self.max_torque * self.dt / (self.mass * self.length**2)
+        return 2 * max(5, math.ceil(pushed / 0.06 - 1e-9)) + 1
+
     def reset(self, key: PRNGKeyArray) -> PendulumState:
         theta, theta_dot = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
         return PendulumState(jnp.pi * theta, theta_dot)
@@ -88,13 +98,16 @@ class Pendulum(Task):
         state = PendulumState(theta + speed * self.dt, speed)
         return Step(state, reward, jnp.zeros_like(reward, dtype=bool))
 
-    def optimum(self) -> GridOptimum:
+    def optimum(self) -> GridOptimum | None:
         """Dynamic programming on a grid over one turn of θ and all speeds, with equal torques.
 
-        Torques between the 11 would gain less than the grid's error.
+        Of continuous torques, so many are tried that torques between them would gain less than the
+        grid's error: 11, or more for a light or short pendulum. None if these would be too many.
         """
+        if not self.torques and self._dense > MOST_TORQUES:
+            return None
         return GridOptimum(
-            task=self if self.torques else dataclasses.replace(self, torques=11),
+            task=self if self.torques else dataclasses.replace(self, torques=self._dense),
             state=PendulumState,
             axes=(
                 jnp.linspace(-jnp.pi, jnp.pi, 400, endpoint=False),

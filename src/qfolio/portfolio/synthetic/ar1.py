@@ -36,7 +36,6 @@ class Ar1(OneAsset):
     horizon: int = static(252)  # steps of an episode
 
     levels = 11
-    optimum_discount = 0.97
 
     def __check_init__(self) -> None:
         require(self, "rho", lambda x: 0 <= x <= 0.999, "from 0 to 0.999")
@@ -73,7 +72,7 @@ class Ar1(OneAsset):
         levels = np.linspace(0, 1, self.levels)
         solution = ar1(
             self.rho, self.noise, self.drift, self.slope, self.volatility, self.cost, levels,
-            self.optimum_discount,
+            1 - 1 / self.horizon,  # looks as far ahead as an episode is long
         )  # fmt: skip
         weights = jnp.asarray(levels, jnp.float32)
         signals = jnp.asarray(solution.signals, jnp.float32)

@@ -4,7 +4,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from qfolio.core.errors import QfolioError
@@ -12,7 +11,7 @@ from qfolio.core.fields import constant, numbers, require, static
 from qfolio.core.mdp import Policy, Position
 from qfolio.portfolio.market import Relatives
 from qfolio.portfolio.synthetic.base import OneAsset, require_cost
-from qfolio.solvers.regime import regime
+from qfolio.solvers.regime import regime_bands
 
 
 class Regime(OneAsset):
@@ -68,14 +67,11 @@ class Regime(OneAsset):
         return Relatives(jnp.ones(1), moved, moved)
 
     def best(self) -> Policy:
-        solution = regime(self.stays, self.means, -np.log1p(-self.cost))
-        table = jnp.asarray(solution.policy)
+        ahead = 1 - 1 / self.horizon  # looks as far ahead as an episode is long
+        edges = jnp.asarray(regime_bands(self.stays, self.means, self.cost, ahead), jnp.float32)
 
         def policy(state: Position) -> Array:
-            # Costs and rewards are linear in the weight, so each part of it is its own position.
-            enters, stays = table[state.market, 0], table[state.market, 1]
-            weight = state.holding.weights[1]
-            weight = stays * weight + enters * (1 - weight)
+            weight = jnp.clip(state.holding.weights[1], *edges[state.market])
             return jnp.stack([1 - weight, weight])
 
         return policy
