@@ -79,8 +79,9 @@ def train(agents: int, episodes: int, tflops: float, terabytes: float) -> None:
     steps = population.steps * agents
     work = steps * operations(task, agent)
     traffic = steps * bytes_moved(task, agent)
-    keys = start_keys(STARTS)
-    optimum = float(task.optimum().returns(keys).mean())
+    keys, exact = start_keys(STARTS), task.optimum()
+    assert exact is not None
+    optimum = float(exact.returns(keys).mean())
     regrets = (optimum - population.evaluate(keys).returns.mean(1)) / abs(optimum)
     print(f"{agents:,} agents × {episodes} episodes on {devices.describe()}")
     precision = jax.config.jax_default_matmul_precision  # type: ignore[attr-defined]

@@ -221,6 +221,8 @@ def test_the_hidden_pendulum_is_swung_up_and_held():
     population = Population(task, preset.build(), [100])
     while left := population.steps_left(preset.episodes):
         population.advance(left)
-    best = task.optimum().returns(start_keys()).mean()
+    optimum = task.optimum()
+    assert optimum is not None
+    best = optimum.returns(start_keys()).mean()
     returns = population.evaluate(start_keys(), tail=0).returns.mean(1)
     assert (best - returns) / abs(best) < 0.1

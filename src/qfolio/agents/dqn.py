@@ -113,7 +113,7 @@ class DQN(Agent):
     epsilon_end: float = number(0.01)  # least share of random actions
     epsilon_decay: float = number(0.995)  # factor on ε per finished episode
     epsilon_steps: float = constant(0.0)  # length of a linear decay in steps; 0: use epsilon_decay
-    persistence: float = constant(0.0)  # share of exploring steps that repeat the last action
+    persistence: float = constant(0.0)  # of the last action, with probability ε times this
     huber_delta: float = number(math.inf)  # |TD error| beyond which the loss is linear
     reward_scale: float = number(1.0)  # rewards are multiplied by it before learning
     input_gain: float = number(0.0)  # gain of the first layer on inputs scaled to ±1; 0: unscaled

@@ -188,7 +188,7 @@ class SAC(ActorCritic[Learned]):
         policy, process = state.learned.actor(observation), state.noise
         if process is None or isinstance(policy, Categorical):
             return policy.sample(key)
-        # Scaled to a variance of 1, so that each draw alone is the policy's.
+        # Scaled to a variance that grows to 1, so that later draws alone are the policy's.
         theta = self.noise_theta
         noise = math.sqrt(theta * (2 - theta)) * process.value
         return policy.at(noise[:, : policy.coordinates])

@@ -132,6 +132,6 @@ def _numbers(option: str, text: str | None, main: float) -> list[float]:
 
 
 def _whole(option: str, value: float) -> int:
-    if value != int(value):
+    if not value.is_integer():
         raise QfolioError(f"{option} has {value:g}; lags are whole numbers of rows.")
     return int(value)

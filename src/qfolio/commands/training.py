@@ -317,7 +317,7 @@ def write_again(folder: Path) -> None:
     summary = read_json(path) if path.is_file() else {}
     if summary.get("episodes") != run.episodes:
         raise QfolioError(f"The run is not finished; continue with {_resume(run, folder)}.")
-    write_report(folder, report_data(run, summary, contrast, _command(run)))
+    write_report(folder, report_data(run, summary, contrast, _command(run, contrast)))
 
 
 def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
@@ -330,7 +330,7 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
     starts = run.population.starts
     with working(f"Grading on {starts:,} start states and writing the report"):
         summary = run.summary()
-        write_report(folder, report_data(run, summary, contrast, _command(run)))
+        write_report(folder, report_data(run, summary, contrast, _command(run, contrast)))
     print_result(run.population.seeds, summary)
     if summary["rule"]:
         print_rule(summary["rule"])
@@ -345,17 +345,20 @@ def _finish(run: "Run", folder: Path, contrast: "Run | None") -> Document:
     return summary
 
 
-def _resume(run: "Run", folder: Path | None, on: str = "here") -> str:
+def _resume(run: "Run", folder: Path | None, on: str = "here", compare: bool = True) -> str:
     assert folder is not None
-    return again("qfolio train --resume", folder, run.task, run.agent, on=on)
+    command = "qfolio train --resume" if compare else "qfolio train --no-compare --resume"
+    return again(command, folder, run.task, run.agent, on=on)
 
 
-def _command(run: "Run") -> str:
+def _command(run: "Run", contrast: "Run | None") -> str:
     """The command line that repeats a run, and the one that resumes it."""
     from qfolio.experiments.presets import changes
+    from qfolio.report.contrast import contrast_of
 
     config = run.config
-    resume = _resume(run, run.folder)
+    compare = contrast is not None or contrast_of(run.agent) is None
+    resume = _resume(run, run.folder, compare=compare)
     found = changes(config, type(run.task))
     if found is None:
         return resume
@@ -367,6 +370,7 @@ def _command(run: "Run") -> str:
     words = ["qfolio train", config.task, "--agent", config.agent, "--preset"]
     words += [preset, f"--{run.budget.unit}", str(run.budget.amount)]
     words += ["--seeds", str(config.seeds), "--seed", str(config.seed)]
+    words += [] if compare else ["--no-compare"]
     words += ["--set", *map(shlex.quote, changed)] if changed else []
     return f"{' '.join(words)}\n{resume}"
 

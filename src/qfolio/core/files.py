@@ -126,6 +126,15 @@ def new_folder(folder: Path, option: str | None = "--resume") -> Iterator[Path]:
         raise
 
 
+def tidy(folder: Path) -> None:
+    """Removes the temporary files of a killed process from a folder and those in it.
+
+    Only for who holds the folder's lock: another process may be writing one.
+    """
+    for path in folder.rglob(f".*{UNFINISHED}"):
+        path.unlink(missing_ok=True)
+
+
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Locks a folder against other processes until the block or this process ends.

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from qfolio.core.config import Config, read_config, write_config
-from qfolio.core.files import UNFINISHED, naming, read_tree, write_bytes, write_json, write_tree
+from qfolio.core.files import naming, read_tree, tidy, write_bytes, write_json, write_tree
 from qfolio.experiments.budget import Budget, seed_range
 from qfolio.experiments.records import Records, Row
 
@@ -106,8 +106,7 @@ class RunFolder:
                 write_bytes(self.path / name, rows.csv(header=True))
             else:
                 (self.path / name).unlink(missing_ok=True)
-        for path in self.path.glob(f".*{UNFINISHED}"):
-            path.unlink()
+        tidy(self.path)
 
 
 def curve_point(rows: Sequence[Row]) -> dict[str, list[float]]:

@@ -104,8 +104,12 @@ def _changes(run: Run) -> tuple[str | None, dict[str, tuple[Any, Any]]]:
     name, settings = found
     own = preset(name, config.task, config.agent)
     now, before = (f"{budget.amount} {budget.unit}" for budget in (run.budget, own.budget))
+    # Groups of seeds count steps, in whole rollouts.
+    rollout = run.agent.rollout_steps * run.agent.num_envs
+    planned = -(-own.budget.env_steps(run.task, run.agent) // rollout) * rollout
+    same = run.budget.amount == planned and run.budget.unit != own.budget.unit
     plan: dict[str, tuple[Any, Any]] = {
-        "budget": (now, before),
+        "budget": (before if same else now, before),
         "seeds": (config.seeds, own.seeds),
     }
     return name, {key: pair for key, pair in plan.items() if pair[0] != pair[1]} | settings

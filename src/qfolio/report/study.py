@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from qfolio.core.files import write_text
-from qfolio.core.text import amount
+from qfolio.core.text import amount, listed
 from qfolio.portfolio.backtest.statistics.verdict import p_text
 from qfolio.portfolio.study.folder import Result, StudyConfig, StudyFolder, Variant
 from qfolio.portfolio.study.pooling import Active, Evidence, Pools
@@ -88,6 +88,10 @@ def render_study(
     """
     main, agents = result.variants[0], " and ".join(config.agents)
     tables = len(config.tables)
+    notes: dict[str, list[str]] = {}
+    for name, table in config.tables.items():
+        if table.note:
+            notes.setdefault(table.note, []).append(name)
     return render(
         "study.html",
         data=config,
@@ -96,7 +100,7 @@ def render_study(
         spelled=_spelled(main.variant),
         facts=_facts(config, result),
         looks=looks_sentence(result),
-        notes=sorted({table.note for table in config.tables.values() if table.note}),
+        notes=[(listed(names), note) for note, names in notes.items()],
         agents=[
             {
                 "name": name,

@@ -69,7 +69,8 @@ def _facts(data: Sweep) -> list[tuple[str, str, str]]:
     digits = decimals(data.summary["optimum"] or best.value)
     failed = sum(math.isnan(trial.value) for trial in data.trials)
     config = data.config
-    trained = [x for x in data.summary["return_per_seed"] if x is not None]
+    trained = [math.nan if x is None else x for x in data.summary["return_per_seed"]]
+    graded = float(np.mean(trained))
     count = len(data.summary["seeds"])
     seeds = f"{count} {plural('seed', count)}"
     note = f"retrained, {seeds}, graded starts"
@@ -83,7 +84,7 @@ def _facts(data: Sweep) -> list[tuple[str, str, str]]:
             f"{config['seeds']} {plural('seed', config['seeds'])} each, {failed} diverged",
         ),
         ("Best found", number(best.value, digits), f"trial {best.number + 1}, on tuning starts"),
-        ("Best, graded", number(float(np.mean(trained)), digits) if trained else "–", note),
+        ("Best, graded", "diverged" if math.isnan(graded) else number(graded, digits), note),
         ("Trials an hour", number(hour, 0), f"{config['batch']} at once, one process"),
     ]
 

@@ -35,6 +35,23 @@ def test_noise_alone_does_not_rise():
     assert sum(fold.rising for fold in folds) <= 8  # 2.3 expected
 
 
+def test_seeds_that_differ_do_not_look_like_progress():
+    """Rows come a lap of all environments at a time, one seed after another."""
+    rng = np.random.default_rng(0)
+    laps, seeds, environments = 7, 5, 32
+    numbers = np.arange(laps * environments).reshape(laps, 1, environments)
+    episodes = np.broadcast_to(numbers, (laps, seeds, environments)).ravel()
+    better = np.broadcast_to(np.arange(seeds)[:, None], (laps, seeds, environments)).ravel()
+    returns = better + rng.normal(0, 0.1, better.size)
+    fold = FoldTraining.of(returns, episodes)
+    assert fold is not None
+    assert np.ptp(fold.curve) < 0.1
+    assert not fold.rising
+    mixed = FoldTraining.of(returns)
+    assert mixed is not None
+    assert np.ptp(mixed.curve) > 1
+
+
 def test_few_episodes_say_nothing():
     assert FoldTraining.of(np.zeros(2 * POINTS - 1)) is None
 

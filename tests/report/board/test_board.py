@@ -69,6 +69,22 @@ def test_a_resumed_job_counts_nothing_twice(tmp_path):
     assert [point[:2] for point in curve.points] == [(10, 11), (20, 21), (30, -29), (40, -39)]
 
 
+def test_pauses_are_no_work_and_old_jobs_are_no_backlog(tmp_path):
+    """A backtest that was killed on workers and resumed a day later in other groups."""
+    groups = {"event": "queued", "jobs": ["dqn/1", "dqn/2"]}
+    write(tmp_path, start(time=0.0), groups, {**RUNNING, "job": "dqn/1", "time": 1.0},
+          {**record(9, 1.0, "dqn/1"), "share": 0.9, "left": 1.0, "time": 10.0})  # fmt: skip
+    write(tmp_path, start(time=86_410.0), {"event": "queued", "jobs": ["dqn"]},
+          {**RUNNING, "job": "dqn/1", "time": 86_411.0, "share": 0.2})  # fmt: skip
+    experiment = read_again(tmp_path)
+    assert experiment.summary("k")["paused"] == 86_400.0
+    job = experiment.jobs["dqn/1"]
+    assert (job.share, job.left) == (0.2, None)  # from its last checkpoint
+    write(tmp_path, {**RUNNING, "job": "dqn"}, {"event": "done", "job": "dqn"}, END)
+    done = read_again(tmp_path).summary("k")
+    assert (done["jobs"], done["share"]) == ({"done": 1}, 1.0)
+
+
 def test_it_reads_on_where_it_stopped(tmp_path):
     write(tmp_path, start(), RUNNING, record(1, 1.0))
     experiment = read_again(tmp_path)

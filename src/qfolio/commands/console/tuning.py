@@ -29,7 +29,7 @@ def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
     for name, row in (("best", "return_per_seed"), ("preset", "preset_return_per_seed")):
         returns = [math.nan if x is None else x for x in summary[row]]
         mean = sum(returns) / len(returns)
-        worst = figure(min(returns), ".2f")
+        worst = figure(math.nan if math.isnan(mean) else min(returns), ".2f")
         say(f"{name:<8}{figure(mean, '.2f'):>9}   worst seed {worst}")
     if summary["optimum"] is not None:
         seeds = amount(len(returns), "fresh seed")

@@ -20,7 +20,7 @@ import numpy as np
 
 from qfolio.core import devices
 from qfolio.core.errors import QfolioError, require_list, require_type, require_whole
-from qfolio.core.files import locked, new_folder, path_of
+from qfolio.core.files import locked, new_folder, path_of, tidy
 from qfolio.core.mdp import Agent
 from qfolio.core.notebook import card
 from qfolio.core.registry import BASELINES, own_modules, short
@@ -338,6 +338,8 @@ class Backtest:
         first = [next(group) for _, group in groupby(jobs, lambda job: job.agent_name)]
         ahead = preparing(first[1:] if isinstance(executor, Here) else [])
         with lock, ahead, Log(self.folder).opened(**self._about) as log:
+            if self.folder is not None:
+                tidy(self.folder)
             self.interrupted = carry_out(executor, jobs, listen, self.store, log)
 
     @property

@@ -15,6 +15,7 @@ import numpy as np
 from qfolio.core.config import AgentName, Config, read_config, write_config
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json, write_csv
+from qfolio.core.text import shell
 from qfolio.portfolio.backtest.folder import RISK_FREE, BacktestFolder, followed
 from qfolio.portfolio.study.pooling import Pools, TableReturns
 
@@ -162,7 +163,7 @@ class StudyFolder:
         except (AttributeError, KeyError, QfolioError, StopIteration, TypeError, ValueError):
             raise QfolioError(
                 f"{files.path} is damaged; write its tables again with qfolio backtest --resume "
-                f"{files.path}."
+                f"{shell(files.path)}."
             ) from None
 
     def write_table(self, result: Result) -> None:

@@ -440,7 +440,7 @@ def _require_plan(tables: Mapping[str, Prices], variants: Sequence[Variant]) -> 
         if (twin := names.setdefault(table.digest, name)) != name:
             raise QfolioError(f"{twin} and {name} are the same table; give it once.")
     for variant in variants:
-        if variants.count(variant) > 1:
+        if [each.name for each in variants].count(variant.name) > 1:  # a folder
             raise QfolioError(
                 f"A lag of {variant.lag} with a cost of {variant.bps:g} bp is given twice."
             )

@@ -84,6 +84,6 @@ def _costs(simulation: Simulation, year: float) -> dict[str, float]:
 def _training(backtest: Backtest, agent: str) -> list[FoldTraining]:
     """An agent's training in each fold; empty if a fold's records are missing."""
     records = (backtest.records(agent, fold.name) for fold in backtest.folds)
-    folds = [FoldTraining.of(rows.column("return")) for rows in records]
+    folds = [FoldTraining.of(rows.column("return"), rows.column("episode")) for rows in records]
     known = [fold for fold in folds if fold is not None]
     return known if len(known) == len(folds) else []

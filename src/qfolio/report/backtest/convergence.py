@@ -38,11 +38,17 @@ class FoldTraining:
     rising: bool
 
     @classmethod
-    def of(cls, returns: Numbers) -> FoldTraining | None:
-        """From the returns of all episodes in order of time; None if there are too few."""
+    def of(cls, returns: Numbers, episodes: Numbers | None = None) -> FoldTraining | None:
+        """From the returns of all episodes in order of time; None if there are too few.
+
+        episodes: their numbers, by which those of all seeds are put side by side: each part of the
+        training then holds as many of each seed.
+        """
         if len(returns) < 2 * POINTS:
             return None
         values = np.asarray(returns, dtype=float)
+        if episodes is not None:
+            values = values[np.argsort(episodes, kind="stable")]
         third, last = np.array_split(values, 4)[2:]
         error = np.sqrt(third.var(ddof=1) / len(third) + last.var(ddof=1) / len(last))
         curve = np.array([part.mean() for part in np.array_split(values, POINTS)])

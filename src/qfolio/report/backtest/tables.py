@@ -307,7 +307,7 @@ def fold_rows(folds: list[dict[str, Any]]) -> list[dict[str, Any]]:
     if not folds:
         return []
     keys = ("train_first", "train_last", "test_first", "test_last")
-    days = np.array([[fold[key] for key in keys] for fold in folds], dtype="datetime64[D]")
+    days = np.array([[fold[key] for key in keys] for fold in folds], dtype="datetime64[s]")
     days = days.astype(float)
     places = 100 * (days - days.min()) / max(np.ptp(days), 1)
     return [

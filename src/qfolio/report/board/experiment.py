@@ -65,6 +65,7 @@ class JobEvent(msgspec.Struct):
     step: float | None = None
     worker: str = ""
     members: list[str] = []
+    share: float | None = None
     error: str = ""
 
 
@@ -131,6 +132,7 @@ class Job:
         if said.event == "running":
             self.worker, self.members, self.begun = said.worker, said.members, said.time
             self.ended, self.step = None, said.step or 0.0
+            self.share, self.rate, self.left = said.share or 0.0, None, None
             for curve in self.curves.values():
                 curve.cut(self.step)
         else:
@@ -167,6 +169,7 @@ class Experiment:
         self._offset, self._first, self._touched = 0, b"", 0.0
         self.about = Start(0.0)
         self.begun: float | None = None  # the first time
+        self.paused = 0.0  # seconds without work between that and the last event
         self.last = 0.0  # time of the last event
         self.end: End | None = None  # of the work that ended last
         self._working: set[tuple[int | None, str]] = set()  # processes that have not ended
@@ -212,8 +215,11 @@ class Experiment:
             return
         self.version = version
         if isinstance(said, Start):
+            if self.begun is None:
+                self.begun = said.time
+            elif said.kind != SHARED or not self._working:
+                self.paused += max(said.time - self.last, 0.0)
             self.about, self.last = said, said.time
-            self.begun = said.time if self.begun is None else self.begun
             if said.kind != SHARED:
                 self.end = None
                 self._working.clear()
@@ -221,6 +227,10 @@ class Experiment:
         elif isinstance(said, End):
             self.end, self.last = said, said.time
             self._working.discard((said.pid, said.host))
+            if said.state == "done" and not self._working:
+                # Work that was stopped may have been divided into other jobs.
+                ended = ("done", "failed")
+                self.jobs = {name: job for name, job in self.jobs.items() if job.state in ended}
         elif isinstance(said, Result):
             self.results.update(said.values)
         elif isinstance(said, Queued):
@@ -256,7 +266,7 @@ class Experiment:
         return {
             "key": key, "name": self.name, "state": self.state, "kind": self.about.kind,
             "task": self.about.task, "agents": self.about.agents, "seeds": self.about.seeds,
-            "share": self.share, "begun": self.begun, "last": self.last,
+            "share": self.share, "begun": self.begun, "last": self.last, "paused": self.paused,
             "rate": sum(job.rate or 0.0 for job in running) or None,
             "jobs": {state: states.count(state) for state in sorted(set(states))},
             "workers": len({job.worker for job in running if job.worker}),

@@ -222,7 +222,7 @@ function header(shown, single) {
     }
     if (lede.dataset.said !== text + also + single.report) lede.replaceChildren(...words);
     lede.dataset.said = text + also + single.report;
-    facts.push(["done", percent(single.share)], [done ? "took" : "so far", span(until - begun)]);
+    facts.push(["done", percent(single.share)], [done ? "took" : "so far", span(until - begun - single.paused)]);
     if (single.state === "running") facts.push(["left", span(left)], ["steps a second", single.rate ? number(Math.round(single.rate)) : "–"]);
     if (single.seeds) facts.push(["seeds", String(single.seeds)]);
     if (jobs > 1) facts.push(["jobs", `${single.jobs.done || 0} of ${jobs}`]);
@@ -243,7 +243,7 @@ function header(shown, single) {
 function remaining(run, detail) { // jobs say what is left of them; others take as long as they did
   const jobs = [...detail.jobs.values()];
   if (jobs.length === 1) return jobs[0].left;
-  const spent = Date.now() / 1000 - run.begun;
+  const spent = Date.now() / 1000 - run.begun - run.paused;
   return run.share > .01 ? spent * (1 / run.share - 1) : null;
 }
 

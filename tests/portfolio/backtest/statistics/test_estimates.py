@@ -116,6 +116,18 @@ def test_what_has_no_error() -> None:
     assert (same.value, same.interval(), same.tails()) == (0, (0, 0), (1, 1))
 
 
+@pytest.mark.parametrize(("periods", "known"), [(2, False), (4, False), (5, True)])
+def test_a_few_days_prove_nothing(periods: int, known: bool) -> None:
+    """The error of a Sharpe ratio of two days is 0 whatever they are."""
+    rng = np.random.default_rng(0)
+    ours, theirs = rng.normal(0.01, 0.01, (2, 1, periods))
+    for each in estimate(ours, theirs, 252.0).values():
+        assert each.known is known
+        if not known:
+            assert each.tails() == (1.0, 1.0)
+            assert each.interval() == (-math.inf, math.inf)
+
+
 def test_the_luckiest_of_several() -> None:
     rng = np.random.default_rng(5)
     apart = [Estimate(0.0, rng.standard_normal(500), 0.0, 1) for _ in range(5)]

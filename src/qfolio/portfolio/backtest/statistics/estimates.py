@@ -36,6 +36,10 @@ SLOW = 0.8
 """Cosine transforms a year for a difference in volatility: they take two years and a half or more
 for a period."""
 
+SHORTEST = 5
+"""Periods of a test: with two, the error of a Sharpe ratio is always 0, and with few more it is by
+chance."""
+
 FEWEST = 2
 """Cosine transforms of a test that is shorter than that: it shows little of volatility."""
 
@@ -200,6 +204,7 @@ def _estimate(per_seed: Floats, contributions: Floats, most: float = math.inf) -
     with np.errstate(invalid="ignore"):
         total = contributions.mean(axis=0)
         finite = bool(np.isfinite(total).all() and np.isfinite(values).all())
+        finite = finite and periods >= SHORTEST
         loads = (
             dct(total)[1 : count + 1] / (math.sqrt(2) * periods) if finite else np.full(1, np.nan)
         )
