@@ -104,6 +104,15 @@ class Aim(Task):
         return Step(state, 1.0 - (action / 2 - state) ** 2, state < 0)
 
 
+class AimNumbered(Aim):
+    """The same in numbered states, 250 where s < 0 and 3 where s > 0."""
+
+    states = 256
+
+    def observe(self, state):
+        return jnp.where(state < 0, 250, 3)
+
+
 class AimWeights(Aim):
     """One step that pays 1 − 10 |w − (0.2, 0.5, 0.3)|² for weights of cash and two assets."""
 

@@ -26,7 +26,7 @@ from qfolio.portfolio.synthetic.garleanu_pedersen import GarleanuPedersen
 from qfolio.portfolio.synthetic.merton import Merton
 from qfolio.tasks.pendulum import Pendulum
 
-from probes import Aim, AimPlainWeights, AimWeights, OneState
+from probes import Aim, AimNumbered, AimPlainWeights, AimWeights, OneState
 
 DISCOUNT = 0.8
 ANY = [-jnp.inf, jnp.inf]  # rewards that allow every value
@@ -106,6 +106,18 @@ def test_a_deterministic_actor_finds_the_best_action_and_its_value(kind, rescale
     lost = clipped_variance(0.2, 0.1) if kind is TD3 else 0.0
     later = DISCOUNT / (1 - DISCOUNT) * (1 - lost)
     np.testing.assert_allclose(values, [1 + later, 1], rtol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [False, True])
+def test_numbered_states_are_no_quantities(late):
+    """Critics read their numbers one-hot, as actors do."""
+    task, agent = AimNumbered(), DDPG(**SMALL, exploration_noise=0.2, late_action=late)
+    end = learned(task, agent)
+    seen = jax.vmap(task.observe)(STATES[:, 0])
+    np.testing.assert_allclose(end.actor(seen), BEST, atol=0.16)  # 4% of the range
+    later = DISCOUNT / (1 - DISCOUNT)
+    np.testing.assert_allclose(end.critics(seen, BEST)[0], [1 + later, 1], rtol=0.02)
 
 
 @pytest.mark.slow

@@ -32,22 +32,31 @@ from qfolio.learning.targets import Scalar, Scale, huber_loss, possible_values, 
 class Critics(eqx.Module):
     """Networks side by side, each with its own estimate of Q(s, a).
 
-    They read an observation and an action, or an observation alone if actions are numbered.
+    They read an observation and an action, or an observation alone if actions are numbered. states:
+    the number of states, if beside an action an observation is the number of one.
     """
 
     networks: Callable[[PyTree], Array]  # with a leading critic axis
     scale: Scale = eqx.field(static=True)  # of the networks' outputs
+    states: int | None = eqx.field(static=True, default=None)
 
     def __init__(
-        self, make: Callable[[PRNGKeyArray], Network], n: int, scale: Scale, key: PRNGKeyArray
+        self,
+        make: Callable[[PRNGKeyArray], Network],
+        n: int,
+        scale: Scale,
+        key: PRNGKeyArray,
+        states: int | None = None,
     ) -> None:
         self.networks = jax.vmap(make)(jax.random.split(key, n))
-        self.scale = scale
+        self.scale, self.states = scale, states
 
     def __call__(self, observation: PyTree, action: Array) -> Float[Array, "critic batch"]:
         """Q(s, a) of each critic."""
         if jnp.issubdtype(action.dtype, jnp.integer):
             return jnp.take_along_axis(self.every(observation), action[None, :, None], -1)[..., 0]
+        if self.states is not None:
+            observation = networks.one_hot(observation, self.states)
         return self._values(lambda network: network((observation, action))[:, 0])
 
     def every(self, observation: PyTree) -> Float[Array, "critic batch action"]:
@@ -322,6 +331,8 @@ class ActorCritic(Agent, Generic[L]):
         """
         assert not isinstance(task.actions, Discrete)
         action = uniform(task.actions, key, 1)[0]
+        if task.states is not None:
+            observation = networks.one_hot(observation[None], task.states)[0]
         seen = sum(jnp.size(leaf) for leaf in jax.tree.leaves(observation))
         scale = jnp.broadcast_to(jnp.array(task.observation_scale), (seen,))
         gain = jnp.where(self.input_gain > 0, self.input_gain / scale, 1.0)
@@ -335,4 +346,4 @@ class ActorCritic(Agent, Generic[L]):
                 return LateAction(both, self.hidden, key, gain, 1 / unit)
             return Flat(both, self.hidden, 1, key, gains)
 
-        return Critics(make, count, Scale(self.value_rescaling), key)
+        return Critics(make, count, Scale(self.value_rescaling), key, task.states)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import require, require_sizes
@@ -86,10 +86,15 @@ def _rows(
     if encoder is not None:
         observation = jax.nn.relu(encoder(observation))
     if states is not None:
-        there = (observation >= 0) & (observation < states)
-        observation = jnp.where(there[:, None], jax.nn.one_hot(observation, states), jnp.nan)
+        observation = one_hot(observation, states)
     leaves = jax.tree.leaves(observation)
     return jnp.concatenate([leaf.reshape(leaf.shape[0], -1) for leaf in leaves], axis=1)
+
+
+def one_hot(observation: Int[Array, " batch"], states: int) -> Float[Array, "batch state"]:
+    """Numbers of states as rows of zeros and a one; of NaN for a number that is no state."""
+    there = (observation >= 0) & (observation < states)
+    return jnp.where(there[:, None], jax.nn.one_hot(observation, states), jnp.nan)
 
 
 class Reading(NamedTuple):
