@@ -111,7 +111,7 @@ def _holes(grid: Grid, span: _Span) -> list[np.ndarray]:
 
 
 def _without_gaps(grid: Grid, span: _Span, findings: Findings) -> np.ndarray:
-    """Which assets have no gaps, in their features neither."""
+    """Which assets have gaps neither in prices nor in features."""
     drop = span.empty | span.gaps.any(axis=0)
     for block, hole in zip(grid.features, _holes(grid, span), strict=True):
         if block.by_asset:
