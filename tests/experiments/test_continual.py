@@ -213,11 +213,19 @@ def test_the_report_says_what_happened(content):
     assert "does not settle" in verdict(content)
 
 
-def test_the_verdict_says_which_way_had_too_few_steps_to_learn(content):
-    renewed = {**content["courses"]["renewed"], "steps": [0, 8]}
-    found = verdict({**content, "courses": {**content["courses"], "renewed": renewed}})
-    assert "Renewed learning learned nothing: it begins after 8 environment steps" in found
+def test_the_verdict_says_which_way_had_too_few_steps_to_learn(content, tmp_path):
+    slow = dataclasses.replace(AGENT, learning_starts=50)
+    create(dataclasses.replace(PLAN, agent=slow, renewal=0.1), tmp_path / "run")
+    result = compare(tmp_path / "run")
+    assert result is not None
+    found = verdict(result)
+    assert (
+        "Renewed learning learned nothing: it begins after 48 environment steps, and a seed had 40."
+        in found
+    )
     assert "A new agent does not settle" in found
+    assert "Going on does not settle" in found
+    assert "learned nothing" not in verdict(content)
 
 
 def test_the_command_writes_a_folder(monkeypatch, tmp_path, capsys):

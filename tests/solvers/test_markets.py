@@ -180,6 +180,8 @@ def test_bands_of_regimes_are_all_in_and_out_where_switching_pays() -> None:
     np.testing.assert_allclose(apart, 1 - apart[::-1, ::-1], atol=0.02)  # good and bad mirror
     assert 0 < apart[1, 0] < apart[0, 1] < 1
     np.testing.assert_array_equal(regime_bands((0.9, 0.8), (-0.1, 0.1), 0.0), [[0, 0], [1, 1]])
+    swinging = regime_bands((0.0, 0.0), (-0.1, 0.1), 0.005)  # good and bad times take turns
+    np.testing.assert_array_equal(swinging, [[0, 0], [1, 1]])
 
 
 # --------------------------------------------------------------------------------------- AR(1)

@@ -31,7 +31,7 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.core.population import Population
 from qfolio.core.statistics import regret
 from qfolio.core.training import TrainingState
-from qfolio.experiments.budget import Budget, seed_range
+from qfolio.experiments.budget import Budget, seed_range, unlearned
 from qfolio.experiments.comparison.ranking import middle_steps, steps_within
 from qfolio.experiments.described import agent_of, describe, task_of
 from qfolio.experiments.fit import Listener, Training, fit
@@ -137,7 +137,8 @@ class Course(msgspec.Struct):
 
     steps: environment steps of a seed since the change. curve: regrets (point, seed) on the
     first start states. final: regrets (seed,) on all of them; other: the same in the other world
-    (after the change, the old one). seconds: time spent learning, all seeds together.
+    (after the change, the old one). seconds: time spent learning, all seeds together. unlearned: as
+    the function of that name says it, of learning that began anew.
     """
 
     steps: list[int]
@@ -145,6 +146,7 @@ class Course(msgspec.Struct):
     final: list[float]
     other: list[float]
     seconds: float
+    unlearned: str = ""
 
 
 FIRST = "first training"
@@ -395,7 +397,7 @@ def _learn(
     here, there = worlds
     curve = _Curve(here, job)
     curve.add(population, 0)
-    seconds, stopped = 0.0, False
+    seconds, stopped, anew = 0.0, False, not population.steps
     if episodes:
         budget = Budget(population.episodes + episodes)
         chunk = -(-budget.left(population) // points)
@@ -406,4 +408,5 @@ def _learn(
     else:
         job.log.write("done", job=job.name, step=0)
     final, other = (world.regrets(population, population.starts) for world in (here, there))
-    return Course(curve.steps, curve.regrets, final, other, seconds), stopped
+    why = unlearned(population.agent, curve.steps[-1]) if anew else ""
+    return Course(curve.steps, curve.regrets, final, other, seconds, why), stopped

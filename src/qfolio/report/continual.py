@@ -12,9 +12,7 @@ import numpy as np
 
 from qfolio.core.files import write_text
 from qfolio.core.statistics import band, interquartile_mean
-from qfolio.experiments.budget import unlearned
 from qfolio.experiments.continual import WAYS
-from qfolio.experiments.described import agent_of
 from qfolio.report import palette
 from qfolio.report.figures.style import (
     LEAD,
@@ -80,12 +78,10 @@ def verdict(content: Content) -> str:
     before = percent(float(interquartile_mean(content["training"]["final"])))
     found = [f"The policy has a regret of {before} in the world it was trained in, and of {worse} "
              "after the change, without further learning."]  # fmt: skip
-    agent = agent_of(content["agent"], content["agent_settings"])
     for way in ("renewed", "going on", "fresh"):
         steps = content["recovery"][way]["middle"]
         name = {"going on": "Going on", "renewed": "Renewed learning", "fresh": "A new agent"}[way]
-        # Going on, it has what it learns from.
-        why = "" if way == "going on" else unlearned(agent, content["courses"][way]["steps"][-1])
+        why = content["courses"][way]["unlearned"]
         goal = f"within {percent(content['within'], 0)} of the new optimum"
         if why:
             found.append(f"{name} {why}")

@@ -93,6 +93,7 @@ def regime_bands(
     drifted = weights * (1 + gain) / (1 + weights * gain)
     trade = log_remainder(weights[:, None], weights, cost)  # (held, ordered)
     transition = discount * np.array([[last[0], 1 - last[0]], [1 - last[1], last[1]]])
+    step = 0.5 if last.sum() < 1 else 1.0  # or the values of regimes that alternate would swing
     value = np.zeros((2, points))
     while True:
         later = transition @ value
@@ -102,7 +103,8 @@ def regime_bands(
         best = np.clip(np.arange(points), low[:, None], high[:, None])
         found = trade[np.arange(points), best] + np.take_along_axis(after, best, 1)
         change = found - value
-        value = found - found.min()
+        value = value + step * change
+        value -= value.min()
         if np.ptp(change) < 1e-10:
             break
     return weights[np.stack([low, high], 1)]
