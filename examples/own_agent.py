@@ -22,14 +22,8 @@ class Constant(Agent):
     def init(self, task, key):
         return jnp.zeros(1 + task.actions.assets)
 
-    def warm_up(self):
-        return 0
-
     def act(self, state, observation, key):
         return self.policy(state, observation)
-
-    def observe(self, state, rollout):
-        return state
 
     def learn(self, task, state, rollout, key):
         before, after = rollout.state, rollout.next_state

@@ -28,14 +28,8 @@ class Known(Agent):
     def init(self, task, key):
         return jnp.array(0.5)
 
-    def warm_up(self):
-        return 0
-
     def act(self, state, observation, key):
         return self.policy(state, observation)
-
-    def observe(self, state, rollout):
-        return state
 
     def learn(self, task, state, rollout, key):
         return state, {}

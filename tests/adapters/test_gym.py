@@ -87,9 +87,14 @@ def test_scores_become_the_nearest_weights_of_a_market():
 def test_a_task_says_what_is_wrong():
     env = gymnasium.make(gym.IDS["pendulum"])
     env.reset(seed=0)
-    for action in (11, -1, 0.5):
+    for action in (11, -1, 0.5, "left", [[1], [2, 3]]):
         with pytest.raises(QfolioError, match="must be in Discrete"):
             env.unwrapped.step(action)
+    env = gymnasium.make(gym.IDS["pendulum"], torques=0)
+    env.reset(seed=0)
+    for torque in ("left", None, [np.nan], [0.0, 0.0]):
+        with pytest.raises(QfolioError, match="must be in Box"):
+            env.unwrapped.step(torque)
     with pytest.raises(QfolioError, match="did you mean torques"):
         gym.TaskEnv("pendulum", torqes=3)
     with pytest.raises(QfolioError, match="render_mode"):
@@ -305,6 +310,18 @@ def test_rewards_by_name():
     np.testing.assert_allclose(growth["log"], np.log(wealth), rtol=1e-9)
     np.testing.assert_allclose(growth["crra"], (1 - wealth**-2) / 2, rtol=1e-9)
     np.testing.assert_allclose(growth["mean-variance"], wealth - 1 - 1.5 * (wealth - 1) ** 2)
+
+
+def test_active_rewards_are_those_over_the_anchors():
+    prices = table()
+    active = {"anchor": "equal-weight", "active": True, "lag": 0, "cost": 0.0}
+    env = environment(prices, tracking_aversion=10.0, **active)
+    for target, anchored in (([0.0, 1, 1, 1], True), ([0.0, 1, 0, 0], False)):
+        env.reset(options={"start": 10})
+        _, reward, *_ = env.step(np.array(target) / sum(target))
+        moved = prices.values[11] / prices.values[10]
+        over = 0.0 if anchored else np.log(moved[0] / moved.mean())
+        np.testing.assert_allclose(reward, over - 5 * over**2, atol=1e-6)
 
 
 def test_it_says_what_is_wrong():

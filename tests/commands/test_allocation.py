@@ -317,9 +317,13 @@ def test_what_the_ledger_does_not_know_is_refused(copy, monkeypatch, capsys):
     shutil.rmtree(copy / "ledger", ignore_errors=True)
     assert qfolio(monkeypatch, "allocate", copy, "--reproduce", "2020-09-16") == 2
     assert "no allocation of '2020-09-16'; it is empty" in capsys.readouterr().err
-    options = ["--reproduce", "2020-09-16", "--agent", "pathwise"]
-    assert qfolio(monkeypatch, "allocate", copy, *options) == 2
-    assert "--reproduce takes its agent from the ledger" in capsys.readouterr().err
+    for options in (["--agent", "pathwise"], ["--whole-shares"], ["--as-of", "2020-09-16"]):
+        assert qfolio(monkeypatch, "allocate", copy, "--reproduce", "2020-09-16", *options) == 2
+        said = capsys.readouterr().err
+        assert (
+            f"--reproduce takes its settings from the ledger and trades nothing; leave out "
+            f"{options[0]}." in said
+        )
 
 
 def test_a_baseline_is_followed(folder, monkeypatch, capsys):
@@ -328,14 +332,14 @@ def test_a_baseline_is_followed(folder, monkeypatch, capsys):
     assert [row["weight"] for row in plan["assets"]] == pytest.approx([1 / 3] * 3)
     assert plan["expected_cost"] == pytest.approx(3)  # 10 bp of what is spent
     assert plan["trained_until"] is None
-    assert "A baseline, which learned nothing: it grew by" in plan["verdict"]
+    assert "This baseline, which learned nothing, grew by" in plan["verdict"]
     assert records(folder)[-1]["policy"] is None
     capsys.readouterr()
     assert qfolio(monkeypatch, "allocate", folder, "--reproduce", "2020-09-16") == 0
     assert "is reproduced: prices, settings and holdings have" in capsys.readouterr().out
     momentum = ["--agent", "momentum", "--capital", 3000]
     assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *momentum) == 0
-    assert "Baseline: momentum.\nIn its backtest: A baseline" in capsys.readouterr().out
+    assert "Baseline: momentum.\nIn its backtest: This baseline" in capsys.readouterr().out
     assert qfolio(monkeypatch, "allocate", folder, *AS_OF, *momentum, "--update") == 2
     assert "momentum learns nothing; leave out --update" in capsys.readouterr().err
 
@@ -448,7 +452,7 @@ def test_a_holding_within_the_band_is_said_to_stay(copy, monkeypatch, capsys, tm
     path.write_text(json.dumps(json.loads(path.read_text()) | {"calendar": "drift:0.01"}))
     options = [*AS_OF, "--agent", "equal-weight", "--capital", 1, "--whole-shares", "--dry-run"]
     assert qfolio(monkeypatch, "allocate", copy, *options) == 0
-    said = "Nothing is ordered: the trades come to no whole share or lot."
+    said = "Nothing is ordered: every trade is less than a whole share or lot."
     assert said in " ".join(capsys.readouterr().out.split())
 
 

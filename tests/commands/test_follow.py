@@ -171,3 +171,9 @@ def test_columns_come_from_files_of_their_own(folder, monkeypatch, capsys, tmp_p
     capsys.readouterr()
     assert qfolio(monkeypatch, *given, "rate=none.csv") == 2
     assert "'none.csv' cannot be read" in capsys.readouterr().err
+
+
+def test_the_page_does_not_replace_the_rows(folder, monkeypatch, capsys, tmp_path):
+    assert qfolio(monkeypatch, "follow", folder, "--out", tmp_path / "live.html") == 2
+    assert "name it *.csv" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -36,7 +36,8 @@ def test_the_first_ctrl_c_stops_after_the_chunk(tmp_path):
     begun = time.perf_counter()
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
-    assert out.splitlines()[-1] == f"Stopped. Resume with: qfolio train --resume {tmp_path / 'run'}"
+    resume = f"qfolio train --no-compare --resume {tmp_path / 'run'}"
+    assert out.splitlines()[-1] == f"Stopped. Resume with: {resume}"
     assert err == ""
     assert time.perf_counter() - begun < 10  # two seconds where nobody else computes
     assert (tmp_path / "run" / "checkpoint.safetensors").exists()
@@ -54,7 +55,7 @@ def test_ctrl_c_while_it_compiles(tmp_path, count):
     begun = time.perf_counter()
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
-    resume = f"qfolio train --resume {tmp_path / 'run'}"
+    resume = f"qfolio train --no-compare --resume {tmp_path / 'run'}"
     assert err in ("", f"qfolio: interrupted. Resume with: {resume}\n")
     if count == 2:
         assert time.perf_counter() - begun < 5
@@ -78,7 +79,7 @@ class Mine(qfolio.DQN):
 @pytest.mark.parametrize(
     ("words", "resume"),
     [
-        (TRAIN, "train --resume run"),
+        (TRAIN, "train --no-compare --resume run"),
         (["tune", "--trials", "2", "--batch", "2", *TRAIN[3:]], "tune --join run"),
         (["compare", "--agents", "dqn,dqn:best", "--seeds", "2"], "compare --resume run"),
         (

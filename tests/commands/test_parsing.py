@@ -69,7 +69,7 @@ def test_options_are_in_groups(monkeypatch, capsys):
     assert places == sorted(places)
     assert places[2] < page.index("--cap FLOAT") < places[3]
     said = " ".join(page.replace("│", " ").split())
-    assert "Largest weight of one asset, from 0 to 1; a mandate" in said
+    assert "Largest weight of one asset, above 0 and at most 1; a mandate" in said
     assert "may set a cap above 1 instead (default: 1)." in said
 
 

@@ -110,7 +110,7 @@ def test_strategies_and_a_benchmark_of_ones_own(monkeypatch, capsys, tmp_path):
     made = ["backtest", *options, "--benchmark", "world.csv", "--out", "run"]
     assert qfolio(monkeypatch, *made) == 0
     printed = capsys.readouterr().out
-    assert "to world, a year" in printed
+    assert "against world, a year" in printed
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["reference"] == "world"
     assert list(summary["verdicts"]) == ["pathwise", "mine", "fund"]
@@ -221,7 +221,7 @@ def test_backtest_explains_its_agents(folder):
     assert parts.static + parts.timing - parts.cost == pytest.approx(parts.net, abs=1e-12)
     assert json.loads((folder / "summary.json").read_text())["diagnosis"] == why.diagnosis
     page = (folder / "report.html").read_text()
-    assert "that pathwise-together earned" in page
+    assert "pathwise-together earned" in page
     assert why.diagnosis == {}  # it trades, and listens to its observations
     with pytest.raises(QfolioError, match="damaged"):
         Why.read({"agents": {}})

@@ -53,7 +53,7 @@ def test_train_writes_the_whole_folder(run):
     assert header == "seed,episode,return,epsilon,loss,max_q"
     assert len(rows) == 16
     assert str(folder / "report.html") in printed
-    assert "An interval over seeds needs 5 seeds or more (--seeds); 2 are too few." in printed
+    assert "An interval over seeds needs a run with 5 seeds or more; 2 are too few." in printed
 
 
 def test_evaluate_prints_json(run, monkeypatch, capsys):

@@ -60,3 +60,15 @@ def test_jax_is_set_up_before_the_first_array_of_a_task(first, tmp_path):
         capture_output=True, text=True,
     )  # fmt: skip
     assert done.stdout.strip() == f"highest {tmp_path / 'programs'}", done.stderr
+
+
+def test_memory_counts_every_slot(monkeypatch):
+    """On a CPU a device has two at least: one member alone takes twice its state."""
+    members = devices.Members(1)
+    assert members.slots == 2 * len(members.taken)
+    state = jax.ShapeDtypeStruct((2**18,), "float32")  # 1 MiB
+    monkeypatch.setattr(devices, "host_memory", lambda: 2**20 * members.slots)
+    devices.require_memory(state, members.slots)
+    monkeypatch.setattr(devices, "host_memory", lambda: 2**20)
+    with pytest.raises(QfolioError, match=r"need 0\.0 GiB"):
+        devices.require_memory(state, members.slots)

@@ -101,6 +101,16 @@ class Shares(Tiny):
         return float(-abs(action - 2).sum()), False, False
 
 
+class Signed(Tiny):
+    """A whole number of eight bits, whose range is wider than they are."""
+
+    action_space = gymnasium.spaces.Box(-100, 100, (1,), np.int8)
+
+    def outcome(self, action):
+        assert self.action_space.contains(action), action
+        return float(action[0]), False, False
+
+
 class Named(Tiny):
     observation_space = gymnasium.spaces.Dict({"x": gymnasium.spaces.Discrete(2)})
 
@@ -136,7 +146,7 @@ class Faulty(Tiny):
         return seen, reward, False, False, {}
 
 
-KINDS = (Delay, Endless, Numbered, Aim, Shares, Named, Unbounded, Faulty)
+KINDS = (Delay, Endless, Numbered, Aim, Shares, Signed, Named, Unbounded, Faulty)
 ENVIRONMENTS = {kind: f"Test{kind.__name__}-v0" for kind in KINDS}
 for _kind, _id in ENVIRONMENTS.items():
     gymnasium.register(_id, entry_point=_kind, max_episode_steps=4)
@@ -358,6 +368,11 @@ def test_whole_numbers_are_given_where_actions_are_whole():
         environments.reset(index)
     found = environments.step(np.array([[-1, -0.15, 2], [0.7, 0, 1]], np.float32))
     np.testing.assert_array_equal(found.reward, [-5, -5])  # of 0, 2, 5 and of 4, 2, 5
+    environments = Environments(task(Signed), limit=4, count=4)
+    for index in range(4):
+        environments.reset(index)
+    found = environments.step(np.array([[-1], [-0.5], [0], [1]], np.float32))
+    np.testing.assert_array_equal(found.reward, [-100, -50, 0, 100])
 
 
 def test_an_environment_that_is_registered_anew_is_read_anew():

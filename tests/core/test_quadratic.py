@@ -82,6 +82,21 @@ def test_assets_that_are_not_open_have_no_weight():
     np.testing.assert_allclose(found[open_to], wanted, atol=1e-4)
 
 
+@pytest.mark.parametrize("near", [None, jnp.full((2, 4), 0.25)])
+def test_nothing_is_held_where_nothing_is_open(near):
+    """Beside a case of its batch in which something is open."""
+    sigma = jnp.stack([jnp.asarray(next(covariances(4, 1)), jnp.float32)] * 2)
+    open_to = jnp.array([[False] * 4, [True] * 4])
+
+    def weights(scale):
+        return best(scale * sigma, jnp.zeros((2, 4)), open_to, 1.0, near)
+
+    closed, opened = weights(1.0)
+    np.testing.assert_array_equal(closed, 0)
+    assert opened.sum() == pytest.approx(1)
+    assert np.isfinite(jax.grad(lambda scale: (weights(scale) ** 2).sum())(1.0))
+
+
 def test_gradient_is_that_of_finite_differences():
     sigma = jnp.asarray(next(covariances(8, 1, seed=3)), jnp.float32)
     change = jax.random.normal(jax.random.key(0), (8, 8))

@@ -33,6 +33,7 @@ def test_a_wrong_name_gets_advice():
     assert near("ppo", known) == "did you mean PPO?"
     assert closest("xyz", known) is None
     assert near("xyz", known[:2]) == "choose from dqn, PPO."
+    assert near("xyz", []) == "there is none to choose from."
     assert near("xyz", known).endswith("number-16, …")
 
 

@@ -57,16 +57,10 @@ class Bandit(Agent):
         assert isinstance(task.actions, Discrete)
         return Means(jnp.zeros(task.actions.n), jnp.zeros(task.actions.n))
 
-    def warm_up(self) -> int:
-        return 0
-
     def act(self, state: Means, observation: PyTree, key: PRNGKeyArray) -> Array:
         best = (state.total / jnp.maximum(state.visits, 1)).argmax()
         drawn = jax.random.uniform(key, (self.num_envs,)) < self.epsilon
         return jnp.where(drawn, 1 - best, best).astype(jnp.int32)
-
-    def observe(self, state: Means, rollout: Transition) -> Means:
-        return state
 
     def learn(
         self, task: Task, state: Means, rollout: Transition, key: PRNGKeyArray

@@ -9,9 +9,12 @@ from qfolio.experiments.budget import unlearned
 from qfolio.tasks.pendulum import Pendulum
 
 
-@pytest.mark.parametrize("starts", [1, 8, 9, 10])
-def test_an_agent_is_unlearned_until_its_weights_move(starts):
-    agent = DQN(hidden=(8,), num_envs=2, batch_size=8, replay_capacity=64, learning_starts=starts)
+@pytest.mark.parametrize(("starts", "freq"), [(1, 1), (8, 1), (9, 1), (10, 1), (8, 4)])
+def test_an_agent_is_unlearned_until_its_weights_move(starts, freq):
+    agent = DQN(
+        hidden=(8,), num_envs=2, batch_size=8, replay_capacity=64, learning_starts=starts,
+        train_freq=freq,
+    )  # fmt: skip
     population = Population(Pendulum(horizon=20), agent, [0])
     first = population.fetch().agent
     for _ in range(6):

@@ -111,6 +111,7 @@ def test_the_area_ends_where_the_shortest_training_does():
     values = np.array([[4.0, 8.0], [2.0, 8.0], [0.0, 8.0]])
     np.testing.assert_allclose(area([0, 10, 20], values, 10), [3.0, 8.0])
     np.testing.assert_allclose(area([0, 10, 20], values, 15), [(30 + 7.5) / 15, 8.0])
+    np.testing.assert_allclose(area([20], values[2:], 20), values[2])  # earlier points were lost
 
 
 def test_ranking_by_regret():

@@ -227,7 +227,7 @@ def test_a_search_goes_on_where_it_was_left(tmp_path, task, agent):
     assert own[0].values == {"learning_rate": agent.learning_rate, "discount": agent.discount}
     # What it says of a trial is what training that configuration by itself gives.
     last = trials[-1]
-    alone, _ = again.trained({"last": again.configured(last.values)}, range(2), tuning_keys())
+    alone = again.trained({"last": again.configured(last.values)}, range(2), tuning_keys())
     np.testing.assert_array_equal(alone[0], last.returns)
     # Everything on disk is text: nothing of it is ever unpickled.
     for line in (folder / "journal.log").read_text().splitlines():
@@ -237,7 +237,7 @@ def test_a_search_goes_on_where_it_was_left(tmp_path, task, agent):
 
 def test_a_configuration_does_in_a_search_what_it_does_in_a_run(tmp_path, task, agent):
     work = start(tmp_path / "s", task, agent)
-    found, _ = work.trained({"mine": agent}, [7, 8], start_keys())
+    found = work.trained({"mine": agent}, [7, 8], start_keys())
     run = Run.create(task, agent, episodes=EPISODES, seeds=2, seed=7)
     run.train()
     np.testing.assert_array_equal(found[0], run.grade()["return_per_seed"])
@@ -257,9 +257,9 @@ def test_configurations_of_several_programs(tmp_path, task, agent):
     work = start(tmp_path / "s", task, agent, *ranges, trials=6, batch=1)
     shared = [{"hidden": size, "learning_rate": 2e-4} for size in ("16", "8")]
     named = {str(v): work.configured(v) for v in shared}
-    together, _ = work.trained(named, range(2), tuning_keys())
+    together = work.trained(named, range(2), tuning_keys())
     for values, row in zip(shared, together, strict=True):
-        alone, _ = work.trained({"one": work.configured(values)}, range(2), tuning_keys())
+        alone = work.trained({"one": work.configured(values)}, range(2), tuning_keys())
         np.testing.assert_array_equal(alone[0], row)
     assert not np.array_equal(*together)
     work.run()
@@ -345,7 +345,7 @@ def test_a_killed_search_proposes_what_an_unbroken_one_does(
     """killed: batches that the process does not live to finish. Half of 18 trials are random."""
 
     def train(work, agents, *rest):
-        return np.array([[-abs(math.log10(one.learning_rate) + 3)] for one in agents.values()]), 0.0
+        return np.array([[-abs(math.log10(one.learning_rate) + 3)] for one in agents.values()])
 
     monkeypatch.setattr(Tuning, "trained", train)
     unbroken = start(tmp_path / "unbroken", task, agent, trials=18, batch=3, seeds=1)

@@ -66,6 +66,14 @@ def test_no_gradient_is_lost_where_an_asset_cannot_be_held():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
+def test_an_anchor_in_cash_is_tilted_to_cash():
+    empty = view(held=(0.5, 0.3, 0.2), anchor=(0.0, 0.0, 0.0))
+    order = jax.nn.softmax(Tilting(empty, spread=False)(empty))[0]
+    np.testing.assert_allclose(order, [0.3, 0.35, 0.21, 0.14], rtol=1e-5)
+    gradient = jax.grad(lambda n: (n(empty) ** 2).sum())(Tilting(empty, spread=False))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
 def planted(**changes):
     """A table of persistent relative returns, and the momentum that shows them."""
     settings = {

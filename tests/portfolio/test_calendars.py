@@ -58,7 +58,8 @@ def test_later_rows_decide_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    "calendar", ["daily", "0", "-3", "2.5", "Monthly", "drift:", "drift:0", "drift:1", "drift:nan"]
+    "calendar",
+    ["daily", "0", "-3", "2.5", "9" * 30, "Monthly", "drift:", "drift:0", "drift:1", "drift:nan"],
 )
 def test_unknown_calendars(calendar: str) -> None:
     with pytest.raises(QfolioError) as raised:

@@ -234,6 +234,19 @@ def test_the_volatility_of_an_asset_that_joins_late() -> None:
         assert found[row, 1] == pytest.approx(np.std(returns), abs=1e-12)
 
 
+def test_delisted_assets_say_nothing_about_the_volatility_of_a_new_one() -> None:
+    values = table(3, rows=80).values.copy()
+    values[:60, 1], values[20:, 2] = np.nan, values[20, 2]  # B joins, C has paid out
+    listed = np.ones(values.shape, bool)
+    listed[21:, 2] = False
+    days = np.datetime64("2024-01-01") + np.arange(80, dtype="m8[D]")
+    prices = Prices(days, tuple("ABC"), values, listed=listed)
+    found = Conditions.of(prices, Itemized(impact=1, volume="1000")).values["volatility"]
+    for row in (45, 62):
+        alone = volatility(values, row, 0)
+        np.testing.assert_allclose(found[row], alone, atol=1e-12)
+
+
 def test_training_pays_what_the_replay_pays() -> None:
     prices = table(7, rows=40)
     text = (

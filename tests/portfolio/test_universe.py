@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from qfolio.core.errors import QfolioError
-from qfolio.core.mdp import Discrete
+from qfolio.core.mdp import Discrete, Position, Transition
 from qfolio.experiments.presets import Preset, preset
 from qfolio.portfolio.anchors import path
 from qfolio.portfolio.backtest.baselines import baseline
@@ -496,6 +496,31 @@ def test_what_a_delisting_paid_earns_what_cash_earns() -> None:
     assert (others[0][14:] != cash[14:]).all()
 
 
+@pytest.mark.parametrize("lag", [0, 1])
+def test_a_step_in_which_an_asset_pays_out_is_measured(lag: int) -> None:
+    frame = frame_of(40, 2)
+    frame.iloc[25:, 0] = np.nan
+    prices = load(frame, ended="cash-out", delisting_haircut=0.3)
+    task = Portfolio.of(prices, window=5, horizon=5, lag=lag, anchor="equal-weight")
+    state = Position(jnp.array(24 - lag), task.hold(jnp.array([0.0, 1.0, 0.0])))
+    action, end = jnp.array([0.0, 1.0, 0.0]), jnp.array(False)
+    step = task.step(state, action, jax.random.key(0))
+    now = Transition(state, (), action, step.reward, step.state, (), end, end)
+    measured = {name: float(x) for name, x in task.measure(now).items()}
+    assert measured["growth"] == pytest.approx(float(step.reward), abs=1e-6)
+    assert measured["growth"] == pytest.approx(np.log(0.7), abs=1e-6)
+    wanted = {"turnover": 0.0, "cash": 0.0, "assets": 1.0, "distance": 0.5}
+    assert {name: measured[name] for name in wanted} == pytest.approx(wanted, abs=1e-5)
+
+
+def test_rows_without_a_member_are_too_few() -> None:
+    prices = load(frame_of(80, 2))
+    members = np.ones((80, 2), bool)
+    members[:40] = False
+    with pytest.raises(QfolioError, match=r"No asset can be traded over these rows; .*members"):
+        Portfolio.of(replace(prices, members=members), window=5, horizon=5).part(0, 38)
+
+
 @pytest.mark.parametrize("menu", ["grid:4", "tilts:0.2", "overweight:0.2"])
 def test_menus_order_what_is_there(menu: str) -> None:
     prices, _ = moving(2, 60, 5)
@@ -546,7 +571,7 @@ def test_a_table_with_leavers_is_read(tmp_path: Path) -> None:
     filled = load(frame, late="join", ended="cash-out", missing="forward-fill")
     assert filled.listed is not None
     assert filled.listed[:, 2].sum() == 20
-    with pytest.raises(QfolioError, match=r"delisting_haircut is 0\.5; .*ended=cash-out"):
+    with pytest.raises(QfolioError, match=r"delisting_haircut is 0\.5, .*ended=cash-out"):
         load(frame, delisting_haircut=0.5)
 
 

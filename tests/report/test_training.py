@@ -48,8 +48,8 @@ from qfolio.report.figures.curves import (
     draw_learning_curve,
     draw_overestimation,
 )
-from qfolio.report.figures.pendulum import value
-from qfolio.report.figures.policies import draw_policy, policy
+from qfolio.report.figures.pendulum import draw_value
+from qfolio.report.figures.policies import draw_policy
 from qfolio.report.training import (
     amount,
     duration,
@@ -297,7 +297,7 @@ def test_one_seed_one_evaluation_and_no_extras(tmp_path: Path) -> None:
 
 def test_value_needs_maps() -> None:
     with pytest.raises(ValueError, match="maps"):
-        value(Path("value.png"), replace(make_data(steps=1), maps=None))
+        draw_value(replace(make_data(steps=1), maps=None), 7.2)
 
 
 def test_a_full_disk_leaves_the_earlier_report(tmp_path, monkeypatch):
@@ -570,7 +570,7 @@ def test_weights_are_drawn_beside_the_exact_ones() -> None:
 
 def test_policy_needs_a_market() -> None:
     with pytest.raises(ValueError, match="policies of a market"):
-        policy(Path("policy.png"), replace(make_market(), market=None))
+        draw_policy(replace(make_market(), market=None), 7.2)
 
 
 def test_a_beginner_far_off_does_not_hide_the_curve() -> None:

@@ -7,19 +7,27 @@
 ``IDS`` holds the others, one for each task that ``qfolio train`` knows by name.
 """
 
-from functools import cache, partial
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from qfolio.core import settings
+from qfolio.core import settings, simplex
 from qfolio.core.errors import QfolioError
+from qfolio.core.evaluation import step_key
+from qfolio.core.market import View
+from qfolio.core.mdp import Discrete, Simplex
 from qfolio.core.registry import TASKS, find
-from qfolio.portfolio.backtest.simulation import Simulation, simulate
+from qfolio.portfolio.backtest.simulation import simulate
 from qfolio.portfolio.conditions import Conditions
+from qfolio.portfolio.mandate.limits import mandate_text
 from qfolio.portfolio.market import RUIN
 from qfolio.portfolio.prices.findings import day
 from qfolio.portfolio.prices.table import load
+from qfolio.portfolio.rewards import Outcome
+from qfolio.portfolio.task import Portfolio
 
 try:
     import gymnasium
@@ -82,9 +90,6 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         render_mode: str | None = None,
         **task: Any,
     ) -> None:
-        from qfolio.portfolio.mandate.limits import mandate_text
-        from qfolio.portfolio.task import Portfolio
-
         if render_mode not in (None, "ansi"):
             raise QfolioError(f"render_mode is {render_mode!r}; it must be 'ansi' or None.")
         self.render_mode = render_mode
@@ -102,7 +107,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             ):
                 raise QfolioError("scaled_by must have the assets and features of prices.")
             scale = Portfolio.of(other, **{**chosen, "horizon": 1})  # whatever its length
-            self.task = _programs().scaled(self.task, scale)
+            where = lambda task: (task.center, task.scale)  # noqa: E731
+            self.task = eqx.tree_at(where, self.task, where(scale))
         assets, channels = len(self.prices.assets), self.task.center.shape[0]
         self.first = int(self.task.first_decision)
         self.last = int(self.task.last_decision) - self.task.horizon + 1
@@ -139,7 +145,8 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         self._row, self._steps, self._wealth = int(start), 0, 1.0
         self._held = np.eye(len(self.prices.assets) + 1)[0]
         self._plan = self.task.terms.begin(self._held)
-        self._memory = _programs().memory(self.task)
+        with jax.enable_x64(True):
+            self._memory = _doubled(self.task.reward_function.init())
         self._target, self._cost, self._turnover = self._held, 0.0, 0.0
         return self._observe(), self._info()
 
@@ -151,8 +158,11 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         if self._steps >= self.task.horizon:
             raise QfolioError("The episode is over; call reset() first.")
         row, lag = self._row, self.task.lag
-        given = (self.task, row, self._held, self._plan, self._checked(action))
-        self._target, self._plan = _programs().target(*given)
+        given = self._checked(action)
+        with jax.enable_x64(True):
+            ordered, self._plan = _target(self.task, np.int32(row), self._held, self._plan, given)
+        target = np.asarray(ordered, float)
+        self._target = target / target.sum()
         values, costs = self.prices.values[row : row + lag + 2], self.task.costs
         known = self._conditions.part(row, row + lag + 2)
         traded = simulate(
@@ -166,7 +176,11 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
             long_only=self.task.feasible.long_only,
             wealth=self._wealth,
         )
-        reward, self._memory = _programs().reward(self.task, self._memory, traded)
+        growth = max(1 + traded.returns[0], RUIN)
+        earned = Outcome(growth, traded.cost[0], traded.weights[0])
+        with jax.enable_x64(True):
+            reward, memory = _reward(self.task, np.int32(row), self._memory, earned)
+            self._memory = _doubled(memory)
         coming = np.nan_to_num(values[1] / values[0], nan=1.0)
         self._held = costs.held(self._target, coming, known.holding(0, 1))
         self._wealth *= 1 + float(traded.returns[0])
@@ -206,7 +220,7 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
 
     def _observe(self) -> Observation:
         seen = {
-            "features": _programs().features(self.task, self._row),
+            "features": np.array(_features(self.task, np.int32(self._row))),
             "holding": np.clip(self._held[1:], *self._range).astype(np.float32),
         }
         if self.prices.tradable is not None:
@@ -228,74 +242,37 @@ class PortfolioEnv(gymnasium.Env[Observation, Any]):
         return day(self.prices.dates[row])
 
 
-class _Programs:
-    """The task's functions, compiled once for all environments; jax is imported at first use.
-
-    They compute in double precision if their inputs have it.
-    """
-
-    def __init__(self) -> None:
-        import equinox as eqx
-        import jax
-
-        from qfolio.core import devices, simplex
-        from qfolio.core.mdp import Simplex
-        from qfolio.portfolio.rewards import Outcome
-
-        devices.configure()
-
-        @jax.jit
-        def target(task: Any, row: Any, held: Any, plan: Any, action: Any) -> Any:
-            if isinstance(task.actions, Simplex):
-                action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
-            holding = task.hold(held)._replace(plan=plan)
-            traded, plan = task.trade(row, holding, task.wanted(row, holding, action))
-            return traded, task.planned(row, plan)
-
-        self._target = target
-
-        @jax.jit
-        def reward(task: Any, memory: Any, growth: Any, cost: Any, weights: Any) -> Any:
-            return task.reward_function(memory, Outcome(growth, cost, weights))
-
-        self._reward = reward
-        self._features = jax.jit(lambda task, row: task.features(row))
-        self._double = partial(jax.enable_x64, True)
-        self._doubled = lambda tree: jax.tree.map(lambda x: np.asarray(x, float), tree)
-        where = lambda task: (task.center, task.scale)  # noqa: E731
-        self.scaled = lambda task, by: eqx.tree_at(where, task, where(by))
-
-    def target(
-        self, task: Any, row: int, held: np.ndarray, plan: Any, action: np.ndarray
-    ) -> tuple[np.ndarray, Any]:
-        with self._double():
-            found, plan = self._target(task, np.int32(row), held, plan, action)
-            weights = np.asarray(found, float)
-        return np.asarray(weights / weights.sum()), plan
-
-    def memory(self, task: Any) -> Any:
-        """The reward's state at the start of an episode."""
-        with self._double():
-            return self._doubled(task.reward_function.init())
-
-    def reward(self, task: Any, memory: Any, traded: Simulation) -> tuple[float, Any]:
-        """The reward of a one-day simulation, and the reward's state after it."""
-        growth = max(1 + traded.returns[0], RUIN)
-        outcome = growth, traded.cost[0], traded.weights[0]
-        with self._double():
-            reward, memory = self._reward(task, memory, *outcome)
-            return float(reward), self._doubled(memory)
-
-    def features(self, task: Any, row: int) -> np.ndarray:
-        return np.array(self._features(task, np.int32(row)))
+@jax.jit
+def _target(task: Any, row: Any, held: Any, plan: Any, action: Any) -> Any:
+    """The weights to trade to, and the plan at the next row."""
+    holding = task.hold(held)._replace(plan=plan)
+    traded, plan = task.trade(row, holding, task.wanted(row, holding, _on_simplex(task, action)))
+    return traded, task.planned(row, plan)
 
 
-_programs = cache(_Programs)
+@jax.jit
+def _reward(task: Any, row: Any, memory: Any, earned: Outcome) -> Any:
+    """The reward of a row, and the reward's state after it."""
+    reward, memory = task.reward_function(memory, earned)
+    return task.compared(row, row + 1, reward), memory
+
+
+@jax.jit
+def _features(task: Any, row: Any) -> Any:
+    return task.features(row)
+
+
+def _doubled(tree: Any) -> Any:
+    return jax.tree.map(lambda x: np.asarray(x, float), tree)
+
+
+def _on_simplex(task: Any, action: Any) -> Any:
+    if isinstance(task.actions, Simplex):
+        return simplex.project(action, jnp.asarray(task.actions.caps))
+    return action
 
 
 def _action_space(actions: Any) -> spaces.Space[Any]:
-    from qfolio.core.mdp import Discrete, Simplex
-
     if isinstance(actions, Discrete):
         return spaces.Discrete(actions.n)
     if isinstance(actions, Simplex):
@@ -321,14 +298,8 @@ class TaskEnv(gymnasium.Env[Any, Any]):
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
     def __init__(self, name: str, *, render_mode: str | None = None, **chosen: Any) -> None:
-        import jax
-
-        from qfolio.core import devices
-        from qfolio.core.market import View
-
         if render_mode is not None:
             raise QfolioError(f"render_mode is {render_mode!r}; {name} has none.")
-        devices.configure()
         task: Any = settings.build(find("task", name), chosen)
         self.task, self._steps = task, task.horizon  # over
         self._there = jax.device_put(task)  # copies its arrays once, not at each step
@@ -352,7 +323,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self._steps = 0
         self._seed = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
-        self._state, observation = _stepping().reset(self._there, self._seed)
+        self._state, observation = _reset(self._there, self._seed)
         return self._as_numpy(observation), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -360,10 +331,14 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         if self._steps >= self.task.horizon:
             raise QfolioError("The episode is over; call reset() first.")
         numbered = isinstance(self.action_space, spaces.Discrete)
-        given = np.asarray(action, None if numbered else np.float32)
+        try:
+            given = np.asarray(action, None if numbered else np.float32)
+        except (TypeError, ValueError):
+            given = np.empty(0)
         if not self.action_space.contains(given) or not np.isfinite(given).all():
             raise QfolioError(f"The action is {action!r}; it must be in {self.action_space}.")
-        after, observation = _stepping().step(
+        given = given.astype(np.int32) if numbered else given
+        after, observation = _step(
             self._there, self._state, given, self._seed, np.int32(self._steps)
         )
         self._state, self._steps = after.state, self._steps + 1
@@ -381,34 +356,18 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         return np.array(observation, np.float32)
 
 
-class _Stepping:
-    """A task's reset and step, compiled once for all environments of a kind."""
-
-    def __init__(self) -> None:
-        import jax
-
-        from qfolio.core import simplex
-        from qfolio.core.evaluation import step_key
-        from qfolio.core.mdp import Discrete, Simplex
-
-        @jax.jit
-        def reset(task: Any, seed: Any) -> Any:
-            state = task.reset(jax.random.key(seed))
-            return state, task.observe(state)
-
-        @jax.jit
-        def step(task: Any, state: Any, action: Any, seed: Any, time: Any) -> Any:
-            if isinstance(task.actions, Discrete):
-                action = action.astype(jax.numpy.int32)
-            elif isinstance(task.actions, Simplex):
-                action = simplex.project(action, jax.numpy.asarray(task.actions.caps))
-            after = task.step(state, action, step_key(jax.random.key(seed), time))
-            return after, task.observe(after.state)
-
-        self.reset, self.step = reset, step
+@jax.jit
+def _reset(task: Any, seed: Any) -> Any:
+    state = task.reset(jax.random.key(seed))
+    return state, task.observe(state)
 
 
-_stepping = cache(_Stepping)
+@jax.jit
+def _step(task: Any, state: Any, action: Any, seed: Any, time: Any) -> Any:
+    key = step_key(jax.random.key(seed), time)
+    after = task.step(state, _on_simplex(task, action), key)
+    return after, task.observe(after.state)
+
 
 if ID not in gymnasium.registry:
     gymnasium.register(ID, entry_point="qfolio.adapters.gym:PortfolioEnv")

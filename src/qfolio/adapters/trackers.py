@@ -93,5 +93,5 @@ def _module(name: str, package: str) -> ModuleType:
         return import_module(name)
     except ImportError:
         raise QfolioError(
-            f"--track needs {name}, which is not installed: pip install '{package}'."
+            f"This tracker needs {name}, which is not installed: pip install '{package}'."
         ) from None

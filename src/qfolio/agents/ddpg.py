@@ -104,7 +104,7 @@ class DDPG(ActorCritic[Learned]):
             raise QfolioError(
                 f"{type(self).__name__.lower()} needs continuous actions, but those of "
                 f"{task.name} are numbered; use dqn or sac, or make them continuous: "
-                "torques=0 of the pendulum, no menu in a market."
+                "set torques=0 on the pendulum, or leave menu empty in a market."
             )
         actor_key, critic_key = jax.random.split(key)
         network = self.build(task, observation, outputs_of(task.actions), actor_key)

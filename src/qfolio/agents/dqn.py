@@ -202,7 +202,7 @@ class DQN(Agent):
 
     def init(self, task: Task, key: PRNGKeyArray) -> DQNState:
         if not isinstance(task.actions, Discrete):
-            menu = "give it a menu of allocations (menu=grid:10), or "
+            menu = "give it a menu of allocations (menu=tilts:0.1), or "
             raise QfolioError(
                 f"dqn chooses among numbered actions, but those of {task.name} are continuous; "
                 f"{menu if isinstance(task, ExogenousTask) else ''}use sac or ppo."

@@ -155,7 +155,7 @@ class MeanVariance(Onlooker):
         if not isinstance(task.actions, Simplex):
             raise QfolioError(
                 "A learned minimum variance, or mean and variance, gives weights that are not "
-                "negative; leave menu empty, and take a mandate without debts or other agents."
+                "negative; leave menu empty, and use another agent where a mandate allows debts."
             )
         self._require_whole(task)
         each = Member(Means(), Trading.start(0.1))

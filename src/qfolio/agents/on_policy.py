@@ -157,9 +157,6 @@ class OnPolicy(Agent):
         normalizer = self._normalization.begin(task, observation, self.num_envs)
         return OnPolicyState(weights, optimizer.begin(weights, self._optimizer), normalizer)
 
-    def warm_up(self) -> int:
-        return 0
-
     def weights(self, state: OnPolicyState) -> PolicyAndValue:
         return state.normalizer.attached(state.weights)
 
@@ -168,9 +165,6 @@ class OnPolicy(Agent):
 
     def act(self, state: OnPolicyState, observation: PyTree, key: PRNGKeyArray) -> Array:
         return self.weights(state).policy(observation).sample(key)
-
-    def observe(self, state: OnPolicyState, rollout: Transition) -> OnPolicyState:
-        return state
 
     def learn(
         self, task: Task, state: OnPolicyState, rollout: Transition, key: PRNGKeyArray

@@ -74,12 +74,6 @@ class OnPaths(Agent):
     def rollout_steps(self) -> int:
         return self.rollout_length
 
-    def warm_up(self) -> int:
-        return 0
-
-    def observe(self, state: State, rollout: Transition) -> State:
-        return state
-
     def _require_whole(self, task: Task) -> None:
         """Raises QfolioError if a rollout would span two episodes."""
         episode = episode_steps(task, self)

@@ -106,9 +106,6 @@ class Tabular(Agent):
         full = jnp.full(shape, jnp.asarray(self.initial_value, jnp.float32))
         return TableState(jnp.stack([full, jnp.zeros(shape)], -1), jnp.array(0, jnp.int32))
 
-    def warm_up(self) -> int:
-        return 0
-
     def monitor(self, state: TableState) -> Metrics:
         return {"epsilon": self._epsilon(state.episodes)}
 

@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import File, Modules, Name
+from qfolio.commands.arguments import File, Modules, Name, prepare
 from qfolio.commands.parsing import Document
 from qfolio.commands.tables import LATEST, ReadLatest, Returns
-from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
@@ -54,14 +53,14 @@ def allocate(
         holdings: Table with a column of assets (asset, symbol, ticker) and one of shares (shares,
             quantity, qty); a row "cash" holds money (default: all is cash). Shares sold short and
             loans are negative, where the mandate allows them.
-        capital: Cash to invest; not beside holdings that have a cash row.
+        capital: Cash to invest, for holdings without a row of cash.
         agent: Agent to follow; or a baseline such as equal-weight, the benchmark or a strategy of
             your own, if the backtest has it (default: the first agent of the backtest).
         anyway: Allocate even if the backtest is not finished, or found the agent worse than the
             benchmark, or (without a record) if the policy has learned from later prices.
         whole_shares: Trade whole shares only.
-        as_of: Day of the allocation; prices may be up to a week older, or up to a week and the
-            days between rows if those are longer (default: today).
+        as_of: Day of the allocation; prices may be up to a week older, or more where their rows are
+            farther apart than a day (default: today).
         update: Update the policy on the new rows first, and store the new version beside the
             earlier ones.
         orders: Write the trades to this CSV file.
@@ -78,15 +77,13 @@ def allocate(
     import msgspec
     import numpy as np
 
-    from qfolio.core import devices
     from qfolio.core.files import write_csv
 
-    devices.configure()
-    registry.trust(trust)
+    prepare(trust)
     from qfolio.commands import console
     from qfolio.commands.console.desk import print_allocation
     from qfolio.commands.console.tables import print_warnings
-    from qfolio.core.text import amount
+    from qfolio.core.text import amount, listed
     from qfolio.portfolio.desk.allocation import Allocation, require_fresh
     from qfolio.portfolio.desk.desk import Desk
     from qfolio.portfolio.desk.drivers import reasons, sentence
@@ -99,10 +96,15 @@ def allocate(
 
     desk = Desk.open(folder, returns=returns, **latest.reading)
     if reproduce is not None:
-        if agent is not None or update or orders is not None:
+        given = {
+            "--agent": agent is not None, "--anyway": anyway, "--whole-shares": whole_shares,
+            "--as-of": as_of is not None, "--update": update, "--orders": orders is not None,
+            "--dry-run": dry_run,
+        }  # fmt: skip
+        if any(given.values()):
             raise QfolioError(
-                "--reproduce takes its agent from the ledger and trades nothing; leave out "
-                "--agent, --update and --orders."
+                "--reproduce takes its settings from the ledger and trades nothing; leave out "
+                f"{listed([name for name, there in given.items() if there])}."
             )
         return _reproduce(desk, reproduce, prices, holdings, capital)
     name = next(iter(desk.run.agents)) if agent is None else agent
@@ -217,10 +219,7 @@ def follow(
     """
     import numpy as np
 
-    from qfolio.core import devices
-
-    devices.configure()
-    registry.trust(trust)
+    prepare(trust)
     from qfolio.commands import console
     from qfolio.commands.console.desk import print_following
     from qfolio.commands.console.tables import print_warnings
@@ -230,6 +229,10 @@ def follow(
     from qfolio.portfolio.desk.follow import follow as marked
     from qfolio.report.follow import LiveRows, render_following
 
+    if out is not None and out.suffix == ".html":
+        raise QfolioError(
+            f"--out is {out}, the CSV file; name it *.csv, and the page is written beside it."
+        )
     desk = Desk.open(folder, returns=returns, **latest.reading)
     following = marked(desk, prices, benchmark)
     if prices is not None:

@@ -4,11 +4,13 @@ import datetime
 import re
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
+from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 from qfolio.core.registry import own_modules
 from qfolio.experiments.budget import Budget
@@ -57,6 +59,14 @@ def new_folder(*words: str) -> Path:
     """A folder in runs/ that is named by the words, such as task and agent, and the time."""
     name = "-".join([re.sub("[/:]", "-", word) for word in words])
     return Path("runs") / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+
+
+def prepare(trust: Sequence[str]) -> None:
+    """Sets jax up and imports the modules that a user trusts, before anything that needs them."""
+    from qfolio.core import devices
+
+    devices.configure()
+    registry.trust(trust)
 
 
 def typed() -> str:

@@ -48,8 +48,8 @@ class Options(Reading):
         train: Length of the first training window: 5y, 6m, 8w or 500d (d counts rows).
         test: Length of a fold, after which agents are retrained.
         rolling: Train on a window of fixed length instead of all rows so far.
-        cap: Largest weight of one asset, from 0 to 1; a mandate that allows loans or short sales
-            may set a cap above 1 instead.
+        cap: Largest weight of one asset, above 0 and at most 1; a mandate that allows loans or
+            short sales may set a cap above 1 instead.
         mandate: File with the limits of all orders (TOML; see docs/guides/mandate.md).
         limits: Keys of a mandate with their values, such as assets.cap=0.2 trading.turnover=0.3;
             they take precedence over the file.
@@ -68,12 +68,11 @@ class Options(Reading):
             and held) or a strategy of your own, or such a CSV (default: equal-weight).
         baselines: Baselines, separated by commas, by name or your own as module:Name; equal-weight
             is always among them (default: all of qfolio's).
-        seeds: Agents of each kind (default: the preset's number).
+        seeds: Number of seeds of each agent (default: the largest of the presets' numbers).
         seed: First seed; the others follow it.
         episodes: Training episodes of each agent in a fold (default: the preset's number).
-        trials: Earlier trials on these prices, such as settings tried before, which make luck
-            likelier in verdicts and deflated Sharpe ratios; known trials on the default table are
-            added to them.
+        trials: Number of earlier trials on these prices, such as settings tried before, for which
+            verdicts and deflated Sharpe ratios allow; known trials on the default table are added.
         assignments: Hyperparameters of all agents that have them (learning_rate=1e-3) or of one
             (dqn.discount=0.9), or of the task (window=20 reward=crra).
         out: New folder (default: one in runs/).

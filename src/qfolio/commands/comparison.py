@@ -14,6 +14,7 @@ from qfolio.commands.arguments import (
     again,
     budget_of,
     new_folder,
+    prepare,
     typed,
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
@@ -71,10 +72,7 @@ def compare(
             "--resume keeps the comparison's settings; add only --on, --track and --trust."
         )
     budget = budget_of(episodes, steps)
-    from qfolio.core import devices
-
-    devices.configure()
-    registry.trust(trust)
+    prepare(trust)
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import stop

@@ -14,6 +14,7 @@ from qfolio.commands.arguments import (
     Trackers,
     again,
     new_folder,
+    prepare,
     typed,
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
@@ -75,10 +76,7 @@ def continual(
         change or assignments or any(option is not None for option in given)
     ):
         raise QfolioError("--resume keeps the experiment's settings; add only --track and --trust.")
-    from qfolio.core import devices
-
-    devices.configure()
-    registry.trust(trust)
+    prepare(trust)
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.progress import BarProgress, stop

@@ -83,7 +83,7 @@ def grouped(command: Callable[..., Any]) -> Callable[..., None]:
         else:
             parameters.append(parameter.replace(annotation=option.hint))
     if hints["return"] is not type(None):
-        meaning = "Print one JSON document; everything else goes to the standard error output."
+        meaning = "Print one JSON document; everything else goes to standard error."
         loose.append(_option("as_json", Annotated[bool, arg(name="json")], False, meaning))
     for option in loose:
         groups.setdefault(_GROUP_OF.get(option.name, ""), []).append(option)

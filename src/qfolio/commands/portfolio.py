@@ -4,11 +4,10 @@ import dataclasses
 
 from tyro.conf import Positional
 
-from qfolio.commands.arguments import File, Name, again
+from qfolio.commands.arguments import File, Name, again, prepare
 from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points
 from qfolio.commands.parsing import PAGE, Document, Failed, outcome
 from qfolio.commands.tables import READING, Read
-from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 
@@ -57,10 +56,7 @@ def backtest(
             with the same options: finished folds keep their policies, new ones are trained.
         title: Title of the report (default: the agents, the table and its years).
     """
-    from qfolio.core import devices
-
-    devices.configure()
-    registry.trust(options.trust)
+    prepare(options.trust)
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.console.backtest import describe_backtest, print_assessment

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import TYPE_CHECKING, NoReturn
 
-from qfolio.commands.console import bar, console, number, say
+from qfolio.commands.console import console, number, say
 from qfolio.core.training import episode_steps
 from qfolio.experiments.fit import Listener, Training
 from qfolio.experiments.interrupts import EXIT_CODE
@@ -19,16 +19,20 @@ if TYPE_CHECKING:
 
 
 class RunProgress(Listener):
-    """A line for each point of a run's learning curve, and a bar between them.
+    """A line for each point of a run's learning curve; moves a bar of ``console.bar`` between them.
 
     optimum: the optimal mean return on the curve's start states; None if it is unknown. show:
     called with the run at each point of the curve.
     """
 
     def __init__(
-        self, run: "Run", optimum: float | None, show: Callable[["Run"], None] | None = None
+        self,
+        run: "Run",
+        optimum: float | None,
+        update: Callable[..., None],
+        show: Callable[["Run"], None] | None = None,
     ) -> None:
-        self.run, self.optimum, self.show = run, optimum, show
+        self.run, self.optimum, self.update, self.show = run, optimum, update, show
 
     def on_start(self, training: Training) -> None:
         run, budget = self.run, training.budget
@@ -37,8 +41,7 @@ class RunProgress(Listener):
         columns = (budget.unit, value, "greedy", "optimum", "epsilon", "steps/s", "left")
         say("".join(f"{name:>11}" for name in columns))
         self.points = len(run.evaluations)
-        self.bar = bar("compiling", budget.amount, run.done(budget.unit))
-        self.update = self.bar.__enter__()
+        self.update(completed=run.done(budget.unit))
 
     def on_chunk(self, training: Training, rows: Records) -> None:
         run, budget = self.run, training.budget
@@ -60,9 +63,6 @@ class RunProgress(Listener):
             say("".join(f"{cell:>11}" for cell in cells))
             if self.show is not None:
                 self.show(run)
-
-    def on_end(self, training: Training) -> None:
-        self.bar.__exit__(None, None, None)
 
 
 class BarProgress(Listener):
@@ -124,27 +124,14 @@ class _JobProgress(Listener):
         self.whole.note(self.job, self.share * training.share, learning)
 
 
-class SearchProgress:
-    """A line for each batch of a search, and a bar within it."""
-
-    def __enter__(self) -> "SearchProgress":
-        say("".join(f"{name:>11}" for name in ("trials", "diverged", "best", "preset", "an hour")))
-        self.bar = bar("training a batch")
-        self.update = self.bar.__enter__()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.bar.__exit__(None, None, None)
-
-    def chunk(self, done: float) -> None:
-        """Moves the bar; done: the finished share of the batch."""
-        self.update(completed=done)
-
-    def batch(self, now: "Progress") -> None:
+def print_batch(now: "Progress | None" = None) -> None:
+    """Prints a line for a batch of a search, or the heads of the columns before the first."""
+    cells: tuple[str, ...] = ("trials", "diverged", "best", "preset", "an hour")
+    if now is not None:
         best, preset = (number(trial and trial.value) for trial in (now.best, now.preset))
         rate = f"{3600 * now.trials / now.seconds:,.0f}"
         cells = (f"{now.done}/{now.total}", str(now.diverged), best, preset, rate)
-        say("".join(f"{cell:>11}" for cell in cells))
+    say("".join(f"{cell:>11}" for cell in cells))
 
 
 def time_left(seconds: float) -> str:

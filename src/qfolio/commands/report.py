@@ -6,9 +6,8 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from qfolio.commands import comparison, continual, training, tuning
-from qfolio.commands.arguments import Modules
+from qfolio.commands.arguments import Modules, prepare
 from qfolio.commands.parsing import PAGE, Document
-from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 FILES = ("comparison.json", "continual.json", "study.json", "config.json")
@@ -35,10 +34,7 @@ def report(folder: Positional[Path], *, pdf: bool = False, trust: Modules = ()) 
     kind = _kind(folder)
     if pdf and find_browser() is None:
         print_pdf(folder / PAGE, folder / PDF)  # raises before anything is written
-    from qfolio.core import devices
-
-    devices.configure()
-    registry.trust(trust)
+    prepare(trust)
     with console.working("Writing the report"):
         WRITERS[kind](folder)
     console.say(f"Report: {folder / PAGE}")

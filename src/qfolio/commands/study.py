@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from qfolio.commands.arguments import again
+from qfolio.commands.arguments import again, prepare
 from qfolio.commands.backtesting import DEFAULTS, Shared, basis_points
 from qfolio.commands.parsing import PAGE, Document, outcome
-from qfolio.core import registry
 from qfolio.core.errors import QfolioError
 
 if TYPE_CHECKING:
@@ -47,10 +46,7 @@ def study(
     """
     import msgspec
 
-    from qfolio.core import devices
-
-    devices.configure()
-    registry.trust(options.trust)
+    prepare(options.trust)
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.console.study import describe_study, print_study, spell

@@ -18,6 +18,7 @@ from qfolio.commands.arguments import (
     again,
     budget_of,
     new_folder,
+    prepare,
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
@@ -81,14 +82,11 @@ def train(
         track: Trackers that follow the training: tensorboard, wandb, trackio, or your own as
             module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
-        compare: Train two more agents with one thing changed, for the report (for DQN, double
-            DQN; in markets, learning from one action at a time instead of all at once).
-        live: Show an episode in a window at each point of the learning curve.
+        compare: For DQN, also train up to two seeds with one setting changed, for the report:
+            double DQN, or in markets learning from one action at a time instead of all at once.
+        live: Show an episode of the pendulum in a window at each point of the learning curve.
     """
-    from qfolio.core import devices
-
-    devices.configure()
-    registry.trust(trust)
+    prepare(trust)
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.console.training import describe_run
@@ -98,6 +96,7 @@ def train(
     from qfolio.experiments.log import tracked
     from qfolio.experiments.machines.choice import on as executor_of
     from qfolio.experiments.run import Run
+    from qfolio.report.contrast import contrast_of
 
     following = trackers(track)
     budget = budget_of(episodes, steps)
@@ -114,7 +113,10 @@ def train(
             chosen = settings.parse(assignments)
             run = _new_run(task, agent, preset, budget, seeds, seed or 0, folder, chosen)
         elif assignments or any(x is not None for x in (task, agent, preset, seeds, seed, out)):
-            raise QfolioError("--resume keeps the run's settings; add only --episodes or --steps.")
+            raise QfolioError(
+                "--resume keeps the run's settings; add only --episodes or --steps, --on, --track, "
+                "--trust, --no-compare or --live."
+            )
         else:
             run, folder = Run.open(resume), resume
             if live:
@@ -127,7 +129,8 @@ def train(
                 f"Nothing is left to train: each seed has had {trained} already; set a larger "
                 f"total with --{budget.unit}."
             )
-        command = _resume(run, folder, on)
+        plain = not compare and contrast_of(run.agent) is not None
+        command = _resume(run, folder, on, not plain)
         with resumable(command), tracked(*following):
             _train(run, budget, executor, show)
     if run.interrupted:
@@ -162,10 +165,7 @@ def evaluate(
     """
     if episodes is not None:
         require_whole("--episodes", episodes, 1, MOST_STARTS)
-    from qfolio.core import devices
-
-    devices.configure()
-    registry.trust(trust)
+    prepare(trust)
     from qfolio.commands.console.training import print_result
     from qfolio.experiments.run import Run
 
@@ -177,7 +177,9 @@ def evaluate(
 
 
 def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -> None:
-    """Show a run's first agent in a window; without a display, write episode.gif.
+    """Show the first agent of a run on the pendulum in a window, or write episode.gif.
+
+    The file is written where there is no display.
 
     Examples:
         qfolio watch runs/mine
@@ -189,12 +191,10 @@ def watch(folder: Positional[Path], *, episodes: int = 3, trust: Modules = ()) -
     """
     from qfolio.commands.console import say
     from qfolio.commands.window import Window, has_display
-    from qfolio.core import devices
 
     if episodes < 1:
         raise QfolioError(f"--episodes is {episodes}; it must be at least 1.")
-    devices.configure()
-    registry.trust(trust)
+    prepare(trust)
     from qfolio.core.evaluation import STARTS
     from qfolio.core.files import write_bytes
     from qfolio.experiments.run import Run
@@ -258,8 +258,8 @@ def _train(
     """Trains with live progress; in this process, the lines also show the optimum."""
     from qfolio.commands import console
     from qfolio.commands.progress import JobsProgress, RunProgress
-    from qfolio.core.evaluation import start_keys
     from qfolio.experiments.executor import Here
+    from qfolio.experiments.grading import curve_optimum
 
     # A run that other processes began goes on in their groups of seeds, wherever it is resumed.
     if not isinstance(executor, Here) or run.groups.begun:
@@ -267,12 +267,12 @@ def _train(
             run.train(budget, executor=executor, listen=JobsProgress(update))
         return
 
-    solution, optimum = run.task.optimum(), None
-    if solution is not None:
+    optimum = None
+    if run.task.optimum() is not None:
         with console.working("Finding the exact optimum (solved once, then cached)"):
-            on_curve = solution.returns(start_keys())[: run.population.curve_starts]
-            optimum = float(on_curve.mean())
-    run.train(budget, [RunProgress(run, optimum, show)])
+            optimum = curve_optimum(run.population)
+    with console.bar("compiling", budget.amount) as update:
+        run.train(budget, [RunProgress(run, optimum, update, show)])
 
 
 def _contrast(run: "Run", folder: Path, executor: "Executor") -> "Run | None":

@@ -16,6 +16,7 @@ from qfolio.commands.arguments import (
     again,
     budget_of,
     new_folder,
+    prepare,
 )
 from qfolio.commands.parsing import PAGE, Document, outcome
 from qfolio.core import registry, settings
@@ -61,9 +62,9 @@ def tune(
             (default: fast).
         trials: Total number of configurations to try (default: 64).
         seeds: Number of seeds of each configuration (default: 2).
-        episodes: Training episodes of each agent (default: the preset's). learning_rate_steps
+        episodes: Training episodes of each seed (default: the preset's). learning_rate_steps
             changes in proportion, unless it is set.
-        steps: Environment steps of each agent, in place of episodes.
+        steps: Environment steps of each seed, instead of episodes.
         batch: Number of configurations to train at once (default: 16).
         search: Settings to search, for example --search learning_rate=1e-4..1e-2
             hidden=64,64|128,128 (default: those that usually matter, from a tenth to ten times the
@@ -80,15 +81,12 @@ def tune(
             module:Name (default: none).
         trust: Modules of your own code that the folder may name (default: none).
     """
-    from qfolio.core import devices
-
-    devices.configure()
-    registry.trust(trust)
+    prepare(trust)
     tuning = _tuning()
     from qfolio.adapters.trackers import trackers
     from qfolio.commands import console
     from qfolio.commands.console.tuning import describe_search
-    from qfolio.commands.progress import SearchProgress, stop
+    from qfolio.commands.progress import print_batch, stop
     from qfolio.experiments import presets
     from qfolio.experiments.interrupts import resumable
     from qfolio.experiments.log import tracked
@@ -111,8 +109,13 @@ def tune(
         work = tuning.Tuning.open(join, trials=trials, batch=batch)
     resume = again("qfolio tune --join", work.folder, work.task, work.agent, on=on)
     console.say(describe_search(work))
-    with resumable(resume), SearchProgress() as progress, tracked(*following):
-        work.run(progress.batch, progress.chunk, executor)
+    print_batch()
+    with (
+        resumable(resume),
+        console.bar("training a batch") as update,
+        tracked(*following),
+    ):
+        work.run(print_batch, lambda done: update(completed=done), executor)
     if work.interrupted:
         stop(resume)
     if count := work.journal.in_hand():

@@ -39,12 +39,18 @@ class Window:
         try:
             self._env.reset(seed=0)
         except pygame.error as error:
-            raise QfolioError(f"No window can be opened here ({error}).") from None
+            raise QfolioError(
+                f"No window can be opened here ({error}); leave out --live, or use a machine with "
+                "a display."
+            ) from None
         driver = pygame.display.get_driver()
         if driver in ("dummy", "offscreen") and os.environ.get("SDL_VIDEODRIVER") != driver:
             # SDL falls back to these if the display does not answer.
             display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-            raise QfolioError(f"No window can be opened on display {display}; unset it for a GIF.")
+            raise QfolioError(
+                f"No window can be opened on display {display}; correct DISPLAY or "
+                "WAYLAND_DISPLAY, or unset them and write a GIF with qfolio watch DIR."
+            )
         self.caption(caption)
 
     def caption(self, text: str) -> None:

@@ -132,14 +132,16 @@ def host_memory() -> int | None:
 
 
 def require_memory(tree: Any, count: int) -> None:
-    """Raises QfolioError if ``count`` members shaped like ``tree`` exceed the devices' memory."""
+    """Raises QfolioError if ``count`` states shaped like ``tree`` exceed the devices' memory."""
     needed = count * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
     stats = jax.devices()[0].memory_stats()
-    there = stats["bytes_limit"] * len(jax.devices()) if stats else host_memory()
+    used = min(len(jax.devices()), count)
+    there = stats["bytes_limit"] * used if stats else host_memory()
     if there is not None and needed > there:
         raise QfolioError(
-            f"These settings need {needed / 2**30:,.1f} GiB of memory, but there are only "
-            f"{there / 2**30:,.1f}; lower hidden, replay_capacity or the number of seeds."
+            f"These settings need {needed / 2**30:,.1f} GiB of memory, but only "
+            f"{there / 2**30:,.1f} are there; lower hidden, the number of seeds, or the "
+            "replay_capacity of an agent that has one."
         )
 
 
@@ -149,6 +151,7 @@ class Members:
     room: number of members to provide slots for, if more than ``count``.
     one_by_one: whether a device runs its members in turn instead of in lockstep.
     form: everything that compiled programs depend on.
+    slots: number of slots of all devices.
     taken: number of taken slots of each device, the first argument of compiled programs.
 
     Outside, leaves have a leading axis of length ``count``; on the devices, an axis of slots.
@@ -163,6 +166,7 @@ class Members:
         # At least two slots if members take turns: XLA drops an axis of length one and then rounds
         # differently. An empty slot costs memory, but no time.
         slots = max(2 if self.one_by_one else 1, -(-self.room // len(devices)))
+        self.slots = slots * len(devices)
         shares = np.array_split(np.arange(count), len(devices))
         self._slots = np.concatenate([d * slots + np.arange(len(s)) for d, s in enumerate(shares)])
         self._filling = np.concatenate([np.resize(share, slots) for share in shares])

@@ -199,6 +199,10 @@ class HostPopulation(Population):
         self._environments: list[Environments] = []
         self._judges: list[Environments] = []
 
+    @property
+    def _held(self) -> int:
+        return len(self.seeds)
+
     def restore(self, state: TrainingState) -> None:
         tally = jax.tree.map(np.zeros_like, state.tally)
         state = eqx.tree_at(lambda s: s.tally, state, tally)

@@ -310,9 +310,9 @@ class Agent(eqx.Module):
     def init(self, task: Task, key: PRNGKeyArray) -> Any:
         """The state before any experience."""
 
-    @abc.abstractmethod
     def warm_up(self) -> int:
-        """Steps of each environment that are only observed before learning starts."""
+        """Steps of each environment that are only observed before learning starts (default: 0)."""
+        return 0
 
     @abc.abstractmethod
     def act(self, state: Any, observation: PyTree, key: PRNGKeyArray) -> Array:
@@ -322,9 +322,9 @@ class Agent(eqx.Module):
         """What the log records of a training step (default: what the task measures of it)."""
         return task.measure(step)
 
-    @abc.abstractmethod
     def observe(self, state: Any, rollout: Transition) -> Any:
-        """Stores experience and learns nothing."""
+        """Stores experience and learns nothing, as in the warm-up (default: nothing is stored)."""
+        return state
 
     @abc.abstractmethod
     def learn(

@@ -62,7 +62,12 @@ class Population:
         """Raises QfolioError if memory is too small for a form that has not been run before."""
         if not self._programs:
             first = jax.eval_shape(lambda: self.agent.init(self.task, jax.random.key(0)))
-            require_memory(first, max(len(self.seeds), self._room))
+            require_memory(first, self._held)
+
+    @property
+    def _held(self) -> int:
+        """How many members' states are in memory."""
+        return self._members.slots
 
     def _begin(self, own: list[np.ndarray], form: Hashable) -> None:
         """Sets up the members before their first step; ``own`` and ``form`` are from ``_split``."""

@@ -26,6 +26,8 @@ def best(
 ) -> Float[Array, "*batch asset"]:
     """The weights w that maximize gain·w − w'Σw/2 with 1'w = 1, 0 ≤ w ≤ cap, and 0 if not open.
 
+    All are 0 if none is open.
+
     An interior-point method, as in ``solvers.minimum_variance``, finds which weights lie strictly
     between their bounds. Given that, they follow from one linear system, which is what is
     differentiated. A covariance should be in units of its mean variance, and positive definite.
@@ -37,7 +39,7 @@ def best(
     both = open_to[..., :, None] & open_to[..., None, :]
     sigma = jnp.where(both, covariance, 0.0) + (~open_to)[..., None] * jnp.eye(covariance.shape[-1])
     gain = jnp.where(open_to, gain, 0.0)
-    count = open_to.sum(-1, keepdims=True)
+    count = jnp.maximum(open_to.sum(-1, keepdims=True), 1)
     roof = jnp.maximum(cap, 1.01 / count)  # room for the interior
     given = lax.stop_gradient((sigma, gain))
     if near is None:
@@ -55,7 +57,8 @@ def best(
         )
     weights, _ = _solved(sigma, gain, free, full, roof)
     weights = jnp.clip(weights, 0.0, roof)
-    return weights / weights.sum(-1, keepdims=True)
+    total = weights.sum(-1, keepdims=True)
+    return weights / jnp.where(total > 0, total, 1.0)
 
 
 def _solved(
@@ -92,7 +95,7 @@ def _between(
     Wright (1997, Primal-dual interior-point methods, chapter 5), from equal weights, with
     multipliers z of w ≥ 0 and v of w ≤ roof.
     """
-    count = open_to.sum(-1, keepdims=True)
+    count = jnp.maximum(open_to.sum(-1, keepdims=True), 1)
     eye = jnp.eye(sigma.shape[-1])
 
     def improve(_: Array, point: tuple) -> tuple:
@@ -103,7 +106,8 @@ def _between(
         push = target / w - target / room - _times(sigma, w) + gain
         system = sigma + (z / w + v / room)[..., None] * eye
         moved, lifted = _both_solved(system, jnp.where(open_to, push, 0.0), 1.0 * open_to)
-        step = moved - moved.sum(-1, keepdims=True) / lifted.sum(-1, keepdims=True) * lifted
+        lift = lifted.sum(-1, keepdims=True)
+        step = moved - moved.sum(-1, keepdims=True) / jnp.where(lift > 0, lift, 1.0) * lifted
         step_z = target / w - z - z / w * step
         step_v = target / room - v + v / room * step
         length = jnp.ones_like(gap)

@@ -88,6 +88,8 @@ def near(name: str, known: Iterable[str]) -> str:
     names = list(known)
     if close := closest(name, names):
         return f"did you mean {close}?"
+    if not names:
+        return "there is none to choose from."
     more = ", …" if len(names) > MENTIONED else "."
     return f"choose from {', '.join(names[:MENTIONED])}{more}"
 

@@ -75,7 +75,8 @@ def unlearned(agent: "Agent", steps: int) -> str:
 
     The verb and the rest of a sentence whose subject is the agent.
     """
-    stored = agent.warm_up() * agent.num_envs
+    length = agent.rollout_steps
+    stored = -(-agent.warm_up() // length) * length * agent.num_envs  # of whole rollouts
     if steps > stored:
         return ""
     return (

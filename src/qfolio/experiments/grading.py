@@ -56,6 +56,14 @@ def grade(population: Population, starts: int | None = None) -> dict[str, Any]:
     }
 
 
+def curve_optimum(population: Population) -> float | None:
+    """The optimal mean return on the start states of the learning curve, if it is known."""
+    solution = population.task.optimum()
+    if solution is None:
+        return None
+    return float(solution.returns(start_keys())[: population.curve_starts].mean())
+
+
 def _rule(population: Population, solution: Optimum | None) -> dict[str, Any] | None:
     """The members' policies and the best one as few numbers, in tasks that define them."""
     if not isinstance(solution, FollowedOptimum):

@@ -185,7 +185,12 @@ class Run(Seeds):
         return jax.tree.map(lambda x: x[0], self.population.weights())
 
     def grade(self, starts: int | None = None) -> dict[str, Any]:
-        """Returns, optimum and regret of each seed's policy on the first fixed start states."""
+        """Grades each seed's greedy policy on the first fixed start states.
+
+        Returns return_mean, return_ci95, return_per_seed, optimum, regret_per_seed (as shares of
+        the optimum's absolute value), overestimation_per_seed and rule; what is unknown is None.
+        Raises QfolioError if a return is not finite.
+        """
         return grade(self.population, starts)
 
     def summary(self) -> dict[str, Any]:
@@ -233,7 +238,7 @@ def train(
         steps: Environment steps of each seed.
         seeds: Number of agents.
         seed: The first seed; the others follow it.
-        out: New folder for the run (default: nothing is written).
+        out: A new or empty folder for the run (default: nothing is written).
         listeners: Called at the start, after each chunk and at the end; see ``Listener``.
         executor: Where groups of seeds train (default: all in this process); see ``qfolio.on``.
 
@@ -241,8 +246,8 @@ def train(
         The trained run; ``run.summary()`` grades it.
 
     Raises:
-        QfolioError: The agent does not fit the task, a setting is out of range, the folder exists,
-            or a loss is not finite.
+        QfolioError: The agent does not fit the task, a setting is out of range, the folder is
+            not empty, or a loss is not finite.
     """
     devices.configure()
     executor = on(executor)

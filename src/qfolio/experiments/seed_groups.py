@@ -103,7 +103,7 @@ class SeedGroups:
             if part.config.steps != steps:
                 raise QfolioError(
                     f"Some seeds of the run have been trained for {part.config.steps:,} steps, not "
-                    f"for {steps:,}; finish that training first."
+                    f"for {steps:,}; finish that training first, with the earlier budget."
                 )
         # In steps, so that a run resumed in this process trains as long as its groups would.
         run.aim_at(Budget(steps=steps))

@@ -75,7 +75,7 @@ class Covariance(eqx.Module):
         returns = self._limited(jnp.where(open_to[..., None], returns, 0.0))
         weights = _decay(self.correlation, returns.shape[-1])
         seen = returns * jnp.sqrt(weights)
-        count = open_to.sum(-1, keepdims=True)
+        count = jnp.maximum(open_to.sum(-1, keepdims=True), 1)
         cleaned = self._cleaned(
             _correlations(jnp.einsum("...at,...bt->...ab", seen, seen)), count * (weights**2).sum()
         )
@@ -133,7 +133,7 @@ class Means(eqx.Module):
         # A mean over more days is smaller; divided by its standard error, it is not.
         means = (returns / spread) @ (weights / jnp.sqrt((weights**2).sum(0)))
         means = jnp.where(open_to[..., None], means, 0.0)
-        count = open_to.sum(-1)[..., None, None]
+        count = jnp.maximum(open_to.sum(-1), 1)[..., None, None]
         centered = means - means.sum(-2, keepdims=True) / count
         return jnp.where(open_to, centered @ self.coefficients, 0.0)
 

@@ -76,7 +76,8 @@ class Tilting(eqx.Module):
     def __call__(self, view: View) -> Float[Array, "batch output"]:
         assert view.anchor is not None
         tilted = view.anchor * jnp.exp(view.features[..., -1, 1:] @ self.linear)
-        tilted = tilted * (view.anchor.sum(-1) / tilted.sum(-1))[..., None]
+        total = tilted.sum(-1)  # 0 if the anchor is all cash
+        tilted = tilted * (view.anchor.sum(-1) / jnp.where(total > 0, total, 1.0))[..., None]
         assets = view.holding + jax.nn.sigmoid(self.rate) * (tilted - view.holding)
         cash = jnp.maximum(1 - assets.sum(-1, keepdims=True), LEAST_CASH)
         outputs = [jnp.log(cash), jnp.log(jnp.maximum(assets, LEAST))]

@@ -121,8 +121,8 @@ def _history(
 def _column(name: str, prices: Prices) -> Floats:
     if name not in prices.feature_names:
         raise QfolioError(
-            f"anchor is {COLUMN}{name}, but the table has no column {name}; name it with "
-            "--features, with a weight for each asset and date."
+            f"{COLUMN}{name} names a column of weights, but the table has no column {name}; give "
+            "it with --features, with a weight for each asset and date."
         )
     weights = np.nan_to_num(prices.features[..., prices.feature_names.index(name)])
     if weights.min() < 0 or weights.sum(-1).max() > 1 + 1e-6:

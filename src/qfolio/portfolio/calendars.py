@@ -35,7 +35,7 @@ def decision_rows(calendar: str, dates: NDArray[np.datetime64]) -> Bools:
         numbers = dict(zip(PERIODS, (weeks, months, months // 3, months // 12), strict=True))
         period = numbers[calendar]
         return np.diff(period, prepend=period[:1] - 1) > 0
-    if calendar.isdecimal() and int(calendar) > 0:
+    if calendar.isdecimal() and len(calendar) <= 9 and int(calendar) > 0:
         return rows % int(calendar) == 0
     raise QfolioError(
         f"calendar is {calendar!r}; it must be {', '.join(PERIODS)}, a number of rows, or "

@@ -85,7 +85,7 @@ def _column(name: str, prices: Prices) -> Floats:
     if name in prices.market_names:
         return prices.market[:, [prices.market_names.index(name)]]
     if name == "volatility":
-        return _volatility(prices.values)
+        return _volatility(prices.known)
     known = ", ".join(prices.feature_names + prices.market_names) or "none"
     raise QfolioError(
         f"The cost model reads the column {name!r}, which the price table does not have (it has "

@@ -109,7 +109,9 @@ def paths(
         def one(weights: PyTree) -> Array:
             return task.wanted(row, held, agent.policy(weights, view)[0])
 
-        wanted = task.of_mean(row, held, jax.vmap(one)(members).mean(0))
+        wanted = jax.vmap(one)(members).mean(0)
+        if task.mandate:  # the mean itself may break rules on holdings or trades
+            wanted = task.allow(row, held, wanted)
         target, plan = task.trade(row, held, wanted)
         after = Holding(task.drifted(row, target), held.reward, task.planned(row, plan))
         return after, (wanted, target, after)

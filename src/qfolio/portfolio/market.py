@@ -69,6 +69,16 @@ class Contexts(NamedTuple):
     coming: Context = Context()
 
 
+class Trade(NamedTuple):
+    """The execution of a decision, and the growth of wealth to the next one, costs included."""
+
+    before: Float[Array, " entry"]  # weights just before the trade
+    after: Float[Array, " entry"]  # weights just after it
+    remainder: Float[Array, ""]  # share of wealth that remains
+    cost: Float[Array, ""]  # share of wealth paid
+    growth: Float[Array, ""]  # ``RUIN`` if the account is wiped out
+
+
 class Signalled(NamedTuple):
     """The anchor that a menu of signals tilts, and the signals."""
 
@@ -121,7 +131,9 @@ class Menu(eqx.Module):
             self.actions = MenuActions(len(target), pooled=3, each=1)
         elif kind == "signals" and 0 < value <= 10:
             if not signals:
-                raise QfolioError(f"menu={text} tilts by signals; name some with --signals.")
+                raise QfolioError(
+                    f"menu={text} tilts by signals; set some, such as signals=momentum:1y-1m."
+                )
             one = jnp.eye(signals)
             tilts = value * jnp.concatenate([jnp.zeros((1, signals)), one, -one])
             target = jnp.zeros((len(tilts), assets + 1))
@@ -341,22 +353,20 @@ class Market(ExogenousTask):
 
         With an anchor also the distance from it: half the sum of absolute differences in weight.
         """
-        costs = self.costs
-        market, held = step.state.market, step.state.holding.weights
-        next_market = step.next_state.market
+        market, next_market, holding = step.state.market, step.next_state.market, step.state.holding
         moved, at = self.relatives(market, next_market), self.contexts(market, next_market)
-        # What is held next is the target, drifted.
-        after = step.next_state.holding.weights
-        target = grown(after, 1 / costs.growth(after, moved.coming, at.coming))
-        before, after = (costs.held(w, moved.waiting, at.waiting) for w in (held, target))
-        remainder, paid = costs.trade(before, after, at.trade)
+        if at.coming.listed is None and not self._wealth_may_end:
+            # What is held next is the target, drifted; a projection takes longer.
+            after = step.next_state.holding.weights
+            target = grown(after, 1 / self.costs.growth(after, moved.coming, at.coming))
+        else:
+            target = self.target(market, holding, step.action)
+        trade = self._executed(moved, at, holding.weights, target)
         assets = target[1:]
         measured = {
-            "growth": jnp.log(
-                remainder * (after * costs.growth(after, moved.earning, at.earning)).sum()
-            ),
-            "turnover": traded(before, after, remainder),
-            "cost": sum(paid.values()),
+            "growth": jnp.log(trade.growth),
+            "turnover": traded(trade.before, trade.after, trade.remainder),
+            "cost": trade.cost,
             "cash": target[0],
             "assets": assets.sum() ** 2 / jnp.maximum((assets**2).sum(), 1e-12),
         }
@@ -367,21 +377,30 @@ class Market(ExogenousTask):
     def _earn(
         self, market: PyTree, next_market: PyTree, holding: Holding, target: Float[Array, " entry"]
     ) -> tuple[Float[Array, ""], Holding]:
-        costs = self.costs
-        wealth_may_end = costs.depends_on_wealth or not self.feasible.long_only
         moved, at = self.relatives(market, next_market), self.contexts(market, next_market)
-        before = costs.held(holding.weights, moved.waiting, at.waiting)
-        after = costs.held(target, moved.waiting, at.waiting)
-        remainder, paid = costs.trade(before, after, at.trade)
-        growth = remainder * (after * costs.growth(after, moved.earning, at.earning)).sum()
-        drifted = costs.held(target, moved.coming, at.coming)
-        if wealth_may_end:
-            lives = growth > RUIN
-            growth = jnp.where(lives, growth, RUIN)
-            drifted = jnp.where(lives, drifted, jnp.eye(drifted.shape[0])[0])
-        outcome = Outcome(growth, sum(paid.values()), after)
+        trade = self._executed(moved, at, holding.weights, target)
+        drifted = self.costs.held(target, moved.coming, at.coming)
+        if self._wealth_may_end:
+            drifted = jnp.where(trade.growth > RUIN, drifted, jnp.eye(drifted.shape[0])[0])
+        outcome = Outcome(trade.growth, trade.cost, trade.after)
         reward, state = self.reward_function(holding.reward, outcome)
         return reward, Holding(drifted, state, self.planned(market, holding.plan))
+
+    @property
+    def _wealth_may_end(self) -> bool:
+        return self.costs.depends_on_wealth or not self.feasible.long_only
+
+    def _executed(
+        self, moved: Relatives, at: Contexts, held: Float[Array, " entry"], target: Array
+    ) -> Trade:
+        """The trade from the weights held at a decision to its target."""
+        costs = self.costs
+        before, after = (costs.held(w, moved.waiting, at.waiting) for w in (held, target))
+        remainder, paid = costs.trade(before, after, at.trade)
+        growth = remainder * (after * costs.growth(after, moved.earning, at.earning)).sum()
+        if self._wealth_may_end:
+            growth = jnp.where(growth > RUIN, growth, RUIN)
+        return Trade(before, after, remainder, sum(paid.values()), growth)
 
     def planned(self, market: PyTree, plan: Plan | None) -> Plan | None:
         """The plan one row after a decision, drifted with prices."""

@@ -57,7 +57,7 @@ def train(
     """A policy trained on all rows of a price table, all seeds in one program.
 
     Args:
-        prices: Anything that ``prices.load`` reads.
+        prices: Anything that ``qfolio.load_prices`` reads.
         agent: The name of an agent, for its fast preset; a preset; or an agent, which then needs
             ``episodes``.
         seeds, seed: Number of agents (default: the preset's, or 5), with the seeds ``seed``,
@@ -105,7 +105,7 @@ class Policy:
     """Agents of one kind and several seeds, trained on the assets of one table.
 
     task: the portfolio task, with the part of the table that they were trained on.
-    members: the agents' weights, with a leading seed axis.
+    members: the agents' learned parameters, with a leading seed axis.
     learner: the agents' whole states, likewise; without it, the policy cannot be updated.
     updates: number of updates so far.
     learned: the date of the last row that it has learned from; NaT if unknown.

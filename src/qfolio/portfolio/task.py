@@ -220,15 +220,17 @@ class Portfolio(Market):
             )
         rows = slice(first + 1, last + 1)
         usable = np.ones(self.limits.shape[0], bool) if tradable is None else tradable
-        if not usable.any():
+        there = usable if self.tradable is None else np.asarray(self.tradable)[rows] & usable
+        if not there.any():
             raise QfolioError(
-                "No asset can be traded over these rows; give rows in which some have prices."
+                "No asset can be traded over these rows; give rows in which some have prices (and, "
+                "with --members, are members)."
             )
         channels = np.concatenate(
             [np.asarray(self.log_relatives)[rows, :, None], np.asarray(self.extra)[rows]], axis=2
         )[:, usable]
-        if self.tradable is not None and not self.tradable[rows].all():
-            channels = channels[np.asarray(self.tradable)[rows][:, usable]][:, None]
+        if self.tradable is not None and not there[:, usable].all():
+            channels = channels[there[:, usable]][:, None]
         center, scale = channels.mean((0, 1)), channels.std((0, 1))
         center[0] = 0.0  # returns keep their sign, which is informative
         limits = np.where(usable, self.max_weight, 0.0)
@@ -329,12 +331,6 @@ class Portfolio(Market):
             order = cashed(order, self.tradable[market + 1])
         return self.terms.next_row(market, plan, order)
 
-    def of_mean(
-        self, market: Row, holding: Holding, wanted: Float[Array, " entry"]
-    ) -> Float[Array, " entry"]:
-        """The order for a mean of targets, which itself may break rules on holdings or trades."""
-        return self.allow(market, holding, wanted) if self.mandate else wanted
-
     @property
     def actions(self) -> Actions:
         """The allocations of the menu; without one, all weights up to the largest."""
@@ -421,8 +417,8 @@ class Portfolio(Market):
     def anchor_weights(self, market: Row) -> Float[Array, " asset"] | None:
         """The anchor's weights; those of assets that cannot be traded go to the others.
 
-        An asset that can be traded has at least ``LEAST`` times an equal weight, so that a weight
-        of 0 marks an asset that cannot.
+        An asset that can be traded has at least ``LEAST`` times an equal share of the anchor, so
+        that a weight of 0 marks an asset that cannot, unless the whole anchor is cash.
         """
         if not self.anchor:
             return None
@@ -431,13 +427,8 @@ class Portfolio(Market):
         open_to = limits > 0
         kept = jnp.where(open_to, weights, 0.0)
         share = kept / jnp.maximum(kept.sum(), 1e-9)
-        share = (1 - LEAST) * share + LEAST * open_to / self._count(open_to)
+        share = (1 - LEAST) * share + LEAST * open_to / jnp.maximum(open_to.sum(), 1)
         return jnp.minimum(weights.sum() * share, limits)
-
-    def _count(self, open_to: Bool[Array, " asset"]) -> Int[Array, ""]:
-        """How many assets are open to trade; 1 if there is none at a row."""
-        count = open_to.sum()
-        return count if self.tradable is None else jnp.maximum(count, 1)
 
     @property
     def tilting(self) -> int:
@@ -451,7 +442,7 @@ class Portfolio(Market):
         if anchor is None:
             limits = self._limits(market)
             open_to = limits > 0
-            anchor = jnp.minimum(open_to / self._count(open_to), limits)
+            anchor = jnp.minimum(open_to / jnp.maximum(open_to.sum(), 1), limits)
         others = lax.dynamic_index_in_dim(self.extra, market, keepdims=False)
         return Signalled(anchor, others[:, others.shape[1] - self.tilting :])
 
@@ -465,20 +456,23 @@ class Portfolio(Market):
     def settle(
         self, market: Row, next_market: Row, holding: Holding, action: Array
     ) -> tuple[Float[Array, ""], Holding]:
-        """As in any market; ``active`` subtracts the reward of holding the anchor, free of cost.
+        reward, after = super().settle(market, next_market, holding, action)
+        return self.compared(market, next_market, reward), after
 
-        That reward depends on the market alone, so that the best policy stays the same and noise
-        that all policies share is removed (input-dependent baselines, Mao et al. 2019).
+    def compared(self, market: Row, next_market: Row, reward: Float[Array, ""]) -> Float[Array, ""]:
+        """A reward; ``active`` subtracts that of holding the anchor, free of cost.
+
+        What is subtracted depends on the market alone, so that the best policy stays the same and
+        noise that all policies share is removed (input-dependent baselines, Mao et al. 2019).
         ``tracking_aversion`` penalizes tracking error: the mean square of active rewards is nearly
         their variance.
         """
-        reward, after = super().settle(market, next_market, holding, action)
         if self.active:
             shared = self.reference(market, next_market)
             assert shared is not None  # there is an anchor
             reward -= shared
             reward -= self.tracking_aversion / 2 * reward**2
-        return reward, after
+        return reward
 
     def relatives(self, market: Row, next_market: Row) -> Relatives:
         # Rows up to market + lag + 1 exist for every decision that is settled.

@@ -13,6 +13,7 @@ from qfolio.core.arrays import Floats
 from qfolio.core.evaluation import greedy, play, start_keys
 from qfolio.core.mdp import Agent, Box, Policy, Position
 from qfolio.core.training import episode_steps
+from qfolio.experiments.grading import curve_optimum
 from qfolio.experiments.presets import changes, preset
 from qfolio.experiments.records import Records
 from qfolio.experiments.run import Run
@@ -38,10 +39,7 @@ def report_data(
     run: Run, summary: dict[str, Any], contrast: Run | None, command: str
 ) -> ReportData:
     """Collects everything ``write_report`` needs. The maps and the episode are the first seed's."""
-    solution = run.task.optimum()
-    optimum = np.nan
-    if solution is not None:
-        optimum = float(solution.returns(start_keys())[: run.population.curve_starts].mean())
+    solution, best = run.task.optimum(), curve_optimum(run.population)
     pendulum = run.task if isinstance(run.task, Pendulum) else None
     known = solution if isinstance(solution, FollowedOptimum) else None
     exact = solution if isinstance(solution, GridOptimum) else None
@@ -61,7 +59,7 @@ def report_data(
         comparison=_curve(contrast, names[1], unit) if contrast and contrast.evaluations else None,
         training_done=_done(run, unit, episodes.column("episode").astype(float)),
         training_returns=episodes.column("return"),
-        optimum=optimum,
+        optimum=np.nan if best is None else best,
         maps=_maps(run, pendulum, exact) if pendulum and exact else None,
         episode=greedy_episode(run, pendulum) if pendulum else None,
         market=_market(run, summary, known) if known else None,

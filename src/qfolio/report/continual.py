@@ -76,7 +76,7 @@ def verdict(content: Content) -> str:
     """Return the result in a few plain sentences."""
     worse = percent(_middle(content, "frozen"))
     before = percent(float(interquartile_mean(content["training"]["final"])))
-    found = [f"The policy has a regret of {before} in the world it was trained in, and of {worse} "
+    found = [f"The policy has a regret of {before} in the task it was trained on, and of {worse} "
              "after the change, without further learning."]  # fmt: skip
     for way in ("renewed", "going on", "fresh"):
         steps = content["recovery"][way]["middle"]

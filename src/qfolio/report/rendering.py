@@ -10,7 +10,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from qfolio.core.arrays import Floats
 from qfolio.core.statistics import FEWEST_SEEDS
-from qfolio.core.text import plural
+from qfolio.core.text import figure, plural
 from qfolio.report import palette
 
 THIN_SPACE = "\N{NARROW NO-BREAK SPACE}"
@@ -48,14 +48,9 @@ def place(value: float, low: float, high: float) -> float:
 
 def number(value: float, digits: int = 1, *, sign: bool = False) -> str:
     """Return a number with a typographic minus sign and commas between thousands."""
-    if math.isnan(value):
-        return "–"
     if math.isinf(value):
         return "\N{MINUS SIGN}∞" if value < 0 else "+∞" if sign else "∞"
-    text = f"{value:{'+' if sign else ''},.{digits}f}"
-    if not text.strip("+-0.,"):
-        text = text.lstrip("+-")
-    return text.replace("-", "\N{MINUS SIGN}")
+    return figure(value, f"{'+' if sign else ''},.{digits}f")
 
 
 def years(first: str, last: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +46,7 @@ class Sweep:
     def comparison(self) -> str:
         """Whether the best configuration beats the preset, in a sentence."""
         best, preset = (
-            np.array([math.nan if x is None else x for x in self.summary[row]])
+            np.array(self.summary[row], float)
             for row in ("return_per_seed", "preset_return_per_seed")
         )
         gains = best - preset
@@ -65,8 +64,9 @@ class Sweep:
                 f"which returns {number(preset.mean(), digits)} with {seeds} and the graded starts."
             )
         says = (
-            f"With {seeds} and the graded starts the best of {len(self.trials)} configurations "
-            f"returns {number(best.mean(), digits)}, the preset {number(preset.mean(), digits)}"
+            f"With {seeds}, on the starts for grading, the best of {len(self.trials)} "
+            f"configurations returns {number(best.mean(), digits)}, the preset "
+            f"{number(preset.mean(), digits)}"
         )
         if len(gains) == 1:
             return f"{says}; a single seed allows no further conclusion."

@@ -14,7 +14,7 @@ from qfolio.core.statistics import interquartile_mean
 from qfolio.report.animation import pendulum_gif
 from qfolio.report.data import MarketData, ReportData, decimals
 from qfolio.report.figures import curves, pendulum, policies
-from qfolio.report.figures.style import LEAD, WIDE, svgs
+from qfolio.report.figures.style import LEAD, WIDE, save_png, svgs
 from qfolio.report.rendering import (
     amount,
     changed_settings,
@@ -44,13 +44,13 @@ def write_report(folder: Path, data: ReportData) -> None:
         OSError: A file cannot be written.
         ValueError: The shapes of the episode do not match.
     """
-    curves.learning_curve(folder / "learning_curve.png", data)
+    save_png(folder / "learning_curve.png", curves.draw_learning_curve, data, LEAD)
     for name, draw, applies in (
-        ("value.png", pendulum.value, data.maps is not None),
-        ("policy.png", policies.policy, _has_policy(data)),
+        ("value.png", pendulum.draw_value, data.maps is not None),
+        ("policy.png", policies.draw_policy, _has_policy(data)),
     ):
         if applies:
-            draw(folder / name, data)
+            save_png(folder / name, draw, data, WIDE)
         else:
             (folder / name).unlink(missing_ok=True)
     animation, gif = folder / "episode.gif", None

@@ -69,7 +69,7 @@ def _facts(data: Sweep) -> list[tuple[str, str, str]]:
     digits = decimals(data.summary["optimum"] or best.value)
     failed = sum(math.isnan(trial.value) for trial in data.trials)
     config = data.config
-    trained = [math.nan if x is None else x for x in data.summary["return_per_seed"]]
+    trained = np.array(data.summary["return_per_seed"], float)
     graded = float(np.mean(trained))
     count = len(data.summary["seeds"])
     seeds = f"{count} {plural('seed', count)}"
@@ -128,7 +128,7 @@ def _finals(data: Sweep) -> list[tuple[str, list[str]]]:
     optimum = data.summary["optimum"]
     rows = []
     for name, key in (("Best", "return_per_seed"), ("Preset", "preset_return_per_seed")):
-        returns = np.array([math.nan if x is None else x for x in data.summary[key]])
+        returns = np.array(data.summary[key], float)
         if not np.isfinite(returns).all():
             rows.append((name, ["diverged", "–", "–", "–"]))
             continue

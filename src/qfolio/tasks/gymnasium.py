@@ -105,8 +105,9 @@ class Facts(NamedTuple):
             return (actions.ravel() + self.first_action).tolist()
         # A diverged agent is detected by its losses; the environment should not get its NaN.
         share = (np.clip(np.nan_to_num(actions), -1.0, 1.0) + 1) / 2
-        made = self.low + share.reshape(-1, *self.low.shape) * (self.high - self.low)
         whole = np.issubdtype(self.low.dtype, np.integer)
+        low, high = (x.astype(float) if whole else x for x in (self.low, self.high))
+        made = low + share.reshape(-1, *low.shape) * (high - low)
         return list(np.rint(made).astype(self.low.dtype) if whole else made)
 
     def seen(self, observation: Any) -> Any:
@@ -144,7 +145,8 @@ def _read(id: str, kwargs: str) -> Facts:
     seen, done = env.observation_space, env.action_space
     env.close()
     if isinstance(seen, spaces.Box):
-        bounds = np.maximum(np.abs(seen.low), np.abs(seen.high)).astype(float).ravel()
+        low, high = seen.low.astype(float), seen.high.astype(float)
+        bounds = np.maximum(np.abs(low), np.abs(high)).ravel()
         known = (bounds > 0) & (bounds < 1e6)
         scale = tuple(np.where(known, bounds, 1.0).tolist())
     elif not isinstance(seen, spaces.Discrete):

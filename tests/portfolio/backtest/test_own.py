@@ -320,6 +320,23 @@ def test_orders_in_shares_hold_shares():
     np.testing.assert_allclose(weight[:3], [cash / total, 60 * a[120] / total, 50 * b[120] / total])
 
 
+def test_shares_of_a_delisted_asset_are_paid_out():
+    prices, listed = table(), np.ones((ROWS, 3), bool)
+    values = prices.values.copy()
+    listed[100:, 0], values[100:, 0] = False, 0.7 * values[99, 0]
+    prices = dataclasses.replace(prices, listed=listed, values=values)
+    orders = weights([20, 20, 120], asset=["cash", "A", "B"], shares=[8000, 100, 50])
+    backtest = create(prices, strategies={"mine": orders}, cost=0.0)
+    entry = backtest.replay.own("strategy", backtest._own["mine"])
+    cash = 8000 - 100 * (values[20, 0] - values[120, 0]) - 50 * values[120, 1]
+    bought = 50 * values[120, 1]
+    weight = entry.decisions[0, 120 - FIRST]
+    np.testing.assert_allclose(weight, np.array([cash, 0, bought, 0]) / (cash + bought))
+    sold = weights([20, 20, 120], asset=["cash", "A", "A"], shares=[8000, 100, -100])
+    with pytest.raises(QfolioError, match=r"row 2 .*A has no price any more, and was paid out"):
+        create(prices, strategies={"mine": sold})
+
+
 def test_the_report_says_where_a_strategy_breaks_the_mandate():
     mine = np.full((ROWS, 3), np.nan)
     mine[[100, 120, 130]] = [[0.3, 0.3, 0.3], [0.6, 0.2, 0.1], [0.7, 0.2, 0.1]]

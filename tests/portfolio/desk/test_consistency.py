@@ -72,3 +72,11 @@ def test_the_band_of_independent_returns():
     np.testing.assert_allclose(np.log(middle), rows * mean, atol=0.05)
     spread = (np.log(high) - np.log(low)) / (2 * 1.96 * deviation * np.sqrt(rows))
     assert spread[500:].mean() == pytest.approx(1, abs=0.15)
+
+
+def test_the_band_of_a_backtest_that_was_wiped_out():
+    tested = np.append(plain(np.random.default_rng(1), 200, SHARPE), [-1.0, *np.zeros(50)])
+    low, middle, high = band(tested, 100, np.random.default_rng(0))
+    assert (low <= middle).all()
+    assert (middle <= high).all()
+    assert 0 < low[-1] < 0.01

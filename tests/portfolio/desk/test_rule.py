@@ -162,5 +162,5 @@ def test_orders_that_the_lag_leaves_unfilled_are_named(tmp_path, fill, pending):
         said[rows] = " ".join(desk.terms(rule, known, allocation, 0.0))
         if rows == 120:
             desk.record("equal-weight", allocation, known, False)
-    unfilled = "lag of 2 rows the orders of 2020-04-29 are not filled yet"
+    unfilled = "lag of 2 rows, the orders of 2020-04-29 are not filled yet"
     assert [rows for rows, text in said.items() if unfilled in text] == pending

@@ -166,3 +166,11 @@ def test_the_largest_weights_are_kept():
     found = np.asarray(made.project(wanted, wanted))
     assert np.flatnonzero(found[1:] > 0).tolist() == [0, 2, 4, 6]  # with those that floors need
     assert largest(made.violations(found)) <= 1e-6
+
+
+def test_a_mandate_has_the_same_limits_whatever_can_be_traded():
+    """Policies of several folds share their programs, and folders theirs shapes."""
+    text = mandate_text({"assets": {"floor": {"c": -0.1}}}, ("a", "b", "c"))
+    every, some = (feasible(text, np.array([True, True, c])) for c in (True, False))
+    assert every.names == some.names
+    assert every.limits.rows.shape == some.limits.rows.shape

@@ -24,9 +24,8 @@ def explained():
 def test_the_page_says_where_the_return_came_from(explained):
     text = Page(render_backtest(explained)).text
     for sentence in (
-        "Of the 14.2% a year that DQN-together earned, 13.1% come from equal weights, "
-        "+0.4% from weights that were constantly different and +1.1% from their timing "
-        "(together t = 1.7), and costs took 0.4%.",
+        "DQN-together earned 14.2% a year: 13.1% from equal weights, +0.4% from constant tilts "
+        "and +1.1% from timing (t = 1.7 for the two together), less 0.4% in costs.",
         "Diagnosis: DQN-together traded once and never again.",
         "with constant tilts, t = 1.7",
         "Returns less those of equal weight, regressed on factors made from the table. R² 31%",
@@ -82,9 +81,9 @@ def test_signals_are_ordered_by_their_worth(explained):
 def test_small_parts_have_more_digits(explained):
     parts = made_up_why().agents["DQN-together"].decomposition
     small = type(parts)(0.1315, 0.131, 0.001, 0.0001, 0.1, 0.0006, [], [])
-    assert "+0.10% from weights" in headline("x", small)
-    assert "costs took 0.06%" in headline("x", small)
-    assert "costs took 0.4%" in headline("x", parts)
+    assert "+0.10% from constant tilts" in headline("x", small)
+    assert "less 0.06% in costs" in headline("x", small)
+    assert "less 0.4% in costs" in headline("x", parts)
 
 
 def test_a_weight_that_never_changes_has_a_scale_with_round_ends(explained):

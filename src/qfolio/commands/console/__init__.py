@@ -40,7 +40,7 @@ def working(text: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., None]]:
+def bar(text: str, total: float = 1.0) -> Iterator[Callable[..., None]]:
     """A bar with text beside it, on terminals only, removed at the end.
 
     Yields the function that moves it: ``update(completed=…)``, with ``description=…`` for new text.
@@ -52,7 +52,7 @@ def bar(text: str, total: float = 1.0, done: int = 0) -> Iterator[Callable[..., 
     with rich.progress.Progress(
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as live:
-        yield partial(live.update, live.add_task(text, total=total, completed=done))
+        yield partial(live.update, live.add_task(text, total=total))
 
 
 def print_table(

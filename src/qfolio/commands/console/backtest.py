@@ -65,7 +65,7 @@ def _print_relative(assessment: "Assessment") -> None:
     """A row for agents, the user's own strategies and the best baseline, beside the benchmark."""
     from qfolio.portfolio.backtest.statistics.assessment import JUDGED
 
-    first = f"to {assessment.reference}, a year"
+    first = f"against {assessment.reference}, a year"
     shown = {
         "active_return": "+.2%",
         "tracking_error": ".1%",

@@ -45,8 +45,9 @@ def print_study(result: "Result") -> None:
         heads = (agent, "a year", "95% interval", "IR", "t", "rebal.", "Sharpe")
         print_table(heads, rows, bold=[_pooled(main.variant)])
     say(
-        "Growth is what exceeds the benchmark's, t against it (pooled: Stouffer's z), rebal. the t "
-        "(or z) against its best rebalancing, Sharpe the ratio less that of the best baseline."
+        "“a year” is growth less the benchmark's, and t tests it (pooled: Stouffer's z); “rebal.” "
+        "is the t (or z) against its best rebalancing; Sharpe is the ratio less the highest of a "
+        "baseline."
     )
     for sentences in result.verdicts.values():
         for sentence in sentences:

@@ -49,7 +49,7 @@ def print_result(seeds: list[int], result: dict[str, Any]) -> None:
         say(f"95% interval of the mean return over seeds: {number(low)} to {number(high)}")
     else:
         say(
-            f"An interval over seeds needs {FEWEST_SEEDS} seeds or more (--seeds); "
+            f"An interval over seeds needs a run with {FEWEST_SEEDS} seeds or more; "
             f"{len(returns)} {'is' if len(returns) == 1 else 'are'} too few."
         )
 

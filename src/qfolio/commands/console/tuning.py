@@ -1,7 +1,8 @@
 """What a search prints: its space before it starts, and the best configuration."""
 
-import math
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from qfolio.commands.console import say, tell
 from qfolio.core.registry import short
@@ -27,10 +28,9 @@ def print_search(summary: dict[str, Any], verdicts: list[str]) -> None:
     """The best configuration beside the preset and the optimum, and the search's verdicts."""
     say("")
     for name, row in (("best", "return_per_seed"), ("preset", "preset_return_per_seed")):
-        returns = [math.nan if x is None else x for x in summary[row]]
-        mean = sum(returns) / len(returns)
-        worst = figure(math.nan if math.isnan(mean) else min(returns), ".2f")
-        say(f"{name:<8}{figure(mean, '.2f'):>9}   worst seed {worst}")
+        returns = np.array(summary[row], float)
+        mean, worst = figure(returns.mean(), ".2f"), figure(returns.min(), ".2f")
+        say(f"{name:<8}{mean:>9}   worst seed {worst}")
     if summary["optimum"] is not None:
         seeds = amount(len(returns), "fresh seed")
         say(f"optimum {figure(summary['optimum'], '.2f'):>9}   ({seeds}, graded starts)")

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from qfolio.core.evaluation import start_keys
 from qfolio.core.host import HostPopulation
 from qfolio.core.training import begin
 from qfolio.experiments.comparison.operations import operations_per_step
 from qfolio.experiments.comparison.ranking import Result
+from qfolio.experiments.grading import curve_optimum
 from qfolio.experiments.run import Run
 
 
@@ -22,9 +22,6 @@ def measure(run: Run, devices: int) -> Result:
     """
     summary = run.summary()
     seeds = len(run.population.seeds)
-    solution, curve_optimum = run.task.optimum(), None
-    if solution is not None:
-        curve_optimum = float(solution.returns(start_keys())[: run.population.curve_starts].mean())
     rows = run.evaluations
     members = jax.eval_shape(partial(begin, run.task, run.agent), jnp.uint32(0))
     weights = jax.tree.leaves(jax.eval_shape(run.agent.weights, members.agent))
@@ -36,7 +33,7 @@ def measure(run: Run, devices: int) -> Result:
         curve_starts=run.population.curve_starts,
         curve_steps=[int(row["env_steps"]) for row in rows[::seeds]],
         curve_returns=np.reshape([row["return"] for row in rows], (-1, seeds)).tolist(),
-        curve_optimum=curve_optimum,
+        curve_optimum=curve_optimum(run.population),
         episodes=summary["episodes"],
         env_steps=summary["env_steps"],
         seconds_train=summary["seconds_train"],

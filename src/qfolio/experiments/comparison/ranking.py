@@ -142,6 +142,8 @@ def area(steps: Sequence[int], values: Floats, until: int) -> Floats:
     """Mean of each curve up to step ``until``, for values of shape (point, seed)."""
     ends = np.append([x for x in steps if x < until], until)
     heights = np.stack([np.interp(ends, steps, column) for column in values.T])
+    if len(ends) == 1:  # a curve whose earlier points were lost
+        return heights[:, 0]
     return np.asarray(np.trapezoid(heights, ends, axis=-1) / (ends[-1] - ends[0]))
 
 

@@ -157,8 +157,8 @@ class Comparison:
         """
         if len(entrants) < 2:
             raise QfolioError(
-                "A comparison needs two or more agents; name them with --agents, for example "
-                "--agents dqn:fast,dqn:report."
+                "A comparison needs two or more agents; name them with --agents, separated by "
+                "commas."
             )
         seed_range(seeds, seed)
         for name, entrant in entrants.items():
@@ -397,7 +397,8 @@ def _require_fit(name: str, entrant: Entrant, seeds: int) -> None:
     """Raises QfolioError if an agent cannot learn the task; traces programs, runs none."""
     try:
         state = jax.eval_shape(partial(begin, entrant.task, entrant.agent), jnp.uint32(0))
-        devices.require_memory(state, seeds)
+        compiled = entrant.task.compiled
+        devices.require_memory(state, devices.Members(seeds).slots if compiled else seeds)
     except QfolioError as error:
         raise QfolioError(f"{name}: {error}") from None
 

@@ -16,7 +16,8 @@ def on(text: Executor | str | None) -> Executor:
             cluster reached through Ray Client. None stands for "here", and an executor for itself.
 
     Raises:
-        QfolioError: The text names no executor, or the number of processes is out of range.
+        QfolioError: The text names no executor, the number of processes is out of range, or Ray is
+            not installed, cannot be reached or has no room.
     """
     if text is None:
         return Here()

@@ -12,7 +12,7 @@ import re
 import socket
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, TypeVar
 
 from qfolio.core.errors import QfolioError
@@ -66,8 +66,8 @@ class Ray:
         if self.workers < 1:
             what = "GPU" if self.lockstep else f"node with {_cores(cpus)}"
             raise QfolioError(
-                f"The Ray cluster has no {what}, so no worker can start; add one, or give workers, "
-                "which then wait for it."
+                f"The Ray cluster has no {what}, so no worker can start; add one, or in Python use "
+                "Ray(workers=…), which waits for it."
             )
 
     @property
@@ -77,7 +77,7 @@ class Ray:
     def map(
         self, jobs: Iterable[Job[R] | None], listen: Callable[[Job[R]], Sequence[Listener]]
     ) -> Generator[tuple[Job[R], R], None, None]:
-        return dispatch(lambda: _opened(self), jobs, listen)
+        return dispatch(lambda: contextlib.closing(_Actors(self)), jobs, listen)
 
 
 class _Actors:
@@ -157,15 +157,6 @@ class _Actors:
 
     def _listen(self, worker: int) -> None:
         self._answers[self._actors[worker].listen.remote()] = worker
-
-
-@contextlib.contextmanager
-def _opened(executor: Ray) -> Iterator[_Actors]:
-    actors = _Actors(executor)
-    try:
-        yield actors
-    finally:
-        actors.close()
 
 
 def _connected(address: str | None) -> Any:

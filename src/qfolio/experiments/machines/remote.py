@@ -84,7 +84,7 @@ class RemoteTraining(Training):
         if name == "population":
             raise QfolioError(
                 "A listener asks for the population of a training that runs on a worker; it may "
-                "ask for progress and rows, or train with --on here."
+                "ask for progress and rows, or train in this process (--on here)."
             )
         raise AttributeError(name)
 

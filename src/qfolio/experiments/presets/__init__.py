@@ -53,7 +53,7 @@ def preset(name: str, task: str = "pendulum", agent: str = "dqn") -> Preset:
         agent: A name that ``qfolio train`` knows.
 
     Raises:
-        QfolioError: There is no such preset; the message lists those that exist.
+        QfolioError: There is no such preset; the message names the closest, or those that exist.
     """
     for argument, value in {"name": name, "task": task, "agent": agent}.items():
         require_type(argument, value, str, "text")

@@ -44,7 +44,7 @@ class Trial(NamedTuple):
     @property
     def value(self) -> float:
         """The mean return over seeds; NaN if one of them diverged."""
-        return float(np.mean([math.nan if x is None else x for x in self.returns]))
+        return float(np.array(self.returns, float).mean())
 
 
 class Asked(NamedTuple):

@@ -39,7 +39,7 @@ from qfolio.experiments.records import Records
 from qfolio.experiments.tuning import search
 from qfolio.experiments.tuning.journal import Asked, Journal, Trial, best_of
 from qfolio.experiments.tuning.search import Value
-from qfolio.experiments.tuning.trials import TrainedTrials, TrialsJob, trials_jobs
+from qfolio.experiments.tuning.trials import TrialsJob, trials_jobs
 
 STUDY = "study.json"
 """The name of the file that holds the settings."""
@@ -75,7 +75,6 @@ class Progress:
     best: Trial | None
     preset: Trial | None
     seconds: float  # of this batch
-    seconds_compile: float  # of these
     trials: int  # in this batch
 
 
@@ -261,33 +260,29 @@ class Tuning:
         log: Log | None = None,
         listener: Callable[[float], None] | None = None,
         executor: Executor | str | None = None,
-    ) -> tuple[Float[np.ndarray, "agent seed"], float]:
+    ) -> Float[np.ndarray, "agent seed"]:
         """Trains agents; returns mean greedy returns by agent and seed, NaN if the loss diverged.
 
-        Also returns the seconds spent on compiling. Raises KeyboardInterrupt if Ctrl-C stops it
-        before the end.
+        Raises KeyboardInterrupt if Ctrl-C stops it before the end.
 
         agents: by their names in the log.
         """
         executor, config = on(executor), self.config
         starts = np.asarray(jax.random.key_data(keys))
         jobs = trials_jobs(self.task, agents, seeds, config.budget, starts, executor)
-        found, seconds_compile = dict[str, np.ndarray](), 0.0
+        found: dict[str, np.ndarray] = {}
         shares: dict[str, float] = {}
 
         def listen(job: Job, done: float, share: float) -> list[Listener]:
             return [] if listener is None else [_Share(listener, shares, job.name, share)]
 
-        def store(job: TrialsJob, trained: TrainedTrials) -> None:
-            nonlocal seconds_compile
-            found.update(zip(job.names, trained.returns, strict=True))
-            seconds_compile += trained.seconds_compile
+        def store(job: TrialsJob, returns: np.ndarray) -> None:
+            found.update(zip(job.names, returns, strict=True))
 
         self.interrupted |= carry_out(executor, jobs, listen, store, log or Log(None))
         if len(found) < len(agents):
             raise KeyboardInterrupt
-        returns = np.array([found[name] for name in agents]).reshape(len(agents), len(seeds))
-        return returns, seconds_compile
+        return np.array([found[name] for name in agents]).reshape(len(agents), len(seeds))
 
     def conclude(self, executor: Executor | str | None = None) -> dict[str, Any]:
         """Trains the best configuration and the preset with fresh seeds, and grades both.
@@ -311,7 +306,7 @@ class Tuning:
         seeds = range(FRESH, FRESH + self.config.fresh_seeds)
         agents = {"best": self.configured(found.values), "preset": self.agent}
         with self._log() as log:
-            returns, _ = self.trained(agents, seeds, start_keys(), log, executor=executor)
+            returns = self.trained(agents, seeds, start_keys(), log, executor=executor)
         solution = self.task.optimum()
 
         def optimum(keys: Key[Array, " start"]) -> float | None:
@@ -346,9 +341,7 @@ class Tuning:
                 with contextlib.suppress(QfolioError):
                     agents[_name(one)] = self.configured(one.values)
             seeds = range(self.config.seeds)
-            returns, seconds_compile = self.trained(
-                agents, seeds, tuning_keys(), log, listener, executor
-            )
+            returns = self.trained(agents, seeds, tuning_keys(), log, listener, executor)
         except BaseException:
             for one in asked:
                 self.journal.give_up(one)
@@ -366,7 +359,6 @@ class Tuning:
             best=best_of(trials),
             preset=next((trial for trial in trials if trial.is_preset), None),
             seconds=seconds,
-            seconds_compile=seconds_compile,
             trials=len(asked),
         )
 

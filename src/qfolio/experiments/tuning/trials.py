@@ -4,7 +4,6 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +15,6 @@ from qfolio.core.mdp import Agent, Task
 from qfolio.experiments.budget import Budget
 from qfolio.experiments.executor import Executor, Here, at_once
 from qfolio.experiments.fit import Listener, fit
-
-
-class TrainedTrials(NamedTuple):
-    """Mean greedy returns by configuration and seed, NaN where the loss diverged."""
-
-    returns: Float[np.ndarray, "configuration seed"]
-    seconds_compile: float
 
 
 @dataclass(frozen=True)
@@ -53,8 +45,8 @@ class TrialsJob:
     def members(self) -> list[str]:
         return [f"{name}, seed {seed}" for name in self.names for seed in self.seeds]
 
-    def run(self, listeners: Sequence[Listener]) -> TrainedTrials | None:
-        """The results of the configurations; None if Ctrl-C stopped the training."""
+    def run(self, listeners: Sequence[Listener]) -> Float[np.ndarray, "configuration seed"] | None:
+        """Mean greedy returns, NaN where the loss diverged; None if Ctrl-C stopped the training."""
         count = len(self.seeds)
         members = [agent for agent in self.agents for _ in self.seeds]
         population = population_of(
@@ -67,10 +59,7 @@ class TrialsJob:
         keys = jax.random.wrap_key_data(jnp.asarray(self.starts[: population.starts]))
         returns = np.asarray(population.evaluate(keys, tail=0).returns).mean(1)
         finite = np.array(population.healthy) & np.isfinite(returns)
-        shape = (len(self.agents), count)
-        return TrainedTrials(
-            np.where(finite, returns, np.nan).reshape(shape), population.seconds_compile
-        )
+        return np.where(finite, returns, np.nan).reshape(len(self.agents), count)
 
 
 def trials_jobs(

@@ -65,6 +65,6 @@ def require(prices: Prices, config: BacktestConfig) -> None:
         raise QfolioError(
             f"A backtest of {len(prices.assets):,} assets on {len(prices):,} rows with "
             f"{amount(config.seeds, 'seed')} needs about {wanted / 2**30:,.1f} GiB of "
-            f"memory, but there are only {there / 2**30:,.1f}; give fewer assets, rows, "
+            f"memory, but only {there / 2**30:,.1f} are there; give fewer assets, rows, "
             "agents, signals, baselines or seeds."
         )

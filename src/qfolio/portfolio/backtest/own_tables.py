@@ -185,6 +185,9 @@ def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Pric
     names = [label(cell) for cell in table.columns[asset].tolist()]
     for row in np.unique(rows[rows < len(prices)]).tolist():
         close = prices.values[row]
+        gone = np.isnan(prices.known[row]) & ~np.isnan(close)
+        cash += float(holding[gone] @ close[gone])  # what delisted assets paid out
+        holding[gone] = 0.0
         for i in np.flatnonzero(rows == row).tolist():
             place = _asset(names[i], prices)
             if place is None:
@@ -200,9 +203,10 @@ def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Pric
                     )
                 cash += traded[i]
                 continue
-            if np.isnan(close[place]):
+            if gone[place] or np.isnan(close[place]):
+                why = "any more, and was paid out" if gone[place] else "yet"
                 raise QfolioError(
-                    f"row {table.first_row + i} ({day(dates[i])}): {names[i]} has no price yet."
+                    f"row {table.first_row + i} ({day(dates[i])}): {names[i]} has no price {why}."
                 )
             holding[place] += traded[i]
             cash -= traded[i] * close[place]

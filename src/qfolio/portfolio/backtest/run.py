@@ -138,8 +138,8 @@ class Backtest:
             prices: A table, or anything else that ``load_prices`` reads.
             agents: The agents to train, by name: presets, whose task settings include window, menu,
                 reward, …, or agents of your own.
-            train, test: Lengths such as "5y", "6m" or "500d"; with ``expanding``, training keeps
-                its start.
+            train, test: Lengths such as "5y", "6m" or "500d" (d counts rows); with ``expanding``,
+                training keeps its start.
             lag: Rows from a decision to its execution.
             cost: One-way trading cost, as a fraction of the value traded.
             cap: Largest weight of one asset; with 1, a mandate that allows loans or short sales
@@ -156,14 +156,17 @@ class Backtest:
                 calendars). All may trade on the first row of the test.
             baselines: Names of the registry, or your own as ``module:Name``; equal weights are
                 always included.
-            strategies: Strategies of your own by name, as ``own_tables.read_own`` takes them.
-            benchmark: What all are compared with, as ``benchmark.field_of`` takes it (default:
-                equal weights).
+            strategies: Strategies of your own by name: a CSV or Parquet file, a data frame, or an
+                array with a row for each row of prices. It has weights of shape (rows, N + 1), cash
+                first, or (rows, N), NaN where there is no order; or returns of shape (rows,).
+            benchmark: What all are compared with: the name of a baseline, an asset (bought and
+                held) or a strategy, or a source like those (default: equal weights).
             seeds: Number of agents of each kind, with the seeds ``seed``, ``seed + 1``, ….
             episodes: Training episodes in a fold of each agent without a preset.
             task: Settings of the portfolio task for agents without a preset.
-            trials: Number of earlier trials on these prices, see ``differences.py``; those of the
-                default table (``prices.table.DEFAULT_TRIALS``) are added to them.
+            trials: Number of earlier trials on these prices, for which verdicts and deflated Sharpe
+                ratios allow; those of the default table (``prices.table.DEFAULT_TRIALS``) are
+                added to them.
             command: The command that started it, for the report.
             title: The report's title (default: agents, table and years).
             out: A new or empty folder; without it nothing is written.
@@ -181,7 +184,7 @@ class Backtest:
             require_type("task", task, Mapping, 'a dictionary of settings, such as {"window": 20}')
         place = None if out is None else path_of("out", out)
         if not agents:
-            raise QfolioError("A backtest needs at least one agent; name some with --agents.")
+            raise QfolioError("A backtest needs at least one agent; name some (--agents).")
         preset = all(isinstance(agent, Preset) for agent in agents.values())
         if preset and (episodes is not None or task):
             raise QfolioError(

@@ -114,7 +114,8 @@ class Allocation:
         targets = policy.weights(prices, holdings, spent=spent)
         weights = _ordered(np.array([targets[name] for name in names]), held)
         trades = np.zeros(len(shares))
-        context = context_of(policy.costs, prices, wealth)
+        conditions = Conditions.of(prices, policy.costs)
+        context = context_of(policy.costs, conditions, len(prices) - 1, wealth)
         after = partial(settled, policy.costs, context, held, wealth, shares, known)
         if not np.array_equal(weights, held):
             kept = abs(weights - held)[1:] <= NOISE
@@ -240,11 +241,12 @@ def turnover(held: Any, reached: Any, trades: Any) -> float:
     return float(changes[np.asarray(trades) != 0].sum())
 
 
-def context_of(model: CostModel, prices: Prices, wealth: float) -> Context:
-    """The circumstances of a trade at the table's last row."""
-    known = Conditions.of(prices, model)
+def context_of(
+    model: CostModel, known: Conditions, row: int, wealth: float, lag: int = 1
+) -> Context:
+    """The circumstances of a trade at a row, ``lag`` rows after its decision."""
     capital = model.capital if isinstance(model, Itemized) else wealth
-    return known.trade(len(prices) - 1, 1, wealth / capital)
+    return known.trade(row, lag, wealth / capital)
 
 
 def settled(

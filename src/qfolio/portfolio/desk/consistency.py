@@ -20,6 +20,7 @@ from qfolio.portfolio.backtest.statistics.bootstrap import (
     block_length,
     stationary_bootstrap_indices,
 )
+from qfolio.portfolio.market import RUIN
 
 ALPHA = 0.05
 """Probability of a false alarm, over all time."""
@@ -92,5 +93,6 @@ def band(tested: ArrayLike, rows: int, rng: np.random.Generator) -> Floats:
     block = block_length(returns)
     draws = -(-rows // len(returns))
     days = [stationary_bootstrap_indices(len(returns), block, RESAMPLES, rng) for _ in range(draws)]
-    paths = np.cumsum(np.log1p(returns)[np.concatenate(days, 1)[:, :rows]], axis=1)
+    logs = np.log(np.where(returns == -1, RUIN, 1 + returns))
+    paths = np.cumsum(logs[np.concatenate(days, 1)[:, :rows]], axis=1)
     return np.asarray(np.exp(np.quantile(paths, (0.025, 0.5, 0.975), axis=0)))

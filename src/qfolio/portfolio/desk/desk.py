@@ -19,7 +19,8 @@ from qfolio.portfolio.calendars import band, decision_rows
 from qfolio.portfolio.desk.allocation import NOISE, Allocation
 from qfolio.portfolio.desk.holdings import cashed_out
 from qfolio.portfolio.desk.ledger import Ledger, Record, file_digest, holdings_digest
-from qfolio.portfolio.desk.rule import Kind, Ordered, Rule, Untrained
+from qfolio.portfolio.desk.rule import Ordered, Rule, Untrained
+from qfolio.portfolio.desk.standing import Kind
 from qfolio.portfolio.policy import Policy
 from qfolio.portfolio.prices.findings import Finding, day
 from qfolio.portfolio.prices.frequency import spacing
@@ -184,8 +185,8 @@ class Desk:
         if not dates:
             return []
         return [
-            f"By the backtest's lag of {lag} rows the orders of {listed(dates)} are not filled "
-            "yet: unless these holdings contain them, the same is ordered again."
+            f"With the backtest's lag of {lag} rows, the orders of {listed(dates)} are not filled "
+            "yet; if the holdings do not contain them, the same trades are ordered again."
         ]
 
     def _timing(
@@ -200,7 +201,7 @@ class Desk:
         days, within = table.dates, band(calendar)
         if not allocation.trades.any():
             if abs(allocation.weights - allocation.held)[1:].max() > NOISE:
-                return ["Nothing is ordered: the trades come to no whole share or lot."]
+                return ["Nothing is ordered: every trade is less than a whole share or lot."]
             if within:
                 far = f"no weight is more than {within:g} from what is wanted"
                 return [f"Nothing is ordered: {far}."]
@@ -316,5 +317,5 @@ def waiting(prices: Prices, lag: int) -> list[str]:
         return []
     return [
         f"The backtest and follow fill these orders {amount(lag, 'row')} later, after about "
-        f"{lag * usual:.0f} days; if you trade at once, follow a backtest with --lag 0."
+        f"{lag * usual:.0f} days; if you trade at once, allocate from a backtest with --lag 0."
     ]

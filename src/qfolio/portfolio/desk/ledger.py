@@ -134,7 +134,7 @@ class Ledger:
             content = {**_of(allocation), **facts}
             before = next((r for r in reversed(records) if r.date == content["date"]), None)
             if before is not None and _inputs(before) == _inputs(content):
-                return before, f"It is already record {before.number} of the ledger."
+                return before, f"This allocation is already record {before.number} of the ledger."
             record = msgspec.convert(
                 {
                     **content,

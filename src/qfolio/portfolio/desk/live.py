@@ -106,7 +106,7 @@ class _Account:
     """
 
     def __init__(self, prices: Prices, model: CostModel, lag: int, rows: int) -> None:
-        self._prices, self._model, self._lag, self._rows = prices, model, lag, rows
+        self._model, self._lag, self._rows = model, lag, rows
         self._values = np.nan_to_num(prices.values)
         self._known = Conditions.of(prices, model)
         self._due: dict[int, np.ndarray] = {}  # by row
@@ -156,7 +156,7 @@ class _Account:
         paid = 0.0
         if trades.any() and wealth > 0:
             held = np.append(self.cash, self.units * self._values[row]) / wealth
-            context = context_of(self._model, self._prices.between(None, row + 1), wealth)
+            context = context_of(self._model, self._known, row, wealth, self._lag)
             given = (self.units, self._values[row], trades)
             self.cash, costs = settled(self._model, context, held, wealth, *given)
             self.units, paid = self.units + trades, sum(costs.values())

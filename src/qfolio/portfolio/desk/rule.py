@@ -5,7 +5,7 @@ These are the baselines of a backtest and the strategies of the user's own.
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,13 +23,9 @@ from qfolio.portfolio.prices.frequency import require_alike
 from qfolio.portfolio.prices.table import Prices, load
 from qfolio.portfolio.task import Portfolio
 
-Kind = Literal["agent", "baseline", "strategy"]
-
 
 class Untrained(abc.ABC):
     """A strategy of a backtest that learns nothing, under the terms of any agent's task."""
-
-    kind: ClassVar[Kind]
 
     def __init__(self, name: str, assets: tuple[str, ...], task: Portfolio, cap: float) -> None:
         self.name, self.assets, self.cap = name, assets, cap
@@ -73,8 +69,6 @@ class Rule(Untrained):
 
     The baseline learns from the training window that ends there: all rows, or the last ``train``.
     """
-
-    kind = "baseline"
 
     def __init__(
         self,
@@ -131,8 +125,6 @@ class Ordered(Untrained):
     As in the backtest, its orders are carried out even if they break the mandate or the cap, and
     each is filled at once.
     """
-
-    kind = "strategy"
 
     def __init__(
         self, name: str, own: Own, assets: tuple[str, ...], task: Portfolio, cap: float

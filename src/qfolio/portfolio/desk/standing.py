@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from qfolio.core.errors import QfolioError
 from qfolio.core.files import read_json
 from qfolio.core.text import figure, shell
 from qfolio.portfolio.backtest.folder import followed
-from qfolio.portfolio.desk.rule import Kind
+
+Kind = Literal["agent", "baseline", "strategy"]
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Standing:
 def _measured(kind: Kind, measures: dict[str, dict[str, float]]) -> str:
     growth, sharpe, turnover = (measures[k]["mean"] for k in ("growth", "sharpe", "turnover"))
     return (
-        f"A {kind}, which learned nothing: it grew by {figure(growth, '.1%')} a year after "
+        f"This {kind}, which learned nothing, grew by {figure(growth, '.1%')} a year after "
         f"costs, with a Sharpe ratio of {figure(sharpe, '.2f')} and a "
         f"turnover of {figure(turnover, '.1f')} a year."
     )

@@ -61,7 +61,7 @@ def feasible(text: str, usable: Bool[np.ndarray, " asset"], most: float = 1.0) -
 
     ones = np.ones(len(assets))
     limit(ones, 1 - mandate.cash.min, "cash is below its minimum by")
-    if mandate.cash.max < 1 or low.min() < 0:
+    if mandate.cash.max < 1 or floor.min() < 0:
         limit(-ones, mandate.cash.max - 1, "cash is above its maximum by")
     for column, value, group in mandate.every_group:
         members = 1.0 * np.isin(assets, group.assets)

@@ -48,10 +48,12 @@ class Choices:
                 advice = near(str(value), filter(None, choices))
                 raise QfolioError(f"{name} is {quote(value)}; {advice}")
         haircut = self.delisting_haircut
-        if not 0 <= haircut <= 1 or (haircut and self.ended != "cash-out"):
+        if not 0 <= haircut <= 1:
+            raise QfolioError(f"delisting_haircut is {haircut}; it must be from 0 to 1.")
+        if haircut and self.ended != "cash-out":
             raise QfolioError(
-                f"delisting_haircut is {haircut}; it must be from 0 to 1, and be given with "
-                "ended=cash-out (--ended cash-out)."
+                f"delisting_haircut is {haircut}, but no asset is cashed out; set ended=cash-out "
+                "(--ended cash-out), or leave the haircut out."
             )
         for name in ("features", "columns"):
             given = getattr(self, name)

@@ -22,15 +22,19 @@ def require_grown(before: Prices, after: Prices) -> None:
     ):
         for name in old:
             if name not in new:
-                raise QfolioError(f"The new table has no {kind} {quote(name)}; {REMEDY}")
+                raise QfolioError(
+                    f"The new table has no {kind} {quote(name)}; add it, or start a new backtest."
+                )
         for name in new:
             if name not in old:
                 raise QfolioError(
                     f"The new table has the {kind} {quote(name)}, which the backtest's lacks; "
-                    f"leave it out, or {REMEDY}"
+                    "leave it out, or start a new backtest."
                 )
         if old != new:
-            raise QfolioError(f"The new table has its {kind}s in another order; restore it.")
+            raise QfolioError(
+                f"The new table has its {kind}s in another order; restore that order."
+            )
     # A first delisting may be new, but not where assets started late: it lets them be held earlier.
     ends = before.listed is None and not np.isnan(before.values).any()
     if before.masks.keys() != after.masks.keys() - ({"listed"} if ends else set()):

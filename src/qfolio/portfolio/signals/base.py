@@ -1,7 +1,7 @@
 """A signal, from which the library's and a user's own derive."""
 
 import abc
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -36,7 +36,7 @@ class Signal(eqx.Module):
                 "look back on 1 to 100,000 and skip fewer."
             )
 
-    def __call__(self, prices: Floats) -> Floats:
+    def __call__(self, prices: Floats) -> Any:  # a user's may be a data frame
         """The signal, shape (row, asset), NaN where it is unknown.
 
         prices: of the same shape, NaN before an asset's first price.

@@ -20,7 +20,7 @@ from qfolio.portfolio.backtest.statistics.bootstrap import (
     histories,
     percentile_interval,
 )
-from qfolio.portfolio.backtest.statistics.differences import Finding, estimates
+from qfolio.portfolio.backtest.statistics.differences import Finding
 from qfolio.portfolio.backtest.statistics.estimates import Estimate, clear, estimate
 from qfolio.portfolio.backtest.statistics.measures import (
     log_growth,
@@ -137,7 +137,7 @@ def evidence(tested: TableReturns, agent: str) -> Evidence:
     reference, best = next(iter(to)), _best_rebalancing(tested)
     baseline = _best_baseline(tested)
     theirs = tested.baselines[baseline]
-    sharpe = estimates(ours[None], theirs[None], year, tested.risk_free)["sharpe"]
+    sharpe = estimate(ours[None], theirs[None], year, tested.risk_free)["sharpe"]
     return Evidence(
         first=tested.days[0],
         last=tested.days[-1],

@@ -106,7 +106,7 @@ class Study:
             agents: The agents to train, by name, as ``Backtest.create`` takes them.
             lags, costs: Every lag is combined with every cost (a fraction of the value traded); the
                 first of each make the main variant.
-            train, test: Lengths such as "5y" or "500d".
+            train, test: Lengths such as "5y" or "500d" (d counts rows).
             trials: Earlier looks at each of the tables.
             after: Folders of earlier studies; their looks at the same tables are counted, too.
             command: The command that started it, for the reports.
@@ -207,7 +207,7 @@ class Study:
             f"{len(config.looks)} of {amount(len(self.places), 'backtest')} finished",
             str(self.folder),
         ]
-        header = ("pooled, a year, net", "less the reference", "z", "")
+        header = ("pooled, a year, net", "less the benchmark", "z", "")
         return card(f"Study of {' and '.join(config.agents)}", facts, header, rows)
 
     @property

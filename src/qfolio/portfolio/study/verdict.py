@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from qfolio.core.text import amount
+from qfolio.core.text import amount, figure
 from qfolio.portfolio.backtest.folder import EQUAL_WEIGHT
 from qfolio.portfolio.backtest.statistics.bootstrap import LEVEL
 from qfolio.portfolio.backtest.statistics.verdict import p_text
@@ -102,13 +102,8 @@ def percent(value: float | None) -> str:
     if value is None:
         return "undefined"
     digits = 1 if abs(value) >= 0.0995 else 2
-    return f"{_signed(100 * value, digits)}%"
+    return figure(value, f"+.{digits}%")
 
 
 def decimal(value: float | None) -> str:
-    return "undefined" if value is None else _signed(value, 2)
-
-
-def _signed(value: float, digits: int) -> str:
-    text = f"{value:+.{digits}f}"
-    return text.lstrip("+-") if not text.strip("+-0.") else text.replace("-", "\N{MINUS SIGN}")
+    return "undefined" if value is None else figure(value, "+.2f")

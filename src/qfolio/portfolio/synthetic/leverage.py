@@ -5,16 +5,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from qfolio.core import simplex
 from qfolio.core.fields import constant, number, require, static
 from qfolio.core.mdp import Box, Policy, Position
 from qfolio.portfolio.costs import Context
 from qfolio.portfolio.mandate.feasible import Feasible
-from qfolio.portfolio.market import Contexts, Holding, Relatives
-from qfolio.portfolio.synthetic.base import SyntheticMarket
-from qfolio.portfolio.synthetic.merton import lognormal_table
+from qfolio.portfolio.market import Contexts, Holding
+from qfolio.portfolio.synthetic.merton import Scenarios, lognormal_table
 from qfolio.solvers.merton import LeveragedOptimum, leveraged_optimal
 
 
@@ -37,7 +36,7 @@ class Anything(Feasible):
         return {"the sum is off 1 by": abs(weights.sum(-1) - 1)}
 
 
-class Leverage(SyntheticMarket):
+class Leverage(Scenarios):
     """Three assets and cash, which may be borrowed at a higher rate than it earns when lent.
 
     Returns over a quarter are drawn from a fixed set of log-normal scenarios; the third asset is
@@ -53,13 +52,10 @@ class Leverage(SyntheticMarket):
     menu: str = static("")  # choices of weights, such as grid:10; empty: any
     horizon: int = static(100)  # quarters of an episode
 
-    cost = 0.0
     reward = "crra"
     dt = 0.25
     drift = (0.10, 0.08, 0.02)  # per year, like the volatilities
     volatilities = (0.2, 0.15, 0.25)
-    correlation = 0.3
-    scenarios = 500
 
     def __check_init__(self) -> None:
         require(self, "cash_rate", lambda x: -0.1 <= x <= 0.5, "from -0.1 to 0.5 per year")
@@ -89,26 +85,12 @@ class Leverage(SyntheticMarket):
         return action
 
     def table(self) -> np.ndarray:
-        """Price relatives of each scenario, shape (scenario, asset)."""
         return lognormal_table(
             tuple(mean * self.dt for mean in self.drift),
             tuple(sigma * self.dt**0.5 for sigma in self.volatilities),
             self.correlation,
             self.scenarios,
         )
-
-    def reset_market(self, key: PRNGKeyArray) -> Int[Array, ""]:
-        return jnp.array(0, jnp.int32)
-
-    def next_market(self, market: Array, key: PRNGKeyArray) -> Int[Array, ""]:
-        return jax.random.randint(key, (), 0, self.scenarios, jnp.int32)
-
-    def features(self, market: Array) -> Float[Array, "asset time channel"]:
-        return jnp.eye(len(self.drift))[:, None, :]  # one-hot: nothing else tells them apart
-
-    def relatives(self, market: Array, next_market: Array) -> Relatives:
-        moved = jnp.asarray(self.table(), jnp.float32)[next_market]
-        return Relatives(jnp.ones_like(moved), moved, moved)
 
     def contexts(self, market: Array, next_market: Array) -> Contexts:
         period = Context(years=self.dt)
@@ -128,6 +110,3 @@ class Leverage(SyntheticMarket):
         weights = policy(Position(jnp.array(0), self.hold(simplex.with_rest(jnp.zeros(3)))))
         named = {f"weight of asset {i + 1}": float(weight) for i, weight in enumerate(weights)}
         return named | {"weight of cash": 1 - sum(named.values())}
-
-    def scenes(self) -> list[tuple[str, Any]]:
-        return []

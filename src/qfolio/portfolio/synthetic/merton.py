@@ -1,5 +1,6 @@
 """Merton's market on the simplex; ``solvers/merton.py`` solves it."""
 
+import abc
 from functools import cache
 from typing import Any
 
@@ -37,32 +38,16 @@ def lognormal_table(
     return np.exp(np.array(means) - sigma**2 / 2 + shocks.T)
 
 
-class Merton(SyntheticMarket):
-    """Three assets whose returns are drawn from a fixed set of log-normal scenarios, with cash.
-
-    The best weights maximize E log(b·x) over the simplex (Merton 1969; with the constraint, the
-    conditions of Cover 1984); one asset is not worth holding.
-    """
-
-    menu: str = static("")  # choices of weights, such as grid:10; empty: any
-    horizon: int = static(100)  # steps of an episode
+class Scenarios(SyntheticMarket):
+    """Three assets whose returns are drawn from a fixed set of scenarios, and cash."""
 
     cost = 0.0
-    means = (0.010, 0.006, 0.001)
-    volatilities = (0.12, 0.08, 0.10)
     correlation = 0.3
     scenarios = 500
 
-    @property
-    def limits(self) -> Float[Array, " asset"]:
-        return jnp.ones(3)
-
-    @staticmethod
-    def table() -> np.ndarray:
+    @abc.abstractmethod
+    def table(self) -> np.ndarray:
         """Price relatives of each scenario, shape (scenario, asset)."""
-        return lognormal_table(
-            Merton.means, Merton.volatilities, Merton.correlation, Merton.scenarios
-        )
 
     def reset_market(self, key: PRNGKeyArray) -> Int[Array, ""]:
         return jnp.array(0, jnp.int32)
@@ -77,6 +62,34 @@ class Merton(SyntheticMarket):
         moved = jnp.asarray(self.table(), jnp.float32)[next_market]
         return Relatives(jnp.ones(3), moved, moved)
 
+    def scenes(self) -> list[tuple[str, Any]]:
+        return []
+
+
+class Merton(Scenarios):
+    """Three assets whose returns are drawn from a fixed set of log-normal scenarios, with cash.
+
+    The best weights maximize E log(b·x) over the simplex (Merton 1969; with the constraint, the
+    conditions of Cover 1984); one asset is not worth holding.
+    """
+
+    menu: str = static("")  # choices of weights, such as grid:10; empty: any
+    horizon: int = static(100)  # steps of an episode
+
+    means = (0.010, 0.006, 0.001)
+    volatilities = (0.12, 0.08, 0.10)
+
+    @property
+    def limits(self) -> Float[Array, " asset"]:
+        return jnp.ones(3)
+
+    @staticmethod
+    def table() -> np.ndarray:
+        """Price relatives of each scenario, shape (scenario, asset)."""
+        return lognormal_table(
+            Merton.means, Merton.volatilities, Merton.correlation, Merton.scenarios
+        )
+
     def best(self) -> Policy:
         scenarios = np.column_stack([np.ones(self.scenarios), self.table()])
         weights = jnp.asarray(growth_optimal(scenarios).weights, jnp.float32)
@@ -86,6 +99,3 @@ class Merton(SyntheticMarket):
         state = Position(jnp.array(0), self.hold(jnp.full(4, 0.25)))
         weights = policy(state)
         return {f"weight of asset {i}": float(weights[i]) for i in (1, 2, 3)}
-
-    def scenes(self) -> list[tuple[str, Any]]:
-        return []

@@ -24,7 +24,7 @@ def key_facts(data: BacktestData) -> list[str]:
         *_universe(data.prices),
     ]
     if "cost" in settings:
-        facts.append(f"{basis_points(settings['cost'])} a trade")
+        facts.append(f"{basis_points(settings['cost'])} of the value traded")
     if "lag" in settings:
         facts.append(f"lag of {_counted(settings['lag'], unit)}")
     if data.folds:
@@ -56,8 +56,8 @@ def universe(prices: dict[str, Any]) -> list[str]:
         said.append("An asset may be bought only while its membership lasts.")
     if not ended:
         said.append(
-            "A table of assets that still trade is chosen with hindsight (survivorship): assets "
-            "that stopped trading would have made every result worse."
+            "A table of assets that still trade is chosen with hindsight (survivorship): without "
+            "those that stopped trading, results are probably too good."
         )
     return said
 

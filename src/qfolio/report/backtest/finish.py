@@ -27,11 +27,11 @@ class Finished(NamedTuple):
 def finish(backtest: Backtest) -> Finished:
     """Replay all strategies, and write the results of ``qfolio backtest`` to its folder.
 
-    These are returns.csv, weights.csv, summary.json, which ``qfolio allocate`` reads, why.json and
-    the report.
+    These are returns.csv, weights.csv, why.json, report.html, wealth.png and summary.json;
+    ``qfolio allocate`` reads the last.
 
     Raises:
-        QfolioError: The backtest has no folder.
+        QfolioError: The backtest has no folder, or is not finished.
     """
     wanted = "a backtest, such as qfolio.Backtest.open(folder)"
     require_type("backtest", backtest, Backtest, wanted)

@@ -69,10 +69,9 @@ def headline(name: str, parts: Decomposition) -> str:
         )
     }  # fmt: skip
     return (
-        f"Of the {said['net']} a year that {name} earned, {said['equal']} come from equal "
-        f"weights, {said['tilts']} from weights that were constantly different and "
-        f"{said['timing']} from their timing (together t = {number(parts.active_t)}), and costs "
-        f"took {said['cost']}."
+        f"{name} earned {said['net']} a year: {said['equal']} from equal weights, {said['tilts']} "
+        f"from constant tilts and {said['timing']} from timing (t = {number(parts.active_t)} for "
+        f"the two together), less {said['cost']} in costs."
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,12 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 from qfolio.report.figures.style import (
-    LEAD,
     NARROW,
     new_figure,
     percent_axis,
     percent_tick,
-    save_png,
     short_tick,
 )
 
@@ -32,11 +29,6 @@ LEAST_REGRET = 1e-4
 
 DECADES = 5
 """Maximum number of decades on a scale of regrets; larger regrets are off the scale."""
-
-
-def learning_curve(path: Path, data: ReportData) -> None:
-    """Save the greedy return over training, and its regret if the optimum is known, as PNG."""
-    save_png(path, draw_learning_curve, data, LEAD)
 
 
 def draw_learning_curve(data: ReportData, width: float) -> Figure:

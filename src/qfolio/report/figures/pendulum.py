@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,20 +16,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-from qfolio.report.figures.style import NARROW, WIDE, Panels, colors, new_figure, save_png
-
-
-def value(path: Path, data: ReportData) -> None:
-    """Save maps of the learned and the exact value and policy as PNG.
-
-    Raises:
-        ValueError: The data has no maps.
-    """
-    save_png(path, draw_value, data, WIDE)
+from qfolio.report.figures.style import NARROW, Panels, colors, new_figure
 
 
 def draw_value(data: ReportData, width: float) -> Figure:
-    """Draw the learned and the exact policy, and the values if there are any, over the states."""
+    """Draw the learned and the exact policy, and the values if there are any, over the states.
+
+    Raises ValueError without maps.
+    """
     maps = data.maps
     if maps is None:
         raise ValueError("the value figure needs maps of the state space")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,25 +19,17 @@ if TYPE_CHECKING:
 
 from qfolio.report.figures.style import (
     NARROW,
-    WIDE,
     end_label,
     legend_above,
     new_figure,
-    save_png,
 )
 
 
-def policy(path: Path, data: ReportData) -> None:
-    """Save the targets of the learned policies and the best one as PNG.
-
-    Raises:
-        ValueError: The data has no policy of a market.
-    """
-    save_png(path, draw_policy, data, WIDE)
-
-
 def draw_policy(data: ReportData, width: float) -> Figure:
-    """Draw the targets of the learned policies and the best one in a market."""
+    """Draw the targets of the learned policies and the best one in a market.
+
+    Raises ValueError without them.
+    """
     drawn = data.market.policy if data.market else None
     if drawn is None:
         raise ValueError("the policy figure needs the policies of a market")

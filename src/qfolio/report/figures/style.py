@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from qfolio.core.files import write_bytes
 from qfolio.report import palette
-from qfolio.report.data import ReportData
 from qfolio.report.rendering import percent
 
 if TYPE_CHECKING:
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
-Draw = Callable[[ReportData, float], "Figure"]
 Panels = NDArray[np.object_]
 
 LEAD = 10.5

@@ -1,10 +1,11 @@
 """Slices, gradients and rules of policies that are known."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 
 from qfolio.portfolio.backtest.attribution.distillation import distil
-from qfolio.portfolio.backtest.attribution.gradients import integrated_gradients
+from qfolio.portfolio.backtest.attribution.gradients import DAYS, integrated_gradients
 from qfolio.portfolio.backtest.attribution.replays import channels
 from qfolio.portfolio.backtest.attribution.slices import slices
 from qfolio.portfolio.backtest.replay import decide
@@ -99,3 +100,16 @@ def test_a_delisted_asset_dilutes_no_average(stretches):
     drawn = slices(Known("market"), apart, NAMES, list("ABCDEFG"), weights, SHARED).signals[3]
     alone = slices(Known("market"), stretches, NAMES, list("ABCDEF"), held(), SHARED).signals[3]
     assert drawn.x == pytest.approx(alone.x, abs=1e-4)
+
+
+@pytest.mark.parametrize("folds", [2, 0])
+def test_days_on_which_nothing_can_be_bought_are_left_out(folds):
+    apart = four_folds(with_a_delisted_asset(planted()))
+    cut, there = apart[folds].fold.decisions.start, apart[0].task.tradable
+    closed = there.at[cut:].set(False)
+    apart = [each._replace(task=eqx.tree_at(lambda t: t.tradable, each.task, closed))
+             for each in apart]  # fmt: skip
+    weights = np.full((600, ASSETS + 2), 1 / (ASSETS + 2))
+    found = integrated_gradients(Known("momentum"), apart, NAMES, weights)
+    assert (found.days if found else 0) == DAYS * folds // 4
+    assert found is None or np.isfinite([found.whole, found.gap]).all()

@@ -64,7 +64,7 @@ def test_the_corrected_p_value_decides(assessment: Assessment) -> None:
     taken_away = about(growth=Contrast(0.008, (0.001, 0.034), 0.02, 0.0502, "none"))
     assert said(assessment, None, taken_away) == [
         "No evidence that dqn beats equal weight in growth, Sharpe ratio or volatility after "
-        "costs: the difference in annual growth to it is +0.8% (95% interval +0.1% to +3.4%; "
+        "costs: the difference in annual growth from it is +0.8% (95% interval +0.1% to +3.4%; "
         "corrected p = 0.051), in Sharpe ratio 0.00 (95% interval -0.10 to +0.10; corrected "
         "p = 1.00) and in volatility 0.0% (95% interval -9.5% to +10.5%; corrected p = 1.00)."
     ]
@@ -115,14 +115,14 @@ def test_claims_are_plain(assessment: Assessment) -> None:
     best = about("other", growth=better, sharpe=untested, volatility=untested)
     *_, last = said(assessment, none, none, best)
     assert last == (
-        "dqn beats other in growth after costs: the difference in annual growth to other is +1.0% "
-        "(95% interval +0.5% to +1.5%; corrected p = 0.020)."
+        "dqn beats other in growth after costs: the difference in annual growth from other is "
+        "+1.0% (95% interval +0.5% to +1.5%; corrected p = 0.020)."
     )
     less = Contrast(-0.1, (-0.18, -0.02), 0.01, 0.02, "worse")
     calmest = about("calm", growth=untested, sharpe=less, volatility=untested)
     *_, last = said(assessment, none, none, None, calmest)
     assert last == (
-        "dqn falls short of calm in Sharpe ratio after costs: the difference in Sharpe ratio to "
+        "dqn falls short of calm in Sharpe ratio after costs: the difference in Sharpe ratio from "
         "calm is -0.10 (95% interval -0.18 to -0.02; corrected p = 0.020)."
     )
 

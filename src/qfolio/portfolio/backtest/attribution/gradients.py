@@ -49,7 +49,9 @@ class Gradients(msgspec.Struct, frozen=True):
 def integrated_gradients(
     agent: Agent, stretches: Sequence[Stretch], names: Sequence[str], held: np.ndarray
 ) -> Gradients | None:
-    """Attribute an agent's target weights, the mean of all seeds; None if it has a menu.
+    """Attribute an agent's target weights, the mean of all seeds.
+
+    None if it has a menu, or if no asset could be bought on any of the days.
 
     Args:
         stretches: The folds with its policies.
@@ -60,7 +62,7 @@ def integrated_gradients(
         return None
     each = -(-DAYS // len(stretches))
     begin = stretches[0].fold.decisions.start
-    parts, seen, whole, gaps = [], [], [], []
+    days, parts, seen, whole, gaps = 0, [], [], [], []
     there = open_to(stretches)
     for task, members, fold in stretches:
         rows = np.linspace(fold.decisions.start, fold.decisions.stop - 1, each + 2)[1:-1].astype(
@@ -70,17 +72,22 @@ def integrated_gradients(
         given = jnp.asarray(rows, jnp.int32), holding
         moved, latest, change = (np.asarray(x) for x in integrated(task, agent, members, *given))
         bought = there[rows - begin]
+        if not bought.any():
+            continue
+        days += int(bought.any(1).sum())
         parts.append(moved.swapaxes(1, 2)[bought])
         seen.append(latest[bought])
         whole.append(abs(change[bought]).mean())
         gaps.append(abs(moved.sum(1) - change)[bought].mean())
+    if not parts:
+        return None
     pulled, shown = np.concatenate(parts), np.concatenate(seen)
     return Gradients(
         pulls=[
             Pull(name, float(abs(pulled[:, c]).mean()), _correlation(pulled[:, c], shown[:, c]))
             for c, name in enumerate(names)
         ],
-        days=each * len(stretches),
+        days=days,
         whole=float(np.mean(whole)),
         gap=float(np.mean(gaps)),
     )

@@ -45,7 +45,7 @@ class Why(msgspec.Struct, frozen=True):
         except msgspec.ValidationError as error:
             raise QfolioError(
                 f"The attributions of the backtest are damaged ({error}); write them again with "
-                "qfolio backtest --resume."
+                "qfolio backtest --resume FOLDER."
             ) from None
 
     def to_json(self) -> dict[str, Any]:

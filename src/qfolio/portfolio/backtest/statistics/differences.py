@@ -112,7 +112,7 @@ def compare(
     differences: dict[str, dict[str, Difference]] = {role: {} for role in rivals}
     for name, ours in returns.items():
         others = {
-            other: estimates(ours, returns[other], periods_per_year, risk_free)
+            other: estimate(ours, returns[other], periods_per_year, risk_free)
             for rival in rivals.values()
             for other in (rival.without(name) if name in judged else (rival.name,))
         }
@@ -144,18 +144,6 @@ def compare(
         known: dict[str, Any] = {key: tested}
         differences[role][name] = dataclasses.replace(differences[role][name], **known)
     return differences
-
-
-def estimates(
-    ours: Floats, theirs: Floats, periods_per_year: float, risk_free: Floats | None
-) -> dict[Measured, Estimate]:
-    """The differences of a pair, with Sharpe ratios of returns in excess of cash."""
-    found = estimate(ours, theirs, periods_per_year)
-    if risk_free is None:
-        return found
-    mine, other = (np.maximum(each - risk_free, -1) for each in (ours, theirs))
-    excess = estimate(mine, other, periods_per_year)
-    return {**found, "sharpe": excess["sharpe"]}
 
 
 def tails_to(

@@ -36,12 +36,12 @@ SLOW = 0.8
 """Cosine transforms a year for a difference in volatility: they take two years and a half or more
 for a period."""
 
+FEWEST = 2
+"""Cosine transforms of a test that is shorter than that: it shows little of volatility."""
+
 SHORTEST = 5
 """Periods of a test: with two, the error of a Sharpe ratio is always 0, and with few more it is by
 chance."""
-
-FEWEST = 2
-"""Cosine transforms of a test that is shorter than that: it shows little of volatility."""
 
 
 def clear(difference: ArrayLike) -> Floats:
@@ -112,7 +112,9 @@ class Estimate(NamedTuple):
         return self._replace(value=-self.value, loads=-self.loads)
 
 
-def estimate(ours: Floats, theirs: Floats, periods_per_year: float) -> dict[Measured, Estimate]:
+def estimate(
+    ours: Floats, theirs: Floats, periods_per_year: float, risk_free: Floats | None = None
+) -> dict[Measured, Estimate]:
     """Estimate the differences of one strategy from another, all annual.
 
     Growth: the mean of the difference in log returns. Sharpe ratio: the delta method of Ledoit &
@@ -125,18 +127,22 @@ def estimate(ours: Floats, theirs: Floats, periods_per_year: float) -> dict[Meas
         ours: Simple returns of shape (seeds, periods).
         theirs: Likewise, with the same periods; usually one seed.
         periods_per_year: For example 252 for trading days.
+        risk_free: Returns of cash, shape (periods,), which Sharpe ratios subtract (default: 0).
     """
     year = math.sqrt(periods_per_year)
     logs = paired_difference(log_growth(ours), log_growth(theirs).mean(axis=0))
     mine, other = _moments(ours), _moments(theirs)
+    over, their = mine, other
+    if risk_free is not None:
+        over, their = (_moments(np.maximum(x - risk_free, -1)) for x in (ours, theirs))
     scale = (mine.deviation**2 + (other.deviation**2).mean()) / 2
     squares = mine.centered**2 - (other.centered**2).mean(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return {
             "growth": _estimate(periods_per_year * logs.mean(axis=1), periods_per_year * logs),
             "sharpe": _estimate(
-                year * (mine.sharpe - other.sharpe.mean()),
-                year * (mine.sharpe_part() - other.sharpe_part().mean(axis=0)),
+                year * (over.sharpe - their.sharpe.mean()),
+                year * (over.sharpe_part() - their.sharpe_part().mean(axis=0)),
             ),
             "volatility": _estimate(
                 np.log(mine.deviation) - np.log(other.deviation).mean(),

@@ -1,6 +1,6 @@
 """The figures of a tear sheet: tails, months, drawdowns, rolling ratios, contributions of assets.
 
-They describe a track record and test nothing; ``measures.py`` has what is tested. Definitions
+They describe a track record and test nothing; ``measures.py`` has what is tested. Other definitions
 follow quantstats and pyfolio where these agree.
 """
 
@@ -17,6 +17,7 @@ from qfolio.portfolio.backtest.statistics.measures import (
     deviations,
     drawdown,
     log_growth,
+    measures,
     monthly,
     ratio_or_zero,
 )
@@ -24,6 +25,9 @@ from qfolio.portfolio.backtest.statistics.sharpe import skewness_and_kurtosis
 
 TAIL = 0.05
 """Share of returns in the tail beyond the value at risk, whose mean loss is CVaR."""
+
+SHARED = ("growth", "volatility", "sharpe", "sortino", "calmar", "drawdown")
+"""Figures that are measures of ``measures.py``."""
 
 
 class Fall(NamedTuple):
@@ -216,14 +220,11 @@ def figures(returns: ArrayLike, dates: ArrayLike, periods_per_year: float) -> di
     """
     values = np.asarray(returns, dtype=float)
     checked_dates(dates, len(values))
-    depth, annual = drawdown(values), math.sqrt(periods_per_year)
+    depth, nothing = drawdown(values), np.zeros_like(values)
+    found = measures(values, nothing, nothing, periods_per_year)
     table = monthly(values, dates)[1]
     months = table[~np.isnan(table)]
     years = np.nanprod(1 + table, axis=-1)[~np.isnan(table).all(axis=-1)] - 1
-    total = float(log_growth(values).sum())
-    growth = math.expm1(total * periods_per_year / len(values))
-    spread = float(values.std(ddof=1)) if len(values) > 1 else math.nan
-    downside = math.sqrt(float((np.minimum(values, 0) ** 2).mean()))
     gains, losses = values[values > 0], values[values < 0]
     skewness, kurtosis = skewness_and_kurtosis(values[None])
     low, high = np.quantile(values, [TAIL, 1 - TAIL])
@@ -234,19 +235,14 @@ def figures(returns: ArrayLike, dates: ArrayLike, periods_per_year: float) -> di
         return float(ratio_or_zero(above, below))
 
     return {
-        "growth": growth,
-        "total": math.expm1(total),
-        "volatility": annual * spread,
-        "sharpe": annual * over(float(values.mean()), spread),
-        "sortino": annual * over(float(values.mean()), downside),
-        "calmar": over(growth, float(depth.max())),
+        **{key: float(found[key]) for key in SHARED},
+        "total": math.expm1(float(log_growth(values).sum())),
         "stability": stability(values),
         "omega": over(float(gains.sum()), abs(float(losses.sum()))),
         "gain_to_pain": over(float(months.sum()), abs(float(months[months < 0].sum()))),
         "kelly": kelly(values),
         "winning": longest_run(values > 0),
         "losing": longest_run(values < 0),
-        "drawdown": float(depth.max()),
         "longest": longest / periods_per_year,
         "time_below": float((depth > 0).mean()),
         "ulcer": math.sqrt(float((depth**2).mean())),

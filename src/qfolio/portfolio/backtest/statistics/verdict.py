@@ -147,7 +147,7 @@ def evidence(difference: Difference, assessment: Assessment) -> str:
             lead = f"in {_MEASURES[key]}"
             if not texts:
                 what = "annual growth" if key == "growth" else _MEASURES[key]
-                lead = f"the difference in {what} to {difference.reference} is"
+                lead = f"the difference in {what} from {difference.reference} is"
             texts.append(f"{lead} {_numbers(key, each, p)}")
     if not texts:
         return ""
