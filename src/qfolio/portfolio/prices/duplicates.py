@@ -7,7 +7,7 @@ thousand assets takes no time.
 
 import numpy as np
 
-from qfolio.core.text import amount, quote
+from qfolio.core.text import quote
 from qfolio.portfolio.prices.findings import LISTED, Findings, first_of
 from qfolio.portfolio.prices.gaps import Rest
 from qfolio.portfolio.prices.grid import Grid
@@ -43,8 +43,7 @@ def check_duplicates(grid: Grid, rest: Rest, findings: Findings) -> None:
             f"{said}: perhaps one asset under {'two' if len(members) == 2 else 'several'} names",
             advice="If so, keep one: equal weights and caps count each name.",
         )
-    if (more := len(found) - LISTED) > 0:
-        findings.warn(f"and {amount(more, 'more group')} of assets with equal returns", count=more)
+    findings.others("warning", len(found), "group", " of assets with equal returns")
 
 
 def _both(one: str, other: str, ratios: np.ndarray) -> str:

@@ -58,10 +58,9 @@ class Findings(list[Finding]):
         """An error for each row in ``said``; ``spot`` tells where it is."""
         for line in list(said)[:LISTED]:
             self.error(said[line], **spot(line), advice=advice)
-        if (rest := len(said) - LISTED) > 0:
+        if said:
             column = spot(next(iter(said)))["column"]
-            more = f"and {amount(rest, 'more row')} of this kind"
-            self.error(more, column=column, advice=advice, count=rest)
+            self.others("error", len(said), "row", " of this kind", column=column, advice=advice)
 
     def older(self, moments: Sequence[Any], noun: str, kind: str) -> None:
         """A warning that counts all but the latest of such moments, which are listed.
@@ -70,8 +69,14 @@ class Findings(list[Finding]):
         learns of all findings on them.
         """
         if (more := len(moments) - LISTED) > 0:
-            said = f"and {amount(more, f'more {noun}')} {kind}, the latest on this date"
-            self.warn(said, date=day(moments[more - 1]), count=more)
+            date, said = day(moments[more - 1]), f" {kind}, the latest on this date"
+            self.others("warning", len(moments), noun, said, date=date)
+
+    def others(self, severity: Severity, total: int, noun: str, said: str, **rest: Any) -> None:
+        """Counts the findings of a kind that are not listed; total: of all of its findings."""
+        if (more := total - LISTED) > 0:
+            message = f"and {amount(more, f'more {noun}')}{said}"
+            self.append(Finding(severity, message, count=more, **rest))
 
     @property
     def bad(self) -> bool:

@@ -213,8 +213,7 @@ def _report_assets(
         name = f"{quote(grid.assets[j])}: " if grid.long else ""
         column = grid.table.names[grid.prices.columns[j]]
         findings.error(name + said(j), column=column, advice=advice)
-    if (rest := len(found) - LISTED) > 0:
-        findings.error(f"and {amount(rest, 'more asset')} {kind}", advice=advice, count=rest)
+    findings.others("error", len(found), "asset", f" {kind}", advice=advice)
 
 
 def _report_dropped(grid: Grid, drop: np.ndarray, reason: str, findings: Findings) -> None:

@@ -68,10 +68,9 @@ def report_cells(
     for i, j in spots[:LISTED].tolist():
         said = f" {what}" if isinstance(what, str) else f": {what(i, j)}"
         findings.error(grid.subject(block, j) + said, **grid.spot(block, i, j), advice=advice)
-    if (rest := len(spots) - LISTED) > 0:
-        kind = what if isinstance(what, str) else "is not a number"
-        more = amount(rest, f"more {block.name}")
-        findings.error(f"and {more}: the {block.name} {kind}", advice=advice, count=rest)
+    kind = what if isinstance(what, str) else "is not a number"
+    more = f": the {block.name} {kind}"
+    findings.others("error", len(spots), block.name, more, advice=advice)
 
 
 def arrange(table: Table, columns: Columns, findings: Findings) -> Grid | None:

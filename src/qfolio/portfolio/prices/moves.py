@@ -49,8 +49,7 @@ def check_moves(grid: Grid, rest: Rest, findings: Findings) -> None:
             f"{subject(j)} goes from {values[i, j]:.6g} to {values[i + 1, j]:.6g} in one row",
             advice="Check the units of both prices.", **spot(i + 1, j),
         )  # fmt: skip
-    if (more := len(wild) - LISTED) > 0:
-        findings.error(f"and {amount(more, 'more price')} that change by such factors", count=more)
+    findings.others("error", len(wild), "price", " that change by such factors")
     ticks, splits, others = _sort_out(logs, moves, _jumps(values, moves, sizes))
     for (i, j), rows in list(ticks.items())[-LISTED:]:
         spell = "in the next row" if rows == 1 else f"{rows} rows later"

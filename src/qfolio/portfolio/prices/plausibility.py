@@ -39,8 +39,7 @@ def check_cells(grid: Grid, findings: Findings) -> None:
                 f"there are no numbers: {said}", column=table.names[block.columns[j]],
                 advice="Remove the column, or write its numbers as 1234.5.",
             )  # fmt: skip
-        if (rest := int(texts.sum()) - LISTED) > 0:
-            findings.error(f"and {amount(rest, 'more column')} without numbers", count=rest)
+        findings.others("error", int(texts.sum()), "column", " without numbers")
 
         def said_of(i: int, j: int, block: Block = block) -> str:
             return _complaint(grid, block, i, j)

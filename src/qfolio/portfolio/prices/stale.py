@@ -107,9 +107,8 @@ def _report_ended(grid: Grid, rest: Rest, spells: list[_Spell], findings: Findin
             "(--ended); otherwise it can still be bought.",
             **grid.spot(grid.prices, rest.head + last, column),
         )
-    if (more := len(spells) - LISTED) > 0:
-        said = f"and {amount(more, 'more price')} unchanged for long up to the last row"
-        findings.warn(said, date=day(grid.dates[-1]), count=more)
+    said = " unchanged for long up to the last row"
+    findings.others("warning", len(spells), "price", said, date=day(grid.dates[-1]))
 
 
 def _report_constant(grid: Grid, rest: Rest, spells: list[_Spell], findings: Findings) -> None:
@@ -118,8 +117,7 @@ def _report_constant(grid: Grid, rest: Rest, spells: list[_Spell], findings: Fin
             f"the price of {quote(grid.assets[rest.assets[j]])} never changes",
             advice="Remove the asset unless it is meant to earn nothing; cash needs no asset.",
         )
-    if (more := len(spells) - LISTED) > 0:
-        findings.warn(f"and {amount(more, 'more price')} that never change", count=more)
+    findings.others("warning", len(spells), "price", " that never change")
 
 
 def _report_idle(
