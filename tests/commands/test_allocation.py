@@ -6,7 +6,10 @@ import shutil
 
 import pytest
 
+from qfolio.core.files import write_arrays
 from qfolio.portfolio.desk.ledger import Ledger
+from qfolio.portfolio.prices.stored import to_arrays
+from qfolio.portfolio.prices.table import load
 
 from shell import TINY_BACKTEST, qfolio
 from tables import write_table
@@ -290,6 +293,34 @@ def test_any_order_is_reproduced_after_an_update(copy, monkeypatch, capsys, tmp_
     (policies / "latest-1.safetensors").write_bytes(before)
     assert qfolio(monkeypatch, "allocate", copy, "--reproduce", "2020-09-26") == 2
     assert "the file of the policy latest-1 differ" in capsys.readouterr().err
+
+
+def test_what_was_changed_since_an_allocation_is_noticed(copy, monkeypatch, capsys, tmp_path):
+    shutil.rmtree(copy / "ledger", ignore_errors=True)
+    newer = ["--prices", write_table(tmp_path / "newer.csv", rows=270), "--as-of", "2020-09-26"]
+    assert qfolio(monkeypatch, "allocate", copy, *newer, "--capital", 1000) == 0
+    again = ["allocate", copy, "--reproduce", "2020-09-26"]
+    record, config = copy / "ledger" / "0001.json", copy / "config.json"
+    content, settings = record.read_text(), config.read_text()
+    changed = json.loads(content)
+    changed["target"][:2] = changed["target"][1::-1]
+    capsys.readouterr()
+
+    def refused(said):
+        assert qfolio(monkeypatch, *again) == 2
+        assert said in capsys.readouterr().err
+
+    record.write_text(json.dumps(changed))
+    refused("gives other weights from the same inputs")
+    record.write_text(content)
+    config.write_text(f"{settings} ")
+    refused("config.json differ")
+    config.write_text(settings)
+    (kept,) = (copy / "ledger" / "prices").iterdir()
+    write_arrays(kept, to_arrays(load(write_table(tmp_path / "other.csv", rows=270, scale=2))))
+    refused("does not belong to record 1")
+    record.rename(record.with_name("0007.json"))
+    refused("0007.json is damaged")
 
 
 @pytest.mark.parametrize(

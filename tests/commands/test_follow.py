@@ -8,6 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from qfolio.portfolio.desk.desk import Desk
+from qfolio.portfolio.desk.follow import follow
+
 from shell import qfolio
 from tables import write_table
 
@@ -54,6 +57,9 @@ def test_follow_shows_live_beside_the_backtest(folder, monkeypatch, capsys, tmp_
     assert float(rows[-1]["growth"]) == pytest.approx(found["growth"])
     low, middle, high = found["band"]
     assert low < middle < high
+    for name, end in (("low", low), ("middle", middle), ("high", high)):
+        assert float(rows[-1][f"band_{name}"]) == pytest.approx(end)
+    assert all(0 < float(row["cash"]) < 0.9 * float(row["wealth"]) for row in rows)
     assert found["benchmark"] == "equal-weight"
     assert float(rows[-1]["benchmark"]) == pytest.approx(found["benchmark_growth"])
     assert found["alarm_since"] is None
@@ -177,3 +183,18 @@ def test_the_page_does_not_replace_the_rows(folder, monkeypatch, capsys, tmp_pat
     assert qfolio(monkeypatch, "follow", folder, "--out", tmp_path / "live.html") == 2
     assert "name it *.csv" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_gain_at_every_row_is_above_the_band(folder, monkeypatch, capsys, tmp_path):
+    prices = table(tmp_path / "rise.csv", 420, fall=-0.02)
+    assert qfolio(monkeypatch, "follow", folder, "--prices", prices) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Live is above the band." in printed
+
+
+def test_rows_that_a_backtest_was_given_later_are_live(folder, tmp_path, monkeypatch):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    later = table(tmp_path / "later.csv", 345)
+    before = follow(Desk.open(copy), later).tested
+    assert qfolio(monkeypatch, "backtest", later, "--resume", copy) == 0
+    np.testing.assert_array_equal(follow(Desk.open(copy), later).tested, before)

@@ -25,6 +25,7 @@ from qfolio.core.files import (
     read_arrays,
     write_arrays,
     write_bytes,
+    write_json,
 )
 
 ARRAYS = {"weights": np.arange(6, dtype=np.float32).reshape(2, 3), "steps": np.array(7)}
@@ -69,6 +70,16 @@ def test_one_flipped_bit_is_noticed(place, tmp_path):
         read_arrays(path)
 
 
+def test_another_shape_of_the_same_numbers_is_noticed(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    write_arrays(path, {"x": np.arange(6.0).reshape(2, 3)})
+    content = path.read_bytes()
+    assert content.count(b"[2,3]") == 1
+    path.write_bytes(content.replace(b"[2,3]", b"[3,2]"))
+    with pytest.raises(QfolioError, match="digest"):
+        read_arrays(path)
+
+
 def test_arrays_without_a_digest_are_refused(tmp_path):
     from safetensors.numpy import save_file
 
@@ -78,8 +89,30 @@ def test_arrays_without_a_digest_are_refused(tmp_path):
 
 
 def test_a_folder_that_cannot_be_made_leaves_nothing(tmp_path):
+    def fail(folder):
+        write_bytes(folder / "config.json", b"{}")
+        raise ZeroDivisionError
+
     with pytest.raises(ZeroDivisionError), new_folder(tmp_path / "run") as folder:
-        write_bytes(folder / "config.json", bytes(1 // 0))
+        fail(folder)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such rights")
+def test_a_folder_has_the_rights_that_the_user_gives(tmp_path):
+    before = os.umask(0o027)
+    try:
+        with new_folder(tmp_path / "run"):
+            pass
+    finally:
+        os.umask(before)
+    assert (tmp_path / "run").stat().st_mode & 0o777 == 0o750
+
+
+def test_json_holds_finite_numbers_only(tmp_path):
+    for number in (math.nan, math.inf):
+        with pytest.raises(ValueError, match="JSON"):
+            write_json(tmp_path / "summary.json", {"x": [number]})
     assert not list(tmp_path.iterdir())
 
 

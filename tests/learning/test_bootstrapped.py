@@ -100,6 +100,7 @@ def test_planted_momentum_is_found_and_tilted_to():
         ({"bootstrap_heads": 1, "caution": 1.0}, "caution compares heads"),
         ({"bootstrap_heads": 0}, "bootstrap_heads is 0"),
         ({"caution": -1.0}, "caution is -1"),
+        ({"batch_size": 1}, "market_baseline compares"),
     ],
 )
 def test_settings_that_do_not_fit(changes, message):

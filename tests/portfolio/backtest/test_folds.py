@@ -125,3 +125,8 @@ def test_all_dates_of_a_long_table_are_spelled_at_once() -> None:
     assert texts[:2] == ["2020-01-01 09:30:00", "2020-01-01 09:31:00"]
     assert texts[-1] == spell(minutes[-1], minutes)
     assert spell_all(minutes[:1], minutes[::1440]) == ["2020-01-01"]
+
+
+def test_training_is_longer_than_the_lag():
+    with pytest.raises(QfolioError, match="shorter than the lag"):
+        walk_forward(DAYS, "3d", "1y", 3)

@@ -98,6 +98,8 @@ def test_all_strategies_are_replayed_on_the_same_days(finished):
     assert list(entries) == [*agents, *BASELINES, *slower]
     assert len(finished.folds) == 4
     assert len(finished.dates) == 260 - 100
+    assert str(finished.dates[0])[:10] == finished.folds[0].name == "2020-04-10"
+    assert finished.dates[-1] == table().dates[-1]
     for name, entry in entries.items():
         seeds = 2 if name in AGENTS else 1
         assert entry.simulation.returns.shape == (seeds, 160), name
@@ -322,10 +324,16 @@ def test_tables_say_what_was_replayed(finished):
     lines = (finished.folder / "returns.csv").read_text().splitlines()
     assert lines[0].split(",")[:4] == ["date", "dqn/0", "dqn/1", "dqn-together"]
     assert len(lines) == 161
+    assert [lines[i].partition(",")[0] for i in (1, -1)] == ["2020-04-10", "2020-09-16"]
     assert float(lines[1].split(",")[1]) == entries["dqn"].simulation.returns[0, 0]
     assert (finished.folder / "weights.csv").read_text().startswith("date,strategy,cash,A,B,'=<b>C")
     weights = (finished.folder / "weights.csv").read_text().splitlines()
     assert len(weights) - 1 == 160 * sum(e.kind != "rebalancing" for e in entries.values())
+    for row, line in ((0, weights[1]), (-1, weights[160])):
+        date, name, *numbers = line.split(",")
+        assert (date, name) == (str(finished.dates[row])[:10], "dqn")
+        held = entries["dqn"].simulation.weights.mean(0)[row]
+        np.testing.assert_allclose(np.array(numbers, float), held, atol=1e-6)
     summary = json.loads((finished.folder / "summary.json").read_text())
     assert summary["strategies"]["pathwise"]["kind"] == "agent"
     assert list(summary["verdicts"]) == ["dqn", "dqn-together", "pathwise", "pathwise-together"]
@@ -542,3 +550,20 @@ def test_damaged_folders(finished, tmp_path, name, content, message):
     (folder / name).write_text(content)
     with pytest.raises(QfolioError, match=message):
         Backtest.open(folder)
+
+
+def test_the_table_of_another_backtest_is_refused(finished, tmp_path):
+    folder = shutil.copytree(finished.folder, tmp_path / "copy")
+    BacktestFolder(folder).write_prices(table(seed=1))
+    with pytest.raises(QfolioError, match=r"does not belong to config\.json"):
+        Backtest.open(folder)
+
+
+def test_returns_have_what_cash_earned(tmp_path):
+    agents = {"pathwise": AGENTS["pathwise"]}
+    backtest = create(tmp_path / "run", agents=agents, cost_model="itemized(cash_rate=0.05)")
+    backtest.run()
+    entries, _ = backtest.entries()
+    write_tables(backtest, entries, backtest.assess(entries))
+    _, columns = BacktestFolder(tmp_path / "run").read_returns()
+    np.testing.assert_allclose(columns["risk_free"], np.expm1(0.05 / 365), rtol=1e-9)

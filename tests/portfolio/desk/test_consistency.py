@@ -53,6 +53,18 @@ def test_a_large_drop_is_found(sharpe, least):
     assert alarms(plain, sharpe * SHARPE, 60) >= least
 
 
+def test_a_promise_of_several_is_weaker():
+    """Together they are wrong as rarely as one alone."""
+    tested = plain(np.random.default_rng(1), 1000, SHARPE)
+    one, two, both = (
+        Promise.of(tested, np.random.default_rng(0), promises).least for promises in (1, 2, 2)
+    )
+    assert two == both < one
+    spread = 0.01 / np.sqrt(1000)
+    assert one == pytest.approx(tested.mean() - 1.96 * spread, abs=0.2 * spread)
+    assert two == pytest.approx(tested.mean() - 2.24 * spread, abs=0.2 * spread)
+
+
 def test_evidence_by_hand():
     """A loss of half the range below the limit, with the largest bet of 1 / (1/2)."""
     promise = Promise(-1.0, 1.0, 0.0)

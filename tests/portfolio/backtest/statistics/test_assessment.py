@@ -13,6 +13,7 @@ from qfolio.portfolio.backtest.statistics.bootstrap import block_length
 from qfolio.portfolio.backtest.statistics.measures import MEASURES, measures
 from qfolio.portfolio.backtest.statistics.sharpe import (
     expected_maximum_sharpe,
+    minimum_track_record,
     probabilistic_sharpe,
 )
 
@@ -64,6 +65,8 @@ def test_assess_by_hand_on_one_block() -> None:
 
     variance = max(float(np.var(table["sharpe"], ddof=1)) / 252, 1 / 299)
     test = dqn.sharpe_test
+    needed = minimum_track_record(test.ratio / np.sqrt(252), test.skewness, test.kurtosis)
+    assert test.minimum_years == pytest.approx(needed / 252)
     threshold = expected_maximum_sharpe(7, variance)
     assert test.threshold == pytest.approx(threshold * math.sqrt(252))
     sharpe = table["sharpe"].mean() / math.sqrt(252)
