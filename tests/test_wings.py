@@ -41,7 +41,9 @@ def test_no_import_points_up(wing):
 
 def test_the_statistics_of_a_backtest_stand_alone():
     own = "qfolio.portfolio.backtest.statistics"
-    for path in sorted((SOURCE / "portfolio" / "backtest" / "statistics").glob("*.py")):
+    files = sorted((SOURCE / "portfolio" / "backtest" / "statistics").glob("*.py"))
+    assert files
+    for path in files:
         for name in imported(path):
             allowed = not name.startswith("qfolio") or name.startswith((own, "qfolio.core"))
             assert allowed, f"{path.name} imports {name}"

@@ -109,23 +109,24 @@ def test_a_damaged_folder_is_refused(policy, tmp_path):
     policy.save(tmp_path / "kept")
     path = tmp_path / "kept/policy.json"
     config = json.loads(path.read_text())
-    for name, value in (
-        ("kind", "backtest"),
-        ("agent", None),
-        ("agent", "ddqn"),
-        ("assets", 3),
-        ("assets", [1, 2, 3]),
-        ("assets", ["a", "b"]),
-        ("seeds", 3),
-        ("seeds", 10**12),
-        ("rows", "many"),
-        ("learned", "some day"),
-        ("task", {"window": 0}),
-        ("task", []),
-        ("settings", {**config["settings"], "hidden": [9, 9]}),
+    other = "does not belong to the settings beside it"
+    for name, value, said in (
+        ("kind", "backtest", "is a backtest, not a policy"),
+        ("agent", None, "agent: expected str"),
+        ("agent", "ddqn", "no agent 'ddqn'"),
+        ("assets", 3, "assets: expected array"),
+        ("assets", [1, 2, 3], "expected str, got int"),
+        ("assets", ["a", "b"], other),
+        ("seeds", 3, other),
+        ("seeds", 10**12, "seeds: expected int <="),
+        ("rows", "many", "rows: expected int"),
+        ("learned", "some day", "which is not a date"),
+        ("task", {"window": 0}, "window is 0"),
+        ("task", [], "task: expected object"),
+        ("settings", {**config["settings"], "hidden": [9, 9]}, other),
     ):
         path.write_text(json.dumps({**config, name: value}))
-        with pytest.raises(QfolioError):
+        with pytest.raises(QfolioError, match=said):
             Policy.open(tmp_path / "kept")
     path.write_text(json.dumps({k: v for k, v in config.items() if k != "learns"}))
     with pytest.raises(QfolioError, match="damaged"):

@@ -410,6 +410,7 @@ def test_a_mandate_in_motion_is_said_and_checked_over_a_whole_backtest(tmp_path:
     assert any(note.startswith("mine breaks the mandate in") for note in notes)
     first = backtest.folds[0].decisions.start
     for name in ("pathwise", "dqn", "momentum", "equal-weight"):
+        assert (~np.isnan(entries[name].decisions[0])).all(1).any(), name
         for row, order in enumerate(entries[name].decisions[0], first):
             if not np.isnan(order).any():
                 there = prices.tradable[row]  # type: ignore[index]
@@ -446,6 +447,7 @@ def test_an_order_over_several_rows_buys_nothing_that_has_left(seed: int) -> Non
     )  # fmt: skip
     relatives = np.nan_to_num(prices.values[1:] / prices.values[:-1], nan=1.0)
     holding = np.eye(6)[0]
+    assert (~np.isnan(found.decisions)).all(1).sum() > 10
     for row, order in zip(range(20, 58), found.decisions, strict=True):
         if not np.isnan(order).any():
             assert (order[1:] <= holding[1:] + 1e-9)[~prices.tradable[row]].all()

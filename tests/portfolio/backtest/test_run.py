@@ -293,15 +293,23 @@ def test_further_agents_are_prepared_while_the_first_trains(monkeypatch):
     assert backtest.interrupted
 
 
-def test_no_strategy_looks_ahead():
+@pytest.mark.parametrize(
+    ("t", "lag"),
+    [
+        (220, 1),  # within the last fold but one
+        pytest.param(98, 1, marks=pytest.mark.slow),  # the first decision
+        pytest.param(220, 0, marks=pytest.mark.slow),
+        pytest.param(197, 2, marks=pytest.mark.slow),  # the first decision of a later fold
+    ],
+)
+def test_no_strategy_looks_ahead(t, lag):
     """Prices after t change no weight decided up to t, through training, folds and baselines."""
     changed = table().values.copy()
-    t = 220  # within the last fold but one
     changed[t + 1 :] *= np.exp(np.random.default_rng(5).normal(0, 0.3, changed[t + 1 :].shape))
     decisions = []
     for values in (table().values, changed):
         prices = Prices(table().dates, table().assets, values)
-        backtest = create(prices=prices)
+        backtest = create(prices=prices, lag=lag)
         backtest.run()
         entries, _ = backtest.entries()
         decisions.append({name: entry.decisions for name, entry in entries.items()})

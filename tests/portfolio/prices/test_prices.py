@@ -549,15 +549,18 @@ def test_prices_keep_their_rules():
     assert prices.values[0, 0] == 10
     bad = values.copy()
     bad[3, 0] = np.nan
-    for broken in (
-        lambda: Prices(days[::-1], ("A", "B"), values),
-        lambda: Prices(days, ("A", "A"), values),
-        lambda: Prices(days, ("A",), values),
-        lambda: Prices(days, ("A", "B"), -values),
-        lambda: Prices(days, ("A", "B"), bad),
-        lambda: Prices(days, ("A", "B"), values, np.full((5, 2, 1), np.nan), ("f",)),
+    for broken, said in (
+        (lambda: Prices(days[::-1], ("A", "B"), values), "dates must increase"),
+        (lambda: Prices(days, ("A", "A"), values), "must not repeat"),
+        (lambda: Prices(days, ("A",), values), "do not fit 5 dates, 1 assets"),
+        (lambda: Prices(days, ("A", "B"), -values), "prices must be finite and positive"),
+        (lambda: Prices(days, ("A", "B"), bad), "prices must be finite and positive"),
+        (
+            lambda: Prices(days, ("A", "B"), values, np.full((5, 2, 1), np.nan), ("f",)),
+            "features must be finite",
+        ),
     ):
-        with pytest.raises(QfolioError):
+        with pytest.raises(QfolioError, match=said):
             broken()
 
 
