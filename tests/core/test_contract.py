@@ -115,6 +115,7 @@ def test_tasks(name, method, says):
         ("action_values", lambda self, w, o: w, r"returns float32\[2\]; it must be float32\[3,2"),
         ("warm_up", 0, "Own.warm_up must be a method that takes self."),
         ("warm_up", lambda self: None, r"Own.warm_up\(\) is None; it must be a whole number."),
+        ("warm_up", lambda self: 5, "Own warms up for 5 steps, but stores nothing then; define "),
         ("rollout_steps", 0, "rollout_steps of Own is 0; it must be from 1 to "),
     ],
 )  # fmt: skip

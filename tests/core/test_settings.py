@@ -10,7 +10,6 @@ from qfolio.core import registry, settings
 from qfolio.core.errors import QfolioError
 from qfolio.core.fields import number, static
 
-from planted import Known
 from probes import OneState, Probe
 
 
@@ -111,15 +110,6 @@ def test_counts_shape_the_program():
 
     with pytest.raises(QfolioError, match=r"size of Careless .*; declare it as size: int = static"):
         Careless()
-
-
-def test_an_agent_that_warms_up_stores_what_it_sees():
-    class Forgetful(Known):
-        def warm_up(self):
-            return 5
-
-    with pytest.raises(QfolioError, match="Forgetful warms up for 5 steps, but stores nothing"):
-        Forgetful(rule="momentum")
 
 
 def test_settings_are_divided_by_their_owners():

@@ -16,6 +16,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 from qfolio.core.arrays import numbers
 from qfolio.core.errors import QfolioError, require_methods, require_type, require_whole
 from qfolio.core.mdp import Actions, Agent, Box, Discrete, ExogenousTask, Step, Task, Transition
+from qfolio.core.text import amount
 
 SHOWN = 200
 """Most characters of a message that show what a method returned."""
@@ -66,7 +67,13 @@ def require_agent(
 
     state: the agent's, before any experience. step: from ``require_task``.
     """
-    require_whole(f"{type(agent).__name__}.warm_up()", agent.warm_up(), 0, 2**31 - 1)
+    kind, steps = type(agent), agent.warm_up()
+    require_whole(f"{kind.__name__}.warm_up()", steps, 0, 2**31 - 1)
+    if steps and kind.observe is Agent.observe:
+        raise QfolioError(
+            f"{kind.__name__} warms up for {amount(steps, 'step')}, but stores nothing then; "
+            "define observe, or leave warm_up out."
+        )
     state = jax.eval_shape(lambda: _arrays(agent, "init", state))
     seen = _repeated(step.observation, agent.num_envs)
     acts = _shapes(agent, "act", state, seen, key)

@@ -18,9 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from qfolio.core import devices
-from qfolio.core.errors import QfolioError, require_type, require_whole
+from qfolio.core.errors import require_type, require_whole
 from qfolio.core.fields import require, require_static
-from qfolio.core.text import amount
 
 # Every task and every agent begins with this module: here jax has not made an array yet, after
 # which settings of its devices have no effect.
@@ -301,12 +300,6 @@ class Agent(eqx.Module):
         for name, least in (("num_envs", 1), ("episode_steps", 0), ("rollout_steps", 1)):
             of = f"{name} of {type(self).__name__}"
             require_whole(of, getattr(self, name), least, 2**31 - 1)
-        kind = type(self)
-        if kind.observe is Agent.observe and kind.warm_up is not Agent.warm_up and self.warm_up():
-            raise QfolioError(
-                f"{kind.__name__} warms up for {amount(self.warm_up(), 'step')}, but stores "
-                "nothing then; define observe, or leave warm_up out."
-            )
 
     @property
     def rollout_steps(self) -> int:
