@@ -129,8 +129,7 @@ def train(
                 f"Nothing is left to train: each seed has had {trained} already; set a larger "
                 f"total with --{budget.unit}."
             )
-        plain = not compare and contrast_of(run.agent) is not None
-        command = _resume(run, folder, on, not plain)
+        command = _resume(run, folder, on, compare or contrast_of(run.agent) is None)
         with resumable(command), tracked(*following):
             _train(run, budget, executor, show)
     if run.interrupted:

@@ -306,6 +306,10 @@ class Agent(eqx.Module):
         """Steps of each environment that the agent learns from at once."""
         return 1
 
+    def whole_rollouts(self, steps: int) -> int:
+        """Steps of each environment, rounded up to whole rollouts."""
+        return -(-steps // self.rollout_steps) * self.rollout_steps
+
     @abc.abstractmethod
     def init(self, task: Task, key: PRNGKeyArray) -> Any:
         """The state before any experience."""

@@ -147,10 +147,9 @@ class Population:
 
     def _plan(self, steps: int, most: int) -> tuple[int, bool]:
         """How many steps to take now, in whole rollouts, and whether they learn."""
-        length = self.agent.rollout_steps
-        warm_up = -(-self.agent.warm_up() // length) * length - self.steps
+        warm_up = self.agent.whole_rollouts(self.agent.warm_up()) - self.steps
         steps = min(steps, most, warm_up if warm_up > 0 else most)
-        return -(-steps // length) * length, warm_up <= 0
+        return self.agent.whole_rollouts(steps), warm_up <= 0
 
     def _require_healthy(self) -> None:
         healthy = self.healthy

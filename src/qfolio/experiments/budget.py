@@ -54,8 +54,7 @@ class Budget:
 
     def planned(self, population: "Population") -> int:
         """Total steps of all environments of a member, rounded up to whole rollouts."""
-        length = population.agent.rollout_steps
-        left = -(-self.left(population) // length) * length
+        left = population.agent.whole_rollouts(self.left(population))
         return (population.steps + left) * population.agent.num_envs
 
     def left(self, population: "Population") -> int:
@@ -75,8 +74,7 @@ def unlearned(agent: "Agent", steps: int) -> str:
 
     The verb and the rest of a sentence whose subject is the agent.
     """
-    length = agent.rollout_steps
-    stored = -(-agent.warm_up() // length) * length * agent.num_envs  # of whole rollouts
+    stored = agent.whole_rollouts(agent.warm_up()) * agent.num_envs
     if steps > stored:
         return ""
     return (

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from qfolio.core.market import View
+from qfolio.learning.trading import ratio
 
 START = 0.3
 """The share of the way to its target that a new policy trades at a step."""
@@ -76,8 +77,7 @@ class Tilting(eqx.Module):
     def __call__(self, view: View) -> Float[Array, "batch output"]:
         assert view.anchor is not None
         tilted = view.anchor * jnp.exp(view.features[..., -1, 1:] @ self.linear)
-        total = tilted.sum(-1)  # 0 if the anchor is all cash
-        tilted = tilted * (view.anchor.sum(-1) / jnp.where(total > 0, total, 1.0))[..., None]
+        tilted = tilted * ratio(view.anchor.sum(-1), tilted.sum(-1))[..., None]
         assets = view.holding + jax.nn.sigmoid(self.rate) * (tilted - view.holding)
         cash = jnp.maximum(1 - assets.sum(-1, keepdims=True), LEAST_CASH)
         outputs = [jnp.log(cash), jnp.log(jnp.maximum(assets, LEAST))]

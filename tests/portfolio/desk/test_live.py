@@ -165,6 +165,23 @@ def test_a_trade_that_waits_a_row_by_hand():
     assert poor.short == 1
 
 
+@pytest.mark.parametrize("lag", [0, 1, 3])
+def test_a_model_knows_how_long_orders_waited(lag):
+    """As in the replay, which says it, too."""
+
+    class Noting(Proportional):
+        def trade(self, before, after, context):
+            waited.append(context.rows)
+            return super().trade(before, after, context)
+
+    waited: list[int] = []
+    prices = table()
+    records = traded(prices, Proportional(), [10], np.full((1, 4), 0.25))
+    mark(records, prices, Noting(), lag)
+    assert waited
+    assert set(waited) == {lag}
+
+
 def test_an_account_is_wiped_out_once():
     """10 shares bought for 100 with a loan of 50 fall to 4 each, and then rise again."""
     prices, one = by_hand([[10.0], [10.0], [4.0], [8.0]], 10.0, -50.0, 0.0)

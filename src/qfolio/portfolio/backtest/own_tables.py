@@ -179,13 +179,13 @@ def _share_orders(table: Table, when: int, asset: int, shares: int, prices: Pric
     dates = dates_of(table, when)
     traded = numbers_of(table, shares, dates)
     rows, _ = rows_at("It", dates, prices)
-    holding, cash = np.zeros(len(prices.assets)), 0.0
+    holding, cash, known = np.zeros(len(prices.assets)), 0.0, prices.known
     moments: list[np.datetime64] = []
     weights: list[np.ndarray] = []
     names = [label(cell) for cell in table.columns[asset].tolist()]
     for row in np.unique(rows[rows < len(prices)]).tolist():
         close = prices.values[row]
-        gone = np.isnan(prices.known[row]) & ~np.isnan(close)
+        gone = np.isnan(known[row]) & ~np.isnan(close)
         cash += float(holding[gone] @ close[gone])  # what delisted assets paid out
         holding[gone] = 0.0
         for i in np.flatnonzero(rows == row).tolist():
