@@ -32,6 +32,7 @@ from qfolio.report.figures.style import (
     short_tick,
     svgs,
 )
+from qfolio.report.looks import Look
 from qfolio.report.rendering import (
     THIN_SPACE,
     counted,
@@ -53,15 +54,6 @@ FLOOR = 1e-4
 
 UNLIKE = 5.0
 """Budgets that differ by more than this factor are drawn on a logarithmic scale."""
-
-
-@dataclass(frozen=True)
-class Look:
-    """The line style of an agent, the same in every figure."""
-
-    color: str  # a key of palette.LIGHT and palette.DARK
-    dash: str  # dash lengths as in SVG; '' is solid
-    symbol: int  # index of the marker
 
 
 @dataclass(frozen=True)
@@ -93,14 +85,7 @@ class ComparisonData:
 def comparison_data(content: dict[str, Any]) -> ComparisonData:
     """The figures' data, from the content of comparison.json."""
     order = content["ranking"]["order"]
-    looks = {
-        name: Look(
-            f"agent-{place % palette.AGENTS + 1}",
-            ("", "7 3", "2 3")[place // palette.AGENTS % 3],
-            place % len(palette.MARKERS),
-        )
-        for place, name in enumerate(order)
-    }
+    looks = {name: Look.of_agent(place) for place, name in enumerate(order)}
     return ComparisonData(
         content, {name: Result(**content["results"][name]) for name in order}, looks
     )
@@ -137,7 +122,6 @@ def render_comparison(data: ComparisonData) -> str:
         looks=data.looks,
         intervals=ranking["seeds"] >= FEWEST_SEEDS,
         fewest=FEWEST_SEEDS,
-        markers=palette.MARKER_PATHS,
         facts=_facts(data),
         reached=[(name, _reached(data, name)) for name in data.results],
         took=[(name, _took(result)) for name, result in data.results.items()],
@@ -218,8 +202,8 @@ def draw_finals(data: ComparisonData, width: float) -> Figure:
             axes.plot(
                 limit(final["interval"]), [row - 0.1] * 2, color=color, linewidth=4, alpha=0.4
             )
-        symbol = palette.MARKERS[data.looks[name].symbol]
-        axes.plot(limit([final["iqm"]]), [row - 0.1], symbol, color=color, markersize=7)
+        marker = data.looks[name].marker.matplotlib
+        axes.plot(limit([final["iqm"]]), [row - 0.1], marker, color=color, markersize=7)
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(axis="y", labelcolor=palette.INK)
     axes.set_ylim(len(names) - 0.5, -0.6)
@@ -248,13 +232,14 @@ def _draw_curve(axes: Axes, data: ComparisonData, name: str, pace: float, log: b
     )
     axes.fill_between(x, low, high, color=color, alpha=0.16, linewidth=0)
     style: dict[str, Any] = {
-        "linestyle": dashes(look.dash, 1.8),
-        "marker": palette.MARKERS[look.symbol],
-        "markevery": (look.symbol % 4, 4) if len(x) > 6 else 1,
+        "linewidth": look.width,
+        "linestyle": dashes(look.dash, look.width),
+        "marker": look.marker.matplotlib,
+        "markevery": (palette.MARKERS.index(look.marker) % 4, 4) if len(x) > 6 else 1,
         "markersize": 5,
         "clip_on": False,
     }
-    axes.plot(x, middle, color=color, linewidth=1.8, label=name, **style)
+    axes.plot(x, middle, color=color, label=name, **style)
 
 
 def _goal_line(axes: Axes, data: ComparisonData) -> None:

@@ -23,6 +23,7 @@ from qfolio.report.figures.style import (
     short_tick,
     svgs,
 )
+from qfolio.report.looks import Look
 from qfolio.report.rendering import amount, duration, number, percent, render, setting_groups
 
 if TYPE_CHECKING:
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 Content = dict[str, Any]
 """The type of continual.json's content."""
 
-COLORS = dict(zip(WAYS, ("muted", "agent-3", "agent-1", "agent-2"), strict=True))
-"""The color of each way, as keys of palette.LIGHT and palette.DARK."""
+LOOKS = dict(zip(WAYS, map(Look, ("muted", "agent-3", "agent-1", "agent-2")), strict=True))
+"""The look of each way."""
 
 FLOOR = 1e-3
 """The smallest regret drawn on the logarithmic scale."""
@@ -57,7 +58,8 @@ def render_page(content: Content) -> str:
         change=change(content),
         verdict=verdict(content),
         facts=_facts(content),
-        rows=[(way, WAYS[way], COLORS[way], _row(content, way)) for way in WAYS],
+        rows=[(way, WAYS[way], _row(content, way)) for way in WAYS],
+        looks=LOOKS,
         within=percent(content["within"], 0),
         rate=percent(content["rate"], 0),
         renewal=percent(content["renewal"], 0),
@@ -159,9 +161,10 @@ def _draw_course(axes: Axes, content: Content, way: str, last: int) -> None:
     steps, curve = np.array(course["steps"]), np.array(course["curve"])
     if len(steps) == 1:
         steps, curve = np.array([0, last]), np.repeat(curve, 2, axis=0)
-    color = palette.MUTED if COLORS[way] == "muted" else palette.LIGHT[COLORS[way]]
+    look = LOOKS[way]
+    color = palette.LIGHT[look.color]
     low, high, middle = (
         np.maximum(line, FLOOR) for line in (*band(curve), interquartile_mean(curve))
     )
     axes.fill_between(steps, low, high, color=color, alpha=0.16, linewidth=0)
-    axes.plot(steps, middle, color=color, linewidth=1.8, label=way, clip_on=False)
+    axes.plot(steps, middle, color=color, linewidth=look.width, label=way, clip_on=False)

@@ -4,6 +4,8 @@ Blue and orange are distinct for every common form of color blindness. The page 
 colors with its own variables, so that figures follow its light or dark scheme.
 """
 
+from typing import NamedTuple
+
 PAPER = "#ffffff"
 INK = "#1c2530"
 MUTED = "#66707c"
@@ -63,15 +65,23 @@ CSS_VARIABLES = {
 AGENTS = 6
 """Number of colors for agents; further agents reuse them with dashed lines."""
 
-MARKERS = ("o", "s", "D", "^", "v", "p")
-"""Markers of agents, in matplotlib's notation."""
 
-MARKER_PATHS = (
-    "M11,5a4,4 0 1,0 8,0a4,4 0 1,0 -8,0",
-    "M11.5,1.5h7v7h-7z",
-    "M15,0l5,5l-5,5l-5,-5z",
-    "M15,.5l4.5,8h-9z",
-    "M15,9.5l4.5,-8h-9z",
-    "M15,.5l4.6,3.4l-1.8,5.4h-5.6l-1.8,-5.4z",
+class Marker(NamedTuple):
+    """A marker in the notations of those that draw it."""
+
+    matplotlib: str = ""
+    plotly: str = ""
+    svg: str = ""  # a path in a box 30 wide and 10 high
+
+
+UNMARKED = Marker()
+
+MARKERS = (
+    Marker("o", "circle", "M11,5a4,4 0 1,0 8,0a4,4 0 1,0 -8,0"),
+    Marker("s", "square", "M11.5,1.5h7v7h-7z"),
+    Marker("D", "diamond", "M15,0l5,5l-5,5l-5,-5z"),
+    Marker("^", "triangle-up", "M15,.5l4.5,8h-9z"),
+    Marker("v", "triangle-down", "M15,9.5l4.5,-8h-9z"),
+    Marker("p", "pentagon", "M15,.5l4.6,3.4l-1.8,5.4h-5.6l-1.8,-5.4z"),
 )
-"""The same markers as SVG paths, 30 wide and 10 high."""
+"""Markers of agents."""

@@ -12,7 +12,6 @@ from qfolio.portfolio.backtest.statistics.tearsheet import rolling_beta, rolling
 from qfolio.report import palette
 from qfolio.report.backtest.data import BacktestData, StrategySeries, faint_names
 from qfolio.report.backtest.holdings import holdings
-from qfolio.report.backtest.looks import SYMBOLS, Look
 from qfolio.report.backtest.paths import (
     across_seeds,
     compact,
@@ -21,6 +20,7 @@ from qfolio.report.backtest.paths import (
     texts,
     wealth_paths,
 )
+from qfolio.report.looks import Look
 from qfolio.report.rendering import number, percent
 
 POINTS = 1500
@@ -45,7 +45,7 @@ def chart_data(names: list[str], looks: dict[str, Look], data: BacktestData) -> 
                 "color": looks[name].color,
                 "width": looks[name].width,
                 "dash": looks[name].dash,
-                "symbol": None if (place := looks[name].symbol) is None else SYMBOLS[place],
+                "symbol": looks[name].marker.plotly,
                 **_lines(data.strategies[name], ends, firsts),
                 **(_rolling(name, data, ends, window) if window else {}),
             }

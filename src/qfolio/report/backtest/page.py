@@ -19,7 +19,6 @@ from markupsafe import Markup
 from qfolio.core.files import write_text
 from qfolio.portfolio.backtest.statistics.assessment import JUDGED
 from qfolio.portfolio.backtest.statistics.verdict import bound_sentence
-from qfolio.report import palette
 from qfolio.report.backtest.charts import (
     chart_data,
     days_per_point,
@@ -104,7 +103,6 @@ def render_backtest(data: BacktestData) -> str:
             for name in names
         ],
         hidden=payload["hidden"],
-        markers=palette.MARKER_PATHS,
         conclusion=conclusion(data),
         best=best_sentence(data),
         leading=(leading := lead_name(data)),

@@ -37,10 +37,10 @@ def draw_wealth(data: BacktestData, width: float) -> Figure:
             "linewidth": 0.75 * look.width,
             "linestyle": dashes(look.dash, look.width),
         }
-        if look.symbol is not None:
-            start = (0.03 + 0.05 * look.symbol) % 0.14
+        if look.marker != palette.UNMARKED:
+            start = (0.03 + 0.05 * palette.MARKERS.index(look.marker)) % 0.14
             marker: dict[str, Any] = {
-                "marker": palette.MARKERS[look.symbol],
+                "marker": look.marker.matplotlib,
                 "markersize": 5.5,
                 "markeredgecolor": palette.PAPER,
                 "markevery": (round(start * len(days)), max(1, len(days) // 7)),

@@ -139,7 +139,7 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def legend_above(figure: Figure, marks: dict[str, Any]) -> None:
+def legend_above(figure: Figure, marks: dict[str, Any], columns: int = 3) -> None:
     """Put a legend above a figure: an artist by each name, its mark not too faint nor too large."""
     from matplotlib.lines import Line2D
 
@@ -147,7 +147,7 @@ def legend_above(figure: Figure, marks: dict[str, Any]) -> None:
         list(marks.values()),
         list(marks),
         loc="outside upper left",
-        ncols=3,
+        ncols=columns,
         labelcolor=palette.MUTED,
         columnspacing=1.6 if figure.get_figwidth() > NARROW else 1.0,
         handletextpad=0.6,

@@ -14,7 +14,7 @@ from qfolio.experiments.tuning.journal import best_of
 from qfolio.experiments.tuning.search import Dimension
 from qfolio.experiments.tuning.sensitivity import Effect, Outcome
 from qfolio.report import palette
-from qfolio.report.figures.style import NARROW, new_figure, svgs
+from qfolio.report.figures.style import NARROW, legend_above, new_figure, svgs
 from qfolio.report.rendering import percent
 from qfolio.report.sweep import Sweep
 
@@ -56,7 +56,7 @@ def draw_sensitivity(data: Sweep, width: float) -> Figure:
     _height_ticks(axes[0, 0], data.found.outcome)
     for panel in axes[:, 0]:
         panel.set_ylabel(_height_name(data))
-    _legend(figure, marks, 6 if width > NARROW else 2)
+    legend_above(figure, marks, 6 if width > NARROW else 2)
     return figure
 
 
@@ -84,7 +84,7 @@ def draw_pair(data: Sweep, width: float) -> Figure:
         axis.set_ticks(*_ticks(dim, few=width <= NARROW))
         axis.set_label_text(dim.name)
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-    _legend(figure, marks, 4 if width > NARROW else 2)
+    legend_above(figure, marks, 4 if width > NARROW else 2)
     return figure
 
 
@@ -130,21 +130,8 @@ def draw_progress(data: Sweep, width: float) -> Figure:
     if outcome.optimum is not None and high - low < 1:  # room for ticks at round regrets
         axes.set_ylim((low + high - 1) / 2, (low + high + 1) / 2)
     _height_ticks(axes, outcome)
-    _legend(figure, marks, 6 if width > NARROW else 2)
+    legend_above(figure, marks, 6 if width > NARROW else 2)
     return figure
-
-
-def _legend(figure: Figure, marks: dict[str, Any], columns: int) -> None:
-    figure.legend(
-        list(marks.values()),
-        list(marks),
-        loc="outside upper left",
-        ncols=columns,
-        labelcolor=palette.MUTED,
-        columnspacing=1.4,
-        handletextpad=0.4,
-        borderpad=0.3,
-    )
 
 
 def _draw_effect(axes: Axes, data: Sweep, effect: Effect, heights: Floats) -> dict[str, Any]:
