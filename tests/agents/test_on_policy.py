@@ -149,6 +149,20 @@ def test_what_is_measured_while_learning(kind):
         assert measured["clip_fraction"] == 0
 
 
+@pytest.mark.parametrize("kind", [REINFORCE, PPO])
+def test_the_policy_learns_from_batches_of_one_step(kind):
+    """Normalized, the advantage of a single step would always be 0."""
+    sizes = {"batch_size": 1} if kind is PPO else {}
+    agent = kind(hidden=(8,), num_envs=1, rollout_length=1, **sizes)
+    population = Population(Pendulum(horizon=1), agent, [0])
+    before = population.weights()
+    population.advance(20)
+    moved = jax.tree.map(
+        lambda a, b: (a != b).any(), before.actor.mlp, population.weights().actor.mlp
+    )
+    assert all(jax.tree.leaves(moved))
+
+
 def test_normalized_by_hand():
     root = np.sqrt(1.5)
     np.testing.assert_allclose(standardized(jnp.array([1.0, 2, 3])), [-root, 0, root], rtol=1e-6)
@@ -465,8 +479,9 @@ def test_the_first_policy_is_the_same_everywhere():
         (PPO, {"gae_lambda": 1.1}, "gae_lambda is 1.1"),
         (A2C, {"gae_lambda": -1.0}, "gae_lambda is -1"),
         (A2C, {"rollout_length": 0}, "rollout_length is 0"),
+        (A2C, {"num_envs": 0}, "num_envs of A2C is 0"),
         (REINFORCE, {"initial_std": 0.0}, "initial_std is 0"),
-        (REINFORCE, {"episode_steps": 2**31}, "must be from 0 to 2³¹ − 1"),
+        (REINFORCE, {"episode_steps": 2**31}, "must be from 0 to 2147483647"),
         (A2C, {"hidden": (0,)}, "must be one or more layer sizes from 1 to"),
         (REINFORCE, {"network": "tree"}, "network is tree"),
     ],

@@ -102,8 +102,7 @@ class OnPolicy(Agent):
     normalize_rewards: bool = static(False)  # by the running deviation of discounted returns
 
     def __check_init__(self) -> None:
-        require_counts(self, "num_envs rollout_length")
-        require_counts(self, "episode_steps", 0)
+        require_counts(self, "rollout_length")
         require(self, "discount", lambda x: 0 <= x <= 1, "between 0 and 1")
         require(self, "max_grad_norm", lambda x: x > 0, "greater than 0")
         coefficients = "value_coef entropy_coef saturation_penalty"
@@ -225,8 +224,11 @@ class OnPolicy(Agent):
         return log_prob * self.weighed(batch)
 
     def weighed(self, batch: Batch) -> Float[Array, " batch"]:
-        """The advantages in the objective, normalized with ``normalize_advantages``."""
-        if not self.normalize_advantages:
+        """The advantages in the objective, normalized with ``normalize_advantages``.
+
+        That of a single step stays as it is: normalized, it would always be 0.
+        """
+        if not self.normalize_advantages or len(batch.advantage) == 1:
             return batch.advantage
         return standardized(batch.advantage, batch.counted)
 
@@ -250,6 +252,9 @@ class OnPolicy(Agent):
     def diagnose(self, log_ratio: Float[Array, " batch"]) -> Metrics:
         """Further metrics, given the log ratio of new to old probabilities of the actions."""
         return {}
+
+    def cut(self, state: OnPolicyState) -> OnPolicyState:
+        return dataclasses.replace(state, normalizer=state.normalizer.cut())
 
     def descend(
         self, task: Task, state: OnPolicyState, batch: Batch
