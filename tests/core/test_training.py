@@ -11,7 +11,7 @@ from qfolio.agents.ppo import PPO
 from qfolio.core.devices import Members, configure
 from qfolio.core.errors import QfolioError
 from qfolio.core.population import Population, Rehearsal, programs_of
-from qfolio.core.training import advance, begin
+from qfolio.core.training import advance, begin, chunk_steps
 
 from probes import Endless, Explosive, RewardDelay
 
@@ -150,6 +150,16 @@ def test_training_episodes_can_be_cut_shorter(task):
     population, _ = trained(task, agent, [0], [20])
     assert population.episodes == 8
     assert not stored(population).terminal.any()
+
+
+@pytest.mark.parametrize(
+    ("horizon", "rollout", "steps"),
+    [(28, 1, 420), (500, 1, 500), (200, 64, 1600), (200, 2048, 2048), (997, 32, 416)],
+)
+def test_chunks_stay_short(horizon, rollout, steps):
+    """Whole episodes and rollouts where few of them fit; curves and Ctrl-C wait for a chunk."""
+    agent = PPO(num_envs=1, rollout_length=rollout, batch_size=rollout)
+    assert chunk_steps(RewardDelay(horizon=horizon), agent) == steps
 
 
 def test_warm_up_stores_and_does_not_learn(task, agent):

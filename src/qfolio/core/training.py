@@ -20,8 +20,8 @@ from qfolio.core.contract import learning_of, require_agent, require_task
 from qfolio.core.errors import require_methods
 from qfolio.core.mdp import Agent, Metrics, Task, Transition
 
-CHUNK = 400
-"""Least number of steps in a chunk (rounded up to whole episodes)."""
+CHUNK, LONGEST = 400, 4000
+"""Least number of steps in a chunk, and the most that whole episodes may make of it."""
 
 
 class Tally(NamedTuple):
@@ -112,9 +112,10 @@ def healthy(agent: Agent, state: TrainingState) -> Bool[Array, ""]:
 
 
 def chunk_steps(task: Task, agent: Agent) -> int:
-    """Steps in a chunk: whole rollouts and whole episodes of full length."""
+    """Steps in a chunk: whole rollouts, and whole episodes of full length if these are short."""
     length = math.lcm(episode_steps(task, agent), agent.rollout_steps)
-    return length * -(-CHUNK // length)
+    steps = length * -(-CHUNK // length)
+    return steps if steps <= LONGEST else agent.whole_rollouts(CHUNK)
 
 
 def episode_steps(task: Task, agent: Agent) -> int:
