@@ -107,7 +107,8 @@ class Facts(NamedTuple):
         share = (np.clip(np.nan_to_num(actions), -1.0, 1.0) + 1) / 2
         whole = np.issubdtype(self.low.dtype, np.integer)
         low, high = (x.astype(float) if whole else x for x in (self.low, self.high))
-        made = low + share.reshape(-1, *low.shape) * (high - low)
+        # Rounding may lead beyond a bound.
+        made = np.clip(low + share.reshape(-1, *low.shape) * (high - low), low, high)
         return list(np.rint(made).astype(self.low.dtype) if whole else made)
 
     def seen(self, observation: Any) -> Any:
