@@ -2,6 +2,7 @@ import dataclasses
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -93,7 +94,9 @@ def test_every_way_begins_with_what_it_knows(content):
 def test_going_on_needs_a_learning_rate():
     """That of the preset has fallen to zero: as it is, an agent would learn nothing."""
     plan = Plan(OLD, NEW, AGENT, EPISODES)
-    assert plan.going_on == dataclasses.replace(AGENT, learning_rate_final=0.3)
+    assert plan.going_on == dataclasses.replace(
+        AGENT, learning_rate_final=0.3, learning_rate_steps=1.0
+    )
     first = trained(OLD, dataclasses.replace(AGENT, learning_rate_steps=100.0), 32)
     moved = {}
     for final in (0.0, 0.1):
@@ -105,6 +108,16 @@ def test_going_on_needs_a_learning_rate():
         moved[final] = max(np.abs(a - b).max() for a, b in pairs)
     assert moved[0.0] == 0
     assert moved[0.1] > 1e-4
+
+
+@pytest.mark.parametrize("final", [0.0, 1.0])
+def test_going_on_keeps_to_its_rate_wherever_the_schedule_was(final):
+    agent = dataclasses.replace(AGENT, learning_rate_final=final)
+    going_on = Plan(OLD, NEW, agent, EPISODES, rate=0.2).going_on
+    assert isinstance(going_on, DQN)
+    for update in (1, 100, 10_000):
+        rate = float(going_on._schedule(jnp.array(update)))
+        assert rate == pytest.approx(0.2 * agent.learning_rate)
 
 
 def test_renewed_learning_knows_everything_and_remembers_nothing():

@@ -99,8 +99,8 @@ class Plan:
 
     @property
     def going_on(self) -> Agent:
-        """The agent, with a learning rate that does not fall below ``rate``."""
-        return self._set(learning_rate_final=max(self.rate, _setting(self.agent, "final")))
+        """The agent, with a learning rate of ``rate`` times the initial one from now on."""
+        return self._set(learning_rate_final=self.rate, learning_rate_steps=1.0)
 
     @property
     def renewed(self) -> Agent:
