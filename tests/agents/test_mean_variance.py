@@ -109,7 +109,7 @@ def test_cap_and_assets_that_cannot_be_traded():
         ({"risk_aversion": 0.0}, "risk_aversion"),
         ({"ridge": -1.0}, "ridge"),
         ({"units": 0}, "units"),
-        ({"num_envs": 2**31}, "must be from 1 to 2³¹ − 1"),
+        ({"num_envs": 2**31}, "must be from 1 to 2147483647"),
         ({"members": 33}, "from 2 to the number of blocks, 32"),
     ],
 )

@@ -269,7 +269,8 @@ def test_a_rollout_must_not_span_two_episodes():
 
 
 @pytest.mark.parametrize(
-    "settings", [{"head": 84}, {"members": 1}, {"threshold": -1.0}, {"members": 40}]
+    "settings",
+    [{"head": 84}, {"members": 1}, {"threshold": -1.0}, {"members": 40}, {"memory": 0.0}],
 )
 def test_settings_out_of_range(settings: dict[str, Any]):
     with pytest.raises(QfolioError, match=next(iter(settings))):

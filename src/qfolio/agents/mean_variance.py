@@ -25,7 +25,7 @@ from qfolio.core.market import View
 from qfolio.core.mdp import ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
 from qfolio.learning.covariance import Covariance, Means
-from qfolio.learning.evidence import Evidence, blocks_of, left_out, require_members
+from qfolio.learning.evidence import Evidence, EvidenceConfig, blocks_of, left_out
 from qfolio.learning.trading import Trading
 
 
@@ -130,18 +130,15 @@ class MeanVariance(Onlooker):
     memory: float = number(0.9)  # share of the evidence that a gradient step keeps
 
     def __check_init__(self) -> None:
-        require_counts(self, "num_envs units blocks")
-        require_members(self.members, self.blocks)
+        require_counts(self, "units")
+        EvidenceConfig(self.members, self.blocks, self.threshold, self.memory).check()
         require_counts(self, "rollout_length", 2)
         require(self, "head", lambda x: 0 <= x < self.rollout_length, "at least 0 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
         require(self, "every", lambda x: x >= 1 and self.rollout_length % x == 0, "a divisor of "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
-        require_counts(self, "episode_steps", 0)
         require(self, "risk_aversion", lambda x: 0 < x <= 1e9, "above 0 and at most 10⁹")
         require(self, "ridge", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "threshold", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
-        require(self, "memory", lambda x: 0 <= x < 1, "at least 0 and below 1")
         self._schedule.check()
 
     def init(self, task: Task, key: PRNGKeyArray) -> MeanVarianceState:

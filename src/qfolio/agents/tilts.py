@@ -25,7 +25,7 @@ from qfolio.core.fields import number, require, require_counts, static
 from qfolio.core.market import View
 from qfolio.core.mdp import Box, Discrete, ExogenousTask, Metrics, Simplex, Task, Transition
 from qfolio.learning import optimizer
-from qfolio.learning.evidence import Evidence, blocks_of, left_out, require_members
+from qfolio.learning.evidence import Evidence, EvidenceConfig, blocks_of, left_out
 from qfolio.learning.scores import NETWORKS, Attention, Hidden
 from qfolio.learning.trading import Trading, ratio
 
@@ -200,15 +200,12 @@ class Tilts(Onlooker):
     def __check_init__(self) -> None:
         kinds = ", ".join(("linear", *NETWORKS))
         require(self, "network", lambda x: x in ("linear", *NETWORKS), f"one of {kinds}")
-        require_counts(self, "blocks num_envs units")
-        require_members(self.members, self.blocks)
+        require_counts(self, "units")
+        EvidenceConfig(self.members, self.blocks, self.threshold, self.memory).check()
         require_counts(self, "rollout_length", 2)
         require(self, "head", lambda x: 1 <= x < self.rollout_length, "at least 1 and below "
                 f"rollout_length, {self.rollout_length}")  # fmt: skip
-        require_counts(self, "episode_steps", 0)
         require(self, "tracking_aversion ridge", lambda x: 0 <= x <= 1e9, "from 0 to 10⁹")
-        require(self, "threshold", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
-        require(self, "memory", lambda x: 0 <= x < 1, "at least 0 and below 1")
         self._schedule.check()
 
     def init(self, task: Task, key: PRNGKeyArray) -> TiltsState:

@@ -6,9 +6,27 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from qfolio.core.errors import QfolioError
+from qfolio.core.fields import require, require_counts
 from qfolio.core.mdp import ExogenousTask, Transition
+from qfolio.learning.targets import Scalar
 from qfolio.learning.trading import ratio
+
+
+class EvidenceConfig(NamedTuple):
+    """An agent's settings for its evidence, by the names that they have there."""
+
+    members: int
+    blocks: int
+    threshold: Scalar
+    memory: Scalar
+
+    def check(self) -> None:
+        """Raises QfolioError if a setting is out of range."""
+        require_counts(self, "blocks")
+        wanted = f"from 2 to the number of blocks, {self.blocks}, of which each leaves some out"
+        require(self, "members", lambda x: 2 <= x <= self.blocks, wanted)
+        require(self, "threshold", lambda x: 0 <= x <= 1e3, "from 0 to 1,000")
+        require(self, "memory", lambda x: 0 < x < 1, "above 0 and below 1")
 
 
 class Evidence(NamedTuple):
@@ -59,7 +77,8 @@ class Evidence(NamedTuple):
     def share(self, threshold: Array | float) -> Float[Array, ""]:
         """The share of a departure that it leaves: 1 − (threshold/t)², or 0 for t ≤ threshold.
 
-        The positive-part estimator of James & Stein (1961), for a single number.
+        The positive-part estimator of James & Stein (1961), for a single number. With a threshold
+        of 0 it is always 1.
         """
         t = jnp.maximum(self.t, 1e-9)
         return jnp.maximum(1 - (threshold / t) ** 2, 0.0)
@@ -76,15 +95,6 @@ def blocks_of(task: ExogenousTask, rollout: Transition, blocks: int) -> Int[Arra
     found = jax.vmap(jax.vmap(lambda one: block_of(task, one, blocks)))(rollout.state.market)
     own = jnp.arange(found.shape[1]) % blocks
     return jnp.where(jnp.isfinite(task.moves), found, own)
-
-
-def require_members(members: int, blocks: int) -> None:
-    """Raises QfolioError unless each member can leave out a block and learn from another."""
-    if not 2 <= members <= blocks:
-        raise QfolioError(
-            f"members is {members}; each leaves blocks out, so it must be from 2 to the number of "
-            f"blocks, {blocks}."
-        )
 
 
 def left_out(block: Int[Array, "time path"], members: int) -> Bool[Array, "member time path"]:
