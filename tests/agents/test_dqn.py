@@ -313,6 +313,7 @@ def test_adam_equals_its_formula(task):
         {"huber_delta": float("inf"), "values": "quantile"},
         {"noise_scale": -1.0}, {"persistence": 1.5}, {"importance_steps": 0.0},
         {"epsilon_steps": -1.0}, {"train_freq": 0}, {"train_freq": 4, "persistence": 0.5},
+        {"bootstrap_heads": 2}, {"outcomes": 2}, {"market_baseline": True},
     ],
 )  # fmt: skip
 def test_refuses_what_makes_no_sense(settings):
@@ -335,7 +336,8 @@ def test_continuous_actions_are_refused_by_the_tasks_name(task, words):
 
 @pytest.mark.parametrize(
     "changes", [{"values": "quantile", "huber_delta": 1.0}, {"n_steps": 2}, {"prioritized": True},
-                {"noisy": True}, {"persistence": 0.5}, {"value_rescaling": True}],
+                {"noisy": True}, {"persistence": 0.5}, {"value_rescaling": True},
+                {"time_limit_terminal": True}],
 )  # fmt: skip
 def test_all_actions_refuses_what_moves_do_not_give(changes):
     with pytest.raises(QfolioError, match=f"set {next(iter(changes))}="):

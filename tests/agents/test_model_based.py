@@ -251,7 +251,12 @@ def test_the_fast_preset_swings_the_pendulum_up_from_two_thousand_steps():
     assert max(regret) <= 1
 
 
-@pytest.mark.parametrize("task", [Merton()])
+class Whole(Aim):
+    def observe(self, state):
+        return jnp.round(super().observe(state)).astype(jnp.int32)
+
+
+@pytest.mark.parametrize("task", [Merton(), Whole()])
 def test_refuses_what_is_no_row_of_numbers(task):
     with pytest.raises(QfolioError, match="mbpo predicts observations that are one row"):
         MBPO().init(task, jax.random.key(0))

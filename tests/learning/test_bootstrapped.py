@@ -96,7 +96,7 @@ def test_planted_momentum_is_found_and_tilted_to():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"all_actions": False}, "bootstrap_heads learn"),
+        ({"all_actions": False}, "bootstrap_heads is for moves of a market; set all_actions=true"),
         ({"bootstrap_heads": 1, "caution": 1.0}, "caution compares heads"),
         ({"bootstrap_heads": 0}, "bootstrap_heads is 0"),
         ({"caution": -1.0}, "caution is -1"),
@@ -111,7 +111,8 @@ def test_settings_that_do_not_fit(changes, message):
 def test_a_report_compares_heads_with_one_network():
     contrast = contrast_of(agent(caution=1.0))
     assert contrast is not None
-    assert contrast.variant == agent(all_actions=False, bootstrap_heads=1)
+    alone = {"all_actions": False, "outcomes": 0, "market_baseline": False, "bootstrap_heads": 1}
+    assert contrast.variant == agent(**alone)
 
 
 def test_positions_need_a_menu_of_signals():

@@ -37,7 +37,7 @@ class Move(NamedTuple):
 
 PLAIN: dict[str, str | bool | int | float] = {
     "values": "expected", "n_steps": 1, "prioritized": False, "noisy": False, "persistence": 0.0,
-    "value_rescaling": False,
+    "value_rescaling": False, "time_limit_terminal": False,
 }  # fmt: skip
 """The values of an agent's settings that ``all_actions`` requires."""
 

@@ -198,9 +198,10 @@ class MBPO(SAC):
     def init(self, task: Task, key: PRNGKeyArray) -> MBPOState:
         model_key, key, bootstrap_key = jax.random.split(key, 3)
         observation = task.observe(task.reset(key))
-        if getattr(observation, "ndim", 0) != 1 or task.states is not None:
+        row = getattr(observation, "ndim", 0) == 1 and task.states is None
+        if not row or not jnp.issubdtype(observation.dtype, jnp.floating):
             raise QfolioError(
-                "mbpo predicts observations that are one row of numbers; those of "
+                "mbpo predicts observations that are one row of real numbers (float32); those of "
                 f"{task.name} are not; use sac or dqn."
             )
         actions = task.actions

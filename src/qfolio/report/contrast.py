@@ -20,7 +20,14 @@ def contrast_of(agent: Agent) -> Contrast | None:
     if not isinstance(agent, DQN):
         return None
     if agent.all_actions:
-        single = dataclasses.replace(agent, all_actions=False, bootstrap_heads=1, caution=0.0)
+        single = dataclasses.replace(
+            agent,
+            all_actions=False,
+            outcomes=0,
+            market_baseline=False,
+            bootstrap_heads=1,
+            caution=0.0,
+        )
         return Contrast("all actions at once", "one action at a time", single)
     names = ("without double DQN", "double DQN")
     other = dataclasses.replace(agent, double=not agent.double)
